@@ -1,0 +1,102 @@
+"""Feedback policies by iterated LQR smoothing, executed under disturbances in MuJoCo and shown on video.
+
+    import lqrsim as ls
+
+    scenario = ls.scenarios.differential_drive()
+    solution = ls.smooth(scenario.problem)
+    rollout = ls.simulate(scenario.plant(), solution, disturbances=[ls.ControlNoise(0.05)], seed=0)
+    ls.render(rollout, "arena.mp4")
+
+Names are imported when they are first used, so that importing lqrsim costs nothing.
+"""
+
+import importlib
+from importlib.metadata import version as _version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lqrsim import robots as robots
+    from lqrsim import rotations as rotations
+    from lqrsim import scenarios as scenarios
+    from lqrsim.coordinates import Coordinates as Coordinates
+    from lqrsim.costs import ControlCost as ControlCost
+    from lqrsim.costs import Cost as Cost
+    from lqrsim.costs import ObstacleCost as ObstacleCost
+    from lqrsim.costs import QuadraticCost as QuadraticCost
+    from lqrsim.costs import SymbolicCost as SymbolicCost
+    from lqrsim.costs import Term as Term
+    from lqrsim.dynamics import Dynamics as Dynamics
+    from lqrsim.errors import InputError as InputError
+    from lqrsim.files import load_rollout as load_rollout
+    from lqrsim.files import load_solution as load_solution
+    from lqrsim.files import save as save
+    from lqrsim.problem import FixedState as FixedState
+    from lqrsim.problem import InitialPrior as InitialPrior
+    from lqrsim.problem import Problem as Problem
+    from lqrsim.results import AffinePolicy as AffinePolicy
+    from lqrsim.results import Iteration as Iteration
+    from lqrsim.results import Quadratic as Quadratic
+    from lqrsim.results import Rollout as Rollout
+    from lqrsim.results import Solution as Solution
+    from lqrsim.results import Status as Status
+    from lqrsim.results import Trajectory as Trajectory
+    from lqrsim.robots.base import Robot as Robot
+    from lqrsim.robots.differential_drive import DifferentialDrive as DifferentialDrive
+    from lqrsim.robots.quadrotor import Quadrotor as Quadrotor
+    from lqrsim.scenarios import Scenario as Scenario
+    from lqrsim.scenes import Scene as Scene
+    from lqrsim.scenes import load_scene as load_scene
+    from lqrsim.simulation.closed_loop import simulate as simulate
+    from lqrsim.simulation.disturbances import ControlNoise as ControlNoise
+    from lqrsim.simulation.disturbances import Disturbance as Disturbance
+    from lqrsim.simulation.disturbances import ForceNoise as ForceNoise
+    from lqrsim.simulation.disturbances import MeasurementNoise as MeasurementNoise
+    from lqrsim.simulation.disturbances import Push as Push
+    from lqrsim.simulation.plant import Plant as Plant
+    from lqrsim.solvers.ilqr import ilqr as ilqr
+    from lqrsim.solvers.smoother import smooth as smooth
+    from lqrsim.view.plots import plot_run as plot_run
+    from lqrsim.view.render import render as render
+    from lqrsim.view.render import still as still
+    from lqrsim.world import Obstacle as Obstacle
+    from lqrsim.world import World as World
+
+_HOME = {
+    "coordinates": ["Coordinates"],
+    "costs": ["ControlCost", "Cost", "ObstacleCost", "QuadraticCost", "SymbolicCost", "Term"],
+    "dynamics": ["Dynamics"],
+    "errors": ["InputError"],
+    "files": ["load_rollout", "load_solution", "save"],
+    "problem": ["FixedState", "InitialPrior", "Problem"],
+    "results": ["AffinePolicy", "Iteration", "Quadratic", "Rollout", "Solution", "Status", "Trajectory"],
+    "robots.base": ["Robot"],
+    "robots.differential_drive": ["DifferentialDrive"],
+    "robots.quadrotor": ["Quadrotor"],
+    "scenarios": ["Scenario"],
+    "scenes": ["Scene", "load_scene"],
+    "simulation.closed_loop": ["simulate"],
+    "simulation.disturbances": ["ControlNoise", "Disturbance", "ForceNoise", "MeasurementNoise", "Push"],
+    "simulation.plant": ["Plant"],
+    "solvers.ilqr": ["ilqr"],
+    "solvers.smoother": ["smooth"],
+    "view.plots": ["plot_run"],
+    "view.render": ["render", "still"],
+    "world": ["Obstacle", "World"],
+}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+_SUBMODULES = ("robots", "rotations", "scenarios")
+
+__version__ = _version("lqrsim")
+__all__ = sorted([*_MODULE_OF, *_SUBMODULES])  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _SUBMODULES:
+        return importlib.import_module(f"lqrsim.{name}")
+    if name in _MODULE_OF:
+        return getattr(importlib.import_module(f"lqrsim.{_MODULE_OF[name]}"), name)
+    raise AttributeError(f"module 'lqrsim' has no attribute {name!r}; it has {', '.join(__all__)}")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

@@ -1,0 +1,99 @@
+"""What the numbers of a state or control vector mean: names, units, limits, and which of them wrap."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array, InputError, check_array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coordinates:
+    """The meaning of the entries of a vector.
+
+    Attributes:
+      names: one name an entry.
+      units: one unit an entry ("" where there is none).
+      position: indices of the 2 (planar) or 3 (spatial) entries that are the position in the world, in metres; or none.
+      angles: indices of the entries that are angles in radians, equal up to whole turns.
+      rotation_vectors: index of the first of each three entries that are a rotation vector, axis times angle in rad.
+      low, high: limits of each entry, (len(names),); infinite where there is none.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    position: tuple[int, ...] = ()
+    angles: tuple[int, ...] = ()
+    rotation_vectors: tuple[int, ...] = ()
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        size = len(self.names)
+        if len(self.units) != size:
+            raise InputError(
+                f"units: got {len(self.units)} of them, want {size}, one for each of {', '.join(self.names)}"
+            )
+        if len(set(self.names)) != size:
+            raise InputError(f"names: got a name twice in {', '.join(self.names)}, want different names")
+        if len(self.position) not in (0, 2, 3):
+            raise InputError(f"position: got {len(self.position)} entries, want 2 (a planar robot), 3, or none")
+        spans = {"position": self.position, "angles": self.angles, "rotation_vectors": self.rotation_vectors}
+        for field, indices in spans.items():
+            width = 3 if field == "rotation_vectors" else 1
+            if any(not 0 <= index <= size - width for index in indices):
+                raise InputError(f"{field}: got indices {indices}, want them between 0 and {size - width}")
+        if not self.low and not self.high:
+            object.__setattr__(self, "low", (-np.inf,) * size)
+            object.__setattr__(self, "high", (np.inf,) * size)
+        low = check_array("low", self.low, (size,), infinite=True)
+        high = check_array("high", self.high, (size,), infinite=True)
+        if (low >= high).any():
+            i = int(np.argmax(low >= high))
+            raise InputError(
+                f"limits of {self.names[i]}: got {low[i]:g} to {high[i]:g}, want the first below the second"
+            )
+        object.__setattr__(self, "low", tuple(low.tolist()))
+        object.__setattr__(self, "high", tuple(high.tolist()))
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """`name (unit)` for each entry, for axes and tables."""
+        return tuple(f"{n} ({u})" if u else n for n, u in zip(self.names, self.units, strict=True))
+
+    def nearest(self, vector: npt.ArrayLike, near: npt.ArrayLike) -> Array:
+        """The representative of `vector` nearest to `near`; angles and rotation vectors are equal up to whole turns.
+
+        Args:
+          vector, near: (..., n); leading dimensions broadcast.
+        """
+        out, near = np.broadcast_arrays(np.asarray(vector, dtype=np.float64), np.asarray(near, dtype=np.float64))
+        out = out.copy()
+        for i in self.angles:
+            out[..., i] -= 2 * np.pi * np.round((out[..., i] - near[..., i]) / (2 * np.pi))
+        for i in self.rotation_vectors:
+            out[..., i : i + 3] = _nearest_rotation_vector(out[..., i : i + 3], near[..., i : i + 3])
+        return out
+
+    def difference(self, vector: npt.ArrayLike, near: npt.ArrayLike) -> Array:
+        """`nearest(vector, near) - near`, (..., n): the error of `vector`, with whole turns taken out."""
+        return self.nearest(vector, near) - np.asarray(near, dtype=np.float64)
+
+    def clip(self, vector: npt.ArrayLike) -> Array:
+        """`vector` (..., n) held within the limits."""
+        return np.clip(np.asarray(vector, dtype=np.float64), self.low, self.high)
+
+
+def _nearest_rotation_vector(vector: Array, near: Array) -> Array:
+    """Of the vectors `(angle + 2 pi k) axis`, which are all one rotation, the one nearest to `near`; both (..., 3)."""
+    angle = np.linalg.norm(vector, axis=-1, keepdims=True)
+    distance = np.linalg.norm(near, axis=-1, keepdims=True)
+    # The identity has every axis: take the one that `near` points along.
+    small = angle < 1e-12
+    axis = np.where(small, near / np.where(distance > 0, distance, 1.0), vector / np.where(small, 1.0, angle))
+    turns = np.round((np.sum(axis * near, axis=-1, keepdims=True) - angle) / (2 * np.pi))
+    return np.where(turns == 0, vector, (angle + 2 * np.pi * turns) * axis)

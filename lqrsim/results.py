@@ -1,0 +1,419 @@
+"""What comes out: trajectories, policies, value functions, the log of a solve, and executed runs. NumPy only.
+
+`files.py` writes a `Solution` or a `Rollout` to disk and reads it back.
+"""
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.coordinates import Coordinates
+from lqrsim.errors import Array, InputError
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """States (T+1, n) and the controls (T, m) held between them, `dt` seconds apart."""
+
+    states: Array
+    controls: Array
+    dt: float
+
+    @property
+    def steps(self) -> int:
+        """T, the number of control periods."""
+        return len(self.controls)
+
+    @property
+    def horizon(self) -> float:
+        """Duration in seconds; the paper's l."""
+        return self.steps * self.dt
+
+    @property
+    def times(self) -> Array:
+        """Times of the states in seconds, (T+1,)."""
+        return self.dt * np.arange(self.steps + 1)
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """Quadratic functions of the state, one a knot: `1/2 x'Hx + x'g + const`.
+
+    Paper: Eqs. (8), (14), (20).
+
+    Attributes:
+      hessian: (T+1, n, n), symmetric; S, Sbar.
+      gradient: (T+1, n), the slope at the origin; bold s, bold sbar.
+      constant: (T+1,); s, sbar.
+    """
+
+    hessian: Array
+    gradient: Array
+    constant: Array
+
+    def __add__(self, other: "Quadratic") -> "Quadratic":
+        return Quadratic(self.hessian + other.hessian, self.gradient + other.gradient, self.constant + other.constant)
+
+    def __call__(self, states: npt.ArrayLike) -> Array:
+        """The values (T+1,) at states (T+1, n)."""
+        x = np.asarray(states, dtype=np.float64)
+        curved = 0.5 * np.einsum("ti,tij,tj->t", x, self.hessian, x)
+        return curved + np.einsum("ti,ti->t", x, self.gradient) + self.constant
+
+    def minimizer(self) -> Array:
+        """The states (T+1, n) of least value. Paper: Eq. (21). Raises LinAlgError where a Hessian is singular."""
+        return -np.linalg.solve(self.hessian, self.gradient[..., None])[..., 0]
+
+    def minimum(self) -> Array:
+        """The least value at each knot, (T+1,)."""
+        return self(self.minimizer())
+
+
+@dataclass(frozen=True, kw_only=True)
+class AffinePolicy:
+    """The feedback law `u_t = gain_t x + offset_t`, with what is needed to run it on a robot.
+
+    Calling it needs NumPy alone. Paper: Eq. (13); for the inverse policy, which takes the state of *arrival*, Eq. (19).
+
+    Attributes:
+      gain: (T, m, n); L.
+      offset: (T, m); bold l.
+      nominal: (T, n), the state that each law was made about. Angles of a measured state are taken nearest to it.
+      dt: seconds between two laws.
+      state_coordinates, control_coordinates: names and units; which states wrap; the limits that the actuators keep.
+    """
+
+    gain: Array
+    offset: Array
+    nominal: Array
+    dt: float
+    state_coordinates: Coordinates
+    control_coordinates: Coordinates
+
+    @property
+    def steps(self) -> int:
+        """T, the number of laws."""
+        return len(self.gain)
+
+    def control(self, state: npt.ArrayLike, step: int) -> Array:
+        """The law of one step before saturation, (..., m), at states (..., n) given in the nominal's representative."""
+        return np.asarray(state, dtype=np.float64) @ self.gain[step].T + self.offset[step]
+
+    def __call__(self, state: npt.ArrayLike, t: float, *, interpolate: bool = False) -> Array:
+        """The control (..., m) to apply in a measured state (..., n), `t` seconds after the start.
+
+        Angles and rotation vectors may be given in any representative. The result is held within the control
+        limits. Between two knots the earlier law is held, as it is in the plan; `interpolate=True` blends the two
+        instead, for controllers that run faster than the plan. After the horizon the last law stays in force.
+
+        Raises:
+          InputError: `t` is negative or not finite, or the state is not finite or not of length n.
+        """
+        state = np.asarray(state, dtype=np.float64)
+        if state.shape[-1:] != self.gain.shape[-1:]:
+            raise InputError(f"state: got shape {state.shape}, want ({self.gain.shape[-1]},) in its last dimension")
+        if not np.isfinite(state).all():
+            raise InputError(f"state: got {state}, want finite numbers")
+        if not (np.isfinite(t) and t >= 0):
+            raise InputError(f"t: got {t}, want seconds since the start, >= 0")
+        # A time that is a knot up to rounding belongs to the law that begins there.
+        knot = t / self.dt + 1e-9
+        step = min(int(knot), self.steps - 1)
+        gain, offset, nominal = self.gain[step], self.offset[step], self.nominal[step]
+        if interpolate and step + 1 < self.steps:
+            weight = max(knot - 1e-9 - step, 0.0)
+            gain = (1 - weight) * gain + weight * self.gain[step + 1]
+            offset = (1 - weight) * offset + weight * self.offset[step + 1]
+            nominal = (1 - weight) * nominal + weight * self.nominal[step + 1]
+        control = self.state_coordinates.nearest(state, nominal) @ gain.T + offset
+        return self.control_coordinates.clip(control)
+
+
+class Status(enum.StrEnum):
+    """How a solve ended. `meaning` says it in words, `remedy` what to try."""
+
+    CONVERGED = "converged"
+    COST_CONVERGED = "cost converged"
+    MAX_ITERATIONS = "max iterations"
+    INFEASIBLE = "infeasible"
+    DIVERGED = "diverged"
+    NOT_FINITE = "not finite"
+    NOT_POSITIVE_DEFINITE = "not positive definite"
+
+    @property
+    def meaning(self) -> str:
+        return _STATUS_TEXT[self][0]
+
+    @property
+    def remedy(self) -> str:
+        """What to try; empty where nothing needs to be."""
+        return _STATUS_TEXT[self][1]
+
+
+_STATUS_TEXT = {
+    Status.CONVERGED: ("cost change, gap and first-order optimality are all within tolerance", ""),
+    Status.COST_CONVERGED: (
+        "the change of cost is within tolerance; gap and optimality were not asked for",
+        'look at the gap, or solve with stop="optimal"',
+    ),
+    Status.MAX_ITERATIONS: (
+        "the iteration limit came first",
+        "raise max_iterations if the improvements still shrink; if they do not, start closer (start=...)",
+    ),
+    Status.INFEASIBLE: ("no trajectory meets the constraints", "relax the constraint that is named, or give more time"),
+    Status.DIVERGED: (
+        "the cost of the policy grew beyond all bounds",
+        "add a prior to the start, start closer to a solution, shorten dt, or use ilqr(), which never lets the cost rise",
+    ),
+    Status.NOT_FINITE: (
+        "a NaN or an infinity appeared",
+        "check the dynamics and the cost at the step that is named; start closer to a solution; shorten dt",
+    ),
+    Status.NOT_POSITIVE_DEFINITE: (
+        "a matrix that must be inverted was not positive definite",
+        "raise the control weight, add a prior to the start, shorten dt, or use ilqr()",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One line of the log.
+
+    Attributes:
+      cost: true cost of rolling the policy out under the true dynamics.
+      improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration.
+      gap: largest difference between the minimal-total-cost states and that rollout, each state relative to its
+        range along the rollout (at least 1 unit).
+      optimality: the decrease that a linear-quadratic model about the rollout still predicts, relative to the cost; NaN
+        where it was not evaluated (it is once the other tests pass, and after the last iteration).
+      seconds: time this iteration took.
+    """
+
+    cost: float
+    improvement: float
+    gap: float
+    optimality: float
+    seconds: float
+
+    HEADER = f"{'iteration':>9} {'cost':>14} {'improvement':>12} {'gap':>10} {'optimality':>11} {'ms':>8}"
+
+    def row(self, number: int) -> str:
+        """This iteration as a line under `HEADER`."""
+        optimality = "-" if np.isnan(self.optimality) else f"{self.optimality:.1e}"
+        improvement = "-" if np.isinf(self.improvement) else f"{self.improvement:.2e}"
+        return (
+            f"{number:>9} {self.cost:>14.6f} {improvement:>12} {self.gap:>10.1e} {optimality:>11}"
+            f" {1e3 * self.seconds:>8.2f}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solution:
+    """A locally optimal feedback policy and how it was found.
+
+    Attributes:
+      status: how the solve ended; only CONVERGED and COST_CONVERGED are success.
+      detail: where and why, if it is not.
+      policy: the feedback law, from the last backward pass that was completed.
+      inverse_policy: the law that traces the optimum backwards from a state of arrival; None from `ilqr`.
+      cost_to_go, cost_to_come: the value functions of the last passes; None where a pass failed, the latter also from
+        `ilqr`.
+      trajectory: the plan: the rollout of the policy under the true dynamics from its first state.
+      iterations: the log.
+      clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,);
+        None where the problem has no obstacles.
+      solver, options: what was called, with which settings.
+      problem_digest: hash of everything that defined the problem.
+      versions: of lqrsim and the libraries that the numbers depend on.
+      scenario: what the command line was asked for; empty where a program called the solver.
+    """
+
+    status: Status
+    detail: str
+    policy: AffinePolicy
+    inverse_policy: AffinePolicy | None
+    cost_to_go: Quadratic | None
+    cost_to_come: Quadratic | None
+    trajectory: Trajectory
+    iterations: tuple[Iteration, ...]
+    clearance: Array | None
+    solver: str
+    options: Mapping[str, object]
+    problem_digest: str
+    versions: Mapping[str, str]
+    scenario: str = ""
+
+    @property
+    def success(self) -> bool:
+        """True for CONVERGED, and for COST_CONVERGED, where only the cost was asked for."""
+        return self.status in (Status.CONVERGED, Status.COST_CONVERGED)
+
+    @property
+    def cost(self) -> float:
+        """True cost of the plan; NaN if not one iteration was completed."""
+        return self.iterations[-1].cost if self.iterations else float("nan")
+
+    @property
+    def gap(self) -> float:
+        """Gap of the last iteration; see `Iteration.gap`."""
+        return self.iterations[-1].gap if self.iterations else float("nan")
+
+    @property
+    def optimality(self) -> float:
+        """First-order optimality of the last iteration; see `Iteration.optimality`."""
+        return self.iterations[-1].optimality if self.iterations else float("nan")
+
+    @property
+    def total_cost(self) -> Quadratic:
+        """Cost-to-go plus cost-to-come, Eq. (20). Raises InputError where there is no cost-to-come, as from `ilqr`."""
+        if self.cost_to_go is None or self.cost_to_come is None:
+            raise InputError(
+                f"total_cost: got a solution of {self.solver} without both value functions, want one of smooth"
+            )
+        return self.cost_to_go + self.cost_to_come
+
+    def iteration_table(self) -> str:
+        """The log as text, a line an iteration."""
+        rows = [iteration.row(number) for number, iteration in enumerate(self.iterations, start=1)]
+        return "\n".join([Iteration.HEADER, *rows])
+
+    def summary(self) -> str:
+        """The status with its remedy, and what came out, in a few lines."""
+        lines = [f"{self.status.name} after {len(self.iterations)} iterations of {self.solver}: {self.status.meaning}"]
+        if self.detail:
+            lines.append(f"  where:     {self.detail}")
+        if self.status.remedy:
+            lines.append(f"  remedy:    {self.status.remedy}")
+        lines.append(f"  cost:      {self.cost:.6f}   gap: {self.gap:.1e}   optimality: {self.optimality:.1e}")
+        if self.clearance is not None:
+            knot = int(np.argmin(self.clearance))
+            verdict = "collides" if self.clearance[knot] < 0 else "clear"
+            lines.append(f"  clearance: {self.clearance[knot]:.3f} m at {knot * self.trajectory.dt:.2f} s ({verdict})")
+        lines += [f"  limits:    {line}" for line in self._beyond_limits()]
+        return "\n".join(lines)
+
+    def _beyond_limits(self) -> list[str]:
+        """One line for each control that the plan takes beyond its limits."""
+        space, controls = self.policy.control_coordinates, self.trajectory.controls
+        return [
+            f"{label} is planned from {used.min():.3g} to {used.max():.3g}, beyond {low:.3g} to {high:.3g}"
+            for label, used, low, high in zip(space.labels, controls.T, space.low, space.high, strict=True)
+            if used.min() < low or used.max() > high
+        ]
+
+    def __str__(self) -> str:
+        return f"{self.iteration_table()}\n{self.summary()}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rollout:
+    """Closed-loop runs of one policy in MuJoCo, with everything that a picture of them needs.
+
+    K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, to the last bit.
+
+    Attributes:
+      robot, scene: their names. model: the MJCF that was run, as text.
+      plan: what the policy meant to do. policy_digest: hash of the policy.
+      goal_radius: distance in metres from the plan's end within which a trial has reached its goal.
+      radius: of the robot's collision circle or sphere, in metres.
+      states: (K, T+1, n) true states; angles in the representative nearest the plan.
+      measured: (K, T+1, n) the states that the policy was shown.
+      commanded: (K, T, m) what the policy asked for, within the limits. applied: (K, T, m) what the actuators got.
+      forces: (K, T, 3) disturbing force at the robot's centre of mass in N, world axes.
+      clearance: (K, T+1) signed distance to the nearest obstacle minus the radius in metres; infinite without any.
+      contacts: (K,) control periods in which MuJoCo reported a contact of the robot with an obstacle.
+      diverged: (K,) whether the simulation became unstable; the states are NaN from there on.
+      frame_times: (F,) seconds; frames: (K, F, nq) MuJoCo's qpos then, for drawing.
+      disturbances: one description each. seed, first_trial: what the draws came from.
+      versions: of lqrsim and the libraries that the numbers depend on.
+    """
+
+    robot: str
+    scene: str
+    model: str
+    plan: Trajectory
+    policy_digest: str
+    state_coordinates: Coordinates
+    control_coordinates: Coordinates
+    radius: float
+    goal_radius: float
+    states: Array
+    measured: Array
+    commanded: Array
+    applied: Array
+    forces: Array
+    clearance: Array
+    contacts: npt.NDArray[np.int64]
+    diverged: npt.NDArray[np.bool_]
+    frame_times: Array
+    frames: Array
+    disturbances: tuple[str, ...]
+    seed: int
+    first_trial: int = 0
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def trials(self) -> int:
+        """K, the number of runs."""
+        return len(self.states)
+
+    @property
+    def times(self) -> Array:
+        """Times of the states in seconds, (T+1,)."""
+        return self.plan.times
+
+    @property
+    def tracking_error(self) -> Array:
+        """Distance from the plan's position in metres, (K, T+1)."""
+        position = list(self.state_coordinates.position)
+        return np.linalg.norm(self.states[..., position] - self.plan.states[:, position], axis=-1)
+
+    @property
+    def saturated(self) -> npt.NDArray[np.bool_]:
+        """Whether a command stood at a limit, (K, T)."""
+        low, high = np.array(self.control_coordinates.low), np.array(self.control_coordinates.high)
+        return np.any((self.commanded <= low) | (self.commanded >= high), axis=-1)
+
+    @property
+    def collided(self) -> npt.NDArray[np.bool_]:
+        """Whether the clearance was ever negative, (K,)."""
+        return np.any(self.clearance < 0, axis=1)
+
+    @property
+    def reached(self) -> npt.NDArray[np.bool_]:
+        """Whether a trial ended within `goal_radius` of the plan's end, neither collided nor diverged, (K,)."""
+        near = self.tracking_error[:, -1] <= self.goal_radius
+        return near & ~self.collided & ~self.diverged
+
+    @property
+    def outcome(self) -> tuple[str, ...]:
+        """`diverged`, `collided`, `reached` or `missed` for each trial."""
+        flags = zip(self.diverged, self.collided, self.reached, strict=True)
+        return tuple(
+            "diverged" if diverged else "collided" if collided else "reached" if reached else "missed"
+            for diverged, collided, reached in flags
+        )
+
+    def summary(self) -> str:
+        """One line a trial: outcome, tracking error, clearance, saturation."""
+        what = "; ".join(self.disturbances) or "undisturbed"
+        lines = [f"{self.robot} in {self.scene}, {what}, seed {self.seed}"]
+        error = self.tracking_error
+        for k, outcome in enumerate(self.outcome):
+            if self.diverged[k]:
+                last = self.times[np.isfinite(self.states[k]).all(axis=1)][-1]
+                lines.append(f"  trial {self.first_trial + k}: diverged after {last:.2f} s")
+                continue
+            rms, worst = float(np.sqrt(np.mean(error[k] ** 2))), float(error[k].max())
+            lines.append(
+                f"  trial {self.first_trial + k}: {outcome}, tracking error rms {rms:.3g} m, max {worst:.3g} m,"
+                f" final {error[k, -1]:.3g} m; clearance {self.clearance[k].min():.3f} m;"
+                f" {self.contacts[k]} periods in contact; {100 * self.saturated[k].mean():.0f} % saturated"
+            )
+        return "\n".join(lines)
+
+    __str__ = summary

@@ -1,0 +1,28 @@
+"""The robots. Adding one is adding a file here and its MJCF in models/: every subclass of `Robot` in it is found."""
+
+import importlib
+import inspect
+import pkgutil
+from functools import cache
+
+from lqrsim.errors import check_name
+from lqrsim.robots.base import Robot
+
+
+@cache
+def _registry() -> dict[str, type[Robot]]:
+    modules = [importlib.import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__)]
+    classes = [item for module in modules for item in vars(module).values() if inspect.isclass(item)]
+    return {
+        robot.name: robot for robot in classes if issubclass(robot, Robot) and not inspect.isabstract(robot)
+    }
+
+
+def names() -> list[str]:
+    """Names of the robots."""
+    return sorted(_registry())
+
+
+def get(name: str) -> Robot:
+    """The robot of that name, with its default constants. Raises InputError for an unknown name."""
+    return _registry()[check_name("robot", name, names())]()

@@ -1,0 +1,51 @@
+"""What a robot is: its constants, its analytic dynamics, its MJCF names, and the maps between the two."""
+
+import abc
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy.typing as npt
+
+from lqrsim.errors import Array
+
+if TYPE_CHECKING:
+    from lqrsim.dynamics import Dynamics
+
+
+class Robot(abc.ABC):
+    """Subclass it to add a robot; see `quadrotor.py` for an example and `docs/adding_a_robot.md` for the steps.
+
+    Attributes:
+      name: what the command line calls it.
+      body: the body in the MJCF that is the robot. Obstacles are everything else that is fixed to the world.
+      joints: its joints in the MJCF. `qpos` and `qvel` below are theirs alone, in this order.
+      actuators: its actuators in the MJCF, in the order of `actuation`.
+      radius: of its collision circle (planar) or sphere (spatial), in metres.
+    """
+
+    name: ClassVar[str]
+    body: ClassVar[str]
+    joints: ClassVar[tuple[str, ...]]
+    actuators: ClassVar[tuple[str, ...]]
+    radius: float
+
+    @property
+    @abc.abstractmethod
+    def dynamics(self) -> "Dynamics":
+        """The analytic model `xdot = f(x, u)` that policies are computed from."""
+
+    @abc.abstractmethod
+    def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
+        """The analytic state (..., n) of MuJoCo's `qpos` (..., nq), `qvel` (..., nv).
+
+        Angles come out in the representative nearest to `near` (..., n), if given.
+        """
+
+    @abc.abstractmethod
+    def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
+        """The `qpos` (..., nq) and `qvel` (..., nv) that realise an analytic state (..., n)."""
+
+    def actuation(self, control: npt.ArrayLike) -> Array:
+        """MuJoCo's `ctrl` (..., nu) that realises an analytic control (..., m); the same numbers by default."""
+        import numpy as np
+
+        return np.asarray(control, dtype=np.float64)

@@ -1,0 +1,73 @@
+"""The iRobot Create: two wheels, driven by their speeds. Paper: Sec. VI-A."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.dynamics import Dynamics
+from lqrsim.errors import Array
+from lqrsim.robots.base import Robot
+
+
+@dataclass(frozen=True)
+class DifferentialDrive(Robot):
+    """State: (x, y, heading) of the middle of the axle. Control: speed of the left and the right wheel.
+
+    MJCF: models/create.xml.
+    """
+
+    axle_length: float = 0.258  # m, between the wheels
+    radius: float = 0.17  # m, of the body
+    max_speed: float = 0.5  # m/s, of a wheel's rim, either way
+    wheel_radius: float = 0.036  # m; the height of the axle
+
+    name: ClassVar[str] = "differential_drive"
+    body: ClassVar[str] = "create"
+    joints: ClassVar[tuple[str, ...]] = ("create_base", "create_wheel_left", "create_wheel_right")
+    actuators: ClassVar[tuple[str, ...]] = ("create_wheel_left", "create_wheel_right")
+
+    @property
+    def dynamics(self) -> Dynamics:
+        return _dynamics(self)
+
+    def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
+        qpos = np.asarray(qpos, dtype=np.float64)
+        qw, qx, qy, qz = np.moveaxis(qpos[..., 3:7], -1, 0)
+        heading = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+        state = np.concatenate([qpos[..., :2], heading[..., None]], axis=-1)
+        return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
+
+    def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
+        """At rest, wheels on a floor at height zero."""
+        state = np.asarray(state, dtype=np.float64)
+        qpos = np.zeros((*state.shape[:-1], 9))
+        qpos[..., :2] = state[..., :2]
+        qpos[..., 2] = self.wheel_radius
+        qpos[..., 3] = np.cos(state[..., 2] / 2)
+        qpos[..., 6] = np.sin(state[..., 2] / 2)
+        return qpos, np.zeros((*state.shape[:-1], 8))
+
+
+@cache
+def _dynamics(robot: DifferentialDrive) -> Dynamics:
+    return Dynamics(
+        _rate,
+        states={"x": "m", "y": "m", "heading": "rad"},
+        controls={"left": "m/s", "right": "m/s"},
+        parameters={"axle_length": robot.axle_length},
+        position=("x", "y"),
+        angles=("heading",),
+        control_limits=(-robot.max_speed, robot.max_speed),
+    )
+
+
+def _rate(x: Any, u: Any, p: Any) -> list[Any]:
+    from sympy import cos, sin
+
+    _, _, heading = x
+    left, right = u
+    speed = (left + right) / 2
+    return [speed * cos(heading), speed * sin(heading), (right - left) / p.axle_length]

@@ -1,0 +1,106 @@
+"""The quadrotor, driven by the forces of its rotors. Paper: Sec. VI-B."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim import rotations
+from lqrsim.dynamics import Dynamics
+from lqrsim.errors import Array
+from lqrsim.robots.base import Robot
+
+
+@dataclass(frozen=True)
+class Quadrotor(Robot):
+    """State: position, velocity in world axes, rotation vector, angular velocity in body axes. Control: rotor forces.
+
+    Rotor 1 is at +x, 2 at +y, 3 at -x, 4 at -y of the body. MJCF: models/quadrotor.xml.
+    """
+
+    mass: float = 0.5  # kg
+    inertia: float = 0.05  # kg m2, about each axis
+    arm: float = 0.17  # m, from the centre of mass to a rotor
+    torque_ratio: float = 0.025  # N m of a rotor's drag per N of its force; the paper's k_m
+    drag: float = 0.15  # N s/m, against the velocity; the paper's k_v
+    gravity: float = 9.8  # m/s2
+    max_force: float = 3.71  # N, of a rotor; the least is 0
+    radius: float = 0.3  # m, of the collision sphere
+
+    name: ClassVar[str] = "quadrotor"
+    body: ClassVar[str] = "quadrotor"
+    joints: ClassVar[tuple[str, ...]] = ("quadrotor_x", "quadrotor_y", "quadrotor_z", "quadrotor_rotation")
+    actuators: ClassVar[tuple[str, ...]] = (
+        "quadrotor_rotor_1",
+        "quadrotor_rotor_2",
+        "quadrotor_rotor_3",
+        "quadrotor_rotor_4",
+    )
+
+    @property
+    def hover_force(self) -> float:
+        """Force of each rotor in N that carries the weight."""
+        return self.mass * self.gravity / 4
+
+    @property
+    def dynamics(self) -> Dynamics:
+        return _dynamics(self)
+
+    def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
+        qpos, qvel = np.asarray(qpos, dtype=np.float64), np.asarray(qvel, dtype=np.float64)
+        rotation = _rotation_vector(qpos[..., 3:7])
+        state = np.concatenate([qpos[..., :3], qvel[..., :3], rotation, qvel[..., 3:6]], axis=-1)
+        return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
+
+    def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
+        state = np.asarray(state, dtype=np.float64)
+        position, velocity, rotation, angular_velocity = np.split(state, 4, axis=-1)
+        qpos = np.concatenate([position, _quaternion(rotation)], axis=-1)
+        return qpos, np.concatenate([velocity, angular_velocity], axis=-1)
+
+
+@cache
+def _dynamics(robot: Quadrotor) -> Dynamics:
+    units = {"x y z": "m", "vx vy vz": "m/s", "rx ry rz": "rad", "wx wy wz": "rad/s"}
+    constants = ("mass", "inertia", "arm", "torque_ratio", "drag", "gravity")
+    return Dynamics(
+        _rate,
+        states={name: unit for names, unit in units.items() for name in names.split()},
+        controls={f"rotor_{i}": "N" for i in (1, 2, 3, 4)},
+        parameters={name: getattr(robot, name) for name in constants},
+        position=("x", "y", "z"),
+        rotation_vectors=(("rx", "ry", "rz"),),
+        control_limits=(0.0, robot.max_force),
+    )
+
+
+def _rate(x: Any, u: Any, p: Any) -> list[Any]:
+    velocity, rotation, w = x[3:6], x[6:9], x[9:12]
+    thrust = rotations.rotate(rotation, [0, 0, sum(u)])
+    acceleration = [(thrust[i] - p.drag * velocity[i]) / p.mass for i in range(3)]
+    acceleration[2] -= p.gravity
+    # The inertia is the same about each axis, so the gyroscopic term w x J w is zero.
+    torque = [p.arm * (u[1] - u[3]), p.arm * (u[2] - u[0]), p.torque_ratio * (u[0] - u[1] + u[2] - u[3])]
+    return [*velocity, *acceleration, *rotations.vector_rate(rotation, w), *(t / p.inertia for t in torque)]
+
+
+def _quaternion(rotation: Array) -> Array:
+    """Unit quaternions (..., 4), scalar first, of rotation vectors (..., 3)."""
+    angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
+    # np.sinc(t) is sin(pi t) / (pi t), and 1 at 0: here sin(angle / 2) / angle.
+    return np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * rotation], axis=-1)
+
+
+def _rotation_vector(quaternion: Array) -> Array:
+    """Rotation vectors (..., 3) of at most half a turn, of quaternions (..., 4) of any length and sign."""
+    # q and -q are one rotation: the one with scalar part >= 0 is its half turn or less.
+    scalar = quaternion[..., :1]
+    sign = np.where(scalar < 0, -1.0, 1.0)
+    sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
+    # atan2 is exact at both ends, unlike acos near no turn and asin near half a turn.
+    angle = 2 * np.arctan2(sine, sign * scalar)
+    small = sine < 1e-12
+    ratio = np.where(small, 2.0 / np.where(small, np.abs(scalar), 1.0), angle / np.where(small, 1.0, sine))
+    return sign * ratio * quaternion[..., 1:]

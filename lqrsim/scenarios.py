@@ -1,0 +1,139 @@
+"""The named problems: a robot in a scene, with start, goal and weights. Adding one is adding a function here."""
+
+import inspect
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lqrsim.costs import ControlCost, ObstacleCost, QuadraticCost
+from lqrsim.errors import check_count, check_name
+from lqrsim.problem import InitialPrior, Problem
+from lqrsim.robots.base import Robot
+from lqrsim.robots.differential_drive import DifferentialDrive
+from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.scenes import Scene, load_scene
+
+if TYPE_CHECKING:
+    from lqrsim.simulation.plant import Plant
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """A robot in a scene with something to do.
+
+    Attributes:
+      name: what the command line calls it. summary: what it is, in a line.
+      problem: what to solve; ready to change with `dataclasses.replace(scenario.problem, ...)`.
+      tracking_bound: how far in metres an undisturbed run may be from its plan, at any time.
+    """
+
+    name: str
+    summary: str
+    robot: Robot
+    scene: Scene
+    problem: Problem
+    tracking_bound: float
+
+    def plant(self) -> "Plant":
+        """The robot in its scene as a MuJoCo model that is ready to run."""
+        from lqrsim.simulation.plant import Plant
+
+        return Plant(self.robot, self.scene)
+
+
+def names() -> list[str]:
+    """Names of the scenarios."""
+    return sorted(_functions())
+
+
+def get(name: str) -> Scenario:
+    """The scenario of that name, with its default settings. Raises InputError for an unknown name."""
+    return _functions()[check_name("scenario", name, names())]()
+
+
+def _functions() -> dict[str, Callable[..., Scenario]]:
+    """Every public function of this module that returns a Scenario."""
+    functions = inspect.getmembers(sys.modules[__name__], inspect.isfunction)
+    return {
+        name: f
+        for name, f in functions
+        if f.__annotations__.get("return") is Scenario and name[0] != "_" and name != "get"
+    }
+
+
+def differential_drive() -> Scenario:
+    """The iRobot Create among eleven pillars: Fig. 2, with the authors' weights."""
+    robot, scene = DifferentialDrive(), load_scene("arena")
+    start, goal, nominal = (0.0, -2.5, np.pi), (0.0, 2.5, np.pi), (0.25, 0.25)
+    weight = (5000.0, 5000.0, 50.0)
+    problem = Problem(
+        dynamics=robot.dynamics,
+        dt=1 / 6,
+        steps=150,
+        initial=QuadraticCost(weight, about=start),
+        stage_cost=ControlCost((60.0, 60.0), about=nominal)
+        + ObstacleCost(scene.world, radius=robot.radius, sharpness=10.0),
+        final_cost=QuadraticCost(weight, about=goal),
+        # Facing the goal keeps the first linearisations sensible; the start faces sideways.
+        prior=InitialPrior((0.0, 0.0, 0.4), about=(0.0, 0.0, np.pi / 2), iterations=2),
+    )
+    return Scenario(
+        name="differential_drive",
+        summary="the iRobot Create through an arena of pillars (Fig. 2)",
+        robot=robot,
+        scene=scene,
+        problem=problem,
+        tracking_bound=0.01,
+    )
+
+
+def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
+    """The quadrotor through a cage of twelve beams, from one edge to the antipode: Fig. 3.
+
+    Args:
+      query, seed: which of the random starts and goals; see `quadrotor_queries`.
+    """
+    starts, goals = quadrotor_queries(
+        check_count("query", query, at_least=0) + 1, seed=check_count("seed", seed, at_least=0)
+    )
+    robot, scene = Quadrotor(), load_scene("cage")
+    weight = np.full(12, 500.0)
+    problem = Problem(
+        dynamics=robot.dynamics,
+        dt=1 / 30,
+        steps=150,
+        initial=QuadraticCost(weight, about=starts[query]),
+        stage_cost=ControlCost(np.full(4, 20.0), about=np.full(4, robot.hover_force))
+        + ObstacleCost(scene.world, radius=robot.radius, sharpness=10.0),
+        final_cost=QuadraticCost(weight, about=goals[query]),
+        # Upright keeps the first linearisations sensible.
+        prior=InitialPrior(np.repeat((0.0, 0.0, 0.3, 0.0), 3), about=np.zeros(12)),
+    )
+    return Scenario(
+        name="quadrotor",
+        summary="the quadrotor through a cage of beams (Fig. 3)",
+        robot=robot,
+        scene=scene,
+        problem=problem,
+        tracking_bound=1e-6,
+    )
+
+
+def quadrotor_queries(count: int, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Random starts and goals, each (count, 12), at rest. The first `count` of a seed do not depend on `count`.
+
+    A start lies on an edge of the cube of half-side 2.25 m: one coordinate uniform, the others at +-2.25 m with a
+    jitter of +-0.01 m; its goal is the antipode.
+    """
+    rng = np.random.default_rng(seed)
+    goals = np.zeros((count, 12))
+    for goal in goals:
+        edge = int(rng.integers(12))
+        along, first, second = (edge // 4 + np.arange(3)) % 3
+        goal[along] = rng.uniform(-2.25, 2.25)
+        goal[first] = (2.25 if edge % 4 < 2 else -2.25) + rng.uniform(-0.01, 0.01)
+        goal[second] = (2.25 if edge % 2 == 0 else -2.25) + rng.uniform(-0.01, 0.01)
+    return -goals, goals

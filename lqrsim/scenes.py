@@ -1,0 +1,185 @@
+"""Scenes: MJCF in, a MuJoCo model and the obstacles that a robot must keep clear of out.
+
+The one rule for obstacles, which anyone can apply to their own file: **every geom that is fixed to the world and can
+collide is an obstacle.** Fixed to the world: no joint and no mocap between the geom and the world. Can collide:
+contype or conaffinity is not zero. So
+
+- geoms that are only drawn (both zero) are no obstacles, nor is anything that can move, the robot included;
+- planes are walls, floors and ceilings, infinite whatever size they are drawn with, solid behind. A horizontal one does
+  not bound a robot that moves in the plane (`World.seen_by`);
+- plane, sphere, capsule, cylinder and box have a distance. Any other type is refused by name, not left out;
+- a cylinder or capsule whose ends both lie on or behind planes has no ends that anything can reach, and is infinite.
+"""
+
+import os
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from lqrsim.errors import InputError, check_name
+from lqrsim.world import KINDS, Obstacle, World
+
+# In the wheel models/ lies inside the package, in the repository beside it.
+_PACKAGED = [Path(__file__).parent / "models", Path(__file__).parent.parent / "models"]
+MODELS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A place for a robot to move in.
+
+    Attributes:
+      name: of the packaged scene, or the stem of the file.
+      xml: the whole MJCF as text, includes resolved. It alone makes the model again.
+      model: compiled from `xml`.
+      world: the obstacles, as the module's docstring defines them.
+    """
+
+    name: str
+    xml: str
+    model: mujoco.MjModel
+    world: World
+
+
+def names() -> list[str]:
+    """The packaged scenes: the files in models/ that include a robot."""
+    return sorted(path.stem for path in MODELS.glob("*.xml") if "<include" in path.read_text(encoding="utf-8"))
+
+
+def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
+    """A packaged scene by name, or any MJCF by path. It may include the packaged robots, e.g. `create.xml`, by name.
+
+    Raises:
+      InputError: no such scene or file; it does not parse or compile; an obstacle is of a type without a distance.
+    """
+    path = Path(name_or_path)
+    if path.suffix.lower() != ".xml":
+        packaged = names()
+        try:
+            path = MODELS / f"{check_name('scene', os.fspath(name_or_path), packaged)}.xml"
+        except InputError as error:
+            raise InputError(f"{error}; or the path of an .xml file") from None
+    elif not path.is_file():
+        packaged = ", ".join(names())
+        raise InputError(f"scene: got {os.fspath(name_or_path)!r}, want a file that exists, or one of: {packaged}")
+    return scene_from_xml(_flatten(path), path.stem)
+
+
+def scene_from_xml(xml: str, name: str) -> Scene:
+    """The scene of an MJCF given as text, without includes. Raises InputError as `load_scene` does."""
+    try:
+        model = mujoco.MjModel.from_xml_string(xml)
+    except (ValueError, mujoco.FatalError) as error:
+        raise InputError(f"scene {name}: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
+    if mujoco.mj_isSparse(model) and mujoco.__version__ == "4.0.0":
+        # Newton on a sparse Jacobian gives wrong forces in 4.0.0 (fixed in 4.0.1).
+        raise InputError(
+            f"scene {name}: got a sparse constraint Jacobian, which MuJoCo 4.0.0 solves wrongly;"
+            ' want <option jacobian="dense"/> or a newer MuJoCo'
+        )
+    return Scene(name, xml, model, World(_obstacles(model, name)))
+
+
+def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
+    """Ids of the geoms that are obstacles by the module's rule, in the order of `Scene.world`."""
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    return np.flatnonzero(fixed & collides).tolist()
+
+
+def _obstacles(model: mujoco.MjModel, scene: str) -> list[Obstacle]:
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    found: list[Obstacle] = []
+    for geom in obstacle_geoms(model):
+        kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+        name = model.geom(geom).name or f"{kind} {geom}"
+        if kind not in KINDS:
+            raise InputError(
+                f"scene {scene}: got the obstacle {name!r} of type {kind}, want one of: {', '.join(KINDS)};"
+                ' or contype="0" conaffinity="0" if it is only to be drawn'
+            )
+        size = np.zeros(3) if kind == "plane" else model.geom_size[geom].copy()
+        found.append(Obstacle(name, kind, data.geom_xpos[geom].copy(), data.geom_xmat[geom].reshape(3, 3).copy(), size))
+    planes = [obstacle for obstacle in found if obstacle.kind == "plane"]
+    return [_endless(obstacle, planes) if obstacle.kind in ("capsule", "cylinder") else obstacle for obstacle in found]
+
+
+def _endless(bar: Obstacle, planes: list[Obstacle]) -> Obstacle:
+    """The cylinder or capsule, infinite if both its ends are walled off."""
+    if all(_walled_off(bar, end, planes) for end in (-1, 1)):
+        return replace(bar, size=np.array([bar.size[0], np.inf, 0.0]))
+    return bar
+
+
+def _walled_off(bar: Obstacle, end: int, planes: list[Obstacle]) -> bool:
+    """Whether the end of a cylinder or capsule, as a disc across its axis, lies wholly on or behind a plane."""
+    radius, half_length, _ = bar.size
+    axis = end * bar.rotation[:, 2]
+    centre = bar.position + half_length * axis
+
+    def height(plane: Obstacle) -> float:
+        normal = plane.rotation[:, 2]
+        return normal @ (centre - plane.position) + radius * np.linalg.norm(np.cross(normal, axis))
+
+    return any(height(plane) <= 1e-6 for plane in planes)
+
+
+def _flatten(path: Path) -> str:
+    """The MJCF at `path` as one text: includes in place, files of meshes and textures by their full path.
+
+    MuJoCo can write a model as text too, but with six digits, which is another model.
+    """
+    seen: set[Path] = set()
+
+    def read(file: Path) -> ElementTree.Element:
+        seen.add(file.resolve())
+        try:
+            root = ElementTree.parse(file).getroot()
+        except ElementTree.ParseError as error:
+            raise InputError(f"scene: got {file.name}, which is not XML ({error}), want an MJCF file") from None
+        except OSError as error:
+            raise InputError(f"scene: got {file.name}, which cannot be read ({error.strerror}), want a file") from None
+        expand(root)
+        return root
+
+    def expand(element: ElementTree.Element) -> None:
+        children = list(element)
+        for child in children:
+            element.remove(child)
+        for child in children:
+            if child.tag == "include":
+                element.extend(read(find(child.get("file", ""))))
+            else:
+                expand(child)
+                element.append(child)
+
+    def find(name: str) -> Path:
+        # MuJoCo's rule, relative to the main file, and then the packaged models.
+        file = next((file for file in (path.parent / name, MODELS / name) if file.is_file()), None)
+        if file is None:
+            packaged = ", ".join(sorted(file.name for file in MODELS.glob("*.xml")))
+            raise InputError(f"scene: got an include of {name!r}, want a file beside {path.name} or one of: {packaged}")
+        if file.resolve() in seen:
+            raise InputError(f"scene: got {name} included twice in {path.name}, want each file once")
+        return file
+
+    root = read(path)
+    if root.tag != "mujoco":
+        raise InputError(f"scene: got {path.name} with <{root.tag}> at its root, want <mujoco>")
+    if any("file" in asset.attrib for asset in root.iterfind("asset/*")):
+        folder = path.parent.resolve()
+        settings = {key: value for compiler in root.iterfind("compiler") for key, value in compiler.attrib.items()}
+        common = settings.get("assetdir", "")
+        root.append(
+            ElementTree.Element(
+                "compiler",
+                {kind: str(folder / settings.get(kind, common)) for kind in ("meshdir", "texturedir")},
+            )
+        )
+    text = ElementTree.tostring(root, encoding="unicode")
+    return re.sub(r"\n\s*\n+", "\n", text) + "\n"

@@ -1,0 +1,1 @@
+"""The solvers: each takes a `Problem` and returns a `Solution`."""

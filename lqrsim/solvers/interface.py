@@ -1,0 +1,56 @@
+"""What a compiled core knows about its problem: the names that the kernels are written against.
+
+`integration.py`, `kernels.py`, `passes.py` and the sources that dynamics and costs write are joined into one file for
+each structure (see `compiled.py`), with these sizes as constants and these functions filled in. This module only
+declares them, so that each of those files can be read, linted and type-checked on its own.
+"""
+
+import numpy as np
+
+N = 0  # states
+M = 0  # controls
+W = N + M  # a state and a control, joined
+K = 0  # of these, how many entries a cost is not convex in
+
+
+def stack(*shape: int) -> np.ndarray:
+    """An uninitialised float64 array of constant shape, on the stack of the compiled function."""
+    return np.empty(shape)
+
+
+def rate(x, u, p, out) -> None:
+    """Write xdot = f(x, u), (N,)."""
+
+
+def rate_jacobian(x, u, p, out, fx, fu) -> None:
+    """Write f (N,), and the entries of df/dx (N, N) and df/du (N, M) that are not zero everywhere."""
+
+
+def stage_value(x, u, t, data) -> float:
+    """The stage cost c(x, u, t)."""
+    return 0.0
+
+
+def stage_quadratic(x, u, t, data, hessian, gradient) -> float:
+    """Write the projected Hessian (W, W) and the gradient (W,) of the stage cost at (x, u); return its value."""
+    return 0.0
+
+
+def initial_value(x, u, t, data) -> float:
+    """The initial cost c_0(x)."""
+    return 0.0
+
+
+def initial_quadratic(x, u, t, data, hessian, gradient) -> float:
+    """As `stage_quadratic`, of the initial cost."""
+    return 0.0
+
+
+def final_value(x, u, t, data) -> float:
+    """The final cost c_l(x)."""
+    return 0.0
+
+
+def final_quadratic(x, u, t, data, hessian, gradient) -> float:
+    """As `stage_quadratic`, of the final cost."""
+    return 0.0

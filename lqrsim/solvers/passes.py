@@ -1,0 +1,295 @@
+"""The sweeps over time that the solvers are made of. The numba subset; see `interface.py`.
+
+Shapes: `states` (T+1, N), `controls` (T, M), Hessians (T+1, N, N), gradients (T+1, N), constants (T+1,), gains
+(T, M, N), feedforwards (T, M). `p` are the parameters of the dynamics; `initial`, `stage`, `final` tuples of arrays,
+one a cost term. A sweep returns the step at which it failed, or -1.
+
+The prior is `1/2 (x - prior_about[t])' diag(prior_weight) (x - prior_about[t])` at t >= 1: no part of the cost, but
+added to its quadratic model in the first iterations, where it keeps the linearisations sensible.
+"""
+
+from lqrsim.integration import step, step_jacobian
+from lqrsim.solvers.interface import (
+    M,
+    N,
+    W,
+    final_quadratic,
+    final_value,
+    initial_quadratic,
+    initial_value,
+    stack,
+    stage_quadratic,
+    stage_value,
+)
+from lqrsim.solvers.kernels import (
+    about_origin,
+    affine,
+    cholesky,
+    cholesky_solve,
+    congruence,
+    minimize_control,
+    minimizer,
+    offset,
+    riccati_backward,
+    riccati_forward,
+)
+
+
+def rollout(x0, gain, feedforward, p, dt, initial, stage, final, states, controls):
+    """Run the policy from x0 under the true dynamics; write the trajectory and return its true cost."""
+    steps = len(gain)
+    x, u = states[0], stack(M)
+    for i in range(N):
+        x[i] = x0[i]
+    cost = initial_value(x, u, 0, initial)
+    for t in range(steps):
+        x, u = states[t], controls[t]
+        affine(gain[t], feedforward[t], x, u)
+        cost += stage_value(x, u, t, stage)
+        step(x, u, p, dt, states[t + 1])
+    return cost + final_value(states[steps], u, steps, final)
+
+
+def trajectory_cost(states, controls, initial, stage, final):
+    """The true cost of a trajectory."""
+    steps = len(controls)
+    cost = initial_value(states[0], controls[0], 0, initial)
+    for t in range(steps):
+        cost += stage_value(states[t], controls[t], t, stage)
+    return cost + final_value(states[steps], controls[steps - 1], steps, final)
+
+
+def stage_model(x, u, t, stage, prior_weight, prior_about, hessian, gradient):
+    """Write the stage about (x, u) as a quadratic about the origin, Eqs. (26)-(27); return its constant."""
+    value = stage_quadratic(x, u, t, stage, hessian, gradient)
+    if t > 0:
+        for i in range(N):
+            weight, error = prior_weight[i], x[i] - prior_about[t, i]
+            hessian[i, i] += weight
+            gradient[i] += weight * error
+            value += 0.5 * weight * error * error
+    return about_origin(hessian, gradient, x, u, value)
+
+
+def end_model(hessian, gradient, value, x, S, s):
+    """Write an initial or final cost, quadratised at x, as (S, s) about the origin; return its constant.
+
+    Paper: Eqs. (23), (31).
+    """
+    none = stack(M)
+    for i in range(M):
+        none[i] = 0.0
+    constant = about_origin(hessian, gradient, x, none, value)
+    for i in range(N):
+        s[i] = gradient[i]
+        for j in range(N):
+            S[i, j] = hessian[i, j]
+    return constant
+
+
+def clear(matrix):
+    """Set a matrix to zero."""
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            matrix[i, j] = 0.0
+
+
+def forward_pass(
+    x_hat, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, final, prior_weight, prior_about
+):  # fmt: skip
+    """The forward extended LQR pass, Sec. V-B: from the cost-to-go and its policy, the cost-to-come and its own.
+
+    `x_hat` (N,) is where c_0 is quadratised, and on return the minimiser at T, where c_l was. S[T], s[T], k[T] are set.
+    """
+    steps = len(L)
+    hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
+    fx, fu, x_next, x_back, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(M)
+    clear(fx)
+    clear(fu)
+    value = initial_quadratic(x_hat, u, 0, initial, hessian, gradient)
+    kbar[0] = end_model(hessian, gradient, value, x_hat, Sbar[0], sbar[0])
+    for t in range(steps):
+        affine(L[t], l[t], x_hat, u)
+        step(x_hat, u, p, dt, x_next)
+        step_jacobian(x_next, u, p, -dt, fx, fu, x_back, jacobian)
+        offset(jacobian, x_next, u, x_back, c)
+        constant = stage_model(x_hat, u, t, stage, prior_weight, prior_about, hessian, gradient)
+        kbar[t + 1], good = riccati_forward(
+            jacobian, c, hessian, gradient, constant, Sbar[t], sbar[t], kbar[t], Lbar[t], lbar[t],
+            Sbar[t + 1], sbar[t + 1],
+        )  # fmt: skip
+        if not good:
+            return t
+        if t + 1 < steps and not minimizer(S[t + 1], s[t + 1], Sbar[t + 1], sbar[t + 1], x_hat):
+            return t + 1
+        if t + 1 == steps:
+            if not minimizer(S[steps], s[steps], Sbar[steps], sbar[steps], x_hat):
+                # In the first iteration there may be no minimum without c_l, and the state of arrival is what we have.
+                for i in range(N):
+                    x_hat[i] = x_next[i]
+            value = final_quadratic(x_hat, u, steps, final, hessian, gradient)
+            k[steps] = end_model(hessian, gradient, value, x_hat, S[steps], s[steps])
+            if not minimizer(S[steps], s[steps], Sbar[steps], sbar[steps], x_hat):
+                return steps
+    return -1
+
+
+def backward_pass(
+    x_hat, x_hats, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, prior_weight, prior_about
+):  # fmt: skip
+    """The backward extended LQR pass, Sec. V-A: from the cost-to-come and its policy, the cost-to-go and its own.
+
+    `x_hat` (N,) is the minimiser at T, and on return that at 0, where c_0 was quadratised anew. Writes all the
+    minimisers to `x_hats` (T+1, N).
+    """
+    steps = len(L)
+    hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
+    fx, fu, x_next, x_back, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(M)
+    clear(fx)
+    clear(fu)
+    for t in range(steps - 1, -1, -1):
+        for i in range(N):
+            x_hats[t + 1, i] = x_hat[i]
+        affine(Lbar[t], lbar[t], x_hat, u)
+        step(x_hat, u, p, -dt, x_back)
+        step_jacobian(x_back, u, p, dt, fx, fu, x_next, jacobian)
+        offset(jacobian, x_back, u, x_next, c)
+        constant = stage_model(x_back, u, t, stage, prior_weight, prior_about, hessian, gradient)
+        k[t], good = riccati_backward(
+            jacobian, c, hessian, gradient, constant, S[t + 1], s[t + 1], k[t + 1], L[t], l[t], S[t], s[t]
+        )
+        if not good or not minimizer(S[t], s[t], Sbar[t], sbar[t], x_hat):
+            return t
+    value = initial_quadratic(x_hat, u, 0, initial, hessian, gradient)
+    kbar[0] = end_model(hessian, gradient, value, x_hat, Sbar[0], sbar[0])
+    if not minimizer(S[0], s[0], Sbar[0], sbar[0], x_hat):
+        return 0
+    for i in range(N):
+        x_hats[0, i] = x_hat[i]
+    return -1
+
+
+def differential_pass(states, controls, p, dt, stage, final, L, l, S, s, k):
+    """The backward pass of iLQR about a feasible trajectory; l is relative to it, S, s, k are about the origin.
+
+    Returns the step at which it failed or -1, and the decrease of cost that the linear-quadratic model predicts.
+    """
+    steps = len(controls)
+    hessian, gradient, jacobian = stack(W, W), stack(W), stack(N, W)
+    fx, fu, x_next, none = stack(N, N), stack(N, M), stack(N), stack(M)
+    slope, curve = stack(N), stack(N, N)
+    clear(fx)
+    clear(fu)
+    for i in range(M):
+        none[i] = 0.0
+    value = final_quadratic(states[steps], none, steps, final, hessian, gradient)
+    predicted, ahead = 0.0, value
+    for i in range(N):
+        slope[i] = gradient[i]
+        for j in range(N):
+            curve[i, j] = hessian[i, j]
+    k[steps] = end_model(hessian, gradient, value, states[steps], S[steps], s[steps])
+    for t in range(steps - 1, -1, -1):
+        step_jacobian(states[t], controls[t], p, dt, fx, fu, x_next, jacobian)
+        ahead += stage_quadratic(states[t], controls[t], t, stage, hessian, gradient)
+        congruence(jacobian, curve, slope, hessian, gradient)
+        decrease = minimize_control(hessian, gradient, L[t], l[t], curve, slope)
+        if not decrease >= 0:
+            return t, predicted
+        predicted += decrease
+        k[t] = ahead - predicted
+        for i in range(N):
+            s[t, i] = slope[i]
+            for j in range(N):
+                S[t, i, j] = curve[i, j]
+                s[t, i] -= curve[i, j] * states[t, j]
+            k[t] -= 0.5 * (slope[i] + s[t, i]) * states[t, i]
+    return -1, predicted
+
+
+def initial_decrease(x0, initial, S, s):
+    """The decrease that moving the soft start x0 adds to the prediction, given the cost-to-go at 0; NaN if none."""
+    hessian, gradient, none = stack(W, W), stack(W), stack(M)
+    total, slope, direction = stack(N, N), stack(N), stack(N)
+    for i in range(M):
+        none[i] = 0.0
+    initial_quadratic(x0, none, 0, initial, hessian, gradient)
+    for i in range(N):
+        slope[i] = gradient[i] + s[i]
+        for j in range(N):
+            slope[i] += S[i, j] * x0[j]
+            total[i, j] = hessian[i, j] + S[i, j]
+        direction[i] = slope[i]
+    if not cholesky(total, N):
+        return float("nan")
+    cholesky_solve(total, N, direction)
+    decrease = 0.0
+    for i in range(N):
+        decrease += 0.5 * slope[i] * direction[i]
+    return decrease
+
+
+def largest_gap(x_hats, states):
+    """The largest difference between two sequences of states, each state relative to its range (at least 1)."""
+    gap = 0.0
+    for i in range(N):
+        low, high, worst = states[0, i], states[0, i], 0.0
+        for t in range(len(states)):
+            difference = abs(x_hats[t, i] - states[t, i])
+            if not difference <= worst:  # a NaN too
+                worst = difference
+            low, high = min(low, states[t, i]), max(high, states[t, i])
+        relative = worst / max(high - low, 1.0)
+        if not relative <= gap:
+            gap = relative
+    return gap
+
+
+def smoother_iteration(
+    x_hat, x_hats, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, final,
+    prior_weight, prior_about, states, controls,
+):  # fmt: skip
+    """One forward pass, one backward pass and the rollout of the new policy.
+
+    Returns the step at which a pass failed or -1, which pass that was (0 forward, 1 backward), the true cost of the
+    rollout and its gap.
+    """
+    failed = forward_pass(
+        x_hat, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, final, prior_weight, prior_about
+    )
+    if failed >= 0:
+        return failed, 0, 0.0, 0.0
+    failed = backward_pass(
+        x_hat, x_hats, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, prior_weight, prior_about
+    )
+    if failed >= 0:
+        return failed, 1, 0.0, 0.0
+    cost = rollout(x_hat, L, l, p, dt, initial, stage, final, states, controls)
+    return -1, 0, cost, largest_gap(x_hats, states)
+
+
+def line_search(states, controls, L, l, p, dt, initial, stage, final, old, new_states, new_controls):
+    """Try steps 1, 1/2, 1/4, ... along the change l of the controls until the true cost falls below `old`.
+
+    Writes the trajectory. Returns its cost and the step, which is 0 if none above 1e-8 lowers the cost.
+    """
+    steps = len(controls)
+    fraction = 1.0
+    while fraction >= 1e-8:
+        for i in range(N):
+            new_states[0, i] = states[0, i]
+        cost = initial_value(new_states[0], new_controls[0], 0, initial)
+        for t in range(steps):
+            x, u = new_states[t], new_controls[t]
+            for i in range(M):
+                total = controls[t, i] + fraction * l[t, i]
+                for j in range(N):
+                    total += L[t, i, j] * (x[j] - states[t, j])
+                u[i] = total
+            cost += stage_value(x, u, t, stage)
+            step(x, u, p, dt, new_states[t + 1])
+        cost += final_value(new_states[steps], new_controls[steps - 1], steps, final)
+        if cost < old:
+            return cost, fraction
+        fraction *= 0.5
+    return old, 0.0

@@ -1,0 +1,116 @@
+"""From a plain Python function of symbols to the source of a compiled one. SymPy is imported only when this runs."""
+
+import keyword
+from collections.abc import Callable, Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+from lqrsim.errors import InputError, check_number
+from lqrsim.rotations import RATIOS
+
+
+class Parameters(SimpleNamespace):
+    """The `p` of `f(x, u, p)`: one attribute a parameter; an unknown name is refused with the valid ones."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise InputError(f"parameter: got {name!r}, want one of: {', '.join(vars(self)) or '(there are none)'}")
+
+
+def check_parameters(parameters: Mapping[str, float]) -> dict[str, float]:
+    """The parameters as floats. Raises InputError unless each is finite and its name can be written `p.name`."""
+    for name in parameters:
+        if not name.isidentifier() or keyword.iskeyword(name):
+            raise InputError(f"parameters: got the name {name!r}, want a Python name, to be read as p.name")
+    return {name: check_number(f"parameters: {name}", value) for name, value in parameters.items()}
+
+
+def trace(
+    function: Callable[..., Any], states: int, controls: int, parameters: Sequence[str]
+) -> tuple[list[Any], list[Any], list[Any]]:
+    """Call `function(x, u, p)` with symbols.
+
+    Returns:
+      The expressions it returned (one, or a list of them), the symbols x[0], x[1], ..., and the symbols u[0], ....
+
+    Raises:
+      InputError: it failed on symbols, or returned something that is no expression.
+    """
+    import sympy
+
+    x = [sympy.Symbol(f"x{i}", real=True) for i in range(states)]
+    u = [sympy.Symbol(f"u{i}", real=True) for i in range(controls)]
+    p = Parameters(**{name: sympy.Symbol(f"p{i}", real=True) for i, name in enumerate(parameters)})
+    name = getattr(function, "__qualname__", repr(function))
+    try:
+        returned = function(x, u, p)
+    except InputError as error:
+        raise InputError(f"{name}(x, u, p): {error}") from None
+    except Exception as error:  # whatever a user's function may raise becomes one line
+        raise InputError(
+            f"{name}(x, u, p): got {type(error).__name__} ({error}) when called with symbols, want plain arithmetic and"
+            " functions of SymPy (from sympy import sin, exp, ...)"
+        ) from None
+    listed = returned if isinstance(returned, (list, tuple)) else [returned]
+    expressions = []
+    for i, entry in enumerate(listed):
+        try:
+            expression = sympy.sympify(entry, strict=True)
+        except sympy.SympifyError:
+            raise InputError(f"{name}(x, u, p): got {entry!r} as entry {i}, want an expression") from None
+        known = {*x, *u, *vars(p).values()}
+        strange = sorted(str(symbol) for symbol in expression.free_symbols - known)
+        if strange:
+            raise InputError(f"{name}(x, u, p): got the unknown symbol {strange[0]} in entry {i}, want x, u and p only")
+        if expression.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo):
+            raise InputError(f"{name}(x, u, p): got {expression} as entry {i}, want a finite expression")
+        expressions.append(expression)
+    return expressions, x, u
+
+
+def write_function(
+    name: str, arguments: str, data: str, assignments: Mapping[str, Any], *, returns: str | None = None
+) -> str:
+    """Source of a function that evaluates SymPy expressions, with common subexpressions shared.
+
+    Args:
+      arguments: the signature. data: the argument that holds the parameters p0, p1, ...; x and u are those named so.
+      assignments: target (`out[0]`, `hessian[1, 2]`, ...; `+=` if it ends in `+`) -> expression.
+      returns: the target, among `assignments`, that is returned instead of stored.
+    """
+    import sympy
+    from sympy.printing.pycode import PythonCodePrinter
+
+    class Printer(PythonCodePrinter):
+        def _print_Function(self, expr: Any) -> str:
+            head = expr.func.__name__
+            if head.partition("_d")[0] in RATIOS:
+                return f"{head}({self._print(expr.args[0])})"
+            return super()._print_Function(expr)  # pyright: ignore[reportAttributeAccessIssue]
+
+        def _print_Pow(self, expr: Any, rational: bool = False) -> str:
+            base, exponent = expr.args
+            if exponent.is_Integer and 2 <= abs(int(exponent)) <= 4:
+                # Products are several times faster than pow.
+                product = "*".join([self.parenthesize(base, 60)] * abs(int(exponent)))
+                return f"({product})" if exponent > 0 else f"(1/({product}))"
+            return super()._print_Pow(expr, rational=rational)
+
+    printer = Printer({"fully_qualified_modules": False})
+    shared, reduced = sympy.cse(list(assignments.values()), symbols=sympy.numbered_symbols("s"))
+    used = set().union(*(e.free_symbols for e in [*reduced, *(value for _, value in shared)]))
+    lines = [f"def {name}({arguments}):"]
+    for symbol in sorted((s for s in used if str(s)[0] in "xup"), key=lambda s: (str(s)[0], int(str(s)[1:]))):
+        letter, index = str(symbol)[0], str(symbol)[1:]
+        lines.append(f"    {symbol} = {data if letter == 'p' else letter}[{index}]")
+    lines += [f"    {symbol} = {printer.doprint(value)}" for symbol, value in shared]
+    for target, value in zip(assignments, reduced, strict=True):
+        sign = "+=" if target.endswith("+") else "="
+        lines.append(f"    {target.rstrip('+')} {sign} {printer.doprint(value)}")
+    if returns is not None:
+        lines.append(f"    return {returns}")
+    if printer._not_supported:  # pyright: ignore[reportAttributeAccessIssue]
+        heads = sorted({type(e).__name__ for e in printer._not_supported})  # pyright: ignore[reportAttributeAccessIssue]
+        raise InputError(f"{name}: got the unsupported function {heads[0]}, want elementary functions")
+    return "\n".join(lines) + "\n"
