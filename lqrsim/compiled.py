@@ -29,13 +29,15 @@ import numpy.typing as npt
 import platformdirs
 
 from lqrsim import integration, rotations, world
-from lqrsim.costs import Term
 from lqrsim.errors import Array
 from lqrsim.problem import Problem
 from lqrsim.solvers import kernels, passes, projection
 from lqrsim.world import World
 
 logger = logging.getLogger("lqrsim")
+
+# The terms of a cost as far as they are structure: the source of each, and what it may bend in (see `Term`).
+Structure = tuple[tuple[str, tuple[int, ...] | None], ...]
 
 # `contract` and the like let LLVM fuse and reorder sums, but keep NaN and infinity meaningful.
 _PRELUDE = '''\
@@ -77,11 +79,16 @@ _SOLVER_ENTRIES = (
 def core(problem: Problem) -> ModuleType:
     """The compiled passes for problems of this structure; see `solvers/passes.py` for what it offers."""
     n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
-    sizes = {"N": n, "M": m, "W": n + m}
+    costs = [(name, tuple((t.source, t.bends) for t in problem.terms(field))) for name, field in _FIELDS.items()]
+    return _core(n, m, problem.dynamics.source, tuple(costs))
+
+
+@cache
+def _core(n: int, m: int, dynamics: str, costs: tuple[tuple[str, Structure], ...]) -> ModuleType:
     modules = (rotations, world, integration, kernels, passes)
-    parts = [*(_functions(module) for module in modules), problem.dynamics.source]
-    parts += [_cost_source(name, problem.terms(field)) for name, field in _FIELDS.items()]
-    return _load("\n\n".join(parts), sizes, _SOLVER_ENTRIES)
+    parts = [*(_functions(module) for module in modules), dynamics]
+    parts += [_cost_source(name, structure) for name, structure in costs]
+    return _load("\n\n".join(parts), {"N": n, "M": m, "W": n + m}, _SOLVER_ENTRIES)
 
 
 _FIELDS = {"initial": "initial", "stage": "stage_cost", "final": "final_cost"}
@@ -118,23 +125,25 @@ def nearest(data, points, out):
     for i in range(len(points)):
         out[i] = inf
         for row in range(0, len(data), {world.ROW}):
-            out[i] = min(out[i], signed_distance(data, row, points[i, 0], points[i, 1], points[i, 2]))
+            distance = signed_distance(data, row, points[i, 0], points[i, 1], points[i, 2])
+            if not distance >= out[i]:  # NaN, too: nowhere is not far away
+                out[i] = distance
 """
     return _load(f"{_functions(world)}\n\n{source}", {}, ("nearest",))
 
 
-def _cost_source(name: str, terms: tuple[Term, ...]) -> str:
+def _cost_source(name: str, terms: Structure) -> str:
     """Source of `<name>_value` and `<name>_quadratic`, which sum the terms."""
     parts, values, convex, bent = [], [], [], []
-    for i, term in enumerate(terms):
-        renamed = term.source
+    for i, (source, bends) in enumerate(terms):
+        renamed = source
         for function in ("value", "derivatives"):
             renamed = re.sub(rf"^def {function}\(", f"def {name}{i}_{function}(", renamed, flags=re.MULTILINE)
         parts.append(renamed)
         values.append(f"    total += {name}{i}_value(x, u, t, data[{i}])")
         call = f"    total += {name}{i}_derivatives(x, u, t, data[{i}], hessian, gradient)"
-        (convex if term.bends is None else bent).append(call)
-    support = tuple(sorted({i for term in terms for i in term.bends or ()}))
+        (convex if bends is None else bent).append(call)
+    support = tuple(sorted({i for _, bends in terms for i in bends or ()}))
     if support:
         # The sum of what may be indefinite is projected once; what is convex is added after.
         parts.append(_rename(_functions(projection), {"project": f"{name}_project", "K": str(len(support))}))
@@ -183,15 +192,12 @@ class _Specialise(ast.NodeTransformer):
         return node
 
 
-_loaded: dict[str, ModuleType] = {}
-
-
 def _load(source: str, sizes: dict[str, int], entries: Iterable[str]) -> ModuleType:
     """The module of that text, from memory, from disk, or written anew."""
     body = ast.unparse(ast.fix_missing_locations(_Specialise(sizes, entries).visit(ast.parse(source))))
     text = _PRELUDE + body + "\n"
     name = f"lqrsim_core_{hashlib.sha256(text.encode()).hexdigest()[:24]}"
-    if name not in _loaded:
+    if name not in sys.modules:
         path = _write(text, name)
         if not any((path.parent / "__pycache__").glob(f"{name}.*.nbi")):
             logger.info("compiling for a new kind of problem (some 15 seconds, once) ...")
@@ -199,10 +205,9 @@ def _load(source: str, sizes: dict[str, int], entries: Iterable[str]) -> ModuleT
         assert specification is not None
         assert specification.loader is not None
         module = importlib.util.module_from_spec(specification)
-        sys.modules[name] = module
         specification.loader.exec_module(module)
-        _loaded[name] = module
-    return _loaded[name]
+        sys.modules[name] = module  # where numba and pickle look for it
+    return sys.modules[name]
 
 
 def _write(text: str, name: str) -> Path:

@@ -182,16 +182,15 @@ def _read(path: Path, kind: str) -> tuple[dict[str, npt.NDArray[Any]], dict[str,
     if not path.is_file():
         raise InputError(f"{kind}: got {path}, want a file that exists")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # Opened here, for NumPy leaves a file open that is no archive.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         meta = json.loads(str(arrays.pop("meta")))
         found, version = meta["format"], meta["version"]
     except OSError as error:
         raise InputError(f"{kind}: got {path}, want a file that can be read ({error.strerror or error})") from None
     except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, AttributeError):
-        raise InputError(
-            f"{kind}: got {path}, which is damaged or not lqrsim's, want a file that lqrsim wrote"
-        ) from None
+        raise InputError(f"{kind}: got {path}, which is damaged, want a file that lqrsim wrote") from None
     if found != f"lqrsim {kind}":
         raise InputError(f"{kind}: got {path}, which holds a {found!r}, want a {f'lqrsim {kind}'!r}")
     if version != VERSIONS[kind]:

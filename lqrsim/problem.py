@@ -74,8 +74,9 @@ class Problem:
             )
         costs = {"stage_cost": terms_of(self.stage_cost), "final_cost": terms_of(self.final_cost)}
         if isinstance(self.initial, FixedState):
-            check_array("initial: FixedState", self.initial.state, (len(self.dynamics.state_coordinates),))
-            costs["initial"] = ()
+            state = check_array("initial: FixedState", self.initial.state, (len(self.dynamics.state_coordinates),))
+            # Costs nothing, and lets a fixed and a soft start share what is compiled.
+            costs["initial"] = (QuadraticCost(np.zeros(len(state)), about=state),)
         else:
             costs["initial"] = terms_of(self.initial)
         bound = {name: tuple(cost.bind(self.dynamics) for cost in terms) for name, terms in costs.items()}

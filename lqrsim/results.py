@@ -161,12 +161,12 @@ _STATUS_TEXT = {
     ),
     Status.MAX_ITERATIONS: (
         "the iteration limit came first",
-        "raise max_iterations if the improvements still shrink; if they do not, start closer (start=...)",
+        "raise max_iterations if the improvements still shrink; if they do not, try other initial_controls or a prior",
     ),
     Status.INFEASIBLE: ("no trajectory meets the constraints", "relax the constraint that is named, or give more time"),
     Status.DIVERGED: (
         "the cost of the policy grew beyond all bounds",
-        "add a prior to the start, start closer to a solution, shorten dt, or use ilqr(), which never lets the cost rise",
+        "add a prior, start closer to a solution, shorten dt, or use ilqr(), which never lets the cost rise",
     ),
     Status.NOT_FINITE: (
         "a NaN or an infinity appeared",
@@ -174,7 +174,7 @@ _STATUS_TEXT = {
     ),
     Status.NOT_POSITIVE_DEFINITE: (
         "a matrix that must be inverted was not positive definite",
-        "raise the control weight, add a prior to the start, shorten dt, or use ilqr()",
+        "raise the control weight, add a prior, shorten dt, or use ilqr()",
     ),
 }
 
@@ -206,7 +206,7 @@ class Iteration:
         optimality = "-" if np.isnan(self.optimality) else f"{self.optimality:.1e}"
         improvement = "-" if np.isinf(self.improvement) else f"{self.improvement:.2e}"
         return (
-            f"{number:>9} {self.cost:>14.6f} {improvement:>12} {self.gap:>10.1e} {optimality:>11}"
+            f"{number:>9} {self.cost:>14.9g} {improvement:>12} {self.gap:>10.1e} {optimality:>11}"
             f" {1e3 * self.seconds:>8.2f}"
         )
 
@@ -288,7 +288,7 @@ class Solution:
             lines.append(f"  where:     {self.detail}")
         if self.status.remedy:
             lines.append(f"  remedy:    {self.status.remedy}")
-        lines.append(f"  cost:      {self.cost:.6f}   gap: {self.gap:.1e}   optimality: {self.optimality:.1e}")
+        lines.append(f"  cost:      {self.cost:.9g}   gap: {self.gap:.1e}   optimality: {self.optimality:.1e}")
         if self.clearance is not None:
             knot = int(np.argmin(self.clearance))
             verdict = "collides" if self.clearance[knot] < 0 else "clear"

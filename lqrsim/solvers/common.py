@@ -134,8 +134,8 @@ def predicted_decrease(
     m = controls.shape[1]
     value = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
     law = np.zeros((steps, m, n)), np.zeros((steps, m))
-    failed, decrease = core.differential_pass(
-        states, controls, data["p"], data["dt"], data["stage"], data["final"], *law, *value
+    failed, _, decrease = core.differential_pass(
+        states, controls, data["p"], data["dt"], data["stage"], data["final"], 0.0, *law, *value
     )
     if failed >= 0:
         return float("inf")

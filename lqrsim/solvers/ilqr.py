@@ -12,6 +12,10 @@ from lqrsim.problem import Problem
 from lqrsim.results import Quadratic, Solution, Status
 from lqrsim.solvers.common import Callback, Log, Settings, Workspace, assemble, predicted_decrease
 
+# Far outside an arena costs reach 1e20, and rounding takes the backward pass its positive-definite matrices. Then, and
+# only then, changes of the controls get a weight; it falls again by the same steps.
+_LEAST_DAMPING, _MOST_DAMPING = 1.0, 1e25
+
 
 def ilqr(
     problem: Problem,
@@ -53,17 +57,22 @@ def ilqr(
     relative = np.zeros_like(work.l)
     search = work.L, relative, data["p"], data["dt"], *costs
     compiled.prepare(core.line_search, states, controls, *search, cost, new_states, new_controls)
-    _backward(core, data, states, controls, work, relative)  # compiled before the clock starts, too
+    _backward(core, data, states, controls, 0.0, work, relative)  # compiled before the clock starts, too
     log = Log(settings, callback, first_cost=cost)
     status = Status.NOT_FINITE if not np.isfinite(cost) else None
     detail = "rollout of the initial controls" if status else ""
+    damping = 0.0
     while status is None:
-        failed = _backward(core, data, states, controls, work, relative)
+        damping *= 0.1
+        failed, finite = _backward(core, data, states, controls, damping, work, relative)
+        while failed >= 0 and finite and damping < _MOST_DAMPING:
+            damping = max(10 * damping, _LEAST_DAMPING)
+            failed, finite = _backward(core, data, states, controls, damping, work, relative)
         if failed >= 0:
-            finite = np.isfinite(work.S).all() and np.isfinite(work.s).all()
             status = Status.NOT_POSITIVE_DEFINITE if finite else Status.NOT_FINITE
             detail = f"backward pass of iteration {len(log.iterations) + 1}, step {failed} of {problem.steps}"
             break
+        damping = damping if damping > _LEAST_DAMPING else 0.0
         cost, fraction = core.line_search(states, controls, *search, cost, new_states, new_controls)
         if fraction > 0:
             states, new_states, controls, new_controls = new_states, states, new_controls, controls
@@ -76,7 +85,7 @@ def ilqr(
         if status is None and fraction == 0:
             status, detail = Status.MAX_ITERATIONS, "the line search found no lower cost"
     # One more backward pass, so that the policy and its cost-to-go are about the trajectory that was found.
-    whole = _backward(core, data, states, controls, work, relative) < 0
+    whole = _backward(core, data, states, controls, 0.0, work, relative)[0] < 0
     offset = controls - np.einsum("tij,tj->ti", work.L, states[:-1])
     return assemble(
         problem, solver="ilqr", settings=settings, status=status, detail=detail, log=log,
@@ -86,11 +95,17 @@ def ilqr(
 
 
 def _backward(
-    core: ModuleType, data: dict[str, Any], states: Array, controls: Array, work: Workspace, relative: Array
-) -> int:
-    """The backward pass about a trajectory; the step at which it failed, or -1."""
-    failed, _ = core.differential_pass(
-        states, controls, data["p"], data["dt"], data["stage"], data["final"],
+    core: ModuleType,
+    data: dict[str, Any],
+    states: Array,
+    controls: Array,
+    damping: float,
+    work: Workspace,
+    relative: Array,
+) -> tuple[int, bool]:
+    """The backward pass about a trajectory; the step at which it failed or -1, and whether all was finite there."""
+    failed, finite, _ = core.differential_pass(
+        states, controls, data["p"], data["dt"], data["stage"], data["final"], damping,
         work.L, relative, work.S, work.s, work.k,
     )  # fmt: skip
-    return failed
+    return failed, finite

@@ -5,7 +5,7 @@ or, with states and controls joined, (W, W); their upper triangle is what is rea
 Paper: Eqs. (8)-(21), in discrete time.
 """
 
-from math import sqrt
+from math import inf, sqrt
 
 from lqrsim.solvers.interface import M, N, W, stack
 
@@ -23,6 +23,15 @@ def cholesky(a, size):
             factor = a[k, i]
             for j in range(i, size):
                 a[i, j] -= factor * a[k, j]
+    return True
+
+
+def finite(a):
+    """Whether no entry of a matrix is NaN or infinite."""
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            if not abs(a[i, j]) < inf:
+                return False
     return True
 
 
@@ -156,7 +165,7 @@ def riccati_backward(jacobian, c, cost, slope, constant, S1, s1, k1, gain, feedf
     """One step of the cost-to-go, Eqs. (9)-(11), (13): from (S1, s1, k1) at t + 1 to (S, s) at t.
 
     `jacobian` = [A B] and c are the linearised step; `cost` (W, W) and `slope` (W,) the stage about the origin, used
-    up. Returns the constant and whether the step succeeded.
+    up: on return `cost` is the Hessian of what was minimised. Returns the constant and whether the step succeeded.
     """
     v = stack(N)
     for i in range(N):

@@ -2,7 +2,7 @@
 
 Shapes: `states` (T+1, N), `controls` (T, M), Hessians (T+1, N, N), gradients (T+1, N), constants (T+1,), gains
 (T, M, N), feedforwards (T, M). `p` are the parameters of the dynamics; `initial`, `stage`, `final` tuples of arrays,
-one a cost term. A sweep returns the step at which it failed, or -1.
+one a cost term. A sweep returns the step at which it failed, or -1, and whether all numbers there were finite.
 
 The prior is `1/2 (x - prior_about[t])' diag(prior_weight) (x - prior_about[t])` at t >= 1: no part of the cost, but
 added to its quadratic model in the first iterations, where it keeps the linearisations sensible.
@@ -27,6 +27,7 @@ from lqrsim.solvers.kernels import (
     cholesky,
     cholesky_solve,
     congruence,
+    finite,
     minimize_control,
     minimizer,
     offset,
@@ -119,9 +120,9 @@ def forward_pass(
             Sbar[t + 1], sbar[t + 1],
         )  # fmt: skip
         if not good:
-            return t
+            return t, finite(hessian) and finite(jacobian)
         if t + 1 < steps and not minimizer(S[t + 1], s[t + 1], Sbar[t + 1], sbar[t + 1], x_hat):
-            return t + 1
+            return t + 1, finite(S[t + 1]) and finite(Sbar[t + 1])
         if t + 1 == steps:
             if not minimizer(S[steps], s[steps], Sbar[steps], sbar[steps], x_hat):
                 # In the first iteration there may be no minimum without c_l, and the state of arrival is what we have.
@@ -130,8 +131,8 @@ def forward_pass(
             value = final_quadratic(x_hat, u, steps, final, hessian, gradient)
             k[steps] = end_model(hessian, gradient, value, x_hat, S[steps], s[steps])
             if not minimizer(S[steps], s[steps], Sbar[steps], sbar[steps], x_hat):
-                return steps
-    return -1
+                return steps, finite(S[steps]) and finite(Sbar[steps])
+    return -1, True
 
 
 def backward_pass(
@@ -159,20 +160,22 @@ def backward_pass(
             jacobian, c, hessian, gradient, constant, S[t + 1], s[t + 1], k[t + 1], L[t], l[t], S[t], s[t]
         )
         if not good or not minimizer(S[t], s[t], Sbar[t], sbar[t], x_hat):
-            return t
+            return t, finite(hessian) and finite(jacobian) and finite(Sbar[t])
     value = initial_quadratic(x_hat, u, 0, initial, hessian, gradient)
     kbar[0] = end_model(hessian, gradient, value, x_hat, Sbar[0], sbar[0])
     if not minimizer(S[0], s[0], Sbar[0], sbar[0], x_hat):
-        return 0
+        return 0, finite(S[0]) and finite(Sbar[0])
     for i in range(N):
         x_hats[0, i] = x_hat[i]
-    return -1
+    return -1, True
 
 
-def differential_pass(states, controls, p, dt, stage, final, L, l, S, s, k):
+def differential_pass(states, controls, p, dt, stage, final, damping, L, l, S, s, k):
     """The backward pass of iLQR about a feasible trajectory; l is relative to it, S, s, k are about the origin.
 
-    Returns the step at which it failed or -1, and the decrease of cost that the linear-quadratic model predicts.
+    `damping` is a weight on changes of the controls.
+
+    Returns as every sweep does, and the decrease of cost that the linear-quadratic model predicts.
     """
     steps = len(controls)
     hessian, gradient, jacobian = stack(W, W), stack(W), stack(N, W)
@@ -193,9 +196,11 @@ def differential_pass(states, controls, p, dt, stage, final, L, l, S, s, k):
         step_jacobian(states[t], controls[t], p, dt, fx, fu, x_next, jacobian)
         ahead += stage_quadratic(states[t], controls[t], t, stage, hessian, gradient)
         congruence(jacobian, curve, slope, hessian, gradient)
+        for i in range(M):
+            hessian[N + i, N + i] += damping
         decrease = minimize_control(hessian, gradient, L[t], l[t], curve, slope)
         if not decrease >= 0:
-            return t, predicted
+            return t, finite(hessian) and finite(jacobian), predicted
         predicted += decrease
         k[t] = ahead - predicted
         for i in range(N):
@@ -204,7 +209,7 @@ def differential_pass(states, controls, p, dt, stage, final, L, l, S, s, k):
                 S[t, i, j] = curve[i, j]
                 s[t, i] -= curve[i, j] * states[t, j]
             k[t] -= 0.5 * (slope[i] + s[t, i]) * states[t, i]
-    return -1, predicted
+    return -1, True, predicted
 
 
 def initial_decrease(x0, initial, S, s):
@@ -251,21 +256,21 @@ def smoother_iteration(
 ):  # fmt: skip
     """One forward pass, one backward pass and the rollout of the new policy.
 
-    Returns the step at which a pass failed or -1, which pass that was (0 forward, 1 backward), the true cost of the
-    rollout and its gap.
+    Returns the step at which a pass failed or -1, whether it was the backward pass, whether all numbers there were
+    finite, the true cost of the rollout and its gap.
     """
-    failed = forward_pass(
+    failed, good = forward_pass(
         x_hat, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, final, prior_weight, prior_about
     )
     if failed >= 0:
-        return failed, 0, 0.0, 0.0
-    failed = backward_pass(
+        return failed, False, good, 0.0, 0.0
+    failed, good = backward_pass(
         x_hat, x_hats, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, prior_weight, prior_about
     )
     if failed >= 0:
-        return failed, 1, 0.0, 0.0
+        return failed, True, good, 0.0, 0.0
     cost = rollout(x_hat, L, l, p, dt, initial, stage, final, states, controls)
-    return -1, 0, cost, largest_gap(x_hats, states)
+    return -1, True, True, cost, largest_gap(x_hats, states)
 
 
 def line_search(states, controls, L, l, p, dt, initial, stage, final, old, new_states, new_controls):

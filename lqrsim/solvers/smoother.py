@@ -73,11 +73,11 @@ def smooth(
     while status is None:
         prior = problem.prior is not None and len(log.iterations) < problem.prior.iterations
         prior_weight = problem.prior.weight.copy() if problem.prior is not None and prior else no_prior
-        failed, backward, cost, gap = core.smoother_iteration(
+        failed, backward, finite, cost, gap = core.smoother_iteration(
             *iteration, prior_weight, prior_about, work.states, work.controls
         )
         if failed >= 0:
-            status = _failure(work)
+            status = Status.NOT_POSITIVE_DEFINITE if finite else Status.NOT_FINITE
             which = "backward" if backward else "forward"
             detail = f"{which} pass of iteration {len(log.iterations) + 1}, step {failed} of {steps}"
             break
@@ -100,9 +100,3 @@ def smooth(
 
 def _model(data: dict) -> tuple:
     return data["p"], data["dt"], data["initial"], data["stage"], data["final"]
-
-
-def _failure(work: Workspace) -> Status:
-    """Why a pass could not go on: a number that is none, or a matrix that bends the wrong way."""
-    finite = all(np.isfinite(array).all() for array in (work.S, work.s, work.Sbar, work.sbar, work.x_hat))
-    return Status.NOT_POSITIVE_DEFINITE if finite else Status.NOT_FINITE

@@ -1,0 +1,84 @@
+"""Random linear-quadratic problems and their exact solution by one dense linear system: the oracle of the tests."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lqrsim.errors import Array
+
+
+@dataclass(frozen=True)
+class LinearQuadratic:
+    """x' = A x + B u + c; stage cost 1/2 z'Hz + z'h + k with z = (x, u); ends 1/2 x'Qx + x'q + k."""
+
+    A: Array
+    B: Array
+    c: Array
+    H: Array
+    h: Array
+    k: Array
+    Q0: Array
+    q0: Array
+    k0: float
+    QT: Array
+    qT: Array
+    kT: float
+
+
+def random_problem(seed: int, n: int, m: int, steps: int) -> LinearQuadratic:
+    """Well conditioned, with cross terms: the joint Hessian is positive definite, A near the identity."""
+    rng = np.random.default_rng(seed)
+
+    def definite(size: int) -> Array:
+        root = rng.normal(size=(size, size))
+        return root @ root.T + np.eye(size)
+
+    return LinearQuadratic(
+        A=np.eye(n) + 0.2 * rng.normal(size=(steps, n, n)),
+        B=rng.normal(size=(steps, n, m)),
+        c=rng.normal(size=(steps, n)),
+        H=np.array([definite(n + m) for _ in range(steps)]),
+        h=rng.normal(size=(steps, n + m)),
+        k=rng.normal(size=steps),
+        Q0=definite(n),
+        q0=rng.normal(size=n),
+        k0=float(rng.normal()),
+        QT=definite(n),
+        qT=rng.normal(size=n),
+        kT=float(rng.normal()),
+    )
+
+
+def solve_dense(problem: LinearQuadratic) -> tuple[Array, Array, float]:
+    """States (T+1, n), controls (T, m) and the least cost, from the KKT system of the whole horizon at once."""
+    steps, n, m = problem.B.shape
+    size = (steps + 1) * n + steps * m
+
+    def state(t: int) -> slice:
+        return slice(t * n, (t + 1) * n)
+
+    def control(t: int) -> slice:
+        return slice((steps + 1) * n + t * m, (steps + 1) * n + (t + 1) * m)
+
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    constraint, right = np.zeros((steps * n, size)), np.zeros(steps * n)
+    hessian[state(0), state(0)] += problem.Q0
+    gradient[state(0)] += problem.q0
+    hessian[state(steps), state(steps)] += problem.QT
+    gradient[state(steps)] += problem.qT
+    for t in range(steps):
+        z = np.r_[state(t), control(t)]
+        hessian[np.ix_(z, z)] += problem.H[t]
+        gradient[z] += problem.h[t]
+        constraint[state(t), state(t)] = -problem.A[t]
+        constraint[state(t), control(t)] = -problem.B[t]
+        constraint[state(t), state(t + 1)] = np.eye(n)
+        right[state(t)] = problem.c[t]
+    zeros = np.zeros((steps * n, steps * n))
+    solution = np.linalg.solve(
+        np.block([[hessian, constraint.T], [constraint, zeros]]), np.concatenate([-gradient, right])
+    )[:size]
+    cost = 0.5 * solution @ hessian @ solution + gradient @ solution
+    cost += problem.k0 + problem.kT + problem.k.sum()
+    states = solution[: (steps + 1) * n].reshape(steps + 1, n)
+    return states, solution[(steps + 1) * n :].reshape(steps, m), float(cost)

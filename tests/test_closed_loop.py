@@ -1,0 +1,304 @@
+"""Running policies in MuJoCo: tracking, repeatability, what is recorded, and what bad input is told."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import mujoco
+import numpy as np
+import pytest
+from tracking import hover, track, weave
+
+from lqrsim.dynamics import Dynamics
+from lqrsim.errors import InputError
+from lqrsim.results import Status, Trajectory
+from lqrsim.robots.base import Robot
+from lqrsim.robots.differential_drive import DifferentialDrive
+from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.scenes import load_scene
+from lqrsim.simulation.closed_loop import simulate
+from lqrsim.simulation.disturbances import ControlNoise, Disturbance, Effect, ForceNoise, MeasurementNoise
+from lqrsim.simulation.plant import Plant
+
+NOISE = (ControlNoise(0.02), ForceNoise(0.1), MeasurementNoise(0.005))
+RECORDS = ("states", "measured", "commanded", "applied", "forces", "clearance", "contacts", "diverged", "frames")
+
+
+@pytest.fixture(scope="module")
+def arena():
+    return Plant(DifferentialDrive(), load_scene("arena"))
+
+
+@pytest.fixture(scope="module")
+def cage():
+    return Plant(Quadrotor(), load_scene("cage"))
+
+
+def test_undisturbed_quadrotor_keeps_to_its_plan_within_a_micrometre(cage):
+    rollout = simulate(cage, hover())
+    assert rollout.tracking_error.max() < 1e-6
+    assert rollout.outcome == ("reached",)
+    # The plan is worth tracking: it moves, and tilts.
+    assert np.ptp(rollout.plan.states[:, :3], axis=0).max() > 0.01
+
+
+def test_undisturbed_differential_drive_keeps_to_its_plan_within_a_centimetre_across_the_cut_at_pi(arena):
+    rollout = simulate(arena, weave())
+    assert rollout.tracking_error.max() < 0.01
+    headings = rollout.states[0, :, 2]
+    assert headings.min() < np.pi < headings.max()
+    assert np.abs(np.diff(headings)).max() < 0.2  # no jump by a whole turn
+    assert rollout.outcome == ("reached",)
+    assert rollout.contacts.tolist() == [0]  # the wheels on the floor do not count
+
+
+@pytest.mark.parametrize(("fixture", "plan"), [("arena", weave), ("cage", hover)])
+def test_a_trial_is_the_same_to_the_last_bit_whatever_runs_beside_it(request, fixture, plan):
+    plant, solution = request.getfixturevalue(fixture), plan(30)
+    # Nine, so that vector instructions of any width have a remainder.
+    together = simulate(plant, solution, disturbances=NOISE, seed=3, trials=9)
+    again = simulate(plant, solution, disturbances=NOISE, seed=3, trials=9)
+    for name in RECORDS:
+        np.testing.assert_array_equal(getattr(again, name), getattr(together, name), err_msg=name)
+    for trial in (0, 5, 8):
+        alone = simulate(plant, solution, disturbances=NOISE, seed=3, first_trial=trial)
+        assert alone.first_trial == trial
+        for name in RECORDS:
+            np.testing.assert_array_equal(getattr(alone, name)[0], getattr(together, name)[trial], err_msg=name)
+    other = simulate(plant, solution, disturbances=NOISE, seed=4, trials=9)
+    assert (other.states[:, -1] != together.states[:, -1]).all()
+    assert (together.states[1:, -1] != together.states[:-1, -1]).all()
+
+
+def test_adding_a_disturbance_leaves_the_draws_of_those_before_it(cage):
+    one = simulate(cage, hover(10), disturbances=[ForceNoise(0.1)])
+    two = simulate(cage, hover(10), disturbances=[ForceNoise(0.1), MeasurementNoise(0.01)])
+    np.testing.assert_array_equal(one.forces, two.forces)
+
+
+def test_records_are_of_what_happened(cage):
+    solution = hover()
+    rollout = simulate(cage, solution, disturbances=[ControlNoise(3.0), MeasurementNoise(0.01)], trials=2)
+    low, high = 0.0, cage.robot.max_force
+    assert rollout.applied.min() == low
+    assert rollout.applied.max() == high
+    for trial in range(2):
+        for step in (0, 17):
+            command = solution.policy(rollout.measured[trial, step], rollout.times[step])
+            np.testing.assert_allclose(rollout.commanded[trial, step], command, rtol=1e-12)
+    # The states follow from the controls that were applied, not from those that were commanded.
+    before, control = rollout.states[0, 8], rollout.applied[0, 8]
+    expected = cage.robot.dynamics.step(before, control, 1 / 30)
+    difference = cage.robot.dynamics.state_coordinates.difference(rollout.states[0, 9], expected)
+    np.testing.assert_allclose(difference, 0, atol=1e-5)
+    np.testing.assert_allclose(rollout.clearance, cage.world.distance(rollout.states[..., :3]) - 0.3)
+    assert rollout.disturbances == ("control noise, std 3", "measurement noise, std 0.01")
+    assert rollout.model == cage.scene.xml
+    assert (rollout.robot, rollout.scene, rollout.goal_radius) == ("quadrotor", "cage", 0.3)
+
+
+@pytest.mark.parametrize(("fixture", "plan"), [("arena", weave), ("cage", hover)])
+def test_frames_are_frequent_and_belong_to_the_states(request, fixture, plan):
+    plant, solution = request.getfixturevalue(fixture), plan(30)
+    rollout = simulate(plant, solution, disturbances=NOISE)
+    model = mujoco.MjModel.from_xml_string(rollout.model)
+    assert rollout.frames.shape == (1, len(rollout.frame_times), model.nq)
+    assert np.diff(rollout.frame_times).max() < 1 / 30 + 1e-9
+    np.testing.assert_allclose(rollout.frame_times[[0, -1]], rollout.times[[0, -1]])
+    each = (len(rollout.frame_times) - 1) // rollout.plan.steps
+    at_knots = rollout.frames[:, ::each][..., plant.qpos]
+    states = plant.robot.state(at_knots, np.zeros((*at_knots.shape[:-1], model.nv)), near=rollout.states)
+    position = list(plant.robot.dynamics.state_coordinates.position)
+    np.testing.assert_allclose(states[..., position], rollout.states[..., position], atol=1e-12)
+
+
+def test_a_wall_stops_the_robot_and_is_counted_as_contact(arena):
+    ahead = track(DifferentialDrive(), (0.5, -2.4, 0.0), np.full((60, 2), 0.3), 1 / 6)  # 3 m ahead, and the wall in 1.5
+    rollout = simulate(arena, ahead)
+    assert rollout.contacts[0] > 20
+    assert rollout.outcome == ("collided",)
+    # Held by the wall: contacts give way by millimetres, not by the 1.7 m that the plan goes on.
+    assert 2 - 0.17 - 0.01 < rollout.states[0, -1, 0] < 2 - 0.17 + 0.01
+
+
+def test_progress_counts_the_control_periods(cage):
+    seen = []
+    simulate(cage, hover(5), progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 5), (2, 5), (3, 5), (4, 5), (5, 5)]
+
+
+# A robot, a scene and disturbances of a user's own, outside the package.
+
+SLED = """<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <geom type="box" size="0.1 1 1" pos="3 0 0"/>
+    <body name="sled">
+      <joint name="along" type="slide" axis="1 0 0"/> <joint name="across" type="slide" axis="0 1 0"/>
+      <geom type="sphere" size="0.1" mass="2"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="push" joint="along" ctrlrange="-5 5"/> <motor name="steer" joint="across" ctrlrange="-5 5"/>
+  </actuator>
+</mujoco>"""
+
+
+@dataclass(frozen=True)
+class Sled(Robot):
+    radius: float = 0.1
+
+    name = "sled"
+    body = "sled"
+    joints = ("across", "along")  # not in the order of the file
+    actuators = ("steer", "push")
+
+    @cached_property
+    def dynamics(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return Dynamics(
+            lambda x, u, p: [x[2], x[3], u[0] / p.mass, u[1] / p.mass],
+            states={"y": "m", "x": "m", "vy": "m/s", "vx": "m/s"},
+            controls={"steer": "N", "push": "N"},
+            parameters={"mass": 2.0},
+            position=("x", "y"),
+            control_limits=(-5, 5),
+        )
+
+    def state(self, qpos, qvel, near=None):
+        return np.concatenate([qpos, qvel], axis=-1)
+
+    def configuration(self, state):
+        return np.asarray(state)[..., :2], np.asarray(state)[..., 2:]
+
+
+@dataclass(frozen=True)
+class Wind(Disturbance):
+    """Blows harder the farther the robot is to the left, in one trial only: a force that depends on the state."""
+
+    strength: float
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        def blow(step, states):
+            force = np.zeros((len(states), 3))
+            force[1, 0] = self.strength * states[1, 1]
+            return force
+
+        return Effect(force=blow)
+
+
+@dataclass(frozen=True)
+class Delay(Disturbance):
+    """Commands arrive one period late: something that remembers."""
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        last = [np.zeros((len(generators), plan.controls.shape[1]))]
+
+        def actuate(step, controls):
+            last.append(controls)
+            return last.pop(0)
+
+        return Effect(actuate=actuate)
+
+
+@pytest.fixture
+def sled(tmp_path):
+    (tmp_path / "ice.xml").write_text(SLED)
+    return Plant(Sled(), load_scene(tmp_path / "ice.xml"))
+
+
+def test_a_robot_and_disturbances_of_ones_own_plug_in(sled):
+    controls = np.tile([0.1, -0.2], (40, 1))
+    solution = track(sled.robot, (0.0, 1.0, 0.0, 0.0), controls, 0.1, feedback=False)
+    rollout = simulate(sled, solution, disturbances=[Wind(-2.0), Delay()], trials=2)
+    assert rollout.disturbances == ("Wind(strength=-2.0)", "Delay()")
+    np.testing.assert_array_equal(rollout.applied[:, 0], 0)
+    np.testing.assert_array_equal(rollout.applied[:, 1:], rollout.commanded[:, :-1])
+    # Trial 0 is late by one period; a double integrator then runs behind the plan by known amounts.
+    times = rollout.times[1:] - 0.1
+    np.testing.assert_allclose(rollout.states[0, 1:, 1], 1 - 0.1 * times**2 / 2, atol=0.003)  # semi-implicit Euler
+    np.testing.assert_array_equal(rollout.forces[1, :, 0], -2.0 * rollout.states[1, :-1, 1])
+    # A box without a name is an obstacle all the same, 3 - 0.1 - 0.1 m from the origin.
+    np.testing.assert_allclose(rollout.clearance[0, 0], 2.8 - 1.0)
+
+
+def test_a_trial_that_blows_up_is_lost_and_the_others_are_not(sled, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    solution = track(sled.robot, (0.0, 1.0, 0.0, 0.0), np.zeros((40, 2)), 0.1)
+    calm = simulate(sled, solution, trials=3)
+    rollout = simulate(sled, solution, disturbances=[Wind(1e9)], trials=3)
+    assert rollout.diverged.tolist() == [False, True, False]
+    assert rollout.outcome == ("reached", "diverged", "reached")
+    np.testing.assert_array_equal(rollout.states[[0, 2]], calm.states[[0, 2]])
+    alive = np.isfinite(rollout.states[1]).all(axis=1)
+    assert alive[0]
+    assert not alive[-1]
+    assert (np.diff(alive.astype(int)) <= 0).all()  # once lost, lost
+    for name in ("measured", "clearance"):
+        lost = np.isnan(getattr(rollout, name)[1]).reshape(41, -1).all(axis=1)
+        np.testing.assert_array_equal(lost, ~alive, err_msg=name)
+    assert np.isnan(rollout.frames[1, -1]).all()
+    assert "trial 1: diverged after" in rollout.summary()
+    assert [path.name for path in tmp_path.iterdir()] == ["ice.xml"]  # and no log of MuJoCo's
+
+
+def test_a_policy_that_returns_nan_is_lost_not_taken_for_zero(sled):
+    solution = track(sled.robot, (0.0, 1.0, 0.0, 0.0), np.zeros((10, 2)), 0.1)
+    offset = solution.policy.offset.copy()
+    offset[4] = np.nan
+    rollout = simulate(sled, replace(solution, policy=replace(solution.policy, offset=offset)))
+    assert rollout.outcome == ("diverged",)
+    assert np.isfinite(rollout.states[0, :4]).all()
+    assert np.isnan(rollout.states[0, 5:]).all()
+
+
+# Bad input
+
+
+def test_a_scene_without_the_robot_is_told_what_it_has():
+    with pytest.raises(InputError, match=r"^scene arena: got no robot quadrotor in it, want its body .* has: .*create"):
+        Plant(Quadrotor(), load_scene("arena"))
+
+
+@pytest.mark.parametrize(("part", "name"), [("body", "sled"), ("joint", "across"), ("actuator", "steer")])
+def test_a_robot_that_lacks_a_part_is_told_which(tmp_path, part, name):
+    (tmp_path / "ice.xml").write_text(SLED.replace(f'"{name}"', f'"other_{name}"'))
+    with pytest.raises(InputError, match=f"^scene ice: got no robot sled in it, want its {part} '{name}';.*other_"):
+        Plant(Sled(), load_scene(tmp_path / "ice.xml"))
+
+
+def test_a_control_period_that_is_no_multiple_of_the_physics_step_is_told_both(cage):
+    solution = track(Quadrotor(), np.zeros(12), np.full((5, 4), 1.225), 0.05)
+    with pytest.raises(InputError, match=r"^control period: got 0.05 s, want a multiple of .* cage, 0.0333333 s; or"):
+        simulate(cage, solution)
+    with pytest.raises(InputError, match=r"^control period: got 0.01 s, .*timestep=\"0.01"):
+        cage.substeps(0.01)
+    assert cage.substeps(1 / 10) == 3
+
+
+def test_a_policy_for_another_robot_is_refused(cage):
+    with pytest.raises(InputError, match=r"^solution: got a policy with states x, y, heading, want those of robot"):
+        simulate(cage, weave(5))
+
+
+def test_a_plan_that_is_not_finite_is_refused(cage):
+    solution = hover(5)
+    states = solution.trajectory.states.copy()
+    states[3, 0] = np.inf
+    failed = replace(solution, status=Status.NOT_FINITE, trajectory=replace(solution.trajectory, states=states))
+    with pytest.raises(InputError, match=r"^solution: got a plan that is not finite \(NOT_FINITE\), want one"):
+        simulate(cage, failed)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"trials": 0}, "^trials: got 0, want a whole number >= 1$"),
+        ({"seed": -1}, "^seed: got -1, want a whole number >= 0$"),
+        ({"first_trial": 0.5}, "^first_trial: got 0.5"),
+        ({"goal_radius": float("nan")}, "^goal_radius: got nan"),
+        ({"disturbances": ["wind"]}, "^disturbances: got 'wind', want Disturbance objects"),
+    ],
+)
+def test_bad_options_are_told(cage, options, message):
+    with pytest.raises(InputError, match=message):
+        simulate(cage, hover(5), **options)

@@ -1,0 +1,67 @@
+"""Representatives of angles and rotation vectors, against SciPy's rotations."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import lqrsim as ls
+
+SPACE = ls.Coordinates(
+    names=("x", "heading", "rx", "ry", "rz"), units=("m", *("rad",) * 4), angles=(1,), rotation_vectors=(2,)
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_nearest_is_the_same_pose_and_the_nearest_of_all(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vector, near = rng.normal(size=(2, 5)) * [1, 10, 3, 3, 3]
+    found = SPACE.nearest(vector, near)
+    assert found[0] == vector[0]
+    # The same angle, and the same rotation by SciPy's account: 1e-12, rounding of a few turns.
+    assert np.exp(1j * found[1]) == pytest.approx(np.exp(1j * vector[1]), abs=1e-12)
+    turned = Rotation.from_rotvec(found[2:]) * Rotation.from_rotvec(vector[2:]).inv()
+    assert turned.magnitude() < 1e-7  # the arc cosine in it has half the digits near zero
+    # No representative, within five turns either way, is nearer.
+    angle = np.linalg.norm(vector[2:])
+    others = [vector[2:] * (1 + 2 * np.pi * k / angle) for k in range(-5, 6)]
+    best = min(np.linalg.norm(other - near[2:]) for other in others)
+    assert np.linalg.norm(found[2:] - near[2:]) <= best + 1e-12
+    assert abs(found[1] - near[1]) <= np.pi + 1e-12
+
+
+def test_the_identity_takes_the_axis_of_its_neighbour() -> None:
+    found = SPACE.nearest(np.zeros(5), [0, 0, 0, 0, 6.0])
+    np.testing.assert_allclose(found[2:], [0, 0, 2 * np.pi])
+    assert (SPACE.nearest(np.zeros(5), np.zeros(5)) == 0).all()
+
+
+def test_leading_dimensions_broadcast() -> None:
+    rng = np.random.default_rng(0)
+    vectors, near = 5 * rng.normal(size=(4, 3, 5)), 5 * rng.normal(size=(3, 5))
+    many = SPACE.nearest(vectors, near)
+    for i in range(4):
+        for j in range(3):
+            assert (many[i, j] == SPACE.nearest(vectors[i, j], near[j])).all()
+
+
+def test_a_vector_near_enough_is_returned_to_the_bit() -> None:
+    vector = np.array([0.1, 3.0, 0.3, -0.2, 1.1])
+    assert (SPACE.nearest(vector, vector + 0.1) == vector).all()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"units": ("m",)}, "units: got 1 of them, want 2"),
+        ({"names": ("a", "a")}, "names: got a name twice"),
+        ({"position": (0,)}, "position: got 1 entries, want 2"),
+        ({"angles": (2,)}, r"angles: got indices \(2,\), want them between 0 and 1"),
+        ({"low": (1.0, 0.0), "high": (0.0, 1.0)}, "limits of a: got 1 to 0, want the first below the second"),
+    ],
+)
+def test_what_does_not_fit_is_refused(fields: dict, message: str) -> None:
+    with pytest.raises(ls.InputError, match=message):
+        ls.Coordinates(**{"names": ("a", "b"), "units": ("", ""), **fields})

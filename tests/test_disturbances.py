@@ -1,0 +1,126 @@
+"""Each disturbance does what its numbers say, in their units, and refuses what does not fit."""
+
+import numpy as np
+import pytest
+from tracking import hover, weave
+
+from lqrsim.errors import InputError
+from lqrsim.robots.differential_drive import DifferentialDrive
+from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.scenes import load_scene
+from lqrsim.simulation.closed_loop import simulate
+from lqrsim.simulation.disturbances import ControlNoise, ForceNoise, MeasurementNoise, Push
+from lqrsim.simulation.plant import Plant
+
+TRIALS = 40
+
+
+@pytest.fixture(scope="module")
+def arena():
+    return Plant(DifferentialDrive(), load_scene("arena"))
+
+
+@pytest.fixture(scope="module")
+def cage():
+    return Plant(Quadrotor(), load_scene("cage"))
+
+
+def assert_white(noise, std):
+    """Noise (trials, steps, d): mean 0, the stated std, no correlation in time, across trials or between channels.
+
+    Each within five of its standard errors over N samples: 1 / sqrt(N), for the std 1 / sqrt(2 N). The seed is fixed.
+    """
+    std = np.broadcast_to(std, noise.shape[-1])
+    scaled, root = noise / std, np.sqrt(noise[..., 0].size)
+    assert np.abs(scaled.mean(axis=(0, 1))).max() < 5 / root
+    assert np.abs(scaled.std(axis=(0, 1)) - 1).max() < 5 / (np.sqrt(2) * root)
+    assert np.abs((scaled[:, 1:] * scaled[:, :-1]).mean(axis=(0, 1))).max() < 5 / root
+    assert np.abs((scaled[1:] * scaled[:-1]).mean(axis=(0, 1))).max() < 5 / root
+    assert np.abs((scaled[..., 1:] * scaled[..., :-1]).mean(axis=(0, 1))).max() < 5 / root
+
+
+def test_control_noise(arena, cage):
+    rollout = simulate(cage, hover(), disturbances=[ControlNoise(0.05)], trials=TRIALS)
+    assert not rollout.saturated.any()
+    assert_white(rollout.applied - rollout.commanded, 0.05)
+    rollout = simulate(arena, weave(60), disturbances=[ControlNoise((0.01, 0.03))], trials=TRIALS)
+    assert_white(rollout.applied - rollout.commanded, [0.01, 0.03])
+
+
+def test_measurement_noise_is_in_the_unit_of_each_state_and_leaves_the_true_state(cage):
+    std = np.repeat([0.02, 0.05, 0.01, 0.03], 3)
+    rollout = simulate(cage, hover(), disturbances=[MeasurementNoise(std.tolist())], trials=TRIALS)
+    assert_white(rollout.measured - rollout.states, std)
+    undisturbed = simulate(cage, hover())
+    np.testing.assert_array_equal(undisturbed.measured, undisturbed.states)
+
+
+def test_force_noise_accelerates_by_force_over_mass(cage):
+    rollout = simulate(cage, hover(), disturbances=[ForceNoise((0.1, 0.2, 0.3))], trials=TRIALS)
+    assert_white(rollout.forces, [0.1, 0.2, 0.3])
+    # One period on: the analytic step, plus force / mass for one period less what drag (0.3 / s) takes of it.
+    robot, dt = cage.robot, 1 / 30
+    expected = robot.dynamics.step(rollout.states[3, 7], rollout.applied[3, 7], dt)
+    gained = rollout.states[3, 8, 3:6] - expected[3:6]
+    decay = robot.drag / robot.mass
+    np.testing.assert_allclose(gained, rollout.forces[3, 7] / robot.mass * (1 - np.exp(-decay * dt)) / decay, atol=1e-7)
+
+
+def test_a_push_delivers_its_impulse_in_the_period_that_contains_it(cage):
+    robot, impulse = cage.robot, np.array([0.05, -0.02, 0.03])
+    rollout = simulate(cage, hover(), disturbances=[Push(impulse.tolist(), at=0.51)])
+    period = 15  # from 0.5 s on
+    np.testing.assert_array_equal(np.flatnonzero(rollout.forces[0].any(axis=1)), [period])
+    np.testing.assert_allclose(rollout.forces[0].sum(axis=0) / 30, impulse)
+    gained = rollout.states[0, period + 1, 3:6] - rollout.plan.states[period + 1, 3:6]
+    np.testing.assert_allclose(gained, impulse / robot.mass, rtol=0.01)  # drag takes 0.5 % over the period
+    # A time that is a knot belongs to the period that begins there, whatever its rounding.
+    at_knot = simulate(cage, hover(), disturbances=[Push(impulse.tolist(), at=0.7)])
+    np.testing.assert_array_equal(np.flatnonzero(at_knot.forces[0].any(axis=1)), [21])
+
+
+def test_a_push_moves_the_differential_drive_at_its_centre_of_mass(arena):
+    free = simulate(arena, weave(12))
+    pushed = simulate(arena, weave(12), disturbances=[Push((0.0, 3.0, 0.0), at=1.0)])  # 18 N, friction holds 28 N
+    shoved = simulate(arena, weave(12), disturbances=[Push((0.0, 9.0, 0.0), at=1.0)])  # 54 N
+    aside = [abs(run.states[0, 7, 1] - free.states[0, 7, 1]) for run in (pushed, shoved)]
+    assert aside[0] < 0.02
+    assert aside[1] > 0.1
+    assert np.abs(shoved.states[0, 7, 2] - free.states[0, 7, 2]) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ControlNoise(-0.1), "^ControlNoise: std: got -0.1, want a finite number >= 0$"),
+        (lambda: ControlNoise((0.1, -0.1)), "^ControlNoise: std: got -0.1, want numbers >= 0$"),
+        (lambda: MeasurementNoise(float("nan")), "^MeasurementNoise: std: got nan"),
+        (lambda: MeasurementNoise("much"), "^MeasurementNoise: std: got 'much'"),  # pyright: ignore[reportArgumentType]
+        (lambda: ForceNoise((0.1, 0.1)), "^ForceNoise: std: got 2 numbers, want 1 or 3: x, y, z$"),
+        (lambda: Push((1.0, 2.0), at=1.0), r"^Push: impulse: got shape \(2,\), want \(3,\)$"),
+        (lambda: Push((1.0, 2.0, np.inf), at=1.0), "^Push: impulse: got inf"),
+        (lambda: Push((1.0, 2.0, 3.0), at=-1.0), "^Push: at: got -1.0, want a finite number >= 0$"),
+    ],
+)
+def test_numbers_that_mean_nothing_are_refused_when_the_disturbance_is_made(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("disturbance", "message"),
+    [
+        (ControlNoise((0.1, 0.1, 0.1)), "^ControlNoise: std: got 3 numbers, want 1 or 2: left, right$"),
+        (MeasurementNoise((0.1, 0.1)), "^MeasurementNoise: std: got 2 numbers, want 1 or 3: x, y, heading$"),
+        (Push((1.0, 0.0, 0.0), at=5.0), "^Push: at: got 5 s, want a time before the plan ends at 5 s$"),
+    ],
+)
+def test_a_disturbance_that_does_not_fit_the_plant_is_refused_by_name(arena, disturbance, message):
+    with pytest.raises(InputError, match=message):
+        simulate(arena, weave(30), disturbances=[disturbance])
+
+
+def test_descriptions_are_readable():
+    assert ForceNoise(0.1).description == "force noise, std 0.1 N"
+    assert MeasurementNoise((0.1, 0.2)).description == "measurement noise, std (0.1, 0.2)"
+    assert Push((0.3, 0.0, 0.0), at=2.0).description == "push of (0.3, 0, 0) N s at 2 s"

@@ -1,0 +1,71 @@
+"""The pages in docs/ are programs: what they build outside the package plugs in, unchanged."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim import robots
+from lqrsim.cli import main
+from lqrsim.view import gl
+
+DOCS = Path(__file__).parent.parent / "docs"
+BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def run_page(name: str) -> dict[str, Any]:
+    """Run the Python blocks of a page, in order, in one namespace; tracebacks have the page's line numbers."""
+    page = DOCS / name
+    text = page.read_text(encoding="utf-8")
+    namespace: dict[str, Any] = {"__name__": page.stem}
+    for block in BLOCK.finditer(text):
+        line = text.count("\n", 0, block.start(1))
+        exec(compile("\n" * line + block.group(1), str(page), "exec"), namespace)
+    return namespace
+
+
+def test_a_robot_scene_cost_and_disturbance_of_ones_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_page("adding_a_robot.md")
+    solution, rollout, windy = (names[name] for name in ("solution", "rollout", "windy"))
+    assert isinstance(solution, ls.Solution)
+    assert solution.status is ls.Status.CONVERGED
+    assert isinstance(rollout, ls.Rollout)
+    assert isinstance(windy, ls.Rollout)
+    # The puck is linear and MuJoCo integrates with the same RK4: rounding is all that is left.
+    assert rollout.tracking_error.max() < 1e-12
+    assert rollout.clearance.min() > 0.1
+    assert rollout.outcome == ("reached",)
+    # The wind blows east, only east of the middle, as much as it says.
+    expected = 0.2 * np.maximum(windy.states[:, :-1, 0], 0)
+    np.testing.assert_allclose(windy.forces[..., 0], expected, rtol=0, atol=1e-15)
+    assert windy.tracking_error.max() > 0.01
+    # Its own cost acts: the plan keeps the speed limit better than one without it.
+    speeds = np.linalg.norm(solution.trajectory.states[:, 2:], axis=1)
+    assert speeds.max() < 1.05
+    assert "puck" not in robots.names()
+
+    page = (DOCS / "adding_a_robot.md").read_text(encoding="utf-8")
+    (tmp_path / "rink.py").write_text("\n".join(BLOCK.findall(page)), encoding="utf-8")
+    assert main(["solve", "rink.py:rink"]) == 0
+    assert main(["simulate", "runs/rink/solution.npz", "--scenario", "rink.py:rink"]) == 0
+    assert "puck in rink, undisturbed" in capsys.readouterr().out
+    if gl.available():
+        assert ls.render(rollout, tmp_path / "rink.mp4", size=(320, 240), fps=5).stat().st_size > 1000
+
+
+def test_a_policy_is_loaded_with_numpy_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, drive_solution: ls.Solution
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ls.save(drive_solution, "solution.npz")
+    control = run_page("file_format.md")["control"]
+    assert callable(control)
+    for t in (0.0, 3.3, 24.99, 30.0):
+        state = drive_solution.trajectory.states[min(int(6 * t), 149)] + [0.02, -0.01, 6 * np.pi + 0.1]
+        np.testing.assert_allclose(control(state, t), drive_solution.policy(state, t), rtol=0, atol=1e-12)

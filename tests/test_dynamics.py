@@ -1,0 +1,157 @@
+"""The analytic models: derivatives against finite differences, flows against SciPy and closed forms."""
+
+import mpmath
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+import lqrsim as ls
+from lqrsim import compiled, rotations
+from lqrsim.errors import Array
+
+ROBOTS = [ls.DifferentialDrive(), ls.Quadrotor()]
+
+
+def random_point(robot: ls.Robot, rng: np.random.Generator) -> tuple[Array, Array]:
+    n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
+    return rng.uniform(-1.5, 1.5, size=n), rng.uniform(0, 1.5, size=m)
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
+@pytest.mark.parametrize("dt", [1 / 6, 1 / 30, -1 / 30])
+def test_jacobians_are_those_of_the_step(robot: ls.Robot, dt: float) -> None:
+    """Central differences of step 1e-6 in double precision are good to 1e-6 at derivatives of order one."""
+    rng, h = np.random.default_rng(0), 1e-6
+    for _ in range(20):
+        x, u = random_point(robot, rng)
+        a, b, c = robot.dynamics.linearize(x, u, dt)
+        np.testing.assert_allclose(a @ x + b @ u + c, robot.dynamics.step(x, u, dt), rtol=0, atol=1e-12)
+        for i, unit in enumerate(np.eye(len(x))):
+            ahead, behind = (robot.dynamics.step(x + s * h * unit, u, dt) for s in (1, -1))
+            np.testing.assert_allclose(a[:, i], (ahead - behind) / (2 * h), rtol=0, atol=1e-6)
+        for i, unit in enumerate(np.eye(len(u))):
+            ahead, behind = (robot.dynamics.step(x, u + s * h * unit, dt) for s in (1, -1))
+            np.testing.assert_allclose(b[:, i], (ahead - behind) / (2 * h), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
+def test_the_compiled_step_is_the_plain_one(robot: ls.Robot, request: pytest.FixtureRequest) -> None:
+    scenario = request.getfixturevalue(robot.name)
+    core, rng = compiled.core(scenario.problem), np.random.default_rng(1)
+    for _ in range(20):
+        x, u = random_point(robot, rng)
+        n, m = len(x), len(u)
+        out, jacobian = np.zeros(n), np.zeros((n, n + m))
+        core.step_jacobian(x, u, robot.dynamics.data, 0.1, np.zeros((n, n)), np.zeros((n, m)), out, jacobian)
+        a, b, _ = robot.dynamics.linearize(x, u, 0.1)
+        # The same formulas, in an order that the compiler chose: rounding.
+        np.testing.assert_allclose(out, robot.dynamics.step(x, u, 0.1), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(jacobian, np.hstack([a, b]), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
+def test_the_step_is_of_order_four(robot: ls.Robot) -> None:
+    """Against SciPy's integrator at 1e-12: halving the step divides the error of one step by 2^5, here by 28 to 36."""
+    x, u = random_point(robot, np.random.default_rng(2))
+
+    def error(dt: float) -> float:
+        flow = solve_ivp(lambda _, y: robot.dynamics.rate(y, u), (0, dt), x, rtol=1e-12, atol=1e-13)
+        return float(np.abs(robot.dynamics.step(x, u, dt) - flow.y[:, -1]).max())
+
+    assert 28 < error(0.4) / error(0.2) < 36
+
+
+def test_the_quadrotor_hovers_and_falls() -> None:
+    robot = ls.Quadrotor()
+    hover = robot.dynamics.step(np.zeros(12), np.full(4, robot.hover_force), 0.1)
+    np.testing.assert_allclose(hover, 0, atol=1e-14)
+    # From rest without thrust: v = -(g m / k) (1 - exp(-k t / m)), the fall of a body with linear drag.
+    t, rate = 0.1, robot.drag / robot.mass
+    fall = robot.dynamics.step(np.zeros(12), np.zeros(4), t)
+    assert fall[5] == pytest.approx(-robot.gravity / rate * (1 - np.exp(-rate * t)), rel=1e-6)  # one step, order 4
+
+
+def test_rotation_functions_are_the_matrix_exponential() -> None:
+    import sympy
+
+    r = sympy.symbols("r:3", real=True)
+    turned = sympy.lambdify(r, rotations.rotate(r, [0, 0, 1]), modules=[vars(rotations), "math"])
+    for vector in np.random.default_rng(3).normal(size=(50, 3)) * 2:
+        x, y, z = vector
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        np.testing.assert_allclose(turned(*vector), expm(cross)[:, 2], rtol=0, atol=1e-12)
+
+
+def test_the_rate_of_a_rotation_vector_is_that_of_the_rotation() -> None:
+    """Turning on by w dt in body axes, composed by SciPy, moves the vector by its rate times dt, to second order."""
+    import sympy
+
+    r, w = sympy.symbols("r:3", real=True), sympy.symbols("w:3", real=True)
+    rate = sympy.lambdify([*r, *w], rotations.vector_rate(r, w), modules=[vars(rotations), "math"])
+    rng, dt = np.random.default_rng(4), 1e-5
+    for _ in range(50):
+        vector = rng.normal(size=3)
+        vector *= rng.uniform(0, 2.9) / np.linalg.norm(vector)
+        spin = rng.normal(size=3)
+        ahead, behind = (
+            (Rotation.from_rotvec(vector) * Rotation.from_rotvec(s * dt * spin)).as_rotvec() for s in (1, -1)
+        )
+        np.testing.assert_allclose(rate(*vector, *spin), (ahead - behind) / (2 * dt), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+@pytest.mark.parametrize("name", rotations.RATIOS)
+def test_ratios_are_smooth_at_zero(name: str, order: int) -> None:
+    """Against 40 digits of mpmath, on both sides of the switch to the series; each differentiation costs digits."""
+    exact = {
+        "sine_ratio": lambda s: mpmath.sin(mpmath.sqrt(s)) / mpmath.sqrt(s),
+        "cosine_ratio": lambda s: (1 - mpmath.cos(mpmath.sqrt(s))) / s,
+        "cotangent_ratio": lambda s: (1 - mpmath.sqrt(s) / 2 * mpmath.cot(mpmath.sqrt(s) / 2)) / s,
+    }[name]
+    function = getattr(rotations, name + ("" if order == 0 else f"_d{order}"))
+    tolerance = [1e-13, 1e-11, 1e-8][order]
+    with mpmath.workdps(40):
+        for s in [*np.logspace(-8, 1.4, 60), 0.2499999, 0.2500001]:
+            want = mpmath.diff(exact, mpmath.mpf(float(s)), order)
+            assert abs(function(float(s)) - want) < tolerance * max(1e-2, abs(want))
+
+
+def _pendulum(x, u, p):
+    from sympy import sin
+
+    angle, speed = x
+    return [speed, u[0] - p.stiffness * sin(angle)]
+
+
+FIELDS = {
+    "states": {"angle": "rad", "speed": "rad/s"},
+    "controls": {"torque": "N m"},
+    "parameters": {"stiffness": 2.0},
+    "angles": ("angle",),
+}
+
+
+@pytest.mark.parametrize(
+    ("function", "fields", "message"),
+    [
+        (
+            _pendulum,
+            {"parameters": {}},
+            r"_pendulum\(x, u, p\): parameter: got 'stiffness', want one of: \(there are none",
+        ),
+        (_pendulum, {"parameters": {"stiffness": np.nan}}, "parameters: stiffness: got nan, want a finite number"),
+        (_pendulum, {"angles": ("angel",)}, r"angles: got 'angel', want one of: angle, speed \(did you mean angle\?\)"),
+        (lambda x, u, p: [x[1]], {}, "got 1 entries, want 2: one for each of angle, speed"),
+        (lambda x, u, p: [x[1], float(x[0])], {}, "got TypeError .* when called with symbols"),
+        (lambda x, u, p: [x[1], x[2]], {}, "got IndexError"),
+        (lambda x, u, p: [x[1], "fast"], {}, "got 'fast' as entry 1, want an expression"),
+        (lambda x, u, p: [x[1], x[0] / (u[0] - u[0])], {}, "as entry 1, want a finite expression"),
+        (_pendulum, {"control_limits": (1.0, -1.0)}, "limits of torque: got 1 to -1, want the first below the second"),
+    ],
+)
+def test_bad_dynamics_get_one_line(function, fields: dict, message: str) -> None:
+    with pytest.raises(ls.InputError, match=message) as caught:
+        _ = ls.Dynamics(function, **{**FIELDS, **fields}).source
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,78 @@
+"""Running a policy: time, angles, limits."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import lqrsim as ls
+
+
+def test_on_the_plan_it_plays_the_plan(drive_solution: ls.Solution) -> None:
+    plan = drive_solution.trajectory
+    for t in (0, 1, 77, 149):
+        control = drive_solution.policy(plan.states[t], plan.times[t])
+        np.testing.assert_allclose(control, plan.controls[t], rtol=0, atol=1e-12)
+
+
+def test_knots_belong_to_the_law_that_begins_there(drive_solution: ls.Solution) -> None:
+    """At t = k dt, however it was rounded, and until the next knot; after the horizon the last law stays."""
+    policy, state = drive_solution.policy, drive_solution.trajectory.states[60]
+    for step in range(150):
+        for t in (step * policy.dt, step / 6, np.nextafter(step / 6, 0) if step else 0.0, (step + 0.99) * policy.dt):
+            expected = policy.control_coordinates.clip(
+                policy.control(policy.state_coordinates.nearest(state, policy.nominal[step]), step)
+            )
+            assert (policy(state, t) == expected).all()
+    assert (policy(state, 25.0) == policy(state, 24.9)).all()
+    assert (policy(state, 1e6) == policy(state, 24.9)).all()
+
+
+def test_interpolation_meets_the_laws_at_the_knots(drive_solution: ls.Solution) -> None:
+    policy, state = drive_solution.policy, drive_solution.trajectory.states[60] + 0.001
+    for step in (0, 60, 149):
+        assert policy(state, step / 6, interpolate=True) == pytest.approx(policy(state, step / 6), abs=1e-12)
+    between = policy(state, 60.5 / 6, interpolate=True)
+    expected = (policy.control(state, 60) + policy.control(state, 61)) / 2
+    assert between == pytest.approx(np.clip(expected, -0.5, 0.5), abs=1e-9)
+
+
+def test_whole_turns_change_nothing(drive_solution: ls.Solution, quadrotor_solution: ls.Solution) -> None:
+    state = drive_solution.trajectory.states[10]
+    for turns in (-3, 1, 2):
+        turned = state + np.array([0, 0, 2 * np.pi * turns])
+        assert drive_solution.policy(turned, 10 / 6) == pytest.approx(drive_solution.policy(state, 10 / 6), abs=1e-12)
+    state = quadrotor_solution.trajectory.states[75]
+    turned = state.copy()
+    angle = np.linalg.norm(state[6:9])
+    turned[6:9] *= (angle - 2 * np.pi) / angle
+    assert (Rotation.from_rotvec(turned[6:9]) * Rotation.from_rotvec(state[6:9]).inv()).magnitude() < 1e-7
+    assert quadrotor_solution.policy(turned, 2.5) == pytest.approx(quadrotor_solution.policy(state, 2.5), abs=1e-9)
+
+
+def test_commands_keep_the_limits(drive_solution: ls.Solution) -> None:
+    state = drive_solution.trajectory.states[0] + [5.0, 5.0, 0.0]
+    control = drive_solution.policy(state, 0.0)
+    assert (np.abs(control) <= 0.5).all()
+    assert (np.abs(drive_solution.policy.control(state, 0)) > 0.5).any()
+
+
+def test_many_states_at_once(quadrotor_solution: ls.Solution) -> None:
+    policy, rng = quadrotor_solution.policy, np.random.default_rng(0)
+    states = quadrotor_solution.trajectory.states[30] + 0.1 * rng.normal(size=(7, 12))
+    together = policy(states, 1.0)
+    for state, control in zip(states, together, strict=True):
+        np.testing.assert_allclose(policy(state, 1.0), control, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("state", "t", "message"),
+    [
+        (np.zeros(3), -0.1, "t: got -0.1, want seconds since the start, >= 0"),
+        (np.zeros(3), np.nan, "t: got nan"),
+        (np.zeros(4), 0.0, r"state: got shape \(4,\), want \(3,\) in its last dimension"),
+        (np.array([0, np.nan, 0]), 0.0, "state: got .*nan.*, want finite numbers"),
+    ],
+)
+def test_bad_calls_get_one_line(drive_solution: ls.Solution, state, t: float, message: str) -> None:
+    with pytest.raises(ls.InputError, match=message):
+        drive_solution.policy(state, t)

@@ -1,0 +1,148 @@
+"""Problems and costs: what is refused, each with one line that names the field, what it got and what it wanted."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim import compiled
+
+
+def test_a_sum_of_costs_keeps_its_terms_in_order() -> None:
+    a, b, c = (ls.ControlCost([weight], about=[0.0]) for weight in (1.0, 2.0, 3.0))
+    assert ((a + b) + c).terms == (a + (b + c)).terms == (a, b, c)
+
+
+def test_the_stage_model_is_the_cost_to_second_order(quadrotor: ls.Scenario) -> None:
+    """Gradient by central differences of the value, step 1e-6: 1e-5 of gradients of order ten."""
+    problem = quadrotor.problem
+    core, data = compiled.core(problem), compiled.arguments(problem)
+    rng, h = np.random.default_rng(0), 1e-6
+    for _ in range(20):
+        z = rng.uniform(-1, 1, size=16)
+        hessian, gradient = np.zeros((16, 16)), np.zeros(16)
+        value = core.stage_quadratic(z[:12], z[12:], 1, data["stage"], hessian, gradient)
+        assert value == pytest.approx(core.stage_value(z[:12], z[12:], 1, data["stage"]), rel=1e-12)
+        for i, unit in enumerate(np.eye(16)):
+            ahead, behind = (
+                core.stage_value((z + s * h * unit)[:12], (z + s * h * unit)[12:], 1, data["stage"]) for s in (1, -1)
+            )
+            assert gradient[i] == pytest.approx((ahead - behind) / (2 * h), abs=1e-5 * max(1, value))
+        assert np.linalg.eigvalsh(hessian).min() > -1e-9 * np.abs(hessian).max()
+
+
+def test_a_symbolic_cost_is_the_built_in_one(differential_drive: ls.Scenario) -> None:
+    """The control cost once more as a formula: the same optimum to rounding."""
+    problem = differential_drive.problem
+    scene, robot = differential_drive.scene, differential_drive.robot
+
+    def effort(x, u, p):
+        return p.weight / 2 * ((u[0] - p.cruise) ** 2 + (u[1] - p.cruise) ** 2)
+
+    stage = ls.SymbolicCost(effort, parameters={"weight": 60.0, "cruise": 0.25}, convex=True)
+    stage += ls.ObstacleCost(scene.world, radius=robot.radius)
+    other = dataclasses.replace(problem, stage_cost=stage)
+    solution = ls.smooth(other, initial_controls=(0.25, 0.25))
+    assert solution.cost == pytest.approx(ls.smooth(problem).cost, rel=1e-9)
+
+
+STATES = {"x": "m", "y": "m", "speed": "m/s"}
+DYNAMICS = ls.Dynamics(
+    lambda x, u, p: [x[2], 0 * x[2], u[0]], states=STATES, controls={"force": "N"}, position=("x", "y")
+)
+PILLAR = ls.World([ls.Obstacle("pillar", "cylinder", np.zeros(3), np.eye(3), np.array([0.5, 1.0, 0.0]))])
+FIELDS = {
+    "dynamics": DYNAMICS,
+    "dt": 0.1,
+    "steps": 10,
+    "initial": ls.QuadraticCost(np.ones(3), about=(2.0, 0.0, 0.0)),
+    "stage_cost": ls.ControlCost([1.0], about=[0.0]) + ls.ObstacleCost(PILLAR, radius=0.1),
+    "final_cost": ls.QuadraticCost(np.ones(3), about=(4.0, 0.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"dt": 0.0}, "dt: got 0.0, want a finite number > 0"),
+        ({"dt": -0.1}, "dt: got -0.1, want a finite number > 0"),
+        ({"dt": np.nan}, "dt: got nan, want a finite number > 0"),
+        ({"dt": "fast"}, "dt: got 'fast', want a finite number > 0"),
+        ({"steps": 0}, "steps: got 0, want a whole number >= 1"),
+        ({"steps": 1.5}, "steps: got 1.5, want a whole number >= 1"),
+        ({"steps": True}, "steps: got True, want a whole number >= 1"),
+        ({"dynamics": None}, "dynamics: got NoneType, want Dynamics"),
+        ({"stage_cost": 3.0}, "cost: got 3.0, want a cost such as QuadraticCost"),
+        ({"initial": ls.FixedState((1.0, 2.0))}, r"initial: FixedState: got shape \(2,\), want \(3,\)"),
+        ({"initial": ls.FixedState((0.3, 0.0, 0.0))}, r"start at \(0.3, 0\) m, 0.3 m inside obstacle 'pillar'"),
+        (
+            {"initial": ls.QuadraticCost(np.ones(3), about=(0.55, 0.0, 0.0))},
+            r"0.05 m inside obstacle 'pillar', want it clear of obstacles by the robot's radius of 0.1 m",
+        ),
+        ({"final_cost": ls.ControlCost([1.0], about=[0.0])}, "final_cost: got a cost that depends on the control"),
+        (
+            {"final_cost": ls.QuadraticCost(np.ones(2), about=np.zeros(2))},
+            "weight: got size 2, want 3, the number of states",
+        ),
+        (
+            {"stage_cost": ls.ControlCost(np.ones(2), about=np.zeros(2))},
+            "weight: got size 2, want 1, the number of controls",
+        ),
+        ({"stage_cost": ls.SymbolicCost(lambda x, u, p: [x[0], x[1]])}, "got 2 entries, want one: the cost"),
+        ({"stage_cost": ls.SymbolicCost(lambda x, u, p: p.gain * x[0])}, "parameter: got 'gain', want one of"),
+        ({"prior": ls.InitialPrior(np.ones(2), about=np.zeros(2))}, r"prior: got shape \(2,\), want \(3,\)"),
+    ],
+)
+def test_bad_problems_get_one_line(fields: dict, message: str) -> None:
+    with pytest.raises(ls.InputError, match=message) as caught:
+        ls.Problem(**{**FIELDS, **fields})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: ls.QuadraticCost([[1.0, 2.0], [3.0, 4.0]], about=[0, 0]),
+            r"got 2 at \[0, 1\] and 3 at \[1, 0\], want a symmetric",
+        ),
+        (
+            lambda: ls.QuadraticCost([1.0, -1.0], about=[0, 0]),
+            "got smallest eigenvalue -1, want a positive-semidefinite",
+        ),
+        (lambda: ls.ControlCost([1.0, 0.0], about=[0, 0]), "got smallest eigenvalue 0, want a positive-definite"),
+        (lambda: ls.QuadraticCost([1.0, np.nan], about=[0, 0]), r"got nan at index \[1, 1\], want finite numbers"),
+        (lambda: ls.QuadraticCost([1.0, np.inf], about=[0, 0]), r"got inf at index \[1, 1\], want finite numbers"),
+        (lambda: ls.QuadraticCost([[1.0, 0.0]], about=[0]), r"got shape \(1, 2\), want a square matrix"),
+        (lambda: ls.QuadraticCost("heavy", about=[0]), "got 'heavy', want a matrix of numbers or its diagonal"),
+        (lambda: ls.QuadraticCost([1.0], about=[0, 0]), r"about: got shape \(2,\), want \(1,\)"),
+        (lambda: ls.ObstacleCost(PILLAR, radius=-1.0), "radius: got -1.0, want a finite number >= 0"),
+        (lambda: ls.ObstacleCost(PILLAR, radius=0.1, sharpness=0.0), "sharpness: got 0.0, want a finite number > 0"),
+        (lambda: ls.ObstacleCost(None, radius=0.1), "world: got NoneType, want a World"),  # pyright: ignore[reportArgumentType]
+        (lambda: ls.InitialPrior([-1.0], about=[0.0]), "weight: got -1, want numbers >= 0"),
+        (
+            lambda: ls.Obstacle("it", "cone", np.zeros(3), np.eye(3), np.ones(3)),
+            "kind: got 'cone', want one of: plane, sphere",
+        ),
+        (lambda: ls.Obstacle("it", "box", np.zeros(3), np.ones((3, 3)), np.ones(3)), "want orthonormal axes"),
+        (lambda: ls.Obstacle("it", "box", np.zeros(3), np.eye(3), np.zeros(3)), "want lengths above 0"),
+    ],
+)
+def test_bad_parts_get_one_line(make, message: str) -> None:
+    with pytest.raises(ls.InputError, match=message) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_an_obstacle_cost_needs_a_position() -> None:
+    nowhere = ls.Dynamics(lambda x, u, p: [u[0]], states={"x": ""}, controls={"u": ""})
+    with pytest.raises(ls.InputError, match="got dynamics without a position"):
+        ls.Problem(
+            dynamics=nowhere,
+            dt=0.1,
+            steps=2,
+            initial=ls.FixedState([0.0]),
+            stage_cost=ls.ObstacleCost(PILLAR, radius=0.1),
+            final_cost=ls.QuadraticCost([1.0], about=[0.0]),
+        )

@@ -1,0 +1,197 @@
+"""The rule that makes obstacles of an MJCF, the packaged scenes, and what a bad file is told."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from lqrsim import scenes
+from lqrsim.errors import InputError
+from lqrsim.scenes import load_scene
+
+# method.md, section 4, in metres
+PILLARS = [
+    *[(0, -1.35), (1, -0.5), (-0.95, -0.5), (-0.2, 0.3), (0.8, 0.7), (1.1, 2.0)],
+    *[(-1.2, 0.8), (-1.1, 2.1), (-0.1, 1.6), (-1.1, -1.9), (1.1414, -1.6414)],
+]
+
+
+@pytest.fixture
+def scene_of(tmp_path):
+    """Loads a scene from the text of its worldbody, or from a whole file."""
+
+    def load(body="", *, text=None):
+        path = tmp_path / "mine.xml"
+        path.write_text(text or f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+        return load_scene(path)
+
+    return load
+
+
+def by_name(scene):
+    return {obstacle.name: obstacle for obstacle in scene.world.obstacles}
+
+
+def test_arena_is_the_one_of_the_paper():
+    obstacles = by_name(load_scene("arena"))
+    pillars = [obstacle for obstacle in obstacles.values() if obstacle.kind == "cylinder"]
+    np.testing.assert_array_equal([pillar.position[:2] for pillar in pillars], PILLARS)
+    assert {pillar.size[0] for pillar in pillars} == {0.2}
+    planes = {name: obstacle for name, obstacle in obstacles.items() if obstacle.kind == "plane"}
+    assert len(planes) + len(pillars) == len(obstacles)
+    walls = [(plane.position.tolist(), plane.rotation[:, 2].round(12).tolist()) for plane in planes.values()]
+    floor, west, east = ([0, 0, 0], [0, 0, 1]), ([-2, 0, 0], [1, 0, 0]), ([2, 0, 0], [-1, 0, 0])
+    south, north = ([0, -3, 0], [0, 1, 0]), ([0, 3, 0], [0, -1, 0])
+    assert sorted(walls) == sorted([floor, west, east, south, north])
+
+
+def test_distances_in_the_arena_are_those_of_circles_and_a_rectangle():
+    points = np.random.default_rng(0).uniform([-2, -3], [2, 3], (300, 2))
+    to_pillars = np.linalg.norm(points[:, None] - np.array(PILLARS), axis=2).min(axis=1) - 0.2
+    to_walls = np.minimum(2 - np.abs(points[:, 0]), 3 - np.abs(points[:, 1]))
+    distance = load_scene("arena").world.seen_by(2).distance(points)
+    np.testing.assert_allclose(distance, np.minimum(to_pillars, to_walls), atol=1e-12)
+
+
+def test_distances_in_the_cage_are_those_of_twelve_infinite_bars_and_a_cube():
+    points = np.random.default_rng(0).uniform(-3, 3, (300, 3))
+    distances = [3 - np.abs(points).max(axis=1)]
+    for axis in range(3):
+        across = np.delete(points, axis, axis=1)
+        # The nearest of the four bars along this axis is the one of the same signs.
+        distances.append(np.linalg.norm(np.abs(across) - 1.25, axis=1) - 0.4)
+    world = load_scene("cage").world.seen_by(3)
+    assert len(world) == 12 + 6
+    np.testing.assert_allclose(world.distance(points), np.min(distances, axis=0), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", scenes.names())
+def test_packaged_scenes(name):
+    scene = load_scene(name)
+    assert scene.name == name
+    assert scene.model.ncam >= 2
+    assert not mujoco.mj_isSparse(scene.model)
+    assert "include" not in scene.xml.replace("Include", "")
+    # The text alone makes the very same model again, to the last bit.
+    again = mujoco.MjModel.from_xml_string(scene.xml)
+    from_file = mujoco.MjModel.from_xml_path(str(scenes.MODELS / f"{name}.xml"))
+    for field in ("body_mass", "body_inertia", "geom_pos", "geom_size", "dof_damping", "actuator_gear", "cam_pos"):
+        np.testing.assert_array_equal(getattr(again, field), getattr(from_file, field), err_msg=field)
+    assert again.opt.timestep == from_file.opt.timestep == scene.model.opt.timestep
+
+
+def test_what_is_fixed_and_can_collide_is_an_obstacle_and_nothing_else(scene_of):
+    scene = scene_of("""
+        <geom name="ball" type="sphere" size="0.1"/>
+        <geom name="half" type="box" size="1 2 3" contype="0" conaffinity="1"/>
+        <geom name="drawn" type="ellipsoid" size="1 2 3" contype="0" conaffinity="0"/>
+        <body pos="1 0 0" euler="0 90 0"><geom type="capsule" size="0.1 0.5"/></body>
+        <body><freejoint/><geom name="loose" type="sphere" size="0.1"/></body>
+        <body mocap="true"><geom name="carried" type="sphere" size="0.1"/></body>
+    """)
+    obstacles = by_name(scene)
+    assert list(obstacles) == ["ball", "half", "capsule 3"]
+    np.testing.assert_array_equal(obstacles["half"].size, [1, 2, 3])
+    np.testing.assert_allclose(obstacles["capsule 3"].position, [1, 0, 0])
+    np.testing.assert_allclose(obstacles["capsule 3"].rotation[:, 2], [1, 0, 0], atol=1e-12)
+
+
+FLOOR = '<geom name="floor" type="plane" size="1 1 1"/>'
+CEILING = '<geom name="ceiling" type="plane" size="1 1 1" pos="0 0 2" zaxis="0 0 -1"/>'
+
+
+@pytest.mark.parametrize(
+    ("bar", "half_length"),
+    [
+        (FLOOR + CEILING + '<geom name="bar" type="cylinder" size="0.1 1" pos="0 0 1"/>', np.inf),
+        (FLOOR + CEILING + '<geom name="bar" type="capsule" size="0.1 1.2" pos="0 0 1"/>', np.inf),
+        (FLOOR + CEILING + '<geom name="bar" type="cylinder" size="0.1 0.9" pos="0 0 1"/>', 0.9),
+        (FLOOR + '<geom name="bar" type="cylinder" size="0.1 1" pos="0 0 1"/>', 1),
+        # Tilted: one rim of each end is still in the room, or none.
+        (FLOOR + CEILING + '<geom name="bar" type="cylinder" size="0.2 1.41" pos="0 0 1" euler="0 45 0"/>', 1.41),
+        (FLOOR + CEILING + '<geom name="bar" type="cylinder" size="0.2 1.7" pos="0 0 1" euler="0 45 0"/>', np.inf),
+        # A log half sunk into the floor: its ends can be reached.
+        (FLOOR + '<geom name="bar" type="cylinder" size="0.1 1" euler="0 90 0"/>', 1),
+    ],
+)
+def test_a_bar_is_infinite_where_both_its_ends_are_in_walls(scene_of, bar, half_length):
+    assert by_name(scene_of(bar))["bar"].size[1] == half_length
+
+
+@pytest.mark.parametrize(
+    ("asset", "geom", "kind"),
+    [
+        ("", '<geom name="egg" type="ellipsoid" size="1 2 3"/>', "ellipsoid"),
+        ('<mesh name="m" vertex="0 0 0  1 0 0  0 1 0  0 0 1"/>', '<geom name="egg" type="mesh" mesh="m"/>', "mesh"),
+        (
+            '<hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/>',
+            '<geom name="egg" type="hfield" hfield="h"/>',
+            "hfield",
+        ),
+    ],
+)
+def test_an_obstacle_without_a_distance_is_refused_by_name(scene_of, asset, geom, kind):
+    text = f"<mujoco><asset>{asset}</asset><worldbody>{geom}</worldbody></mujoco>"
+    with pytest.raises(InputError, match=f"^scene mine: got the obstacle 'egg' of type {kind}, want one of: plane"):
+        scene_of(text=text)
+    drawn = scene_of(text=text.replace('name="egg"', 'name="egg" contype="0" conaffinity="0"'))
+    assert len(drawn.world) == 0
+
+
+def test_a_scene_of_ones_own_includes_the_packaged_robots_and_files_beside_it(tmp_path):
+    (tmp_path / "rocks.xml").write_text(
+        '<mujoco><worldbody><geom name="rock" type="sphere" size=".2"/></worldbody></mujoco>'
+    )
+    (tmp_path / "tetra.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    path = tmp_path / "garden.xml"
+    path.write_text("""<mujoco>
+      <include file="quadrotor.xml"/>
+      <include file="rocks.xml"/>
+      <asset><mesh name="tetra" file="tetra.obj"/></asset>
+      <worldbody><geom type="mesh" mesh="tetra" contype="0" conaffinity="0"/></worldbody>
+    </mujoco>""")
+    scene = load_scene(path)
+    assert scene.world.names == ("rock",)
+    assert mujoco.MjModel.from_xml_string(scene.xml).body("quadrotor").mass[0] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<mujoco><worldbody></mujoco>", r"^scene: got mine.xml, which is not XML \(mismatched tag: line 1, col"),
+        ("<robot/>", "^scene: got mine.xml with <robot> at its root, want <mujoco>$"),
+        (
+            "<mujoco><worldbody><geom typ='box'/></worldbody></mujoco>",
+            "^scene mine: got an MJCF that MuJoCo refuses: XML Error: Schema violation: unrecognized attribute: 'typ'",
+        ),
+        (
+            "<mujoco><worldbody><geom type='box' size='0 1 1'/></worldbody></mujoco>",
+            "^scene mine: got an MJCF that MuJoCo refuses: Error: size 0 must be positive in geom",
+        ),
+        (
+            '<mujoco><include file="crate.xml"/></mujoco>',
+            "^scene: got an include of 'crate.xml', want a file beside mine.xml or one of: arena.xml, cage.xml, create",
+        ),
+        (
+            '<mujoco><include file="create.xml"/><include file="create.xml"/></mujoco>',
+            "^scene: got create.xml included twice in mine.xml, want each file once$",
+        ),
+    ],
+)
+def test_a_bad_file_is_told_in_one_line(scene_of, text, message):
+    with pytest.raises(InputError, match=message) as caught:
+        scene_of(text=text)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_scene_is_told_the_names():
+    with pytest.raises(InputError, match=r"^scene: got 'aren', want one of: arena, cage .*or the path of an .xml"):
+        load_scene("aren")
+    with pytest.raises(InputError, match=r"^scene: got '.*nowhere.xml', want a file that exists, or one of: arena"):
+        load_scene("somewhere/nowhere.xml")
+
+
+@pytest.mark.skipif(mujoco.__version__ != "4.0.0", reason="the bug is in 4.0.0 alone")
+def test_a_sparse_model_is_refused_where_mujoco_solves_it_wrongly(scene_of):
+    text = '<mujoco><option jacobian="sparse"/><worldbody><body><joint/><geom size="1"/></body></worldbody></mujoco>'
+    with pytest.raises(InputError, match=r"^scene mine: got a sparse constraint Jacobian, which MuJoCo 4.0.0"):
+        scene_of(text=text)

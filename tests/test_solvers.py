@@ -1,0 +1,313 @@
+"""smooth() and ilqr() on the two systems: numbers known from elsewhere, costs recomputed here, honest endings."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import lqrsim as ls
+from lqrsim.errors import Array
+from lqrsim.results import Status
+from lqrsim.scenarios import quadrotor_queries
+
+PILLARS = [
+    (0, -1.35), (1, -0.5), (-0.95, -0.5), (-0.2, 0.3), (0.8, 0.7), (1.1, 2.0), (-1.2, 0.8), (-1.1, 2.1), (-0.1, 1.6),
+    (-1.1, -1.9), (1.1414, -1.6414),
+]  # fmt: skip
+
+
+def drive_cost(states: Array, controls: Array) -> float:
+    """The cost of Sec. VI-A with the authors' weights, written out in NumPy."""
+    cost = 30 * np.sum((controls - 0.25) ** 2)
+    for x, about in ((states[0], (0, -2.5, np.pi)), (states[-1], (0, 2.5, np.pi))):
+        cost += 0.5 * np.sum(np.array([5000, 5000, 50]) * (x - about) ** 2)
+    return cost + np.sum(np.exp(-10 * drive_clearances(states[1:-1])))
+
+
+def drive_clearances(states: Array) -> Array:
+    """Distances to each pillar and wall less the robot's radius."""
+    x, y = states[:, 0], states[:, 1]
+    pillars = [np.hypot(x - px, y - py) - 0.2 for px, py in PILLARS]
+    return np.array([*pillars, x + 2, 2 - x, y + 3, 3 - y]) - 0.17
+
+
+def quadrotor_cost(states: Array, controls: Array, start: Array, goal: Array) -> float:
+    """The cost of Sec. VI-B, written out in NumPy."""
+    cost = 10 * np.sum((controls - 0.5 * 9.8 / 4) ** 2)
+    cost += 250 * np.sum((states[0] - start) ** 2) + 250 * np.sum((states[-1] - goal) ** 2)
+    position = states[1:-1, :3]
+    for axis in range(3):
+        across = np.delete(position, axis, axis=1)
+        for a in (-1.25, 1.25):
+            for b in (-1.25, 1.25):
+                distance = np.hypot(across[:, 0] - a, across[:, 1] - b) - 0.4 - 0.3
+                cost += np.sum(np.exp(-10 * distance))
+        for side in (-1, 1):
+            cost += np.sum(np.exp(-10 * (3 - side * position[:, axis] - 0.3)))
+    return cost
+
+
+def drive_rollout(start: Array, controls: Array) -> Array:
+    """The exact motion of the differential drive at held wheel speeds: arcs of circles."""
+    states = [np.asarray(start, dtype=float)]
+    for left, right in controls:
+        x, y, heading = states[-1]
+        speed, turn = (left + right) / 2, (right - left) / 0.258
+        half = turn / 12
+        length = speed / 6 * np.sinc(half / np.pi)
+        states.append(
+            np.array([x + length * np.cos(heading + half), y + length * np.sin(heading + half), heading + 2 * half])
+        )
+    return np.array(states)
+
+
+@pytest.mark.parametrize(("controls", "cost", "iterations"), [(None, 30.14, 4), ((0.0, 0.0), 54.98, 11)])
+def test_the_differential_drive_reproduces_the_known_costs(
+    differential_drive: ls.Scenario, controls: tuple[float, float] | None, cost: float, iterations: int
+) -> None:
+    """0.5 %: costs found by an independent implementation at the paper's stop test."""
+    solution = ls.smooth(differential_drive.problem, stop="cost", initial_controls=controls)
+    assert solution.status is Status.COST_CONVERGED
+    assert solution.cost == pytest.approx(cost, rel=5e-3)
+    assert len(solution.iterations) == iterations
+    clearance = drive_clearances(solution.trajectory.states)
+    assert clearance.min() > 0
+    assert solution.clearance is not None
+    np.testing.assert_allclose(solution.clearance, clearance.min(axis=0), rtol=0, atol=1e-12)
+
+
+def test_the_reported_cost_is_the_true_cost_of_the_plan(
+    drive_solution: ls.Solution, quadrotor: ls.Scenario, quadrotor_solution: ls.Solution
+) -> None:
+    """Recomputed here to rounding, 1e-10; for the drive also on the exact motion, which RK4 is 1e-6 from in 25 s."""
+    plan = drive_solution.trajectory
+    assert drive_solution.cost == pytest.approx(drive_cost(plan.states, plan.controls), rel=1e-10)
+    exact = drive_rollout(plan.states[0], plan.controls)
+    np.testing.assert_allclose(plan.states, exact, rtol=0, atol=1e-4)
+    plan = quadrotor_solution.trajectory
+    start, goal = (ends[0] for ends in quadrotor_queries(1))
+    assert quadrotor_solution.cost == pytest.approx(quadrotor_cost(plan.states, plan.controls, start, goal), rel=1e-10)
+
+
+@pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+def test_converged_means_locally_optimal(differential_drive: ls.Scenario, solver) -> None:
+    """SciPy's L-BFGS, on the exact motion and the cost written here, cannot improve a CONVERGED plan by 0.1 %."""
+    solution = solver(differential_drive.problem)
+    assert solution.status is Status.CONVERGED
+    assert solution.optimality < 1e-4
+    plan = solution.trajectory
+    soft = solution.solver == "smooth"
+
+    def cost(z: Array) -> float:
+        start, controls = (z[:3], z[3:]) if soft else (plan.states[0], z)
+        controls = controls.reshape(-1, 2)
+        return drive_cost(drive_rollout(start, controls), controls)
+
+    z = np.concatenate([plan.states[0] if soft else [], plan.controls.ravel()])
+    found = minimize(cost, z, method="L-BFGS-B", options={"maxiter": 15, "maxfun": 15 * (len(z) + 1)})
+    assert found.fun > solution.cost * (1 - 1e-3)
+
+
+def test_at_convergence_the_states_of_least_total_cost_are_the_plan(quadrotor: ls.Scenario) -> None:
+    """Sec. V-C. Iterated to 1e-9, what is left is the error of the inverse step, 1e-8 here."""
+    solution = ls.smooth(quadrotor.problem, tolerance=1e-9, gap_tolerance=1e-6)
+    assert solution.status is Status.CONVERGED
+    states, controls = solution.total_cost.minimizer(), solution.trajectory.controls
+    np.testing.assert_allclose(states, solution.trajectory.states, rtol=0, atol=1e-5)
+    dynamics = quadrotor.robot.dynamics
+    for t in range(0, 150, 15):
+        np.testing.assert_allclose(dynamics.step(states[t], controls[t], 1 / 30), states[t + 1], rtol=0, atol=1e-5)
+    # The minimum of the total cost is one number, the cost, at every step (Eq. (20)).
+    np.testing.assert_allclose(solution.total_cost.minimum(), solution.cost, rtol=1e-5)
+    # Both policies give the same controls there (Eq. (22)).
+    assert solution.inverse_policy is not None
+    inverse = [solution.inverse_policy.control(states[t + 1], t) for t in range(150)]
+    np.testing.assert_allclose(inverse, controls, rtol=0, atol=1e-4)
+
+
+def test_the_plan_is_the_rollout_of_the_policy(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    x = quadrotor_solution.trajectory.states[0]
+    for t in range(150):
+        control = quadrotor_solution.policy.control(x, t)
+        np.testing.assert_allclose(control, quadrotor_solution.trajectory.controls[t], rtol=0, atol=1e-9)
+        x = quadrotor.robot.dynamics.step(x, control, 1 / 30)
+        np.testing.assert_allclose(x, quadrotor_solution.trajectory.states[t + 1], rtol=0, atol=1e-9)
+
+
+def test_cost_to_go_predicts_what_is_left(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    """Along the plan the quadratic cost-to-go is the true cost of the rest: 0.1 %, the distance from convergence."""
+    plan, value = quadrotor_solution.trajectory, quadrotor_solution.cost_to_go
+    assert value is not None
+    goal = quadrotor_queries(1)[1][0]
+    predicted = value(plan.states)
+
+    def rest(t: int) -> float:
+        """The true cost from t on: nothing for the start, and the obstacle cost of every state but the first."""
+        cost = quadrotor_cost(plan.states[t:], plan.controls[t:], plan.states[t], goal)
+        if t == 0:
+            return cost
+        # The function above left out the obstacles at t, for they do not act on the first state.
+        hover = np.full((2, 4), 0.5 * 9.8 / 4)
+        return cost + quadrotor_cost(plan.states[[0, t, -1]], hover, plan.states[0], plan.states[-1])
+
+    for t in (0, 40, 100, 149):
+        assert predicted[t] == pytest.approx(rest(t), rel=1e-3)
+
+
+def test_ilqr_starts_where_it_is_told_and_never_lets_the_cost_rise(quadrotor: ls.Scenario) -> None:
+    start = quadrotor_queries(1)[0][0]
+    problem = dataclasses.replace(quadrotor.problem, initial=ls.FixedState(start))
+    solution = ls.ilqr(problem)
+    assert (solution.trajectory.states[0] == start).all()
+    assert solution.status is Status.CONVERGED
+    costs = [iteration.cost for iteration in solution.iterations]
+    assert (np.diff(costs) <= 0).all()
+    assert solution.cost_to_come is None
+    assert solution.inverse_policy is None
+    with pytest.raises(ls.InputError, match="without both value functions"):
+        _ = solution.total_cost
+
+
+def test_another_goal_weight_mass_or_obstacle_compiles_nothing(differential_drive: ls.Scenario) -> None:
+    import numba.core.event as events
+
+    problem = differential_drive.problem
+    for solver in (ls.smooth, ls.ilqr):
+        solver(problem)
+    robot = ls.DifferentialDrive(axle_length=0.3)
+    fewer = ls.World(differential_drive.scene.world.obstacles[:7])
+    other = ls.Problem(
+        dynamics=robot.dynamics,
+        dt=0.2,
+        steps=120,
+        initial=ls.QuadraticCost((4000.0, 4000.0, 40.0), about=(0.1, -2.4, 3.0)),
+        stage_cost=ls.ControlCost((50.0, 70.0), about=(0.2, 0.2))
+        + ls.ObstacleCost(fewer, radius=0.2, sharpness=8.0, weight=2.0),
+        final_cost=ls.QuadraticCost((4000.0, 4000.0, 40.0), about=(0.2, 2.4, 3.0)),
+    )
+    with events.install_recorder("numba:compile") as recorder:
+        for solver in (ls.smooth, ls.ilqr):
+            assert solver(other).iterations
+    assert not recorder.buffer
+
+
+def test_the_same_problem_gives_the_same_bits(drive_solution: ls.Solution) -> None:
+    again = ls.smooth(ls.scenarios.differential_drive().problem)
+    assert (again.policy.gain == drive_solution.policy.gain).all()
+    assert (again.trajectory.states == drive_solution.trajectory.states).all()
+    assert again.problem_digest == drive_solution.problem_digest
+
+
+def scalar_problem(
+    *, cubic: float = 0.0, root: float = 0.0, inside: float = 9.0, bonus: float = 0.0, about: float = 1.0
+) -> ls.Problem:
+    """A scalar integrator that can be made to escape, to leave the domain of its formula, or to be paid for effort."""
+
+    def rate(x, u, p):
+        from sympy import sqrt
+
+        return [u[0] + p.cubic * x[0] ** 3 + p.root * sqrt(x[0] + p.inside)]
+
+    dynamics = ls.Dynamics(
+        rate, states={"x": ""}, controls={"u": ""}, parameters={"cubic": cubic, "root": root, "inside": inside}
+    )
+    return ls.Problem(
+        dynamics=dynamics,
+        dt=0.5,
+        steps=20,
+        initial=ls.QuadraticCost([1.0], about=[about]),
+        stage_cost=ls.ControlCost([1.0], about=[0.0])
+        + ls.SymbolicCost(lambda x, u, p: -p.bonus * u[0] ** 2, parameters={"bonus": bonus}, convex=True),
+        final_cost=ls.QuadraticCost([1.0], about=[0.0]),
+    )
+
+
+class TestEndings:
+    """A hard problem never raises; its status is true and says what to do."""
+
+    @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+    def test_a_motion_that_escapes_to_infinity(self, solver) -> None:
+        solution = solver(scalar_problem(cubic=100.0), max_iterations=30)
+        assert solution.status in (Status.NOT_FINITE, Status.DIVERGED, Status.NOT_POSITIVE_DEFINITE)
+        assert "remedy" in str(solution)
+        assert solution.status.remedy in str(solution)
+
+    def test_a_cost_without_a_minimum(self) -> None:
+        solution = ls.smooth(scalar_problem(bonus=1.0))
+        assert solution.status is Status.NOT_POSITIVE_DEFINITE
+        assert solution.detail == "forward pass of iteration 1, step 0 of 20"
+        assert solution.iterations == ()
+        assert np.isnan(solution.cost)
+        assert solution.cost_to_go is None
+
+    @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+    def test_a_formula_outside_its_domain(self, solver) -> None:
+        assert solver(scalar_problem(root=1.0, inside=-5.0)).status is Status.NOT_FINITE
+
+    @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+    def test_a_cost_of_zero(self, solver) -> None:
+        solution = solver(scalar_problem(about=0.0))
+        assert solution.status is Status.CONVERGED
+        assert solution.cost == 0
+
+    def test_a_first_trajectory_of_ilqr_that_is_infinite(self) -> None:
+        solution = ls.ilqr(scalar_problem(cubic=1e6))
+        assert solution.status is Status.NOT_FINITE
+        assert solution.detail == "rollout of the initial controls"
+
+    @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+    def test_too_few_iterations(self, differential_drive: ls.Scenario, solver) -> None:
+        solution = solver(differential_drive.problem, max_iterations=2)
+        assert solution.status is Status.MAX_ITERATIONS
+        assert len(solution.iterations) == 2
+        assert np.isfinite(solution.optimality)
+
+    def test_the_cost_test_alone_is_not_called_converged(self, differential_drive: ls.Scenario) -> None:
+        solution = ls.smooth(differential_drive.problem, stop="cost", tolerance=0.5)
+        assert solution.status is Status.COST_CONVERGED
+        assert solution.gap > 1e-3
+        strict = ls.smooth(differential_drive.problem, tolerance=0.5)
+        assert strict.gap < 1e-3
+        assert len(strict.iterations) > len(solution.iterations)
+
+
+def test_the_callback_sees_every_iteration_and_may_stop_the_solve(differential_drive: ls.Scenario) -> None:
+    seen: list[ls.Iteration] = []
+    solution = ls.smooth(differential_drive.problem, callback=seen.append)
+    assert tuple(seen) == solution.iterations
+
+    def interrupt(iteration: ls.Iteration) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ls.smooth(differential_drive.problem, callback=interrupt)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"stop": "soon"}, "stop: got 'soon', want one of: optimal, cost"),
+        ({"tolerance": 0.0}, "tolerance: got 0.0, want a finite number > 0"),
+        ({"gap_tolerance": -1.0}, "gap_tolerance: got -1.0, want a finite number > 0"),
+        ({"max_iterations": 0}, "max_iterations: got 0, want a whole number >= 1"),
+        ({"initial_controls": (0.1,) * 3}, r"initial_controls: got shape \(3,\), want \(2,\) or \(150, 2\)"),
+        ({"initial_controls": (np.inf, 0)}, r"initial_controls: got inf at index \[0, 0\], want finite numbers"),
+    ],
+)
+def test_bad_options_get_one_line(differential_drive: ls.Scenario, options: dict, message: str) -> None:
+    with pytest.raises(ls.InputError, match=message):
+        ls.smooth(differential_drive.problem, **options)
+
+
+def test_the_smoother_wants_a_soft_start(differential_drive: ls.Scenario) -> None:
+    problem = dataclasses.replace(differential_drive.problem, initial=ls.FixedState((0, -2.5, np.pi)))
+    with pytest.raises(ls.InputError, match="initial: got a FixedState, want an initial cost"):
+        ls.smooth(problem)
+
+
+def test_the_summary_says_what_matters(drive_solution: ls.Solution) -> None:
+    text = str(drive_solution)
+    assert text.splitlines()[0] == ls.Iteration.HEADER
+    assert "CONVERGED after 4 iterations of smooth" in text
+    assert "clearance: 0.141 m" in text

@@ -1,0 +1,62 @@
+"""Solutions made by hand, without the package's solvers, for the tests of the closed loop."""
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.results import AffinePolicy, Solution, Status, Trajectory
+from lqrsim.robots.base import Robot
+from lqrsim.robots.differential_drive import DifferentialDrive
+from lqrsim.robots.quadrotor import Quadrotor
+
+
+def track(robot: Robot, start: npt.ArrayLike, controls: npt.ArrayLike, dt: float, *, feedback: bool = True) -> Solution:
+    """The plan of some controls from a start, and a time-varying LQR that keeps to it (or its controls alone)."""
+    dynamics, controls = robot.dynamics, np.asarray(controls, dtype=float)
+    steps, m = controls.shape
+    states = [np.asarray(start, dtype=float)]
+    for control in controls:
+        states.append(dynamics.step(states[-1], control, dt))
+    n = len(states[0])
+    value, gain = np.eye(n), np.zeros((steps, m, n))
+    for t in reversed(range(steps if feedback else 0)):
+        a, b, _ = dynamics.linearize(states[t], controls[t], dt)
+        gain[t] = -np.linalg.solve(b.T @ value @ b + np.eye(m), b.T @ value @ a)
+        value = np.eye(n) + a.T @ value @ (a + b @ gain[t])
+    plan = Trajectory(np.array(states), controls, dt)
+    policy = AffinePolicy(
+        gain=gain,
+        offset=controls - np.einsum("tmn,tn->tm", gain, plan.states[:-1]),
+        nominal=plan.states[:-1],
+        dt=dt,
+        state_coordinates=dynamics.state_coordinates,
+        control_coordinates=dynamics.control_coordinates,
+    )
+    return Solution(
+        status=Status.CONVERGED,
+        detail="",
+        policy=policy,
+        inverse_policy=None,
+        cost_to_go=None,
+        cost_to_come=None,
+        trajectory=plan,
+        iterations=(),
+        clearance=None,
+        solver="by hand",
+        options={},
+        problem_digest="",
+        versions={},
+    )
+
+
+def weave(steps: int = 150) -> Solution:
+    """A drive to the left along the arena's wall, to and fro across the cut at heading pi."""
+    turn = 0.05 * np.cos(np.arange(steps) / 6)
+    return track(DifferentialDrive(), (0.9, -2.5, np.pi), np.stack([0.08 - turn, 0.08 + turn], axis=1), 1 / 6)
+
+
+def hover(steps: int = 60) -> Solution:
+    """Two seconds of rocking in the middle of the cage."""
+    robot, time = Quadrotor(), np.arange(steps) / 30
+    rock = 0.02 * np.sin(2 * np.pi * time)
+    controls = robot.hover_force + np.stack([rock, -rock / 2, -rock, rock / 2], axis=1)
+    return track(robot, np.zeros(12), controls, 1 / 30)
