@@ -166,15 +166,15 @@ _STATUS_TEXT = {
     Status.INFEASIBLE: ("no trajectory meets the constraints", "relax the constraint that is named, or give more time"),
     Status.DIVERGED: (
         "the cost of the policy grew beyond all bounds",
-        "add a prior, start closer to a solution, shorten dt, or use ilqr(), which never lets the cost rise",
+        "add a prior, try initial_controls nearer to a solution, shorten dt, or try the other solver",
     ),
     Status.NOT_FINITE: (
         "a NaN or an infinity appeared",
-        "check the dynamics and the cost at the step that is named; start closer to a solution; shorten dt",
+        "check the dynamics and the cost at the step that is named; try other initial_controls; shorten dt",
     ),
     Status.NOT_POSITIVE_DEFINITE: (
         "a matrix that must be inverted was not positive definite",
-        "raise the control weight, add a prior, shorten dt, or use ilqr()",
+        "raise the control weight, add a prior, shorten dt, or try the other solver",
     ),
 }
 

@@ -4,7 +4,6 @@ import inspect
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +14,8 @@ from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenes import Scene, load_scene
-
-if TYPE_CHECKING:
-    from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.disturbances import ControlNoise, Disturbance, ForceNoise, MeasurementNoise, Push
+from lqrsim.simulation.plant import Plant
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +26,7 @@ class Scenario:
       name: what the command line calls it. summary: what it is, in a line.
       problem: what to solve; ready to change with `dataclasses.replace(scenario.problem, ...)`.
       tracking_bound: how far in metres an undisturbed run may be from its plan, at any time.
+      disturbances: what the demo's disturbed run meets: plain to see, and no more than the policy copes with.
     """
 
     name: str
@@ -36,11 +35,10 @@ class Scenario:
     scene: Scene
     problem: Problem
     tracking_bound: float
+    disturbances: tuple[Disturbance, ...] = ()
 
-    def plant(self) -> "Plant":
+    def plant(self) -> Plant:
         """The robot in its scene as a MuJoCo model that is ready to run."""
-        from lqrsim.simulation.plant import Plant
-
         return Plant(self.robot, self.scene)
 
 
@@ -87,6 +85,7 @@ def differential_drive() -> Scenario:
         scene=scene,
         problem=problem,
         tracking_bound=0.01,
+        disturbances=(ControlNoise(0.05), ForceNoise((3.0, 3.0, 0.0)), MeasurementNoise((0.01, 0.01, 0.02))),
     )
 
 
@@ -119,6 +118,12 @@ def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
         scene=scene,
         problem=problem,
         tracking_bound=1e-6,
+        disturbances=(
+            ControlNoise(0.05),
+            ForceNoise(0.1),
+            MeasurementNoise(np.repeat((0.01, 0.02, 0.01, 0.02), 3).tolist()),
+            Push((0.2, 0.0, 0.0), at=3.0),
+        ),
     )
 
 

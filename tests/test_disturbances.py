@@ -120,7 +120,9 @@ def test_a_disturbance_that_does_not_fit_the_plant_is_refused_by_name(arena, dis
         simulate(arena, weave(30), disturbances=[disturbance])
 
 
-def test_descriptions_are_readable():
-    assert ForceNoise(0.1).description == "force noise, std 0.1 N"
-    assert MeasurementNoise((0.1, 0.2)).description == "measurement noise, std (0.1, 0.2)"
-    assert Push((0.3, 0.0, 0.0), at=2.0).description == "push of (0.3, 0, 0) N s at 2 s"
+def test_descriptions_are_readable_and_in_units(arena, cage):
+    assert ForceNoise(0.1).describe(cage) == "force noise, std 0.1 N"
+    assert ControlNoise(0.05).describe(cage) == "control noise, std 0.05 N"
+    assert ControlNoise((0.05, 0.1)).describe(arena) == "control noise, std (0.05, 0.1) m/s"
+    assert MeasurementNoise((0.01, 0.01, 0.02)).describe(arena) == "measurement noise, std 0.01 m, 0.02 rad"
+    assert Push((0.3, 0.0, 0.0), at=2.0).describe(cage) == "push of (0.3, 0, 0) N s at 2 s"

@@ -126,7 +126,7 @@ def simulate(
         diverged=lost,
         frame_times=np.arange(len(frames)) * (plan.dt / per_period),
         frames=pictures,
-        disturbances=tuple(disturbance.description for disturbance in disturbances),
+        disturbances=tuple(disturbance.describe(plant) for disturbance in disturbances),
         seed=seed,
         first_trial=first_trial,
         versions=versions(),

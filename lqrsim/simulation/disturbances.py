@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array, check_number
 from lqrsim.results import Trajectory
 from lqrsim.simulation.plant import Plant
@@ -38,8 +39,7 @@ class Effect:
 class Disturbance(abc.ABC):
     """Base class of all disturbances."""
 
-    @property
-    def description(self) -> str:
+    def describe(self, plant: Plant) -> str:
         """In words and units, for the record; unless it is overridden, how the object is made."""
         return repr(self)
 
@@ -65,9 +65,8 @@ class ControlNoise(Disturbance):
     def __post_init__(self) -> None:
         object.__setattr__(self, "std", _check_std(self, self.std))
 
-    @property
-    def description(self) -> str:
-        return f"control noise, std {_words(self.std)}"
+    def describe(self, plant: Plant) -> str:
+        return f"control noise, std {_with_units(self, self.std, plant.robot.dynamics.control_coordinates)}"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         std = _fit(self, self.std, plant.robot.dynamics.control_coordinates.names)
@@ -88,9 +87,8 @@ class MeasurementNoise(Disturbance):
     def __post_init__(self) -> None:
         object.__setattr__(self, "std", _check_std(self, self.std))
 
-    @property
-    def description(self) -> str:
-        return f"measurement noise, std {_words(self.std)}"
+    def describe(self, plant: Plant) -> str:
+        return f"measurement noise, std {_with_units(self, self.std, plant.robot.dynamics.state_coordinates)}"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         std = _fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
@@ -112,8 +110,7 @@ class ForceNoise(Disturbance):
         object.__setattr__(self, "std", _check_std(self, self.std))
         _fit(self, self.std, "xyz")
 
-    @property
-    def description(self) -> str:
+    def describe(self, plant: Plant) -> str:
         return f"force noise, std {_words(self.std)} N"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
@@ -137,8 +134,7 @@ class Push(Disturbance):
         object.__setattr__(self, "impulse", tuple(check_array("Push: impulse", self.impulse, (3,)).tolist()))
         object.__setattr__(self, "at", check_number("Push: at", self.at, at_least=0.0))
 
-    @property
-    def description(self) -> str:
+    def describe(self, plant: Plant) -> str:
         return f"push of {_words(self.impulse)} N s at {self.at:g} s"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
@@ -173,6 +169,15 @@ def _fit(disturbance: Disturbance, std: npt.ArrayLike, names: Sequence[str]) -> 
             f"{type(disturbance).__name__}: std: got {len(values)} numbers, want 1 or {len(names)}: {', '.join(names)}"
         )
     return np.broadcast_to(values, len(names))
+
+
+def _with_units(disturbance: Disturbance, std: Numbers, coordinates: Coordinates) -> str:
+    """The numbers with their units, each unit once where its numbers are the same: `0.01 m, 0.02 rad`."""
+    values = _fit(disturbance, std, coordinates.names)
+    of_unit = {
+        unit: [v for v, u in zip(values, coordinates.units, strict=True) if u == unit] for unit in coordinates.units
+    }
+    return ", ".join(f"{_words(v if len(set(v)) > 1 else v[0])} {unit}".rstrip() for unit, v in of_unit.items())
 
 
 def _words(numbers: Numbers) -> str:

@@ -1,0 +1,80 @@
+"""What the commands share: progress on the terminal, and an early look at whether the outputs can be written."""
+
+import contextlib
+import logging
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lqrsim.errors import InputError
+
+if TYPE_CHECKING:
+    from lqrsim.problem import Problem
+    from lqrsim.results import Iteration, Solution
+
+
+def say(text: str = "") -> None:
+    """Print at once, also where the output goes to a file or a pipe."""
+    print(text, flush=True)
+
+
+def show_log() -> None:
+    """Show on stderr what the package logs, such as that it compiles."""
+    logger = logging.getLogger("lqrsim")
+    if not logger.handlers:
+        logger.addHandler(logging.StreamHandler())
+        logger.setLevel(logging.INFO)
+
+
+def check_output(field: str, folder: Path) -> None:
+    """Find out before the work starts whether `folder` can be written. Raises InputError if not."""
+    existing = folder.absolute()
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    try:
+        tempfile.TemporaryFile(dir=existing).close()
+    except OSError as error:
+        raise InputError(f"{field}: got {folder}, want a folder that can be written ({error.strerror})") from None
+
+
+def solve(problem: "Problem", solver: str, **options: object) -> "Solution":
+    """Call `lqrsim.smooth` or `lqrsim.ilqr`; print each iteration as it ends, then the status."""
+    from lqrsim.results import Iteration
+    from lqrsim.solvers.ilqr import ilqr
+    from lqrsim.solvers.smoother import smooth
+
+    count = 0
+
+    def show(iteration: "Iteration") -> None:
+        nonlocal count
+        count += 1
+        say(iteration.row(count))
+
+    say(Iteration.HEADER)
+    solution = {"smooth": smooth, "ilqr": ilqr}[solver](problem, callback=show, **options)
+    say(solution.summary())
+    return solution
+
+
+@contextlib.contextmanager
+def progress(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on a terminal, one line elsewhere, for what takes long; call it with how many are done of all."""
+    from tqdm import tqdm
+
+    watched = sys.stderr.isatty()
+    begun = time.monotonic()
+    told = False
+    with tqdm(desc=what, unit=unit, leave=False, delay=1.0, disable=not watched) as bar:
+
+        def update(done: int, total: int) -> None:
+            nonlocal told
+            bar.total = total
+            bar.update(done - bar.n)
+            if not (watched or told) and time.monotonic() - begun > 1.0:
+                told = True
+                say(f"{what} {total} {unit}s ...")
+
+        yield update

@@ -1,0 +1,104 @@
+"""The whole chain, once for each scenario: solve, execute, draw, film, and say what came out."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lqrsim import console, files
+from lqrsim.errors import InputError
+from lqrsim.references import resolve, short_name
+from lqrsim.results import Rollout, Solution
+from lqrsim.scenarios import Scenario
+from lqrsim.simulation.closed_loop import simulate
+from lqrsim.view import gl
+from lqrsim.view.plots import plot_run
+
+TABLE = (
+    f"{'scenario':<20} {'run':<12} {'iterations':>10} {'cost':>10} {'gap':>9} {'clearance m':>12}"
+    f" {'rms m':>9} {'max m':>9} {'final m':>9} {'outcome':>9}"
+)
+
+
+def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick: bool) -> int:
+    """Run the chain for each scenario and print a closing table.
+
+    Args:
+      references: the scenarios; see `references.py`.
+      out: each scenario gets a folder in it.
+      seed: of the disturbances.
+      video: whether to film at all. quick: small videos of fewer frames.
+
+    Returns:
+      1 if a plan did not converge, or an undisturbed run left its plan by more than the scenario's bound; else 0.
+
+    Raises:
+      InputError: an unknown scenario, or a folder that cannot be written.
+    """
+    console.check_output("--out", out)
+    scenarios = {reference: resolve(reference) for reference in references}
+    video = video and _can_film()
+    rows: list[str] = []
+    failures: list[str] = []
+    for reference, scenario in scenarios.items():
+        folder = out / short_name(reference)
+        console.say(f"\n== {reference}: {scenario.summary}")
+        solution = replace(console.solve(scenario.problem, "smooth"), scenario=reference)
+        console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
+        if not solution.success:
+            failures.append(f"{reference}: the plan did not converge ({solution.status.name})")
+        runs = {
+            "undisturbed": _execute(scenario, solution, folder / "undisturbed.npz", seed, disturbed=False),
+            "disturbed": _execute(scenario, solution, folder / "disturbed.npz", seed, disturbed=True),
+        }
+        worst = float(runs["undisturbed"].tracking_error.max())
+        if not worst <= scenario.tracking_bound:  # a diverged run is NaN
+            bound = f"want <= {scenario.tracking_bound:g} m"
+            failures.append(f"{reference}: undisturbed up to {worst:.3g} m off its plan, {bound}")
+        figure = plot_run(solution, runs, folder / "figure.png", world=scenario.scene.world)
+        console.say(f"wrote {figure}")
+        if video:
+            _film(runs["disturbed"], folder / "video.mp4", quick=quick)
+        rows += [_row(reference, name, solution, rollout) for name, rollout in runs.items()]
+    console.say("\n" + "\n".join([TABLE, *rows]))
+    for failure in failures:
+        console.say(f"FAILED {failure}")
+    return 1 if failures else 0
+
+
+def _can_film() -> bool:
+    try:
+        gl.bind()
+    except InputError as error:
+        console.say(f"No videos, everything else works: {error}")
+        return False
+    return True
+
+
+def _execute(scenario: Scenario, solution: Solution, path: Path, seed: int, *, disturbed: bool) -> Rollout:
+    """One closed-loop run, saved and summed up in a line."""
+    disturbances = scenario.disturbances if disturbed else ()
+    with console.progress("simulating", "step") as progress:
+        rollout = simulate(scenario.plant(), solution, disturbances=disturbances, seed=seed, progress=progress)
+    console.say(rollout.summary())
+    console.say(f"wrote {files.save(rollout, path)}")
+    return rollout
+
+
+def _film(rollout: Rollout, path: Path, *, quick: bool) -> None:
+    from lqrsim.view.render import render
+
+    size, fps = ((640, 360), 5) if quick else ((1280, 720), 30)
+    with console.progress("rendering", "frame") as progress:
+        render(rollout, path, size=size, fps=fps, progress=progress)
+    console.say(f"wrote {path}")
+
+
+def _row(reference: str, run: str, solution: Solution, rollout: Rollout) -> str:
+    error = rollout.tracking_error[0]
+    return (
+        f"{reference:<20} {run:<12} {len(solution.iterations):>10} {solution.cost:>10.4f} {solution.gap:>9.1e}"
+        f" {rollout.clearance.min():>12.3f} {np.sqrt(np.mean(error**2)):>9.2e} {error.max():>9.2e} {error[-1]:>9.2e}"
+        f" {rollout.outcome[0]:>9}"
+    )

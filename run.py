@@ -1,0 +1,163 @@
+#!/usr/bin/env python3
+"""The commands of this project. Each sets up what it needs first; `python3 run.py --help` lists them."""
+
+import sys
+
+if sys.version_info < (3, 11):  # noqa: UP036 - this file is also what tells the owner of an older Python
+    sys.exit("run.py: needs Python 3.11 or newer, got %d.%d" % sys.version_info[:2])  # noqa: UP031
+
+import argparse
+import ctypes.util
+import hashlib
+import importlib.util
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent
+VENV = ROOT / ".venv"
+PYTHON = VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+STAMP = VENV / "installed-for"  # says what is installed; UNFINISHED while that is being changed
+UNFINISHED = "an installation that was interrupted"
+GL_PACKAGES = ("libegl1", "libgl1-mesa-dri", "libopengl0")
+
+COMMANDS = {
+    "demo": "solve, execute and film both robots: the main job (arguments go to `lqrsim demo`)",
+    "test": "run all tests (arguments go to pytest, for example: test -k solver)",
+    "check": "lint, formatting and types",
+    "setup": "only set up what the other commands need",
+}
+
+
+def main() -> int:
+    """Run the command that the arguments name; its exit code."""
+    parser = argparse.ArgumentParser(
+        prog="run.py",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="The commands of this project; each sets up what it needs first.",
+        epilog="commands:\n" + "\n".join(f"  {name:6} {text}" for name, text in COMMANDS.items()),
+    )
+    parser.add_argument("command", choices=COMMANDS, metavar="command", help=" | ".join(COMMANDS))
+    parser.add_argument("arguments", nargs=argparse.REMAINDER, help="are passed on")
+    options = parser.parse_args()
+    rest: list[str] = options.arguments
+    if options.command in ("check", "setup") and rest:
+        asked_for_help = rest[0] in ("-h", "--help")
+        print(f"run.py {options.command}: {COMMANDS[options.command]}; it takes no arguments")
+        return 0 if asked_for_help else 2
+
+    set_up_python()
+    if options.command != "check":
+        set_up_graphics()
+    if options.command == "demo":
+        return run([PYTHON, "-m", "lqrsim.cli", "demo", *rest])
+    if options.command == "test":
+        return run([PYTHON, "-m", "pytest", *rest])
+    if options.command == "check":
+        steps = (["ruff", "check"], ["ruff", "format", "--check"], ["basedpyright", "--pythonpath", str(PYTHON)])
+        return max([run([PYTHON, "-m", *step]) for step in steps])
+    print(f"Ready. The command line is {PYTHON.parent / 'lqrsim'}")
+    return 0
+
+
+def set_up_python() -> None:
+    """Make the virtual environment beside this file, and install the project in it, as far as that is not done yet."""
+    wanted = f"{hashlib.sha256((ROOT / 'pyproject.toml').read_bytes()).hexdigest()} {VENV}"
+    stamp = STAMP.read_text(encoding="utf-8") if STAMP.is_file() else ""
+    usable = interpreter_works() and stamp != UNFINISHED and (not stamp or stamp.endswith(f" {VENV}"))
+    if usable and stamp == wanted:
+        return
+    if not usable:
+        make_environment()
+    STAMP.write_text(UNFINISHED, encoding="utf-8")
+    say("Installing lqrsim and what it depends on into .venv (a minute or two the first time) ...")
+    pip = [PYTHON, "-m", "pip", "install", "--disable-pip-version-check"]
+    code = run([*pip, *([] if sys.stdout.isatty() else ["--quiet"]), "--editable", ".[dev]"])
+    if code:
+        sys.exit("run.py: the installation failed for the reason above; the next run starts it again")
+    STAMP.write_text(wanted, encoding="utf-8")
+
+
+def interpreter_works() -> bool:
+    """Whether .venv holds a Python that runs, is new enough and has pip."""
+    try:
+        probe = [str(PYTHON), "-c", "import sys, pip; sys.exit(sys.version_info < (3, 11))"]
+        return subprocess.run(probe, capture_output=True, env=environment(), check=False).returncode == 0
+    except OSError:
+        return False
+
+
+def make_environment() -> None:
+    """Make .venv anew."""
+    # Where Debian splits the standard library, `venv` is there but cannot put pip into what it makes.
+    if importlib.util.find_spec("ensurepip") is None:
+        install_system_packages([f"python3.{sys.version_info.minor}-venv"], "Python's venv module is incomplete")
+        importlib.invalidate_caches()
+        if importlib.util.find_spec("ensurepip") is None:
+            sys.exit("run.py: cannot make a virtual environment before that package is installed")
+    say(f"Making a virtual environment in {VENV} ...")
+    try:
+        if VENV.is_dir() and not VENV.is_symlink():
+            shutil.rmtree(VENV)
+        VENV.mkdir()
+        STAMP.write_text(UNFINISHED, encoding="utf-8")
+    except OSError as error:
+        sys.exit(f"run.py: cannot replace {VENV} ({error.strerror}); close what uses it, or remove it by hand")
+    # The interpreter that an active virtual environment was made from: .venv may be the very one just removed.
+    base = getattr(sys, "_base_executable", sys.executable)
+    if run([base, "-m", "venv", VENV]):
+        sys.exit("run.py: the virtual environment could not be made for the reason above")
+
+
+def set_up_graphics() -> None:
+    """Install the GL libraries that rendering without a display needs on Linux, if it may; otherwise say how."""
+    if sys.platform != "linux":
+        return
+    found = ctypes.util.find_library
+    if not (found("EGL") and (found("OpenGL") or found("GL"))):
+        install_system_packages(GL_PACKAGES, "No GL library, so no pictures; everything else works")
+
+
+def install_system_packages(packages: Sequence[str], problem: str) -> None:
+    """Install Debian packages with apt-get where this user may; otherwise print the line that does it."""
+    install = ["apt-get", "install", "--yes", *packages]
+    if os.name == "posix" and os.geteuid() == 0 and shutil.which("apt-get"):
+        say(f"Installing {' '.join(packages)} with apt-get ...")
+        # The lists of a fresh machine are empty or stale; where they are not, fetching them is not needed.
+        unattended = environment() | {"DEBIAN_FRONTEND": "noninteractive"}
+        for step in (install, ["apt-get", "update"], install):
+            done = subprocess.run(step, check=False, capture_output=True, stdin=subprocess.DEVNULL, env=unattended)
+            if done.returncode == 0 and step is install:
+                return
+    say(f"{problem}. On Debian or Ubuntu this installs it: sudo {' '.join(install)}")
+
+
+def environment() -> dict[str, str]:
+    """The environment without what would lead a Python away from its own .venv."""
+    stray = ("PYTHONHOME", "PYTHONPATH", "VIRTUAL_ENV", "__PYVENV_LAUNCHER__")
+    return {name: value for name, value in os.environ.items() if name not in stray}
+
+
+def run(command: Sequence[str | Path]) -> int:
+    """Run a command in the project's folder; its exit code."""
+    with subprocess.Popen([str(part) for part in command], cwd=ROOT, env=environment()) as process:
+        while True:
+            try:
+                code = process.wait()
+                return code if code >= 0 else 128 - code  # a signal ended it
+            except KeyboardInterrupt:
+                pass  # the terminal has told the command too: let it tidy up
+
+
+def say(text: str) -> None:
+    """Print at once, also where the output is a file that other programs write to."""
+    print(text, flush=True)
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -1,0 +1,237 @@
+"""The commands, each on what the one before wrote; and bad input: one line, no traceback, a non-zero exit."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim.cli import main
+from lqrsim.view import gl
+
+OWN_SCENARIOS = """
+import dataclasses
+import time
+
+import lqrsim as ls
+
+
+def shorter(steps: int = 120) -> ls.Scenario:
+    given = ls.scenarios.differential_drive()
+    return dataclasses.replace(given, name="shorter", problem=dataclasses.replace(given.problem, steps=steps))
+
+
+def not_a_scenario() -> int:
+    return 3
+
+
+def endless() -> ls.Scenario:
+    print("ready", flush=True)
+    time.sleep(60)
+    return shorter()
+"""
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The solution file of the differential drive."""
+    folder = tmp_path_factory.mktemp("solved")
+    assert main(["solve", "differential_drive", "--out", str(folder)]) == 0
+    return folder / "solution.npz"
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    """A Python file with scenarios that are not lqrsim's."""
+    path = tmp_path / "own.py"
+    path.write_text(OWN_SCENARIOS, encoding="utf-8")
+    return path
+
+
+def simulate(solved: Path, out: Path, *options: str) -> ls.Rollout:
+    assert main(["simulate", str(solved), "--out", str(out), *options]) == 0
+    return ls.load_rollout(out / "rollout.npz")
+
+
+def one_line(capsys: pytest.CaptureFixture[str]) -> str:
+    """The error message of the last command, which must be one line."""
+    error = capsys.readouterr().err
+    assert error.startswith("lqrsim: error: ")
+    assert error.count("\n") == 1
+    assert error.endswith("\n")
+    return error
+
+
+def test_list_names_every_scenario_with_units(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list"]) == 0
+    printed = capsys.readouterr().out
+    assert all(f"{name}: " in printed for name in ls.scenarios.names())
+    assert "heading (rad)" in printed
+    assert "rotor_1 (N)" in printed
+
+
+def test_solve_prints_the_log_and_writes_the_solution(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["solve", "quadrotor,query=2,seed=0", "--out", str(tmp_path), "--stop", "cost"]) == 0
+    solution = ls.load_solution(tmp_path / "solution.npz")
+    printed = capsys.readouterr().out
+    assert solution.iteration_table() in printed
+    assert solution.summary() in printed
+    assert solution.status is ls.Status.COST_CONVERGED
+    assert solution.scenario == "quadrotor,query=2,seed=0"
+    again = ls.smooth(ls.scenarios.quadrotor(query=2).problem, stop="cost")
+    np.testing.assert_array_equal(solution.policy.gain, again.policy.gain)  # the same program: the same bits
+
+
+def test_solve_says_that_it_did_not_converge(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["solve", "quadrotor", "--solver", "ilqr", "--max-iterations", "1", "--out", str(tmp_path)]
+    assert main(command) == 1
+    assert "remedy:" in capsys.readouterr().out
+    solution = ls.load_solution(tmp_path / "solution.npz")
+    assert (solution.status, solution.solver, len(solution.iterations)) == (ls.Status.MAX_ITERATIONS, "ilqr", 1)
+
+
+def test_simulate_is_the_library_call_that_its_options_say(solved: Path, tmp_path: Path) -> None:
+    noise = "--control-noise 0.05 --force-noise 2 --measurement-noise 0.01 0.01 0.02"
+    rest = "--push 1 0 0 2.5 --seed 4 --trials 2 --first-trial 3"
+    rollout = simulate(solved, tmp_path, *f"{noise} {rest}".split())
+    disturbances = [
+        ls.ControlNoise(0.05),
+        ls.ForceNoise(2.0),
+        ls.MeasurementNoise((0.01, 0.01, 0.02)),
+        ls.Push((1.0, 0.0, 0.0), at=2.5),
+    ]
+    plant, solution = ls.scenarios.differential_drive().plant(), ls.load_solution(solved)
+    again = ls.simulate(plant, solution, disturbances=disturbances, seed=4, trials=2, first_trial=3)
+    np.testing.assert_array_equal(rollout.states, again.states)  # the same seed: the same bits
+    assert rollout.disturbances == again.disturbances
+
+
+def test_simulate_with_another_seed_is_another_run(solved: Path, tmp_path: Path) -> None:
+    runs = [simulate(solved, tmp_path / seed, "--control-noise", "0.05", "--seed", seed) for seed in ("1", "1", "2")]
+    np.testing.assert_array_equal(runs[0].states, runs[1].states)
+    assert not np.array_equal(runs[0].states, runs[2].states)
+
+
+def test_render_films_a_rollout(solved: Path, tmp_path: Path) -> None:
+    if not gl.available():
+        pytest.skip("no OpenGL here")
+    rollout = simulate(solved, tmp_path)
+    size = ["--size", "128", "96", "--fps", "2"]
+    assert main(["render", str(tmp_path / "rollout.npz"), "--out", str(tmp_path / "run.mp4"), *size]) == 0
+    with av.open(str(tmp_path / "run.mp4")) as video:
+        stream = video.streams.video[0]
+        assert (stream.codec_context.name, stream.width, stream.height) == ("h264", 128, 96)
+        assert stream.frames == int(2 * rollout.times[-1]) + 1
+
+
+def test_own_scenario_in_a_file(own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    reference = f"{own}:shorter,steps=100"
+    assert main(["solve", reference, "--out", str(tmp_path)]) == 0
+    solution = tmp_path / "solution.npz"
+    assert ls.load_solution(solution).trajectory.steps == 100
+    capsys.readouterr()
+    # A file of someone else's must not decide what code runs here.
+    assert main(["simulate", str(solution)]) == 2
+    assert f"--scenario {reference}" in one_line(capsys)
+    assert main(["simulate", str(solution), "--scenario", reference]) == 0
+
+
+def test_own_scenario_in_a_module(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(own.parent)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    assert main(["solve", "own:shorter"]) == 0
+    assert ls.load_solution("runs/shorter/solution.npz").scenario == "own:shorter"
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("solve quadrotr", ["scenario: got 'quadrotr'", "differential_drive, quadrotor", "did you mean quadrotor?"]),
+        ("solve quadrotor,querry=3", ["setting of quadrotor: got 'querry'", "query, seed"]),
+        ("solve quadrotor,query=-1", ["query: got -1", ">= 0"]),
+        ("solve quadrotor,query=x", ["query: got 'x'"]),
+        ("solve nowhere.py:make", ["nowhere.py", "a Python file that exists"]),
+        ("solve no_such_module:make", ["no_such_module", "can be imported"]),
+        ("solve {own}:larger", ["got 'larger'", "shorter, not_a_scenario, endless"]),
+        ("solve {own}:not_a_scenario", ["got a int", "want a lqrsim Scenario"]),
+        ("solve {own}:shorter,steps=0", ["steps: got 0"]),
+        ("solve quadrotor --tolerance -1 --out {tmp}", ["tolerance: got -1"]),
+        ("solve quadrotor --max-iterations 0 --out {tmp}", ["max_iterations: got 0"]),
+        ("solve quadrotor --out {own}/runs", ["--out: got", "a folder that can be written"]),
+        ("simulate {tmp}/none.npz", ["none.npz", "a file that exists"]),
+        ("simulate {own}", ["own.py", "a file that lqrsim wrote"]),
+        ("simulate {truncated}", ["truncated.npz", "a file that lqrsim wrote"]),
+        ("simulate {solved} --out {own}", ["--out: got", "a folder that can be written"]),
+        ("simulate {solved} --scenario quadrotor", ["x, y, heading", "quadrotor"]),
+        ("simulate {solved} --trials 0", ["trials: got 0"]),
+        ("simulate {solved} --seed -1", ["seed: got -1"]),
+        ("simulate {solved} --control-noise -0.1", ["ControlNoise: std: got -0.1"]),
+        ("simulate {solved} --force-noise nan", ["ForceNoise: std: got nan"]),
+        ("simulate {solved} --measurement-noise 1 2", ["MeasurementNoise: std: got 2 numbers", "x, y, heading"]),
+        ("simulate {solved} --push 1 0 0 99", ["Push: at: got 99"]),
+        ("render {solved}", ["holds a 'lqrsim solution'", "want a 'lqrsim rollout'"]),
+        ("render {solved} --out x.gif", ["--out: got x.gif", ".mp4"]),
+        ("demo --robots quadrotor hexapod --out {tmp}", ["scenario: got 'hexapod'"]),
+        ("demo --out {own}", ["--out: got", "a folder that can be written"]),
+    ],
+)
+def test_bad_input_is_one_line(
+    command: str, says: list[str], solved: Path, own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truncated = tmp_path / "truncated.npz"
+    truncated.write_bytes(solved.read_bytes()[:-100])
+    before = sorted(path.name for path in tmp_path.iterdir())
+    capsys.readouterr()
+    places = {"solved": solved, "own": own, "tmp": tmp_path, "truncated": truncated}
+    assert main([word.format(**places) for word in command.split()]) == 2
+    message = one_line(capsys)
+    assert all(part in message for part in says), message
+    assert sorted(path.name for path in tmp_path.iterdir()) in (before, sorted([*before, "__pycache__"]))
+
+
+@pytest.mark.parametrize("command", ["", "list", "solve", "simulate", "render", "demo"])
+def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*command.split(), "--help"])
+    assert stop.value.code == 0
+    printed = capsys.readouterr().out
+    assert f"usage: lqrsim {command}".strip() in printed
+
+
+def test_unknown_option_is_refused_before_anything_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["solve", "quadrotor", "--tolerence", "1"])
+    assert stop.value.code == 2
+    assert "--tolerance" in capsys.readouterr().err
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"lqrsim {ls.__version__}\n"
+
+
+def start(*command: str) -> subprocess.Popen[str]:
+    arguments = [sys.executable, "-m", "lqrsim.cli", *command]
+    return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_exit_code_and_line_reach_the_shell() -> None:
+    with start("solve", "quadrotr") as process:
+        printed, error = process.communicate(timeout=60)
+    assert (process.returncode, printed, error.count("\n")) == (2, "", 1)
+    assert "Traceback" not in error
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send to another process")
+def test_ctrl_c_is_one_line_and_leaves_nothing(own: Path, tmp_path: Path) -> None:
+    with start("solve", f"{own}:endless", "--out", str(tmp_path / "out")) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (130, "lqrsim: stopped\n")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,67 @@
+"""What people install works: the built wheel, in an environment that holds it and its dependencies alone."""
+
+import subprocess
+import sys
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+SOLVE = """
+import sys
+from importlib.metadata import distributions
+import lqrsim as ls
+
+assert not {"pytest", "hatchling"} & {distribution.name for distribution in distributions()}, "not an empty environment"
+assert ls.__file__.startswith(sys.prefix), ls.__file__
+assert set(ls.scenarios.names()) >= {"differential_drive", "quadrotor"}
+solution = ls.smooth(ls.scenarios.differential_drive().problem)
+print(solution)
+assert solution.success
+"""
+
+
+def run(*command: object, cwd: Path) -> str:
+    done = subprocess.run([str(part) for part in command], cwd=cwd, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the sdist, and the wheel that was built from that sdist and so proves it whole."""
+    folder = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
+    return folder
+
+
+def test_wheel_holds_the_package_and_the_models(built: Path) -> None:
+    (wheel,) = built.glob("*.whl")
+    inside = set(zipfile.ZipFile(wheel).namelist())
+    sources = {path.relative_to(ROOT).as_posix() for path in (ROOT / "lqrsim").rglob("*.py")}
+    models = {f"lqrsim/models/{path.name}" for path in (ROOT / "models").glob("*.xml")}
+    assert models
+    assert sources | models | {"lqrsim/py.typed"} <= inside
+    assert {name.split("/")[0] for name in inside} == {"lqrsim", f"{'-'.join(wheel.name.split('-')[:2])}.dist-info"}
+
+
+def test_sdist_is_complete(built: Path) -> None:
+    (sdist,) = built.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        inside = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"README.md", "LICENSE", "CHANGELOG.md", "pyproject.toml", "run.py", "tests/test_packaging.py"} <= inside
+
+
+def test_wheel_solves_from_an_empty_environment(built: Path, tmp_path: Path) -> None:
+    """Installs for real, with the dependencies that the wheel names and no others: 15 s where pip has them cached."""
+    (wheel,) = built.glob("*.whl")
+    venv.create(tmp_path / "empty", symlinks=sys.platform != "win32")
+    binaries = tmp_path / "empty" / ("Scripts" if sys.platform == "win32" else "bin")
+    pip = [sys.executable, "-m", "pip", "--python", binaries / "python", "install", "--quiet", "--no-compile"]
+    run(*pip, wheel, cwd=tmp_path)
+    run(binaries / "python", "-I", "-c", SOLVE, cwd=tmp_path)
+    assert run(binaries / "lqrsim", "--version", cwd=tmp_path).split() == ["lqrsim", wheel.name.split("-")[1]]

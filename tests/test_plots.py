@@ -1,0 +1,118 @@
+"""The figure of a run: what is written on it, and that it is the same each time."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim.view.plots import _surface, plot_run
+
+
+@pytest.fixture(scope="module")
+def drive_runs(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> dict[str, ls.Rollout]:
+    plant = differential_drive.plant()
+    disturbed = ls.simulate(plant, drive_solution, disturbances=[ls.ControlNoise(0.05)], seed=1)
+    return {"calm": ls.simulate(plant, drive_solution), "with noise": disturbed}
+
+
+@pytest.fixture(scope="module")
+def flight_runs(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> dict[str, ls.Rollout]:
+    plant = quadrotor.plant()
+    disturbed = ls.simulate(plant, quadrotor_solution, disturbances=[ls.ForceNoise(0.1)], seed=1)
+    return {"calm": ls.simulate(plant, quadrotor_solution), "with noise": disturbed}
+
+
+def texts(path: Path) -> list[str]:
+    """Every text in an svg."""
+    return [re.sub(r"<[^>]+>", "", text) for text in re.findall(r"<text.*?</text>", path.read_text(), re.DOTALL)]
+
+
+def test_axes_have_units_and_runs_have_names(
+    drive_solution: ls.Solution,
+    drive_runs: dict[str, ls.Rollout],
+    differential_drive: ls.Scenario,
+    tmp_path: Path,
+) -> None:
+    path = plot_run(drive_solution, drive_runs, tmp_path / "figure.svg", world=differential_drive.scene.world)
+    found = texts(path)
+    wanted = {"x (m)", "y (m)", "time (s)", "the plan (mm)", "(m/s)", "iteration of smooth", "calm", "with noise"}
+    assert wanted <= set(found)
+    assert path.read_text().count('id="limit"') == 4, "two controls, a low and a high limit each"
+
+
+def test_errors_that_differ_by_decades_get_a_logarithmic_axis(
+    quadrotor_solution: ls.Solution, flight_runs: dict[str, ls.Rollout], quadrotor: ls.Scenario, tmp_path: Path
+) -> None:
+    path = plot_run(quadrotor_solution, flight_runs, tmp_path / "figure.svg", world=quadrotor.scene.world)
+    assert {"z (m)", "the plan (m)", "(N)"} <= set(texts(path))
+    alone = {"with noise": flight_runs["with noise"]}
+    path = plot_run(quadrotor_solution, alone, tmp_path / "figure.svg", world=quadrotor.scene.world)
+    assert "the plan (mm)" in texts(path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".pdf", ".svg"])
+def test_same_runs_give_the_same_bytes(
+    suffix: str,
+    drive_solution: ls.Solution,
+    drive_runs: dict[str, ls.Rollout],
+    differential_drive: ls.Scenario,
+    tmp_path: Path,
+) -> None:
+    before = dict(matplotlib.rcParams)
+    world = differential_drive.scene.world
+    files = [plot_run(drive_solution, drive_runs, tmp_path / f"{n}{suffix}", world=world).read_bytes() for n in "ab"]
+    assert files[0] == files[1]
+    assert dict(matplotlib.rcParams) == before
+    assert {file.suffix for file in tmp_path.iterdir()} == {suffix}
+
+
+def test_works_without_obstacles(
+    drive_solution: ls.Solution, drive_runs: dict[str, ls.Rollout], tmp_path: Path
+) -> None:
+    assert plot_run(drive_solution, drive_runs, tmp_path / "figure.png", world=ls.World([])).stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("kind", ["sphere", "box", "capsule", "cylinder"])
+@pytest.mark.parametrize("infinite", [False, True])
+def test_surfaces_lie_on_the_obstacles(kind: str, infinite: bool) -> None:
+    """The distance is the oracle: it is zero on a surface. A tube is drawn without its ends."""
+    turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    half = np.inf if infinite and kind in ("capsule", "cylinder") else 0.7
+    obstacle = ls.Obstacle("it", kind, np.array([0.3, -0.2, 0.1]), turn, np.array([0.4, half, 0.5]))
+    x, y, z = _surface(obstacle, np.array([-3.0, -3.0, -3.0]), np.array([3.0, 3.0, 3.0]))
+    points = np.stack([x, y, z], axis=-1)
+    assert ls.World([obstacle]).distance(points) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_bad_input_gets_one_line(
+    drive_solution: ls.Solution,
+    drive_runs: dict[str, ls.Rollout],
+    flight_runs: dict[str, ls.Rollout],
+    differential_drive: ls.Scenario,
+    tmp_path: Path,
+) -> None:
+    world = differential_drive.scene.world
+    with pytest.raises(ls.InputError, match=r"path: got .*figure\.jpg', want a name that ends in one of: \.png"):
+        plot_run(drive_solution, drive_runs, tmp_path / "figure.jpg", world=world)
+    with pytest.raises(ls.InputError, match="rollouts: got 0, want 1 to 4"):
+        plot_run(drive_solution, {}, tmp_path / "figure.png", world=world)
+    with pytest.raises(ls.InputError, match=r"rollouts\['calm'\]: got a run of another system"):
+        plot_run(drive_solution, flight_runs, tmp_path / "figure.png", world=world)
+    with pytest.raises(ls.InputError, match="trial: got 1, want one of 0 to 0"):
+        plot_run(drive_solution, drive_runs, tmp_path / "figure.png", world=world, trial=1)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ls.InputError, match="want a file that can be written"):
+        plot_run(drive_solution, drive_runs, tmp_path / "file" / "figure.png", world=world)
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
+
+
+def test_needs_no_pyplot() -> None:
+    code = "import sys, lqrsim.view.plots; print('matplotlib.pyplot' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False"]

@@ -1,0 +1,246 @@
+"""Videos and stills of real runs: what is in the file, and what is in the picture."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import av
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+import lqrsim as ls
+from lqrsim.view import gl
+from lqrsim.view import render as rendering
+from lqrsim.view.render import render, still
+
+draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
+SMALL = (320, 180)
+
+
+@pytest.fixture(scope="module")
+def drive(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> ls.Rollout:
+    return ls.simulate(differential_drive.plant(), drive_solution, disturbances=[ls.ControlNoise(0.05)], seed=3)
+
+
+@pytest.fixture(scope="module")
+def flight(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> ls.Rollout:
+    push = ls.Push((0.2, 0.0, 0.0), at=2.0)
+    return ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[push], seed=3)
+
+
+@pytest.fixture(params=["drive", "flight"])
+def rollout(request: pytest.FixtureRequest) -> ls.Rollout:
+    return request.getfixturevalue(request.param)
+
+
+def pixels(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path)).astype(int)
+
+
+def decode(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+
+
+@draws
+def test_video_is_what_browsers_play(rollout: ls.Rollout, tmp_path: Path) -> None:
+    calls: list[tuple[int, int]] = []
+    path = render(rollout, tmp_path / "run.mp4", size=SMALL, fps=4, progress=lambda *call: calls.append(call))
+    assert path == tmp_path / "run.mp4"
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert (stream.width, stream.height) == SMALL
+        assert stream.average_rate == 4
+        times = [float(frame.time or 0.0) for frame in container.decode(video=0)]
+    # Real time: the last frame shows the last moment that falls on a frame.
+    assert times == pytest.approx(np.arange(len(times)) / 4, abs=1e-6)
+    assert rollout.times[-1] - 1 / 4 < times[-1] <= rollout.times[-1] + 1e-6
+    assert calls == [(number + 1, len(times)) for number in range(len(times))]
+    data = path.read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat"), "a player would have to load all of it first"
+
+
+@draws
+@pytest.mark.parametrize("fps", [0.7, 3])
+def test_frames_show_their_moment_at_any_rate(fps: float, drive: ls.Rollout, tmp_path: Path) -> None:
+    frames = decode(render(drive, tmp_path / "run.mp4", size=SMALL, fps=fps))
+    for number in (0, len(frames) // 2, len(frames) - 1):
+        path = still(drive, tmp_path / "still.png", time=number / fps, size=SMALL)
+        # Compared where they differ most, which is where the robot is; the rest is the same at any time. What
+        # h264 loses there is a third or less of what one frame of motion changes.
+        assert 2 * difference(frames[number], pixels(path)) < difference(frames[number - 1], pixels(path))
+
+
+def difference(first: np.ndarray, second: np.ndarray) -> float:
+    """The largest mean absolute difference of two pictures over a block of 8 x 8 pixels."""
+    change = np.abs(first - second).mean(axis=2)[:176]
+    return float(change.reshape(22, 8, -1, 8).mean(axis=(1, 3)).max())
+
+
+@draws
+def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
+    """Where its geoms are, painting it changes what the default camera sees, obstacles before it or not."""
+    with rendering._stage(rollout, 0, None, (640, 360)) as stage:
+        model = stage.model
+        robot = np.isin(model.geom_group, (0, 1, 2)) & (model.body_weldid[model.geom_bodyid] != 0)
+        painted, material = model.geom_rgba.copy(), model.geom_matid.copy()
+
+        def hide(geoms: np.ndarray) -> None:
+            model.geom_rgba[:], model.geom_matid[:] = painted, material
+            model.geom_matid[geoms], model.geom_rgba[geoms] = -1, (0, 0, 0, 0)
+
+        for time in np.linspace(0, rollout.times[-1], 12):
+            hide(~robot)
+            stage._pose(stage.data, time)
+            stage.renderer.update_scene(stage.data, stage.camera)
+            stage.renderer.enable_segmentation_rendering()
+            mask = stage.renderer.render()[..., 1] == mujoco.mjtObj.mjOBJ_GEOM.value
+            stage.renderer.disable_segmentation_rendering()
+            hide(np.zeros(0, dtype=int))
+            seen = stage.draw(time).astype(int)
+            hide(robot)
+            unseen = stage.draw(time).astype(int)
+            assert mask.sum() > 30, f"at {time:.2f} s"
+            changed = np.abs(seen - unseen).max(axis=2)[mask] > 20
+            assert changed.mean() > 0.4, f"at {time:.2f} s"
+
+
+@draws
+def test_plan_and_trace_are_drawn(drive: ls.Rollout, tmp_path: Path) -> None:
+    # Moved a quarter of a metre aside, and so in the colour of a large error, which is yellow.
+    states = drive.states + np.array([0.25, 0.0, 0.0])
+    moved = dataclasses.replace(drive, states=states)
+
+    def count(time: float) -> tuple[int, int]:
+        image = pixels(still(moved, tmp_path / "still.png", time=time, size=(640, 360)))[:320]
+        red, green, blue = np.moveaxis(image, 2, 0)
+        plan = (red > 120) & (green < 90) & (blue > 50) & (red > 1.4 * blue)
+        trace = (red > 140) & (green > 120) & (blue < 0.75 * green) & (red < 1.5 * green)
+        return int(plan.sum()), int(trace.sum())
+
+    (plan_early, trace_early), (plan_late, trace_late) = count(1.0), count(24.0)
+    assert min(plan_early, plan_late) > 300
+    assert trace_late > trace_early + 300
+
+
+@draws
+def test_same_rollout_gives_the_same_bytes(rollout: ls.Rollout, tmp_path: Path) -> None:
+    files = [render(rollout, tmp_path / f"{name}.mp4", size=SMALL, fps=1).read_bytes() for name in "ab"]
+    assert files[0] == files[1]
+    files = [still(rollout, tmp_path / f"{name}.png", every=1, size=SMALL).read_bytes() for name in "ab"]
+    assert files[0] == files[1]
+
+
+@draws
+def test_robot_is_shown_several_times(flight: ls.Rollout, tmp_path: Path) -> None:
+    once = pixels(still(flight, tmp_path / "once.png", size=(640, 360)))
+    often = pixels(still(flight, tmp_path / "often.png", every=1, size=(640, 360)))
+    assert (np.abs(once - often).max(axis=2) > 20).sum() > 5 * 60
+
+
+@draws
+def test_picture_may_exceed_the_buffer_of_the_model(drive: ls.Rollout, tmp_path: Path) -> None:
+    small = drive.model.replace('offwidth="1920" offheight="1080"', 'offwidth="64" offheight="64"')
+    assert small != drive.model
+    path = still(dataclasses.replace(drive, model=small), tmp_path / "still.png", size=SMALL)
+    assert pixels(path).shape == (180, 320, 3)
+
+
+@draws
+def test_diverged_trial_stands_still(flight: ls.Rollout, tmp_path: Path) -> None:
+    states, frames = flight.states.copy(), flight.frames.copy()
+    states[:, 60:], frames[:, flight.frame_times > 2.0] = np.nan, np.nan
+    broken = dataclasses.replace(flight, states=states, frames=frames, diverged=np.array([True]))
+    images = [pixels(still(broken, tmp_path / "still.png", time=time, size=SMALL)) for time in (3.0, 5.0)]
+    # The captions, upper left, tell the time; the marks of the plan move on.
+    assert (np.abs(images[0] - images[1])[70:].max(axis=2) > 20).mean() < 0.02
+    states[:], frames[:] = np.nan, np.nan
+    with pytest.raises(ls.InputError, match="without one finite state"):
+        still(broken, tmp_path / "still.png", size=SMALL)
+
+
+@draws
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"size": (641, 360)}, "size: got 641 x 360, want even numbers"),
+        ({"size": (640,)}, r"size: got \(640,\), want a width and a height"),
+        ({"size": (32, 360)}, "size: got 32, want a whole number >= 64"),
+        ({"camera": "overvew"}, r"camera: got 'overvew', want one of: .*top.*did you mean overview"),
+        ({"trial": 1}, "trial: got 1, want one of 0 to 0"),
+        ({"fps": 0}, "fps: got 0, want"),
+        ({"path": "run.avi"}, "path: got .*run.avi', want a name that ends in .mp4"),
+        ({"path": "file/run.mp4"}, "want a file that can be written"),
+    ],
+)
+def test_bad_input_gets_one_line(options: dict, message: str, drive: ls.Rollout, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    path = tmp_path / options.pop("path", "run.mp4")
+    with pytest.raises(ls.InputError, match=message) as caught:
+        render(drive, path, **{"size": SMALL, **options})
+    assert "\n" not in str(caught.value)
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
+
+
+@draws
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"time": 26.0}, "time: got 26.0, want a finite number >= 0 <= 25"),
+        ({"every": 0}, "every: got 0, want a finite number >= 0.5"),
+        ({"path": "still.jpg"}, "want a name that ends in .png"),
+    ],
+)
+def test_bad_input_for_a_still(options: dict, message: str, drive: ls.Rollout, tmp_path: Path) -> None:
+    with pytest.raises(ls.InputError, match=message):
+        still(drive, tmp_path / options.pop("path", "still.png"), **{"size": SMALL, **options})
+
+
+@pytest.mark.parametrize("model", ["<mujoco><worldbody>", "<mujoco/>"])
+def test_model_that_does_not_fit(model: str, drive: ls.Rollout, tmp_path: Path) -> None:
+    with pytest.raises(ls.InputError, match=r"rollout\.(model|frames): got") as caught:
+        render(dataclasses.replace(drive, model=model), tmp_path / "run.mp4")
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@draws
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_interrupted_video_leaves_nothing(error: type[BaseException], drive: ls.Rollout, tmp_path: Path) -> None:
+    def stop(done: int, total: int) -> None:
+        if done == 3:
+            raise error
+
+    with pytest.raises(error):
+        render(drive, tmp_path / "run.mp4", size=SMALL, progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("choice", ["", "off"])
+def test_without_opengl_the_message_says_what_to_do(
+    choice: str, drive: ls.Rollout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(gl, "find_library", lambda name: None)
+    monkeypatch.setenv("MUJOCO_GL", choice)
+    gl.bind.cache_clear()
+    try:
+        assert not gl.available()
+        with pytest.raises(ls.InputError, match=r"apt-get install -y libegl1|want it unset") as caught:
+            render(drive, tmp_path / "run.mp4")
+    finally:
+        gl.bind.cache_clear()
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_import_leaves_the_environment_alone() -> None:
+    code = "import os; before = dict(os.environ); import lqrsim.view.render; print(before == dict(os.environ))"
+    environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.split() == ["True"]
