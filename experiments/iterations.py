@@ -43,20 +43,29 @@ def main(config: Config) -> dict[str, Any]:
             "status": [solution.status.name for solution in solved],
             "iterations": [len(solution.iterations) for solution in solved],
             "cost": [solution.cost for solution in solved],
+            "start_offset": [_start_offset(solution, seed=config.seed, query=q) for q, solution in enumerate(solved)],
             "milliseconds": [1e3 * sum(iteration.seconds for iteration in solution.iterations) for solution in solved],
         }
     return result
 
 
+def _start_offset(solution: ls.Solution, *, seed: int, query: int) -> float:
+    """How far in metres the plan begins from where it was to begin."""
+    start = ls.scenarios.quadrotor_queries(query + 1, seed=seed)[0][query]
+    return float(np.linalg.norm(solution.trajectory.states[0, :3] - start[:3]))
+
+
 def report(result: dict[str, Any]) -> str:
-    rows = [f"{'solver':<8} {'solved':>8} {'iterations':>11} {'cost':>8} {'ms':>8} {'ms/iteration':>13}"]
+    rows = [
+        f"{'solver':<8} {'solved':>8} {'iterations':>11} {'cost':>8} {'ms':>8} {'ms/iteration':>13} {'start off m':>12}"
+    ]
     for name in ("smooth", "ilqr"):
         found = result[name]
         iterations, milliseconds = np.mean(found["iterations"]), np.mean(found["milliseconds"])
         solved = sum(status == "COST_CONVERGED" for status in found["status"])
         rows.append(
             f"{name:<8} {solved:>4}/{len(found['status']):<3} {iterations:>11.2f} {np.mean(found['cost']):>8.2f}"
-            f" {milliseconds:>8.1f} {milliseconds / iterations:>13.2f}"
+            f" {milliseconds:>8.1f} {milliseconds / iterations:>13.2f} {np.mean(found['start_offset']):>12.3f}"
         )
     return "\n".join(rows)
 

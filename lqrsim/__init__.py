@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from lqrsim.results import AffinePolicy as AffinePolicy
     from lqrsim.results import Iteration as Iteration
     from lqrsim.results import Quadratic as Quadratic
-    from lqrsim.results import Rollout as Rollout
     from lqrsim.results import Solution as Solution
     from lqrsim.results import Status as Status
     from lqrsim.results import Trajectory as Trajectory
     from lqrsim.robots.base import Robot as Robot
     from lqrsim.robots.differential_drive import DifferentialDrive as DifferentialDrive
     from lqrsim.robots.quadrotor import Quadrotor as Quadrotor
+    from lqrsim.rollout import Rollout as Rollout
     from lqrsim.scenarios import Scenario as Scenario
     from lqrsim.scenes import Scene as Scene
     from lqrsim.scenes import load_scene as load_scene
@@ -68,10 +68,11 @@ _HOME = {
     "errors": ["InputError"],
     "files": ["load_rollout", "load_solution", "save"],
     "problem": ["FixedState", "InitialPrior", "Problem"],
-    "results": ["AffinePolicy", "Iteration", "Quadratic", "Rollout", "Solution", "Status", "Trajectory"],
+    "results": ["AffinePolicy", "Iteration", "Quadratic", "Solution", "Status", "Trajectory"],
     "robots.base": ["Robot"],
     "robots.differential_drive": ["DifferentialDrive"],
     "robots.quadrotor": ["Quadrotor"],
+    "rollout": ["Rollout"],
     "scenarios": ["Scenario"],
     "scenes": ["Scene", "load_scene"],
     "simulation.closed_loop": ["simulate"],

@@ -1,7 +1,6 @@
 """What the commands share: progress on the terminal, and an early look at whether the outputs can be written."""
 
 import contextlib
-import logging
 import sys
 import tempfile
 import time
@@ -19,14 +18,6 @@ if TYPE_CHECKING:
 def say(text: str = "") -> None:
     """Print at once, also where the output goes to a file or a pipe."""
     print(text, flush=True)
-
-
-def show_log() -> None:
-    """Show on stderr what the package logs, such as that it compiles."""
-    logger = logging.getLogger("lqrsim")
-    if not logger.handlers:
-        logger.addHandler(logging.StreamHandler())
-        logger.setLevel(logging.INFO)
 
 
 def check_output(field: str, folder: Path) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 from lqrsim import console, files
 from lqrsim.errors import InputError
 from lqrsim.references import resolve, short_name
-from lqrsim.results import Rollout, Solution
+from lqrsim.results import Solution
+from lqrsim.rollout import Rollout
 from lqrsim.scenarios import Scenario
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.view import gl

@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array
-from lqrsim.results import AffinePolicy, Iteration, Quadratic, Rollout, Solution, Status, Trajectory
+from lqrsim.results import AffinePolicy, Iteration, Quadratic, Solution, Status, Trajectory
+from lqrsim.rollout import Rollout
 
 VERSIONS = {"solution": 1, "rollout": 1}
 

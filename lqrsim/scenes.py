@@ -17,11 +17,21 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 from lqrsim.errors import InputError, check_name
 from lqrsim.world import KINDS, Obstacle, World
+
+try:
+    import mujoco
+except Exception as error:
+    # MuJoCo chooses its OpenGL while it is imported: told to take one that is not there, it raises what comes along.
+    if "MUJOCO_GL" not in os.environ:
+        raise
+    raise InputError(
+        f"MUJOCO_GL: got {os.environ['MUJOCO_GL']!r}, with which MuJoCo cannot be imported here"
+        f" ({' '.join(str(error).split())}), want it unset: lqrsim finds an OpenGL by itself"
+    ) from None
 
 # In the wheel models/ lies inside the package, in the repository beside it.
 _PACKAGED = [Path(__file__).parent / "models", Path(__file__).parent.parent / "models"]

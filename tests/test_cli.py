@@ -226,6 +226,14 @@ def test_exit_code_and_line_reach_the_shell() -> None:
     assert "Traceback" not in error
 
 
+def test_an_opengl_that_mujoco_cannot_load_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    with start("list") as process:
+        printed, error = process.communicate(timeout=60)
+    assert (process.returncode, printed, error.count("\n")) == (2, "", 1)
+    assert "MUJOCO_GL: got 'nonsense'" in error
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send to another process")
 def test_ctrl_c_is_one_line_and_leaves_nothing(own: Path, tmp_path: Path) -> None:
     with start("solve", f"{own}:endless", "--out", str(tmp_path / "out")) as process:

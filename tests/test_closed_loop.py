@@ -92,7 +92,10 @@ def test_records_are_of_what_happened(cage):
     difference = cage.robot.dynamics.state_coordinates.difference(rollout.states[0, 9], expected)
     np.testing.assert_allclose(difference, 0, atol=1e-5)
     np.testing.assert_allclose(rollout.clearance, cage.world.distance(rollout.states[..., :3]) - 0.3)
-    assert rollout.disturbances == ("control noise, std 3", "measurement noise, std 0.01")
+    assert rollout.disturbances == (
+        "control noise, std 3 N",
+        "measurement noise, std 0.01 m, 0.01 m/s, 0.01 rad, 0.01 rad/s",
+    )
     assert rollout.model == cage.scene.xml
     assert (rollout.robot, rollout.scene, rollout.goal_radius) == ("quadrotor", "cage", 0.3)
 

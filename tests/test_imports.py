@@ -16,6 +16,7 @@ ROOMS = (
     ("errors", "versions", "solvers.interface"),
     ("coordinates",),
     ("results",),
+    ("rollout",),
     ("files",),
     ("integration", "rotations", "world"),
     ("tracing",),

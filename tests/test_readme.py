@@ -1,9 +1,12 @@
 """What the README tells people to type works: its Python blocks run in order, in one namespace."""
 
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
+
+import lqrsim as ls
 
 README = Path(__file__).parent.parent / "README.md"
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -11,6 +14,8 @@ BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 def test_code_blocks_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # they write files
+    # The README films 25 s in 720p, which takes over a minute; small and coarse it is the same code.
+    monkeypatch.setattr(ls, "render", partial(ls.render, size=(320, 180), fps=5), raising=False)
     text = README.read_text(encoding="utf-8")
     blocks = list(BLOCK.finditer(text))
     assert blocks, "the README has no Python"

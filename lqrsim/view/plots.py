@@ -12,9 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
+from lqrsim import compiled
 from lqrsim.errors import Array, InputError
 from lqrsim.files import replacing
-from lqrsim.results import Rollout, Solution, Trajectory
+from lqrsim.results import Solution, Trajectory
+from lqrsim.rollout import Rollout
 from lqrsim.world import Obstacle, World
 
 PLAN = "#222222"
@@ -116,7 +118,7 @@ def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
             np.unique(np.append(np.arange(low[axis], high[axis] + spacing, spacing), np.array(places)[:, axis]))
             for axis in (0, 1)
         )
-        distance = flat.distance(np.stack(np.meshgrid(x, y), axis=-1))
+        distance = compiled.signed_distance(flat, np.stack(np.meshgrid(x, y), axis=-1))
         axes.contourf(x, y, distance, levels=[-np.inf, 0, radius], colors=[SOLID, MARGIN])
         axes.contour(x, y, distance, levels=[0], colors=["#5b6470"], linewidths=0.8)
     for name, color, style, points in paths:

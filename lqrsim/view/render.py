@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import textwrap
 from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -14,7 +15,7 @@ from PIL import Image
 
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number
 from lqrsim.files import replacing
-from lqrsim.results import Rollout
+from lqrsim.rollout import Rollout
 from lqrsim.view import caption, gl
 from lqrsim.view.caption import Pixels
 from lqrsim.view.video import encoder
@@ -291,7 +292,9 @@ class _Stage:
         """The captions."""
         run, height = self.rollout, max(round(self.size[1] / 44), 9)
         error, clearance = (float(np.interp(time, self.times, x)) for x in (self.error, self.clearance))
-        lines = [f"{run.robot} in {run.scene}".replace("_", " "), *(run.disturbances or ["undisturbed"])]
+        lines = [f"{run.robot} in {run.scene}".replace("_", " ")]
+        for disturbance in run.disturbances or ["undisturbed"]:
+            lines += textwrap.wrap(disturbance, 34, subsequent_indent="  ")
         lines += [f"time {time:.1f} s", f"tracking error {1e3 * error:.0f} mm"]
         lines += [f"clearance {clearance:.2f} m"] if np.isfinite(clearance) else []
         lines += ["diverged"] if run.diverged[self.trial] and time > self.times[-1] else []
