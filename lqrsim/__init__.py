@@ -54,7 +54,9 @@ if TYPE_CHECKING:
     from lqrsim.simulation.disturbances import Push as Push
     from lqrsim.simulation.plant import Plant as Plant
     from lqrsim.solvers.ilqr import ilqr as ilqr
+    from lqrsim.solvers.ilqr import ilqr_many as ilqr_many
     from lqrsim.solvers.smoother import smooth as smooth
+    from lqrsim.solvers.smoother import smooth_many as smooth_many
     from lqrsim.view.plots import plot_run as plot_run
     from lqrsim.view.render import render as render
     from lqrsim.view.render import still as still
@@ -78,8 +80,8 @@ _HOME = {
     "simulation.closed_loop": ["simulate"],
     "simulation.disturbances": ["ControlNoise", "Disturbance", "ForceNoise", "MeasurementNoise", "Push"],
     "simulation.plant": ["Plant"],
-    "solvers.ilqr": ["ilqr"],
-    "solvers.smoother": ["smooth"],
+    "solvers.ilqr": ["ilqr", "ilqr_many"],
+    "solvers.smoother": ["smooth", "smooth_many"],
     "view.plots": ["plot_run"],
     "view.render": ["render", "still"],
     "world": ["Obstacle", "World"],

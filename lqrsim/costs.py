@@ -128,7 +128,7 @@ class ObstacleCost(Cost):
         world = self.world.seen_by(len(position))
         place = [f"x[{i}]" for i in position] + (["0.0"] if len(position) == 2 else [])
         source = _OBSTACLES.format(place=", ".join(place), axes=repr(position), size=len(position), row=ROW)
-        data = np.concatenate([[self.radius, self.sharpness, self.weight], world.table.ravel()])
+        data = np.concatenate([[self.radius, self.sharpness, self.weight, len(world)], world.table.ravel()])
         return Term(source, data, bends=position)
 
 
@@ -211,8 +211,8 @@ _OBSTACLES = """\
 def value(x, u, t, data):
     total = 0.0
     if t > 0:
-        for i in range((len(data) - 3) // {row}):
-            distance = signed_distance(data, 3 + {row} * i, {place})
+        for i in range(int(data[3])):
+            distance = signed_distance(data, 4 + {row} * i, {place})
             total += exp(-data[1] * (distance - data[0]))
     return data[2] * total
 
@@ -221,15 +221,21 @@ def derivatives(x, u, t, data, hessian, gradient):
     total = 0.0
     if t > 0:
         axes = {axes}
-        slope, curve = stack(3), stack(3, 3)
-        for i in range((len(data) - 3) // {row}):
-            distance = signed_distance_derivatives(data, 3 + {row} * i, {place}, slope, curve)
+        slope, curve, slopes, curves = stack(3), stack(3, 3), stack(3), stack(3, 3)
+        clear(curves, 3, 3)
+        for j in range(3):
+            slopes[j] = 0.0
+        for i in range(int(data[3])):
+            distance = signed_distance_derivatives(data, 4 + {row} * i, {place}, slope, curve)
             cost = data[2] * exp(-data[1] * (distance - data[0]))
             total += cost
-            for j in range({size}):
-                gradient[axes[j]] -= data[1] * cost * slope[j]
-                for k in range({size}):
-                    bend = data[1] * slope[j] * slope[k] - curve[j, k]
-                    hessian[axes[j], axes[k]] += data[1] * cost * bend
+            for j in range(3):
+                slopes[j] -= cost * slope[j]
+                for k in range(3):
+                    curves[j, k] += cost * (data[1] * slope[j] * slope[k] - curve[j, k])
+        for j in range({size}):
+            gradient[axes[j]] += data[1] * slopes[j]
+            for k in range({size}):
+                hessian[axes[j], axes[k]] += data[1] * curves[j, k]
     return total
 """

@@ -94,6 +94,11 @@ class Dynamics:
         )
 
     @property
+    def name(self) -> str:
+        """What messages call the dynamics: the name of `f`."""
+        return getattr(self.f, "__qualname__", repr(self.f))
+
+    @property
     def data(self) -> Array:
         """The parameters' values, in order."""
         return np.array(list(self.parameters.values()), dtype=np.float64)
@@ -115,6 +120,7 @@ class Dynamics:
             [
                 tracing.write_function("rate", "x, u, p, out", "p", values),
                 tracing.write_function("rate_jacobian", "x, u, p, out, fx, fu", "p", values | slopes),
+                tracing.write_chain(n, slopes),
             ]
         )
 

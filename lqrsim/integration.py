@@ -8,46 +8,51 @@ from lqrsim.solvers.interface import M, N, W, rate, rate_jacobian, stack
 
 def step(x, u, p, h, out):
     """Write x after `h` seconds, (N,)."""
-    k1, k2, k3, k4, z = stack(N), stack(N), stack(N), stack(N), stack(N)
-    rate(x, u, p, k1)
+    z, k = stack(N), stack(N)
     for i in range(N):
-        z[i] = x[i] + 0.5 * h * k1[i]
-    rate(z, u, p, k2)
-    for i in range(N):
-        z[i] = x[i] + 0.5 * h * k2[i]
-    rate(z, u, p, k3)
-    for i in range(N):
-        z[i] = x[i] + h * k3[i]
-    rate(z, u, p, k4)
-    for i in range(N):
-        out[i] = x[i] + h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i])
+        out[i] = z[i] = x[i]
+    for stage in range(4):
+        weight = h / 6 if stage == 0 or stage == 3 else h / 3
+        ahead = 0.5 * h if stage < 2 else h
+        rate(z, u, p, k)
+        for i in range(N):
+            out[i] += weight * k[i]
+            z[i] = x[i] + ahead * k[i]
 
 
 def chain(fx, fu, previous, a, out):
-    """Write `fx ([1 0] + a previous) + [0 fu]`, (N, W): the slope of one Runge-Kutta stage in (x, u)."""
+    """Write `fx ([1 0] + a previous) + [0 fu]`, (N, W): the slope of one Runge-Kutta stage in (x, u).
+
+    Dynamics that know which entries are zero everywhere bring a `chain` of their own in place of this one.
+    """
     for i in range(N):
         for j in range(N):
             out[i, j] = fx[i, j]
         for j in range(M):
             out[i, N + j] = fu[i, j]
-        if a != 0:
-            for k in range(N):
-                # Most systems couple few states: skipping the zeros halves the time of an iteration.
-                if fx[i, k] != 0:
-                    factor = a * fx[i, k]
-                    for j in range(W):
-                        out[i, j] += factor * previous[k, j]
+        for k in range(N):
+            # Most systems couple few states: skipping the zeros halves the time of an iteration.
+            if fx[i, k] != 0:
+                factor = a * fx[i, k]
+                for j in range(W):
+                    out[i, j] += factor * previous[k, j]
 
 
 def step_jacobian(x, u, p, h, fx, fu, out, jacobian):
-    """Write the step as above and its Jacobian `[A B]` (N, W); `fx`, `fu` are work arrays whose zeros are set."""
+    """Write the step as above and its Jacobian `[A B]` (N, W); `fx`, `fu` are work arrays whose zeros are set.
+
+    The four stages are written out: a loop over them takes a quarter longer.
+    """
     k, z = stack(N), stack(N)
     first, second = stack(N, W), stack(N, W)
     rate_jacobian(x, u, p, k, fx, fu)
-    chain(fx, fu, first, 0.0, first)
     for i in range(N):
         out[i] = k[i]
         z[i] = x[i] + 0.5 * h * k[i]
+        for j in range(N):
+            first[i, j] = fx[i, j]
+        for j in range(M):
+            first[i, N + j] = fu[i, j]
         for j in range(W):
             jacobian[i, j] = first[i, j]
     rate_jacobian(z, u, p, k, fx, fu)

@@ -7,12 +7,13 @@ they run here as they are, and `compiled.py` puts the same text into every compi
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import sqrt
+from math import inf, sqrt
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_array, check_name
+from lqrsim.solvers.interface import stack
 
 KINDS = ("plane", "sphere", "capsule", "cylinder", "box")
 ROW = 16  # numbers an obstacle takes in `World.table`: kind, position (3), rotation (9, row by row), size (3)
@@ -136,7 +137,7 @@ def _from_above(obstacle: Obstacle) -> Obstacle | None:
 
 def signed_distance(data, row: int, x: float, y: float, z: float) -> float:
     """Signed distance of (x, y, z) to the obstacle whose `ROW` numbers start at `data[row]`; negative inside."""
-    kind = int(data[row])
+    kind = data[row]
     dx, dy, dz = x - data[row + 1], y - data[row + 2], z - data[row + 3]
     c = data[row + 6] * dx + data[row + 9] * dy + data[row + 12] * dz
     if kind == 0:
@@ -161,88 +162,101 @@ def signed_distance(data, row: int, x: float, y: float, z: float) -> float:
 def signed_distance_derivatives(data, row: int, x: float, y: float, z: float, gradient, hessian) -> float:
     """Signed distance as above; writes its gradient (3,) and Hessian (3, 3).
 
-    With `v` the vector from the nearest point (or axis) and `q` the distance from it, the gradient is `v / q` and the
-    Hessian `(F - gradient gradient') / q`, where F projects on the directions in which the obstacle is round there.
-    On an axis or in a centre, where neither exists, both are zero.
+    With `v` the vector from the nearest point (or axis) and `q` its length, the gradient is `v / q` and the Hessian
+    `(F - gradient gradient') / q`, where F projects on the directions in which the obstacle is round there. On an axis
+    or in a centre, where neither exists, both are zero.
     """
-    kind = int(data[row])
+    kind = data[row]
     dx, dy, dz = x - data[row + 1], y - data[row + 2], z - data[row + 3]
-    # Local coordinates, and from them the vector v and the directions F, both in the local axes.
-    a = data[row + 4] * dx + data[row + 7] * dy + data[row + 10] * dz
-    b = data[row + 5] * dx + data[row + 8] * dy + data[row + 11] * dz
-    c = data[row + 6] * dx + data[row + 9] * dy + data[row + 12] * dz
-    fa, fb, fc = 1.0, 1.0, 1.0
-    offset = 0.0
-    extra = 0.0  # curvature of a cylinder's side where the rim is nearest
-    ra, rb = 0.0, 0.0  # its radial direction
+    nx, ny, nz = data[row + 6], data[row + 9], data[row + 12]  # the axis; a plane's normal
+    along = nx * dx + ny * dy + nz * dz
+    if kind == 4:
+        return box_derivatives(data, row, dx, dy, dz, gradient, hessian)
     if kind == 0:
-        va, vb, vc, fa, fb, fc = 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
-        distance, length = c, 1.0
-    elif kind == 1 or kind == 2:
-        va, vb, vc = a, b, c
-        if kind == 2:
-            half = data[row + 14]
-            if abs(c) < half:
-                vc, fc = 0.0, 0.0
-            else:
-                vc = c - half if c > 0 else c + half
-        offset = data[row + 13]
-        length = sqrt(va * va + vb * vb + vc * vc)
-        distance = length - offset
+        return flat_derivatives(along, 1.0, nx, ny, nz, gradient, hessian)
+    radius, half = data[row + 13], data[row + 14]
+    # What is round in all directions has a centre, nearest on the axis at `shift`; a side is flat along the axis.
+    shift, flat = 0.0, 0.0
+    if kind == 2:
+        shift = min(max(along, -half), half)
+        flat = 1.0 if abs(along) < half else 0.0
     elif kind == 3:
-        radial = sqrt(a * a + b * b)
-        side, end = radial - data[row + 13], abs(c) - data[row + 14]
-        sign = 1.0 if c > 0 else -1.0
+        shift, flat = along, 1.0
+    vx, vy, vz = dx - shift * nx, dy - shift * ny, dz - shift * nz
+    length = sqrt(vx * vx + vy * vy + vz * vz)
+    if kind == 3:
+        side, end = length - radius, abs(along) - half
+        sign = 1.0 if along > 0 else -1.0
         if side > 0 and end > 0:
-            ra, rb = a / radial, b / radial
-            va, vb, vc = side * ra, side * rb, sign * end
-            length = sqrt(side * side + end * end)
-            distance = length
-            # The rim is round in the radial and the axial direction; along the rim it turns with the side.
-            extra = side / (length * radial)
-        elif side >= end:
-            va, vb, vc, fc = a, b, 0.0, 0.0
-            length, distance = radial, side
-        else:
-            va, vb, vc, fa, fb, fc = 0.0, 0.0, sign, 0.0, 0.0, 0.0
-            length, distance = 1.0, end
-    else:
-        qa, qb, qc = abs(a) - data[row + 13], abs(b) - data[row + 14], abs(c) - data[row + 15]
-        sa, sb, sc = 1.0 if a > 0 else -1.0, 1.0 if b > 0 else -1.0, 1.0 if c > 0 else -1.0
-        distance = max(qa, qb, qc)
-        va, vb, vc = 0.0, 0.0, 0.0
-        if distance > 0:
-            fa, fb, fc = 1.0 if qa > 0 else 0.0, 1.0 if qb > 0 else 0.0, 1.0 if qc > 0 else 0.0
-            va, vb, vc = fa * sa * qa if qa > 0 else 0.0, sb * qb if qb > 0 else 0.0, sc * qc if qc > 0 else 0.0
-            length = sqrt(va * va + vb * vb + vc * vc)
-            distance = length
-        else:
-            fa, fb, fc, length = 0.0, 0.0, 0.0, 1.0
-            if qa == distance:
-                va = sa
-            elif qb == distance:
-                vb = sb
-            else:
-                vc = sc
-    # The gradient of a flat face has length one without being divided by q, and no curvature: length is 1 there.
-    if length < 1e-12:
-        inverse, curvature = 0.0, 0.0
-    else:
-        inverse = 1.0 / length
-        curvature = inverse if fa + fb + fc > 0 else 0.0
-    ga, gb, gc = va * inverse, vb * inverse, vc * inverse
-    if extra > 0:
-        # (radial radial' + axial axial' - g g') / q + (tangential tangential') extra
-        haa = curvature * (ra * ra - ga * ga) + extra * rb * rb
-        hbb = curvature * (rb * rb - gb * gb) + extra * ra * ra
-        hab = curvature * (ra * rb - ga * gb) - extra * ra * rb
-    else:
-        haa, hbb, hab = curvature * (fa - ga * ga), curvature * (fb - gb * gb), -curvature * ga * gb
-    hcc, hac, hbc = curvature * (fc - gc * gc), -curvature * ga * gc, -curvature * gb * gc
+            return rim_derivatives(data, row, side, end * sign, vx, vy, vz, gradient, hessian)
+        if end > side:
+            return flat_derivatives(end, sign, nx, ny, nz, gradient, hessian)
+    inverse = 1 / length if length >= 1e-12 else 0.0
+    gradient[0], gradient[1], gradient[2] = inverse * vx, inverse * vy, inverse * vz
     for i in range(3):
-        ia, ib, ic = data[row + 4 + 3 * i], data[row + 5 + 3 * i], data[row + 6 + 3 * i]
-        gradient[i] = ia * ga + ib * gb + ic * gc
-        ha, hb, hc = ia * haa + ib * hab + ic * hac, ia * hab + ib * hbb + ic * hbc, ia * hac + ib * hbc + ic * hcc
         for j in range(3):
-            hessian[i, j] = ha * data[row + 4 + 3 * j] + hb * data[row + 5 + 3 * j] + hc * data[row + 6 + 3 * j]
+            round_there = (1.0 if i == j else 0.0) - flat * data[row + 6 + 3 * i] * data[row + 6 + 3 * j]
+            hessian[i, j] = inverse * (round_there - gradient[i] * gradient[j])
+    return length - radius
+
+
+def flat_derivatives(distance: float, sign: float, nx: float, ny: float, nz: float, gradient, hessian) -> float:
+    """A face with the normal `sign n`, at that distance."""
+    gradient[0], gradient[1], gradient[2] = sign * nx, sign * ny, sign * nz
+    for i in range(3):
+        for j in range(3):
+            hessian[i, j] = 0.0
+    return distance
+
+
+def rim_derivatives(
+    data, row: int, side: float, end: float, vx: float, vy: float, vz: float, gradient, hessian
+) -> float:
+    """The rim of a cylinder, from `side` beyond its side, `end` (signed) along its axis, `v` from its axis.
+
+    Round in the radial and the axial direction; along the rim it turns with the side.
+    """
+    radial = sqrt(vx * vx + vy * vy + vz * vz)
+    distance = sqrt(side * side + end * end)
+    outward = stack(3)
+    outward[0], outward[1], outward[2] = vx / radial, vy / radial, vz / radial
+    for i in range(3):
+        gradient[i] = (side * outward[i] + end * data[row + 6 + 3 * i]) / distance
+    for i in range(3):
+        for j in range(3):
+            across = outward[i] * outward[j] + data[row + 6 + 3 * i] * data[row + 6 + 3 * j]
+            around = (1.0 if i == j else 0.0) - across
+            hessian[i, j] = (across - gradient[i] * gradient[j] + around * side / radial) / distance
+    return distance
+
+
+def box_derivatives(data, row: int, dx: float, dy: float, dz: float, gradient, hessian) -> float:
+    """A box, from `d` from its centre: as `signed_distance_derivatives`."""
+    beyond, sign = stack(3), stack(3)
+    deepest, face = -inf, 0
+    for k in range(3):
+        local = data[row + 4 + k] * dx + data[row + 7 + k] * dy + data[row + 10 + k] * dz
+        beyond[k] = abs(local) - data[row + 13 + k]
+        sign[k] = 1.0 if local > 0 else -1.0
+        if beyond[k] > deepest:
+            deepest, face = beyond[k], k
+    if not deepest > 0:
+        axis = row + 4 + face
+        return flat_derivatives(deepest, sign[face], data[axis], data[axis + 3], data[axis + 6], gradient, hessian)
+    distance = 0.0
+    for k in range(3):
+        beyond[k] = max(beyond[k], 0.0)
+        distance += beyond[k] * beyond[k]
+    distance = sqrt(distance)
+    for i in range(3):
+        gradient[i] = 0.0
+        for k in range(3):
+            gradient[i] += data[row + 4 + 3 * i + k] * sign[k] * beyond[k] / distance
+    for i in range(3):
+        for j in range(3):
+            total = -gradient[i] * gradient[j]
+            for k in range(3):
+                if beyond[k] > 0:
+                    total += data[row + 4 + 3 * i + k] * data[row + 4 + 3 * j + k]
+            hessian[i, j] = total / distance
     return distance

@@ -4,8 +4,6 @@ Tolerance 1e-9, relative to the size of what is compared: the problems are well 
 horizons up to 12), and two ways of solving the same linear system differ by rounding alone.
 """
 
-from types import ModuleType
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,7 +16,7 @@ from lqrsim.errors import Array
 from lqrsim.results import Quadratic
 
 
-def integrator(n: int, m: int) -> ModuleType:
+def integrator(n: int, m: int) -> compiled.Core:
     """The core of some problem with n states and m controls; the Riccati steps in it know no more than the sizes."""
     dynamics = ls.Dynamics(
         lambda x, u, p: [u[i % m] - x[i] for i in range(n)],
@@ -39,7 +37,7 @@ def integrator(n: int, m: int) -> ModuleType:
 class Smoothed:
     """LQR smoothing of a linear-quadratic problem, step by step with the compiled kernels."""
 
-    def __init__(self, core: ModuleType, problem: LinearQuadratic) -> None:
+    def __init__(self, core: compiled.Core, problem: LinearQuadratic) -> None:
         steps, n, m = problem.B.shape
         self.L, self.l = np.zeros((steps, m, n)), np.zeros((steps, m))
         self.Lbar, self.lbar = np.zeros((steps, m, n)), np.zeros((steps, m))
@@ -159,10 +157,10 @@ def _project(matrix: Array) -> Array:
     return hessian[:3, :3]
 
 
-_cores: dict[tuple[int, int], ModuleType] = {}
+_cores: dict[tuple[int, int], compiled.Core] = {}
 
 
-def _core(n: int, m: int) -> ModuleType:
+def _core(n: int, m: int) -> compiled.Core:
     if (n, m) not in _cores:
         _cores[n, m] = integrator(n, m)
     return _cores[n, m]

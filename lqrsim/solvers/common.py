@@ -1,9 +1,10 @@
-"""What the solvers share: settings, the stop test, and putting the answer together."""
+"""What the solvers share: settings, the iterations with a look after each, and putting the answer together."""
 
+import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,21 @@ from lqrsim import compiled
 from lqrsim.errors import Array, InputError, check_array, check_count, check_name, check_number
 from lqrsim.problem import Problem
 from lqrsim.results import AffinePolicy, Iteration, Quadratic, Solution, Status, Trajectory
+from lqrsim.solvers import interface
 from lqrsim.versions import versions
 
 Callback = Callable[[Iteration], object]
+
+_STATUS = {
+    interface.CONVERGED: Status.CONVERGED,
+    interface.COST_CONVERGED: Status.COST_CONVERGED,
+    interface.MAX_ITERATIONS: Status.MAX_ITERATIONS,
+    interface.DIVERGED: Status.DIVERGED,
+    interface.NOT_POSITIVE_DEFINITE: Status.NOT_POSITIVE_DEFINITE,
+    interface.NOT_FINITE: Status.NOT_FINITE,
+    interface.NO_START: Status.NOT_FINITE,
+    interface.STALLED: Status.MAX_ITERATIONS,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,100 +61,99 @@ class Settings:
         return check_array("initial_controls", controls, shape).copy()
 
 
-class Log:
-    """The iterations so far, and whether they are enough.
+@dataclass(frozen=True)
+class Ending:
+    """How the iterations of `iterate` ended; `failed` is the step of the pass that failed, or -1."""
+
+    iterations: tuple[Iteration, ...]
+    outcome: int
+    backward: bool
+    failed: int
+
+    @property
+    def status(self) -> Status:
+        return _STATUS[self.outcome]
+
+    @property
+    def pass_failed(self) -> bool:
+        """Whether a pass of one more iteration was begun and not completed."""
+        return self.outcome in (interface.NOT_POSITIVE_DEFINITE, interface.NOT_FINITE)
+
+    def detail(self, steps: int) -> str:
+        """What there is to say besides the status."""
+        if self.pass_failed:
+            which = "backward" if self.backward else "forward"
+            return f"{which} pass of iteration {len(self.iterations) + 1}, step {self.failed} of {steps}"
+        if self.outcome == interface.NO_START:
+            return "rollout of the initial controls"
+        return "the line search found no lower cost" if self.outcome == interface.STALLED else ""
+
+
+def iterate(
+    run: Callable[[int, int], tuple[int, int, bool, int]],
+    log: Array,
+    max_iterations: int,
+    *,
+    each: bool,
+    callback: Callback | None = None,
+) -> Ending:
+    """Run a loop of `solvers/loops.py` to its end.
 
     Args:
-      first_cost: of what the first iteration improves on, where there is such a thing.
+      run: runs the iterations from its first argument up to its second.
+      log: (any, 4), where `run` writes.
+      each: come back after each iteration, to time it, to tell `callback` and to heed Ctrl-C; otherwise nothing but
+        compiled code runs, and the seconds of an iteration are the average.
     """
-
-    def __init__(self, settings: Settings, callback: Callback | None, *, first_cost: float = np.inf) -> None:
-        self.settings, self.callback = settings, callback
-        self.iterations: list[Iteration] = []
-        self._cost = first_cost
-        self._clock = time.perf_counter()
-
-    def add(self, cost: float, gap: float, optimality: Callable[[], float]) -> Status | None:
-        """Record an iteration; the status if it is to be the last. `optimality` is called only where it matters."""
-        asked = self.settings
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            improvement = float(np.subtract(self._cost, cost) / np.abs(cost))
-        if cost == self._cost:
-            improvement = 0.0  # also at a cost of zero
-        settled = abs(improvement) < asked.tolerance
-        if asked.stop == "optimal" and asked.gap_tolerance is not None:
-            settled = settled and gap < asked.gap_tolerance
-        full = len(self.iterations) + 1 >= asked.max_iterations
-        left = optimality() if settled or full else float("nan")
-        self.iterations.append(Iteration(cost, improvement, gap, left, time.perf_counter() - self._clock))
-        self._cost = cost
-        if self.callback is not None:
-            self.callback(self.iterations[-1])
-        self._clock = time.perf_counter()
-        if settled and asked.stop == "cost":
-            return Status.COST_CONVERGED
-        if settled and left < asked.tolerance:
-            return Status.CONVERGED
-        if full:
-            return Status.MAX_ITERATIONS if np.isfinite(cost) else Status.DIVERGED
-        return None
+    iterations: list[Iteration] = []
+    outcome, backward, failed = interface.RUNNING, False, -1
+    while outcome == interface.RUNNING:
+        first = len(iterations)
+        clock = time.perf_counter()
+        done, outcome, backward, failed = run(first, first + 1 if each else max_iterations)
+        seconds = (time.perf_counter() - clock) / max(done - first, 1)
+        for cost, improvement, gap, optimality in log[first:done].tolist():
+            iterations.append(Iteration(cost, improvement, gap, optimality, seconds))
+            if callback is not None:
+                callback(iterations[-1])
+    return Ending(tuple(iterations), outcome, backward, failed)
 
 
-@dataclass
-class Workspace:
-    """The arrays that the passes work on; names as in `solvers/passes.py`."""
-
-    x_hat: Array
-    x_hats: Array
-    L: Array
-    l: Array
-    S: Array
-    s: Array
-    k: Array
-    Lbar: Array
-    lbar: Array
-    Sbar: Array
-    sbar: Array
-    kbar: Array
-    states: Array
-    controls: Array
-
-    @classmethod
-    def of(cls, problem: Problem, start: Array, controls: Array) -> "Workspace":
-        """All zero, but for the start and a policy that plays the given controls."""
-        steps, (n, m) = problem.steps, (len(start), controls.shape[1])
-        zeros = np.zeros
-        return cls(
-            start.copy(), zeros((steps + 1, n)),
-            zeros((steps, m, n)), controls.copy(),
-            zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1),
-            zeros((steps, m, n)), zeros((steps, m)),
-            zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1),
-            zeros((steps + 1, n)), controls.copy(),
-        )  # fmt: skip
+def solve_all(
+    problems: list[Problem],
+    settings: Settings,
+    check: Callable[[Problem], None],
+    solve: Callable[..., Solution],
+    *,
+    threads: int | None,
+    progress: Callable[[int, int], object] | None,
+) -> list[Solution]:
+    """Solve each problem with `solve(problem, settings, each=False)`, on several threads; the answers in order."""
+    threads = processors() if threads is None else check_count("threads", threads)
+    for i, problem in enumerate(problems):
+        if not isinstance(problem, Problem):
+            raise InputError(f"problems[{i}]: got {type(problem).__name__}, want a Problem")
+        try:
+            check(problem)
+            settings.controls(problem)
+        except InputError as error:
+            raise InputError(f"problems[{i}]: {error}") from None
+    with ThreadPoolExecutor(threads, thread_name_prefix="lqrsim") as pool:
+        futures = [pool.submit(solve, problem, settings, each=False) for problem in problems]
+        try:
+            for done, _ in enumerate(as_completed(futures), start=1):
+                if progress is not None:
+                    progress(done, len(futures))
+            return [future.result() for future in futures]
+        except BaseException:  # Ctrl-C, too: what runs is a matter of milliseconds, the rest is not begun
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
-def predicted_decrease(
-    core: ModuleType, data: Mapping[str, Any], states: Array, controls: Array, *, soft: bool
-) -> float:
-    """The decrease of cost that a linear-quadratic model about a feasible trajectory promises; infinite if it fails.
-
-    This is the backward pass of iLQR: what is left to gain to second order. With a soft start, moving it counts too.
-    """
-    if not (np.isfinite(states).all() and np.isfinite(controls).all()):
-        return float("inf")
-    steps, n = len(controls), states.shape[1]
-    m = controls.shape[1]
-    value = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
-    law = np.zeros((steps, m, n)), np.zeros((steps, m))
-    failed, _, decrease = core.differential_pass(
-        states, controls, data["p"], data["dt"], data["stage"], data["final"], 0.0, *law, *value
-    )
-    if failed >= 0:
-        return float("inf")
-    if soft:
-        decrease += core.initial_decrease(states[0], data["initial"], value[0][0], value[1][0])
-    return decrease if np.isfinite(decrease) else float("inf")
+def processors() -> int:
+    """How many processors this process may run on."""
+    affinity = getattr(os, "sched_getaffinity", None)  # not on macOS and Windows
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
 def assemble(
@@ -149,9 +161,7 @@ def assemble(
     *,
     solver: str,
     settings: Settings,
-    status: Status,
-    detail: str,
-    log: Log,
+    ending: Ending,
     states: Array,
     controls: Array,
     law: tuple[Array, Array],
@@ -169,22 +179,29 @@ def assemble(
         )  # fmt: skip
 
     options: dict[str, object] = {key: value for key, value in asdict(settings).items() if key != "initial_controls"}
-    options["initial_controls"] = np.asarray(settings.controls(problem)[0]).tolist()
+    started = settings.controls(problem)
+    options["initial_controls"] = (started[0] if (started == started[0]).all() else started).tolist()
     return Solution(
-        status=status,
-        detail=detail,
+        status=ending.status,
+        detail=ending.detail(problem.steps),
         policy=policy(*law, states[:-1]),
         inverse_policy=policy(*inverse_law, states[1:]) if inverse_law is not None else None,
         cost_to_go=cost_to_go,
         cost_to_come=cost_to_come,
         trajectory=Trajectory(states, controls, problem.dt),
-        iterations=tuple(log.iterations),
+        iterations=ending.iterations,
         clearance=_clearance(problem, states),
         solver=solver,
         options=options,
         problem_digest=problem.digest,
         versions=versions(),
     )
+
+
+def model(problem: Problem) -> tuple[Any, ...]:
+    """The problem's numbers in the order in which the loops take them: p, dt, initial, stage, final."""
+    data = compiled.arguments(problem)
+    return data["p"], data["dt"], data["initial"], data["stage"], data["final"]
 
 
 def _clearance(problem: Problem, states: Array) -> Array | None:

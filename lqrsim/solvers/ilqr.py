@@ -1,20 +1,15 @@
 """Iterative LQR with line search: the baseline that the paper compares with."""
 
-from types import ModuleType
-from typing import Any
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim import compiled
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import InputError
 from lqrsim.problem import Problem
-from lqrsim.results import Quadratic, Solution, Status
-from lqrsim.solvers.common import Callback, Log, Settings, Workspace, assemble, predicted_decrease
-
-# Far outside an arena costs reach 1e20, and rounding takes the backward pass its positive-definite matrices. Then, and
-# only then, changes of the controls get a weight; it falls again by the same steps.
-_LEAST_DAMPING, _MOST_DAMPING = 1.0, 1e25
+from lqrsim.results import Quadratic, Solution
+from lqrsim.solvers.common import Callback, Settings, assemble, iterate, model, solve_all
 
 
 def ilqr(
@@ -44,68 +39,64 @@ def ilqr(
     settings = Settings(
         stop=stop, tolerance=tolerance, max_iterations=max_iterations, initial_controls=initial_controls
     )
+    _check(problem)
+    return _solve(problem, settings, each=True, callback=callback)
+
+
+def ilqr_many(
+    problems: Iterable[Problem],
+    *,
+    threads: int | None = None,
+    stop: str = "optimal",
+    tolerance: float = 1e-4,
+    max_iterations: int = 500,
+    initial_controls: npt.ArrayLike | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> list[Solution]:
+    """Solve many problems as `ilqr` does, on several threads; see `smooth_many`.
+
+    Raises:
+      InputError: an argument is not as described; a problem that is refused is named by its place in the list.
+    """
+    settings = Settings(
+        stop=stop, tolerance=tolerance, max_iterations=max_iterations, initial_controls=initial_controls
+    )
+    return solve_all(list(problems), settings, _check, _solve, threads=threads, progress=progress)
+
+
+def _check(problem: Problem) -> None:
     if problem.start is None:
         raise InputError(
             "initial: got a cost that names no start, want FixedState(x) or QuadraticCost(weight, about=x)"
         )
-    core, data = compiled.core(problem), compiled.arguments(problem)
-    costs = data["initial"], data["stage"], data["final"]
-    work = Workspace.of(problem, problem.start, settings.controls(problem))
-    cost = core.rollout(work.x_hat, work.L, work.l, data["p"], data["dt"], *costs, work.states, work.controls)
-    states, controls = work.states, work.controls
-    new_states, new_controls = states.copy(), controls.copy()
-    relative = np.zeros_like(work.l)
-    search = work.L, relative, data["p"], data["dt"], *costs
-    compiled.prepare(core.line_search, states, controls, *search, cost, new_states, new_controls)
-    _backward(core, data, states, controls, 0.0, work, relative)  # compiled before the clock starts, too
-    log = Log(settings, callback, first_cost=cost)
-    status = Status.NOT_FINITE if not np.isfinite(cost) else None
-    detail = "rollout of the initial controls" if status else ""
-    damping = 0.0
-    while status is None:
-        damping *= 0.1
-        failed, finite = _backward(core, data, states, controls, damping, work, relative)
-        while failed >= 0 and finite and damping < _MOST_DAMPING:
-            damping = max(10 * damping, _LEAST_DAMPING)
-            failed, finite = _backward(core, data, states, controls, damping, work, relative)
-        if failed >= 0:
-            status = Status.NOT_POSITIVE_DEFINITE if finite else Status.NOT_FINITE
-            detail = f"backward pass of iteration {len(log.iterations) + 1}, step {failed} of {problem.steps}"
-            break
-        damping = damping if damping > _LEAST_DAMPING else 0.0
-        cost, fraction = core.line_search(states, controls, *search, cost, new_states, new_controls)
-        if fraction > 0:
-            states, new_states, controls, new_controls = new_states, states, new_controls, controls
 
-        def optimality(states: Array = states, controls: Array = controls, cost: float = cost) -> float:
-            left = predicted_decrease(core, data, states, controls, soft=False)
-            return left / max(abs(cost), np.finfo(float).tiny)
 
-        status = log.add(cost, 0.0, optimality)
-        if status is None and fraction == 0:
-            status, detail = Status.MAX_ITERATIONS, "the line search found no lower cost"
-    # One more backward pass, so that the policy and its cost-to-go are about the trajectory that was found.
-    whole = _backward(core, data, states, controls, 0.0, work, relative)[0] < 0
-    offset = controls - np.einsum("tij,tj->ti", work.L, states[:-1])
+def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callback | None = None) -> Solution:
+    """Solve; with `each`, a look after each iteration (see `iterate`)."""
+    assert problem.start is not None
+    n, steps, zeros = len(problem.dynamics.state_coordinates), problem.steps, np.zeros
+    controls = settings.controls(problem)
+    m = controls.shape[1]
+    states = zeros((steps + 1, n))
+    L, l = zeros((steps, m, n)), zeros((steps, m))
+    go = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
+    log = zeros((settings.max_iterations + 1, 4))
+    core = compiled.core(problem)
+    options = settings.max_iterations, settings.tolerance, settings.stop == "optimal"
+    arrays = (
+        problem.start.copy(), L, l, *go, *model(problem),
+        states, controls, states.copy(), controls.copy(), zeros(1), log,
+    )  # fmt: skip
+    loop = core.entry("ilqr_iterations", steps, 0, 0, *options, *arrays)
+    ending = iterate(
+        lambda first, last: loop(steps, first, last, *options, *arrays),
+        log, settings.max_iterations, each=each, callback=callback,
+    )  # fmt: skip
+    whole = ending.iterations != () and ending.failed < 0
+    if not whole:
+        L[:] = 0  # without a pass about the trajectory there is no feedback; what is left is to play the controls
+    offset = controls - np.einsum("tij,tj->ti", L, states[:-1]) if whole else controls.copy()
     return assemble(
-        problem, solver="ilqr", settings=settings, status=status, detail=detail, log=log,
-        states=states, controls=controls, law=(work.L, offset), inverse_law=None,
-        cost_to_go=Quadratic(work.S, work.s, work.k) if whole else None, cost_to_come=None,
+        problem, solver="ilqr", settings=settings, ending=ending, states=states, controls=controls,
+        law=(L, offset), inverse_law=None, cost_to_go=Quadratic(*go) if whole else None, cost_to_come=None,
     )  # fmt: skip
-
-
-def _backward(
-    core: ModuleType,
-    data: dict[str, Any],
-    states: Array,
-    controls: Array,
-    damping: float,
-    work: Workspace,
-    relative: Array,
-) -> tuple[int, bool]:
-    """The backward pass about a trajectory; the step at which it failed or -1, and whether all was finite there."""
-    failed, finite, _ = core.differential_pass(
-        states, controls, data["p"], data["dt"], data["stage"], data["final"], damping,
-        work.L, relative, work.S, work.s, work.k,
-    )  # fmt: skip
-    return failed, finite

@@ -12,6 +12,11 @@ M = 0  # controls
 W = N + M  # a state and a control, joined
 K = 0  # of these, how many entries a cost is not convex in
 
+# How iterations end; see `Status`. Of those without a status of their own, NO_START is a first trajectory that is not
+# finite, and STALLED a line search that found no lower cost.
+RUNNING, CONVERGED, COST_CONVERGED, MAX_ITERATIONS, DIVERGED = 0, 1, 2, 3, 4
+NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED = 5, 6, 7, 8
+
 
 def stack(*shape: int) -> np.ndarray:
     """An uninitialised float64 array of constant shape, on the stack of the compiled function."""

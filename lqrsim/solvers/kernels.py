@@ -1,7 +1,7 @@
 """Small dense algebra and the Riccati steps of LQR smoothing. The numba subset; see `interface.py`.
 
-Loops run along rows and add multiples of them, which is what LLVM turns into vector instructions. Matrices are (N, N)
-or, with states and controls joined, (W, W); their upper triangle is what is read where they are symmetric.
+The innermost loops are sums of constant length, which LLVM unrolls and turns into vector instructions. Matrices are
+(N, N) or, with states and controls joined, (W, W); their upper triangle is what is read where they are symmetric.
 Paper: Eqs. (8)-(21), in discrete time.
 """
 
@@ -26,10 +26,17 @@ def cholesky(a, size):
     return True
 
 
-def finite(a):
+def clear(a, rows, columns):
+    """Set a matrix to zero."""
+    for i in range(rows):
+        for j in range(columns):
+            a[i, j] = 0.0
+
+
+def finite(a, rows, columns):
     """Whether no entry of a matrix is NaN or infinite."""
-    for i in range(a.shape[0]):
-        for j in range(a.shape[1]):
+    for i in range(rows):
+        for j in range(columns):
             if not abs(a[i, j]) < inf:
                 return False
     return True
@@ -106,14 +113,15 @@ def minimize_control(g, h, gain, feedforward, hessian, gradient):
                 c[k, j] -= factor * c[i, j]
     for i in range(N):
         total = h[i]
-        for j in range(N):
-            hessian[i, j] = 0.5 * (g[i, j] + g[j, i])
         for k in range(M):
-            factor = c[k, i]
-            total -= factor * y[k]
-            for j in range(N):
-                hessian[i, j] -= factor * c[k, j]
+            total -= c[k, i] * y[k]
         gradient[i] = total
+        for j in range(i, N):
+            total = 0.5 * (g[i, j] + g[j, i])
+            for k in range(M):
+                total -= c[k, i] * c[k, j]
+            hessian[i, j] = total
+            hessian[j, i] = total
     # Back substitution: c becomes E^-1 C and y becomes E^-1 e.
     for i in range(M - 1, -1, -1):
         for k in range(i + 1, M):
@@ -134,20 +142,20 @@ def congruence(jacobian, z, v, g, h):
     product = stack(N, W)
     for i in range(N):
         for j in range(W):
-            product[i, j] = 0.0
-        for k in range(N):
-            factor = z[i, k]
-            for j in range(W):
-                product[i, j] += factor * jacobian[k, j]
+            total = 0.0
+            for k in range(N):
+                total += z[i, k] * jacobian[k, j]
+            product[i, j] = total
     for i in range(W):
-        for k in range(N):
-            factor = jacobian[k, i]
-            for j in range(W):
-                g[i, j] += factor * product[k, j]
-    for k in range(N):
-        factor = v[k]
         for j in range(W):
-            h[j] += factor * jacobian[k, j]
+            total = g[i, j]
+            for k in range(N):
+                total += jacobian[k, i] * product[k, j]
+            g[i, j] = total
+        total = h[i]
+        for k in range(N):
+            total += v[k] * jacobian[k, i]
+        h[i] = total
 
 
 def quadratic_at(z, v, c):
@@ -186,25 +194,27 @@ def riccati_forward(jacobian, c, cost, slope, constant, S0, s0, k0, gain, feedfo
     """
     z, a, v, b = stack(N, N), stack(N), stack(N), stack(W)
     joint = stack(W, W)
+    crossed = 0.0
     for i in range(N):
         a[i] = s0[i] + slope[i]
         v[i] = a[i]
         for j in range(N):
             z[i, j] = S0[i, j] + cost[i, j]
             v[i] += z[i, j] * c[j]
-    # What the cross term u'P x_t becomes in (x_{t+1}, u): P Abar, P Bbar + its transpose, P cbar.
-    for i in range(W):
+        for j in range(M):
+            crossed += abs(cost[i, N + j])
+    clear(joint, W, W)
+    for i in range(N):
         b[i] = 0.0
-        for j in range(W):
-            joint[i, j] = 0.0
     for i in range(M):
         b[N + i] = slope[N + i]
         for j in range(M):
             joint[N + i, N + j] = cost[N + i, N + j]
-    for i in range(M):
-        for k in range(N):
-            factor = cost[N + i, k]
-            if factor != 0:
+    if crossed != 0:
+        # What the cross term u'P x_t becomes in (x_{t+1}, u): P Abar, P Bbar + its transpose, P cbar.
+        for i in range(M):
+            for k in range(N):
+                factor = cost[N + i, k]
                 b[N + i] += factor * c[k]
                 for j in range(W):
                     joint[N + i, j] += factor * jacobian[k, j]

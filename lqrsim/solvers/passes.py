@@ -26,6 +26,7 @@ from lqrsim.solvers.kernels import (
     affine,
     cholesky,
     cholesky_solve,
+    clear,
     congruence,
     finite,
     minimize_control,
@@ -36,9 +37,8 @@ from lqrsim.solvers.kernels import (
 )
 
 
-def rollout(x0, gain, feedforward, p, dt, initial, stage, final, states, controls):
+def rollout(steps, x0, gain, feedforward, p, dt, initial, stage, final, states, controls):
     """Run the policy from x0 under the true dynamics; write the trajectory and return its true cost."""
-    steps = len(gain)
     x, u = states[0], stack(M)
     for i in range(N):
         x[i] = x0[i]
@@ -49,15 +49,6 @@ def rollout(x0, gain, feedforward, p, dt, initial, stage, final, states, control
         cost += stage_value(x, u, t, stage)
         step(x, u, p, dt, states[t + 1])
     return cost + final_value(states[steps], u, steps, final)
-
-
-def trajectory_cost(states, controls, initial, stage, final):
-    """The true cost of a trajectory."""
-    steps = len(controls)
-    cost = initial_value(states[0], controls[0], 0, initial)
-    for t in range(steps):
-        cost += stage_value(states[t], controls[t], t, stage)
-    return cost + final_value(states[steps], controls[steps - 1], steps, final)
 
 
 def stage_model(x, u, t, stage, prior_weight, prior_about, hessian, gradient):
@@ -88,25 +79,17 @@ def end_model(hessian, gradient, value, x, S, s):
     return constant
 
 
-def clear(matrix):
-    """Set a matrix to zero."""
-    for i in range(matrix.shape[0]):
-        for j in range(matrix.shape[1]):
-            matrix[i, j] = 0.0
-
-
 def forward_pass(
-    x_hat, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, final, prior_weight, prior_about
+    steps, x_hat, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, final, prior_weight, prior_about
 ):  # fmt: skip
     """The forward extended LQR pass, Sec. V-B: from the cost-to-go and its policy, the cost-to-come and its own.
 
     `x_hat` (N,) is where c_0 is quadratised, and on return the minimiser at T, where c_l was. S[T], s[T], k[T] are set.
     """
-    steps = len(L)
     hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
     fx, fu, x_next, x_back, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(M)
-    clear(fx)
-    clear(fu)
+    clear(fx, N, N)
+    clear(fu, N, M)
     value = initial_quadratic(x_hat, u, 0, initial, hessian, gradient)
     kbar[0] = end_model(hessian, gradient, value, x_hat, Sbar[0], sbar[0])
     for t in range(steps):
@@ -120,9 +103,9 @@ def forward_pass(
             Sbar[t + 1], sbar[t + 1],
         )  # fmt: skip
         if not good:
-            return t, finite(hessian) and finite(jacobian)
+            return t, finite(hessian, W, W) and finite(jacobian, N, W)
         if t + 1 < steps and not minimizer(S[t + 1], s[t + 1], Sbar[t + 1], sbar[t + 1], x_hat):
-            return t + 1, finite(S[t + 1]) and finite(Sbar[t + 1])
+            return t + 1, finite(S[t + 1], N, N) and finite(Sbar[t + 1], N, N)
         if t + 1 == steps:
             if not minimizer(S[steps], s[steps], Sbar[steps], sbar[steps], x_hat):
                 # In the first iteration there may be no minimum without c_l, and the state of arrival is what we have.
@@ -131,23 +114,22 @@ def forward_pass(
             value = final_quadratic(x_hat, u, steps, final, hessian, gradient)
             k[steps] = end_model(hessian, gradient, value, x_hat, S[steps], s[steps])
             if not minimizer(S[steps], s[steps], Sbar[steps], sbar[steps], x_hat):
-                return steps, finite(S[steps]) and finite(Sbar[steps])
+                return steps, finite(S[steps], N, N) and finite(Sbar[steps], N, N)
     return -1, True
 
 
 def backward_pass(
-    x_hat, x_hats, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, prior_weight, prior_about
+    steps, x_hat, x_hats, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, prior_weight, prior_about
 ):  # fmt: skip
     """The backward extended LQR pass, Sec. V-A: from the cost-to-come and its policy, the cost-to-go and its own.
 
     `x_hat` (N,) is the minimiser at T, and on return that at 0, where c_0 was quadratised anew. Writes all the
     minimisers to `x_hats` (T+1, N).
     """
-    steps = len(L)
     hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
     fx, fu, x_next, x_back, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(M)
-    clear(fx)
-    clear(fu)
+    clear(fx, N, N)
+    clear(fu, N, M)
     for t in range(steps - 1, -1, -1):
         for i in range(N):
             x_hats[t + 1, i] = x_hat[i]
@@ -160,29 +142,29 @@ def backward_pass(
             jacobian, c, hessian, gradient, constant, S[t + 1], s[t + 1], k[t + 1], L[t], l[t], S[t], s[t]
         )
         if not good or not minimizer(S[t], s[t], Sbar[t], sbar[t], x_hat):
-            return t, finite(hessian) and finite(jacobian) and finite(Sbar[t])
+            return t, finite(hessian, W, W) and finite(jacobian, N, W) and finite(Sbar[t], N, N)
     value = initial_quadratic(x_hat, u, 0, initial, hessian, gradient)
     kbar[0] = end_model(hessian, gradient, value, x_hat, Sbar[0], sbar[0])
     if not minimizer(S[0], s[0], Sbar[0], sbar[0], x_hat):
-        return 0, finite(S[0]) and finite(Sbar[0])
+        return 0, finite(S[0], N, N) and finite(Sbar[0], N, N)
     for i in range(N):
         x_hats[0, i] = x_hat[i]
     return -1, True
 
 
-def differential_pass(states, controls, p, dt, stage, final, damping, L, l, S, s, k):
+def differential_pass(steps, states, controls, p, dt, stage, final, damping, keep, L, l, S, s, k):
     """The backward pass of iLQR about a feasible trajectory; l is relative to it, S, s, k are about the origin.
 
-    `damping` is a weight on changes of the controls.
+    `damping` is a weight on changes of the controls. With `keep` of 1 all steps are written; with 0 each overwrites the
+    one after it, for those who only ask what the model predicts.
 
     Returns as every sweep does, and the decrease of cost that the linear-quadratic model predicts.
     """
-    steps = len(controls)
     hessian, gradient, jacobian = stack(W, W), stack(W), stack(N, W)
     fx, fu, x_next, none = stack(N, N), stack(N, M), stack(N), stack(M)
     slope, curve = stack(N), stack(N, N)
-    clear(fx)
-    clear(fu)
+    clear(fx, N, N)
+    clear(fu, N, M)
     for i in range(M):
         none[i] = 0.0
     value = final_quadratic(states[steps], none, steps, final, hessian, gradient)
@@ -191,24 +173,28 @@ def differential_pass(states, controls, p, dt, stage, final, damping, L, l, S, s
         slope[i] = gradient[i]
         for j in range(N):
             curve[i, j] = hessian[i, j]
-    k[steps] = end_model(hessian, gradient, value, states[steps], S[steps], s[steps])
+    last = steps * keep
+    k[last] = end_model(hessian, gradient, value, states[steps], S[last], s[last])
     for t in range(steps - 1, -1, -1):
+        at = t * keep
         step_jacobian(states[t], controls[t], p, dt, fx, fu, x_next, jacobian)
         ahead += stage_quadratic(states[t], controls[t], t, stage, hessian, gradient)
         congruence(jacobian, curve, slope, hessian, gradient)
         for i in range(M):
             hessian[N + i, N + i] += damping
-        decrease = minimize_control(hessian, gradient, L[t], l[t], curve, slope)
+        decrease = minimize_control(hessian, gradient, L[at], l[at], curve, slope)
         if not decrease >= 0:
-            return t, finite(hessian) and finite(jacobian), predicted
+            return t, finite(hessian, W, W) and finite(jacobian, N, W), predicted
         predicted += decrease
-        k[t] = ahead - predicted
+        constant = ahead - predicted
         for i in range(N):
-            s[t, i] = slope[i]
+            moved = slope[i]
             for j in range(N):
-                S[t, i, j] = curve[i, j]
-                s[t, i] -= curve[i, j] * states[t, j]
-            k[t] -= 0.5 * (slope[i] + s[t, i]) * states[t, i]
+                S[at, i, j] = curve[i, j]
+                moved -= curve[i, j] * states[t, j]
+            s[at, i] = moved
+            constant -= 0.5 * (slope[i] + moved) * states[t, i]
+        k[at] = constant
     return -1, True, predicted
 
 
@@ -234,12 +220,12 @@ def initial_decrease(x0, initial, S, s):
     return decrease
 
 
-def largest_gap(x_hats, states):
+def largest_gap(steps, x_hats, states):
     """The largest difference between two sequences of states, each state relative to its range (at least 1)."""
     gap = 0.0
     for i in range(N):
         low, high, worst = states[0, i], states[0, i], 0.0
-        for t in range(len(states)):
+        for t in range(steps + 1):
             difference = abs(x_hats[t, i] - states[t, i])
             if not difference <= worst:  # a NaN too
                 worst = difference
@@ -250,35 +236,13 @@ def largest_gap(x_hats, states):
     return gap
 
 
-def smoother_iteration(
-    x_hat, x_hats, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, final,
-    prior_weight, prior_about, states, controls,
+def line_search(
+    steps, states, controls, L, l, p, dt, initial, stage, final, old, new_states, new_controls
 ):  # fmt: skip
-    """One forward pass, one backward pass and the rollout of the new policy.
-
-    Returns the step at which a pass failed or -1, whether it was the backward pass, whether all numbers there were
-    finite, the true cost of the rollout and its gap.
-    """
-    failed, good = forward_pass(
-        x_hat, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, final, prior_weight, prior_about
-    )
-    if failed >= 0:
-        return failed, False, good, 0.0, 0.0
-    failed, good = backward_pass(
-        x_hat, x_hats, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, prior_weight, prior_about
-    )
-    if failed >= 0:
-        return failed, True, good, 0.0, 0.0
-    cost = rollout(x_hat, L, l, p, dt, initial, stage, final, states, controls)
-    return -1, True, True, cost, largest_gap(x_hats, states)
-
-
-def line_search(states, controls, L, l, p, dt, initial, stage, final, old, new_states, new_controls):
     """Try steps 1, 1/2, 1/4, ... along the change l of the controls until the true cost falls below `old`.
 
     Writes the trajectory. Returns its cost and the step, which is 0 if none above 1e-8 lowers the cost.
     """
-    steps = len(controls)
     fraction = 1.0
     while fraction >= 1e-8:
         for i in range(N):

@@ -25,7 +25,7 @@ def project(hessian, support):
             break
         for i in range(K - 1):
             for j in range(i + 1, K):
-                if a[i, j] != 0:
+                if abs(a[i, j]) > 1e-17 * (abs(a[i, i]) + abs(a[j, j])):  # what is smaller changes nothing
                     theta = (a[j, j] - a[i, i]) / (2 * a[i, j])
                     tangent = (1.0 if theta >= 0 else -1.0) / (abs(theta) + sqrt(theta * theta + 1))
                     cosine = 1 / sqrt(tangent * tangent + 1)

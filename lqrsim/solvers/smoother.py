@@ -1,13 +1,15 @@
 """Iterated LQR smoothing: Sec. V of the paper, in its primal form."""
 
+from collections.abc import Callable, Iterable
+
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim import compiled
 from lqrsim.errors import InputError
 from lqrsim.problem import FixedState, Problem
-from lqrsim.results import Quadratic, Solution, Status
-from lqrsim.solvers.common import Callback, Log, Settings, Workspace, assemble, predicted_decrease
+from lqrsim.results import Quadratic, Solution
+from lqrsim.solvers.common import Callback, Settings, assemble, iterate, model, solve_all
 
 
 def smooth(
@@ -46,57 +48,88 @@ def smooth(
         stop=stop, tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations,
         initial_controls=initial_controls,
     )  # fmt: skip
+    _check(problem)
+    return _solve(problem, settings, each=True, callback=callback)
+
+
+def smooth_many(
+    problems: Iterable[Problem],
+    *,
+    threads: int | None = None,
+    stop: str = "optimal",
+    tolerance: float = 1e-4,
+    gap_tolerance: float = 1e-3,
+    max_iterations: int = 200,
+    initial_controls: npt.ArrayLike | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> list[Solution]:
+    """Solve many problems as `smooth` does, on several threads, without Python between the iterations.
+
+    The solutions are those of `smooth`, to the last bit, whatever the number of threads; only the seconds of an
+    iteration are an average. Dynamics and costs that are plain Python take turns, and gain nothing from threads.
+
+    Args:
+      problems: of one structure or of many; each structure is compiled once.
+      threads: how many to use; by default all processors that this process may run on.
+      stop, tolerance, gap_tolerance, max_iterations, initial_controls: as in `smooth`, for all problems.
+      progress: called with how many are done, of how many, as each one ends.
+
+    Returns:
+      One Solution a problem, in their order.
+
+    Raises:
+      InputError: an argument is not as described; a problem that is refused is named by its place in the list.
+    """
+    settings = Settings(
+        stop=stop, tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations,
+        initial_controls=initial_controls,
+    )  # fmt: skip
+    return solve_all(list(problems), settings, _check, _solve, threads=threads, progress=progress)
+
+
+def _check(problem: Problem) -> None:
     if isinstance(problem.initial, FixedState):
         raise InputError(
             "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start);"
             " ilqr() takes a FixedState"
         )
-    n, steps = len(problem.dynamics.state_coordinates), problem.steps
-    start = problem.start if problem.start is not None else np.zeros(n)
-    core, data = compiled.core(problem), compiled.arguments(problem)
-    work = Workspace.of(problem, start, settings.controls(problem))
-    prior_about, no_prior = np.zeros((steps + 1, n)), np.zeros(n)
+
+
+def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callback | None = None) -> Solution:
+    """Solve; with `each`, a look after each iteration (see `iterate`)."""
+    n, steps, zeros = len(problem.dynamics.state_coordinates), problem.steps, np.zeros
+    x_hat = zeros(n) if problem.start is None else problem.start.copy()
+    controls = settings.controls(problem)
+    m = controls.shape[1]
+    x_hats, states = zeros((steps + 1, n)), zeros((steps + 1, n))
+    L, Lbar, kept_L = zeros((steps, m, n)), zeros((steps, m, n)), zeros((steps, m, n))
+    l, lbar, kept_l = controls.copy(), zeros((steps, m)), zeros((steps, m))
+    go = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
+    come = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
+    prior_weight, prior_about, prior_iterations = zeros(n), zeros((steps + 1, n)), 0
     if problem.prior is not None:
+        prior_weight, prior_iterations = problem.prior.weight.copy(), problem.prior.iterations
         prior_about[:] = problem.prior.about
-    iteration = (
-        work.x_hat, work.x_hats, work.L, work.l, work.S, work.s, work.k,
-        work.Lbar, work.lbar, work.Sbar, work.sbar, work.kbar, *_model(data),
+    log = zeros((settings.max_iterations, 4))
+    core = compiled.core(problem)
+    options = (
+        settings.max_iterations,
+        settings.tolerance,
+        float(settings.gap_tolerance or 0),
+        settings.stop == "optimal",
+    )
+    arrays = (
+        x_hat, x_hats, L, l, *go, Lbar, lbar, *come, *model(problem),
+        prior_weight, prior_about, prior_iterations, states, controls, kept_L, kept_l, log,
     )  # fmt: skip
-    # What there is if not even the first iteration is completed: the initial controls and where they lead.
-    states, controls = work.states.copy(), work.controls.copy()
-    core.rollout(start, work.L, work.l, *_model(data), states, controls)
-    compiled.prepare(core.smoother_iteration, *iteration, no_prior, prior_about, work.states, work.controls)
-    compiled.prepare(core.initial_decrease, start, data["initial"], work.S[0], work.s[0])
-    predicted_decrease(core, data, states, controls, soft=True)  # compiled before the clock starts, too
-    log = Log(settings, callback)
-    law, detail, status = (work.L.copy(), work.l.copy()), "", None
-    while status is None:
-        prior = problem.prior is not None and len(log.iterations) < problem.prior.iterations
-        prior_weight = problem.prior.weight.copy() if problem.prior is not None and prior else no_prior
-        failed, backward, finite, cost, gap = core.smoother_iteration(
-            *iteration, prior_weight, prior_about, work.states, work.controls
-        )
-        if failed >= 0:
-            status = Status.NOT_POSITIVE_DEFINITE if finite else Status.NOT_FINITE
-            which = "backward" if backward else "forward"
-            detail = f"{which} pass of iteration {len(log.iterations) + 1}, step {failed} of {steps}"
-            break
-
-        def optimality(cost: float = cost) -> float:
-            left = predicted_decrease(core, data, work.states, work.controls, soft=True)
-            return left / max(abs(cost), np.finfo(float).tiny)
-
-        status = log.add(cost, gap, optimality)
-        law = work.L.copy(), work.l.copy()
-        states, controls = work.states.copy(), work.controls.copy()
-    whole = not detail
+    loop = core.entry("smoother_iterations", steps, 0, 0, *options, *arrays)
+    ending = iterate(
+        lambda first, last: loop(steps, first, last, *options, *arrays),
+        log, settings.max_iterations, each=each, callback=callback,
+    )  # fmt: skip
+    whole = not ending.pass_failed
     return assemble(
-        problem, solver="smooth", settings=settings, status=status, detail=detail, log=log,
-        states=states, controls=controls, law=law, inverse_law=(work.Lbar, work.lbar) if whole else None,
-        cost_to_go=Quadratic(work.S, work.s, work.k) if whole else None,
-        cost_to_come=Quadratic(work.Sbar, work.sbar, work.kbar) if whole else None,
+        problem, solver="smooth", settings=settings, ending=ending, states=states, controls=controls,
+        law=(kept_L, kept_l), inverse_law=(Lbar, lbar) if whole else None,
+        cost_to_go=Quadratic(*go) if whole else None, cost_to_come=Quadratic(*come) if whole else None,
     )  # fmt: skip
-
-
-def _model(data: dict) -> tuple:
-    return data["p"], data["dt"], data["initial"], data["stage"], data["final"]
