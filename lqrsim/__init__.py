@@ -18,9 +18,12 @@ if TYPE_CHECKING:
     from lqrsim import robots as robots
     from lqrsim import rotations as rotations
     from lqrsim import scenarios as scenarios
+    from lqrsim.checks import DerivativeCheck as DerivativeCheck
+    from lqrsim.checks import check_derivatives as check_derivatives
     from lqrsim.coordinates import Coordinates as Coordinates
     from lqrsim.costs import ControlCost as ControlCost
     from lqrsim.costs import Cost as Cost
+    from lqrsim.costs import FunctionCost as FunctionCost
     from lqrsim.costs import ObstacleCost as ObstacleCost
     from lqrsim.costs import QuadraticCost as QuadraticCost
     from lqrsim.costs import SymbolicCost as SymbolicCost
@@ -53,6 +56,8 @@ if TYPE_CHECKING:
     from lqrsim.simulation.disturbances import MeasurementNoise as MeasurementNoise
     from lqrsim.simulation.disturbances import Push as Push
     from lqrsim.simulation.plant import Plant as Plant
+    from lqrsim.simulation.plant import PlantCheck as PlantCheck
+    from lqrsim.simulation.plant import check_plant as check_plant
     from lqrsim.solvers.ilqr import ilqr as ilqr
     from lqrsim.solvers.ilqr import ilqr_many as ilqr_many
     from lqrsim.solvers.smoother import smooth as smooth
@@ -64,8 +69,9 @@ if TYPE_CHECKING:
     from lqrsim.world import World as World
 
 _HOME = {
+    "checks": ["DerivativeCheck", "check_derivatives"],
     "coordinates": ["Coordinates"],
-    "costs": ["ControlCost", "Cost", "ObstacleCost", "QuadraticCost", "SymbolicCost", "Term"],
+    "costs": ["ControlCost", "Cost", "FunctionCost", "ObstacleCost", "QuadraticCost", "SymbolicCost", "Term"],
     "dynamics": ["Dynamics"],
     "errors": ["InputError"],
     "files": ["load_rollout", "load_solution", "save"],
@@ -79,7 +85,7 @@ _HOME = {
     "scenes": ["Scene", "load_scene"],
     "simulation.closed_loop": ["simulate"],
     "simulation.disturbances": ["ControlNoise", "Disturbance", "ForceNoise", "MeasurementNoise", "Push"],
-    "simulation.plant": ["Plant"],
+    "simulation.plant": ["Plant", "PlantCheck", "check_plant"],
     "solvers.ilqr": ["ilqr", "ilqr_many"],
     "solvers.smoother": ["smooth", "smooth_many"],
     "view.plots": ["plot_run"],

@@ -2,6 +2,7 @@
 
 import logging
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -229,6 +230,36 @@ class Demo:
         return demo(self.robots, out=self.out, seed=self.seed, video=self.video, quick=self.quick)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Cache:
+    """Show what is kept of compiled solvers and derived formulas, or remove it.
+
+    Without it everything works the same, and each kind of problem is compiled again, some 10 seconds.
+    """
+
+    clear: bool = False
+    """Remove all of it."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim import cache
+        from lqrsim.errors import InputError
+
+        if self.clear:
+            try:
+                print(f"removed {cache.clear()} items from {cache.folder()}")
+            except OSError as error:
+                raise InputError(f"--clear: got {cache.folder()}, want files that can be removed ({error})") from None
+            return 0
+        items = cache.items()
+        for item in items:
+            used = time.strftime("%Y-%m-%d %H:%M", time.localtime(item.used))
+            print(f"{item.size / 1e6:8.2f} MB  last used {used}  {item.what}")
+        total = sum(item.size for item in items) / 1e6
+        print(f"{len(items)} items, {total:.1f} of at most {cache.LIMIT / 1e6:.0f} MB, in {cache.folder()}")
+        return 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
@@ -244,7 +275,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         print(f"lqrsim {version('lqrsim')}")
         return 0
-    command = tyro.cli(List | Solve | Simulate | Render | Demo, prog="lqrsim", description=DESCRIPTION, args=arguments)
+    command = tyro.cli(
+        List | Solve | Simulate | Render | Demo | Cache, prog="lqrsim", description=DESCRIPTION, args=arguments
+    )
 
     from lqrsim.errors import InputError
 

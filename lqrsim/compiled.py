@@ -27,7 +27,11 @@ import numpy.typing as npt
 
 from lqrsim import cache as disk
 from lqrsim import integration, rotations, world
-from lqrsim.errors import Array
+from lqrsim.costs import Term
+from lqrsim.dynamics import Dynamics
+from lqrsim.errors import Array, InputError
+from lqrsim.fingerprint import fingerprint
+from lqrsim.functions import External
 from lqrsim.problem import Problem
 from lqrsim.solvers import interface, kernels, loops, passes, projection
 from lqrsim.world import World
@@ -97,7 +101,7 @@ class Core:
             log = logger.warning if name in LONG else logger.debug
             log(f"compiling {what}: some 10 seconds, once for this kind of problem ...")
             namespace.update(self._namespace())
-            with _uncollected():
+            with _uncollected(), _as_one():
                 dispatcher.compile(_signature(kinds))
             disk.save(key, _serialise(dispatcher), what)
         dispatcher.disable_compile()
@@ -130,7 +134,7 @@ class Core:
             inner = jit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
             inlined = jit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
             names = {**vars(math), "__name__": __name__, "inner": inner, "inlined": inlined}
-            names |= {name: getattr(pointers, name) for name in ("stack", "pointer")}
+            names |= {name: getattr(pointers, name) for name in ("stack", "pointer", "invoke", "invoke_writing")}
             exec(compile(self.source, "<lqrsim core>", "exec"), names)
             self._compilable.update(names)
         return self._compilable
@@ -155,10 +159,69 @@ _OUTCOMES = {name: value for name, value in vars(interface).items() if name.isup
 
 
 def arguments(problem: Problem) -> dict[str, Any]:
-    """The problem's numbers, as the passes take them."""
-    empty = np.zeros(0)
-    data = {name: tuple(term.data for term in problem.terms(field)) or (empty,) for name, field in _FIELDS.items()}
-    return {"p": problem.dynamics.data, "dt": problem.dt, **data}
+    """The problem's numbers, as the passes take them: before its own, each part has the addresses of its functions."""
+
+    def numbers(part: Dynamics | Term) -> Array:
+        return np.array([*(_address(function) for function in part.functions), *part.data], dtype=np.float64)
+
+    data = {name: tuple(numbers(term) for term in problem.terms(field)) for name, field in _FIELDS.items()}
+    return {"p": numbers(problem.dynamics), "dt": problem.dt, **data}
+
+
+def _address(function: External) -> float:
+    """Where compiled code finds a user's function."""
+    with _compiling:
+        if not function.held:
+            function.held.append(_compile(function) if function.level == "compiled" else function.called_back)
+    return float(function.held[0][1])
+
+
+def _compile(function: External) -> tuple[Any, int]:
+    """A numba function behind C's calling convention: what must be kept alive, and its address.
+
+    Raises:
+      InputError: numba can not compile it.
+    """
+    import numba
+    from numba import carray  # pyright: ignore[reportPrivateImportUsage]
+    from numba.core.errors import NumbaError
+
+    from lqrsim.pointers import readonly
+
+    options = getattr(function.function, "targetoptions", {})
+    own: Any = function.function if options else numba.njit(**_options())(function.function)
+    text, names = function.adapter()
+    names |= {"function": own, "carray": carray, "readonly": readonly, "__name__": __name__}
+    exec(compile(text, "<lqrsim>", "exec"), names)
+    dispatcher: Any = numba.njit(names["adapter"], **_options())
+    print_of_it = fingerprint(own)
+    key = disk.key(
+        _machine(), print_of_it or "", repr(sorted(options.items(), key=str)), text, repr(function.parameters)
+    )
+    stored = disk.load(key) if print_of_it else None
+    if stored is None or not _restore(dispatcher, stored):
+        what = f"{function.name}"
+        compilations.append(what)
+        logger.debug(f"compiling {what} ...")
+        pointer = numba.types.CPointer(numba.types.float64)
+        try:
+            with _uncollected():
+                dispatcher.compile((pointer,) * (3 + (len(function.writes) or 1)))
+        except NumbaError as error:
+            raise InputError(f"{function.name}: got what numba can not compile, want {_reason(error)}") from error
+        if print_of_it:
+            disk.save(key, _serialise(dispatcher), what)
+    (result,) = dispatcher.overloads.values()
+    return result, result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
+
+
+def _reason(error: Exception) -> str:
+    """The line of numba's pages of explanation that says what is wrong."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    telling = [
+        line for line in lines if not re.match(r"Failed in|During:|File |\^|- Resolution|<source|raised from", line)
+    ]
+    return f"its subset of Python ({' '.join(telling[:3])})"
 
 
 def signed_distance(world_seen: World, points: npt.ArrayLike) -> Array:
@@ -192,7 +255,8 @@ def _cost_source(name: str, terms: Structure) -> str:
     for i, (source, bends) in enumerate(terms):
         # Terms of the same source are the same functions: those of an initial and a final cost, say.
         prefix = f"term_{hashlib.sha256(source.encode()).hexdigest()[:8]}"
-        parts.append(re.sub(r"^def (\w+)\(", rf"def {prefix}_\1(", source, flags=re.MULTILINE))
+        own = re.findall(r"^def (\w+)\(", source, flags=re.MULTILINE)
+        parts.append(_rename(source, {name: f"{prefix}_{name}" for name in own}))
         values.append(f"    total += {prefix}_value(x, u, t, data[{i}])")
         call = f"    total += {prefix}_derivatives(x, u, t, data[{i}], hessian, gradient)"
         (convex if bends is None else bent).append(call)
@@ -267,6 +331,41 @@ def _uncollected() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
+
+
+@contextlib.contextmanager
+def _as_one() -> Iterator[None]:
+    """Make machine code of the entry alone, into which all that it calls is linked, and none of each part by itself.
+
+    numba makes both, which takes a quarter longer, and then it is up to the linker which of two copies of a part runs:
+    they differ in the last bit, so the run that compiles and the one that loads would not give the same numbers.
+    """
+    from numba.core import codegen, registry
+    from numba.core.compiler_lock import global_compiler_lock
+
+    class Part(codegen.JITCodeLibrary):
+        def _finalize_final_module(self) -> None:
+            if self.name == "entry":
+                super()._finalize_final_module()
+            else:
+                self._finalize_dynamic_globals()
+                self._verify_declare_only_symbols()
+                self._finalized = True
+
+    target: Any = registry.cpu_target
+    generator = target.target_context.codegen()
+    usual, set_env = generator._library_class, generator.set_env
+
+    def set_env_if_there(name: str, env: Any) -> None:
+        if generator._engine.get_global_value_address(name):  # parts have no memory of their own
+            set_env(name, env)
+
+    with global_compiler_lock:  # so that nothing else is compiled meanwhile
+        generator._library_class, generator.set_env = Part, set_env_if_there
+        try:
+            yield
+        finally:
+            generator._library_class, generator.set_env = usual, set_env
 
 
 def _kind(argument: Any) -> tuple[Any, ...]:

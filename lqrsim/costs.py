@@ -4,7 +4,7 @@ To add a kind of cost, subclass `Cost` and write `bind`; or state it as a formul
 """
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from lqrsim import tracing
 from lqrsim.dynamics import Dynamics
-from lqrsim.errors import Array, InputError, check_array, check_number, check_weight
+from lqrsim.errors import Array, InputError, check_array, check_name, check_number, check_weight
+from lqrsim.functions import External, check_signature, level_of, name_of
 from lqrsim.world import ROW, World
 
 
@@ -25,20 +26,27 @@ class Term:
       source: defines `value(x, u, t, data)` and `derivatives(x, u, t, data, hessian, gradient)`, both returning the
         cost; the latter *adds* the Hessian (n+m, n+m) and gradient (n+m,) at the point, states before controls. The
         numba subset; the names of `world.py` and `rotations.py`, and N, M, W, sqrt, exp and the like are at hand.
-      data: (any,) float64.
+      data: (any,) float64; the source can index it, but not ask for its length.
       bends: indices of the entries of (x, u) in which the Hessian may be indefinite: None for a convex term. The sum of
         all such terms is projected to the nearest positive-semidefinite matrix.
       uses_control: whether it depends on u (only stage costs may).
+      functions: what the source calls with `invoke`; their addresses come first in the data that it is given.
     """
 
     source: str
     data: Array
     bends: tuple[int, ...] | None = None
     uses_control: bool = False
+    functions: tuple[External, ...] = ()
 
 
 class Cost(abc.ABC):
     """One term of a cost."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return type(self).__name__
 
     @abc.abstractmethod
     def bind(self, dynamics: Dynamics) -> Term:
@@ -153,12 +161,26 @@ class SymbolicCost(Cost):
         self.parameters = tracing.check_parameters(parameters or {})
         self.convex = convex
 
+    @property
+    def name(self) -> str:
+        """The name of its function."""
+        return f"{name_of(self.function)}(x, u, p)"
+
     def bind(self, dynamics: Dynamics) -> Term:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        details = ("cost", n, m, *self.parameters)
+        made = tracing.kept(self.function, details, lambda: self._trace(n, m))
+        return Term(
+            made["source"],
+            np.array(list(self.parameters.values()), dtype=np.float64),
+            bends=None if self.convex or not made["bends"] else tuple(made["bends"]),
+            uses_control=made["uses_control"],
+        )
+
+    def _trace(self, n: int, m: int) -> dict[str, Any]:
         traced, x, u = tracing.trace(self.function, n, m, list(self.parameters))
         if len(traced) != 1:
-            name = getattr(self.function, "__qualname__", repr(self.function))
-            raise InputError(f"{name}(x, u, p): got {len(traced)} entries, want one: the cost")
+            raise InputError(f"{self.name}: got {len(traced)} entries, want one: the cost")
         cost, z = traced[0], [*x, *u]
         slopes = [cost.diff(symbol) for symbol in z]
         curves = {(i, j): slope.diff(symbol) for i, slope in enumerate(slopes) for j, symbol in enumerate(z)}
@@ -169,12 +191,72 @@ class SymbolicCost(Cost):
         derivatives = tracing.write_function(
             "derivatives", "x, u, t, data, hessian, gradient", "data", targets, returns="cost"
         )
-        bends = tuple(sorted({i for (i, _), curve in curves.items() if curve != 0}))
+        return {
+            "source": f"{value}\n\n{derivatives}",
+            "bends": sorted({i for (i, _), curve in curves.items() if curve != 0}),
+            "uses_control": bool(cost.free_symbols & set(u)),
+        }
+
+
+class FunctionCost(Cost):
+    """A cost given as a numba or a plain Python function, for what `SymbolicCost` can not express.
+
+    Args:
+      function: `function(x, u, p)` of NumPy arrays x (n,) and u (m,), which must not be changed; returns the cost.
+      derivatives: `derivatives(x, u, p, gradient, hessian)`, which writes to gradient (n+m,) and hessian (n+m, n+m),
+        states before controls; it gets them as zeros. Without it, both are central differences, good to some six
+        digits, at two evaluations for every pair of entries in `depends_on`.
+      depends_on: names of the states and controls that it depends on; all by default. The fewer, the faster.
+      parameters: name -> value, as in `Dynamics`.
+      convex: set it where the Hessian is positive semidefinite everywhere, to save the projection.
+      level: "compiled" or "plain"; by default compiled if the function is numba's, and plain otherwise.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any, Any, Any], float],
+        *,
+        derivatives: Callable[..., None] | None = None,
+        depends_on: Sequence[str] | None = None,
+        parameters: Mapping[str, float] | None = None,
+        convex: bool = False,
+        level: str | None = None,
+    ) -> None:
+        self.function, self.derivatives, self.convex = function, derivatives, convex
+        self.level = level_of(function, level)
+        if self.level == "symbolic":
+            if level is not None:
+                raise InputError("FunctionCost: level: got 'symbolic', want 'compiled', 'plain', or a SymbolicCost")
+            self.level = "plain"
+        self.depends_on = None if depends_on is None else tuple(depends_on)
+        self.parameters = tracing.check_parameters(parameters or {})
+        check_signature(function, ("x", "u", "p"))
+        if derivatives is not None:
+            level_of(derivatives, self.level)
+            check_signature(derivatives, ("x", "u", "p", "gradient", "hessian"))
+
+    @property
+    def name(self) -> str:
+        """The name of its function."""
+        return f"{name_of(self.function)}(x, u, p)"
+
+    def bind(self, dynamics: Dynamics) -> Term:
+        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
+        wanted = names if self.depends_on is None else self.depends_on
+        axes = tuple(sorted({names.index(check_name("FunctionCost: depends_on", name, names)) for name in wanted}))
+        rest: dict[str, Any] = {"level": self.level, "states": n, "controls": m, "parameters": tuple(self.parameters)}
+        rest["offset"] = 1 if self.derivatives is None else 2
+        functions = (External(function=self.function, values=1, **rest),)
+        if self.derivatives is not None:
+            functions += (External(function=self.derivatives, writes=((n + m,), (n + m, n + m)), **rest),)
+        source = _FUNCTION + (_DIFFERENCES if self.derivatives is None else _DERIVATIVES)
         return Term(
-            f"{value}\n\n{derivatives}",
+            source.format(axes=f"({''.join(f'{axis}, ' for axis in axes)})", count=len(axes)),
             np.array(list(self.parameters.values()), dtype=np.float64),
-            bends=None if self.convex or not bends else bends,
-            uses_control=bool(cost.free_symbols & set(u)),
+            bends=None if self.convex else axes,
+            uses_control=any(axis >= n for axis in axes),
+            functions=functions,
         )
 
 
@@ -238,4 +320,70 @@ def derivatives(x, u, t, data, hessian, gradient):
             for k in range({size}):
                 hessian[axes[j], axes[k]] += data[1] * curves[j, k]
     return total
+"""
+
+_FUNCTION = """\
+def value(x, u, t, data):
+    out = stack(1)
+    out[0] = nan
+    invoke(data[0], x, u, data, out)
+    return out[0]
+
+
+"""
+
+_DERIVATIVES = """\
+def derivatives(x, u, t, data, hessian, gradient):
+    slope, curve = stack(W), stack(W, W)
+    clear(curve, W, W)
+    for i in range(W):
+        slope[i] = 0.0
+    invoke_writing(data[1], x, u, data, slope, curve)
+    for i in range(W):
+        gradient[i] += slope[i]
+        for j in range(W):
+            hessian[i, j] += 0.5 * (curve[i, j] + curve[j, i])
+    return value(x, u, t, data)
+"""
+
+# The step is the fourth root of the machine's precision, as a second derivative wants it.
+_DIFFERENCES = """\
+def derivatives(x, u, t, data, hessian, gradient):
+    axes = {axes}
+    z, h, ahead, behind = stack(W), stack(W), stack(W), stack(W)
+    for i in range(W):
+        z[i] = x[i] if i < N else u[i - N]
+        h[i] = 1.2e-4 * max(1.0, abs(z[i]))
+    middle = value(x, u, t, data)
+    for i in range({count}):
+        a = axes[i]
+        ahead[a] = shifted(z, a, h[a], a, 0.0, t, data)
+        behind[a] = shifted(z, a, -h[a], a, 0.0, t, data)
+        gradient[a] += (ahead[a] - behind[a]) / (2 * h[a])
+        hessian[a, a] += (ahead[a] - 2 * middle + behind[a]) / (h[a] * h[a])
+    for i in range({count}):
+        for j in range(i):
+            a, b = axes[i], axes[j]
+            both = shifted(z, a, h[a], b, h[b], t, data) + shifted(z, a, -h[a], b, -h[b], t, data)
+            bend = (both + 2 * middle - ahead[a] - behind[a] - ahead[b] - behind[b]) / (2 * h[a] * h[b])
+            hessian[a, b] += bend
+            hessian[b, a] += bend
+    return middle
+
+
+def shifted(z, i, a, j, b, t, data):
+    x, u = stack(N), stack(M)
+    for k in range(N):
+        x[k] = z[k]
+    for k in range(M):
+        u[k] = z[N + k]
+    if i < N:
+        x[i] += a
+    else:
+        u[i - N] += a
+    if j < N:
+        x[j] += b
+    else:
+        u[j - N] += b
+    return value(x, u, t, data)
 """

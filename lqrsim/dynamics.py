@@ -1,4 +1,4 @@
-"""The dynamics of a system, stated as a plain function and traced once into exact derivatives."""
+"""The dynamics of a system, stated as a function: of symbols, of arrays for numba, or of NumPy arrays."""
 
 import inspect
 import math
@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim import integration, rotations, tracing
+from lqrsim import differences, integration, rotations, tracing
 from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array, check_name, check_number
+from lqrsim.functions import External, check_signature, level_of, name_of
+from lqrsim.solvers import kernels
 
 Limits = tuple[npt.ArrayLike, npt.ArrayLike]
 
@@ -32,8 +34,15 @@ class Dynamics:
             parameters={"inertia": 0.02, "gravity": 9.81, "length": 0.2}, angles=("angle",),
         )
 
+    The same function can be stated at three levels, which differ in speed and in what the function may contain:
+
+      symbolic  called once with SymPy symbols; exact derivatives follow. As fast as it gets, and the default.
+      compiled  a numba function, or one that numba can compile, of arrays. Without `jacobian`, derivatives are central
+                differences, good to some eight digits, and an iteration takes two or three times as long.
+      plain     any Python function of NumPy arrays, called back some microseconds a call, hundreds of times slower.
+
     Args:
-      f: `f(x, u, p)` of SymPy symbols; returns one expression a state. x and u are lists, p has the parameters as
+      f: `f(x, u, p)`; returns one entry a state. x (n,) and u (m,) must not be changed; p has the parameters as
         attributes.
       states, controls: name -> unit, in order.
       parameters: name -> value. Values are data: changing one compiles nothing.
@@ -41,10 +50,13 @@ class Dynamics:
       angles: names of the states that are angles in radians, equal up to whole turns.
       rotation_vectors: names, by threes, of the states that are rotation vectors.
       control_limits: lowest and highest control, numbers or (m,); what the actuators can do, for execution.
+      jacobian: `jacobian(x, u, p, fx, fu)`, for the compiled and the plain level: writes df/dx and df/du, the entries
+        that are not zero, to fx (n, n) and fu (n, m), which it gets as zeros. numba's if f is, Python's if f is.
+      level: "symbolic", "compiled" or "plain"; by default compiled if f is a numba function, and symbolic otherwise.
 
     Raises:
-      InputError: `f` does not return one expression a state, fails on symbols or reads an unknown parameter; a name
-        does not exist; a parameter is not finite.
+      InputError: a name does not exist, a parameter is not finite, or the level does not fit the function. What f
+        returns is looked at when it is first needed.
     """
 
     def __init__(
@@ -58,6 +70,8 @@ class Dynamics:
         angles: Sequence[str] = (),
         rotation_vectors: Sequence[Sequence[str]] = (),
         control_limits: Limits | None = None,
+        jacobian: Callable[..., None] | None = None,
+        level: str | None = None,
     ) -> None:
         if not states or not controls:
             raise InputError(
@@ -75,10 +89,18 @@ class Dynamics:
                 raise InputError(f"rotation_vectors: got {tuple(triple)}, want three neighbouring states")
             starts.append(indices[0])
         low, high = control_limits if control_limits is not None else (-np.inf, np.inf)
-        self.f = f
-        self.parameters = {
-            name: check_number(f"parameters: {name}", value) for name, value in (parameters or {}).items()
-        }
+        self.f, self.jacobian = f, jacobian
+        self.level = level_of(f, level)
+        if jacobian is not None and self.level == "symbolic":
+            raise InputError(
+                f"jacobian: got one for {name_of(f)}, which is symbolic, want none (it is derived) or level='compiled'"
+                " or 'plain'"
+            )
+        check_signature(f, ("x", "u", "p"))
+        if jacobian is not None:
+            level_of(jacobian, self.level)
+            check_signature(jacobian, ("x", "u", "p", "fx", "fu"))
+        self.parameters = tracing.check_parameters(parameters or {})
         self.state_coordinates = Coordinates(
             names=names,
             units=tuple(states.values()),
@@ -96,7 +118,7 @@ class Dynamics:
     @property
     def name(self) -> str:
         """What messages call the dynamics: the name of `f`."""
-        return getattr(self.f, "__qualname__", repr(self.f))
+        return name_of(self.f)
 
     @property
     def data(self) -> Array:
@@ -104,14 +126,32 @@ class Dynamics:
         return np.array(list(self.parameters.values()), dtype=np.float64)
 
     @cached_property
+    def functions(self) -> tuple[External, ...]:
+        """What compiled code calls: nothing if the dynamics are symbolic, else f and the Jacobian, if there is one."""
+        if self.level == "symbolic":
+            return ()
+        n, m, names = len(self.state_coordinates), len(self.control_coordinates), tuple(self.parameters)
+        rest: dict[str, Any] = {"level": self.level, "states": n, "controls": m, "parameters": names}
+        rest["offset"] = 1 if self.jacobian is None else 2
+        rate = External(function=self.f, values=n, entries=self.state_coordinates.names, **rest)
+        if self.jacobian is None:
+            return (rate,)
+        return rate, External(function=self.jacobian, writes=((n, n), (n, m)), **rest)
+
+    @cached_property
     def source(self) -> str:
-        """Source of `rate` and `rate_jacobian` of `solvers/interface.py`. Traces `f` at the first call."""
+        """Source of `rate` and `rate_jacobian` of `solvers/interface.py`; symbolic dynamics are traced for it, once."""
+        if self.level != "symbolic":
+            return _CALL + (inspect.getsource(differences.rate_jacobian) if self.jacobian is None else _CALL_JACOBIAN)
+        details = ("dynamics", *self.state_coordinates.names, *self.control_coordinates.names, *self.parameters)
+        return tracing.kept(self.f, details, lambda: {"source": self._trace()})["source"]
+
+    def _trace(self) -> str:
         n, m = len(self.state_coordinates), len(self.control_coordinates)
         rates, x, u = tracing.trace(self.f, n, m, list(self.parameters))
         if len(rates) != n:
-            name = getattr(self.f, "__qualname__", repr(self.f))
             states = ", ".join(self.state_coordinates.names)
-            raise InputError(f"{name}(x, u, p): got {len(rates)} entries, want {n}: one for each of {states}")
+            raise InputError(f"{self.name}(x, u, p): got {len(rates)} entries, want {n}: one for each of {states}")
         values = {f"out[{i}]": rate for i, rate in enumerate(rates)}
         slopes = {f"fx[{i}, {j}]": rate.diff(xj) for i, rate in enumerate(rates) for j, xj in enumerate(x)}
         slopes |= {f"fu[{i}, {j}]": rate.diff(uj) for i, rate in enumerate(rates) for j, uj in enumerate(u)}
@@ -128,14 +168,22 @@ class Dynamics:
         """`xdot` (n,) at one state (n,) and control (m,), in plain Python."""
         x, u = self._check(state, control)
         out = np.zeros(len(x))
-        self._plain["rate"](x, u, self.data, out)
+        self._plain["rate"](x, u, self._numbers(), out)
         return out
+
+    def rate_jacobian(self, state: npt.ArrayLike, control: npt.ArrayLike) -> tuple[Array, Array]:
+        """df/dx (n, n) and df/du (n, m) at one state and control, in plain Python."""
+        x, u = self._check(state, control)
+        n, m = len(x), len(u)
+        fx, fu = np.zeros((n, n)), np.zeros((n, m))
+        self._plain["rate_jacobian"](x, u, self._numbers(), np.zeros(n), fx, fu)
+        return fx, fu
 
     def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
         """The state (n,) after `dt` seconds (negative: before), control held: one Runge-Kutta step, in plain Python."""
         x, u = self._check(state, control)
         out = np.zeros(len(x))
-        self._plain["step"](x, u, self.data, check_number("dt", dt), out)
+        self._plain["step"](x, u, self._numbers(), check_number("dt", dt), out)
         return out
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
@@ -144,7 +192,7 @@ class Dynamics:
         n, m = len(x), len(u)
         out, jacobian = np.zeros(n), np.zeros((n, n + m))
         self._plain["step_jacobian"](
-            x, u, self.data, check_number("dt", dt), np.zeros((n, n)), np.zeros((n, m)), out, jacobian
+            x, u, self._numbers(), check_number("dt", dt), np.zeros((n, n)), np.zeros((n, m)), out, jacobian
         )
         a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
         return a, b, out - a @ x - b @ u
@@ -159,9 +207,41 @@ class Dynamics:
     def _plain(self) -> dict[str, Any]:
         """The very source that gets compiled, run as plain Python."""
         n, m = len(self.state_coordinates), len(self.control_coordinates)
-        names = {"N": n, "M": m, "W": n + m, "stack": lambda *shape: np.empty(shape)}
-        names |= vars(math) | {name: value for name, value in vars(rotations).items() if callable(value)}
-        exec(compile(self.source, "<traced dynamics>", "exec"), names)
-        for function in (integration.step, integration.chain, integration.step_jacobian):
+        names = {"N": n, "M": m, "W": n + m, "stack": lambda *shape: np.empty(shape), "clear": kernels.clear}
+        # NumPy's functions and not those of math, which raise where compiled code goes on with NaN or infinity.
+        names |= vars(math) | {name: getattr(np, name) for name in vars(math) if callable(getattr(np, name, None))}
+        names |= {name: value for name, value in vars(rotations).items() if inspect.isfunction(value)}
+        names |= {"invoke": self._invoke, "invoke_writing": self._invoke}
+        # An address stands for a function here, too: its place among them.
+        exec(compile(self.source, f"<{self.name}>", "exec"), names)
+        for function in (integration.step, integration.step_jacobian):
             exec(compile(inspect.getsource(function), "<integration>", "exec"), names)
+        if "chain" not in names:
+            exec(compile(inspect.getsource(integration.chain), "<integration>", "exec"), names)
         return names
+
+    def _numbers(self) -> Array:
+        """What `p` is in the compiled functions, with the places of the functions for their addresses."""
+        return np.concatenate([np.arange(len(self.functions), dtype=np.float64), self.data])
+
+    def _invoke(self, place: float, x: Array, u: Array, p: Array, *outputs: Array) -> None:
+        for output, value in zip(outputs, self.functions[int(place)].call(x, u, self.parameters), strict=True):
+            output[:] = value
+
+
+_CALL = """\
+def rate(x, u, p, out):
+    for i in range(N):
+        out[i] = nan
+    invoke(p[0], x, u, p, out)
+
+
+"""
+
+_CALL_JACOBIAN = """\
+def rate_jacobian(x, u, p, out, fx, fu):
+    rate(x, u, p, out)
+    clear(fx, N, N)
+    clear(fu, N, M)
+    invoke_writing(p[1], x, u, p, fx, fu)
+"""

@@ -114,3 +114,37 @@ def pointer(typingctx: Any, array: Any, block: Any) -> Any:
         return context.make_array(sig.args[0])(context, builder, args[0]).data
 
     return Pointer(tuple(size.literal_value for size in block))(array, block), generate
+
+
+@intrinsic
+def readonly(typingctx: Any, array: Any) -> Any:
+    """The same numba array, of a type that refuses to be written to."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return args[0]
+
+    return array.copy(readonly=True)(array), generate
+
+
+def _call(typingctx: Any, address: Any, *pointers: Any) -> Any:
+    """Call the C function whose address the number `address` is, with pointers to float64."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind = ir.FunctionType(ir.VoidType(), [arg.type for arg in args[1:]])
+        function = builder.inttoptr(builder.fptosi(args[0], ir.IntType(64)), kind.as_pointer())
+        builder.call(function, args[1:])
+        return context.get_dummy_value()
+
+    return types.none(address, *pointers), generate
+
+
+@intrinsic
+def invoke(typingctx: Any, address: Any, x: Any, u: Any, data: Any, out: Any) -> Any:
+    """Call the function at `address`, which writes to one array."""
+    return _call(typingctx, address, x, u, data, out)
+
+
+@intrinsic
+def invoke_writing(typingctx: Any, address: Any, x: Any, u: Any, data: Any, a: Any, b: Any) -> Any:
+    """Call the function at `address`, which writes to two arrays."""
+    return _call(typingctx, address, x, u, data, a, b)

@@ -116,11 +116,14 @@ class Problem:
         """Hash of everything that defines the problem: structure and numbers. The prior does not."""
         hasher = hashlib.sha256(f"{self.dynamics.source} {self.dt!r} {self.steps}".encode())
         hasher.update(self.dynamics.data.tobytes())
+        functions = [*self.dynamics.functions]
         if isinstance(self.initial, FixedState):
             hasher.update(np.asarray(self.initial.state).tobytes())
         for name in ("initial", "stage_cost", "final_cost"):
             for term in self.terms(name):
                 hasher.update(term.source.encode() + term.data.tobytes())
+                functions += term.functions
+        hasher.update("\n".join(function.identity for function in functions).encode())
         return hasher.hexdigest()[:16]
 
     def _check_start_clear(self) -> None:

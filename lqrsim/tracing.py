@@ -1,11 +1,16 @@
 """From a plain Python function of symbols to the source of a compiled one. SymPy is imported only when this runs."""
 
+import contextlib
+import json
 import keyword
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from lqrsim import cache
 from lqrsim.errors import InputError, check_number
+from lqrsim.fingerprint import fingerprint
 from lqrsim.rotations import RATIOS
 
 
@@ -24,6 +29,26 @@ def check_parameters(parameters: Mapping[str, float]) -> dict[str, float]:
         if not name.isidentifier() or keyword.iskeyword(name):
             raise InputError(f"parameters: got the name {name!r}, want a Python name, to be read as p.name")
     return {name: check_number(f"parameters: {name}", value) for name, value in parameters.items()}
+
+
+def kept(function: Callable[..., Any], details: object, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What `make` derives from a user's function, from the cache if it is there: then SymPy need not be imported.
+
+    What can not be told from other functions by its fingerprint is derived anew, and errors are not kept.
+    """
+    print_of_it = fingerprint(function)
+    if print_of_it is None:
+        return make()
+    own = Path(__file__).read_text(encoding="utf-8")
+    key = cache.key("derivatives", own, print_of_it, repr(details))
+    stored = cache.load(key)
+    if stored is not None:
+        with contextlib.suppress(ValueError):
+            return json.loads(stored)
+    made = make()
+    name = getattr(function, "__qualname__", repr(function))
+    cache.save(key, json.dumps(made).encode(), f"derivatives of {name}(x, u, p)")
+    return made
 
 
 def trace(

@@ -10,7 +10,7 @@ from lqrsim.errors import InputError
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenes import load_scene, names
-from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.plant import Plant, check_plant
 
 OPEN_FLOOR = """<mujoco>
   <include file="create.xml"/>
@@ -162,3 +162,16 @@ def test_differential_drive_turns_on_the_spot_by_the_wheels_alone(open_floor):
 
 def _bodies(model):
     return [model.body(i) for i in range(model.nbody)]
+
+
+def test_check_plant_agrees_for_our_own_and_names_what_differs():
+    quadrotor = check_plant(Quadrotor(), load_scene("cage"))
+    assert quadrotor.good
+    assert quadrotor.relative.max() < 1e-4  # one Runge-Kutta step each
+    assert check_plant(DifferentialDrive(), load_scene("arena"), period=1 / 6, settle=0.3).good
+    heavy = check_plant(Quadrotor(mass=0.6), load_scene("cage"))
+    assert not heavy.good
+    assert heavy.worst in ("vx", "vy", "vz", "x", "y", "z")
+    assert f"DISAGREES (tolerance 0.02 of the change); worst state: {heavy.worst}, MuJoCo" in str(heavy)
+    with pytest.raises(InputError, match="controls: lowest: got shape"):
+        check_plant(Quadrotor(), load_scene("cage"), controls=((0,), (1,)))

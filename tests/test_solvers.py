@@ -242,8 +242,10 @@ class TestEndings:
         assert solution.cost_to_go is None
 
     @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
-    def test_a_formula_outside_its_domain(self, solver) -> None:
-        assert solver(scalar_problem(root=1.0, inside=-5.0)).status is Status.NOT_FINITE
+    def test_a_formula_outside_its_domain_at_the_start(self, solver) -> None:
+        message = r"rate\(x, u, p\): got nan as entry 0 \(x\) at the start, x = \(1\), u = \(0\), want a finite number"
+        with pytest.raises(ls.InputError, match=message):
+            solver(scalar_problem(root=1.0, inside=-5.0))
 
     @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
     def test_a_cost_of_zero(self, solver) -> None:
@@ -270,6 +272,43 @@ class TestEndings:
         strict = ls.smooth(differential_drive.problem, tolerance=0.5)
         assert strict.gap < 1e-3
         assert len(strict.iterations) > len(solution.iterations)
+
+
+class TestMany:
+    @pytest.mark.parametrize("many", [ls.smooth_many, ls.ilqr_many])
+    @pytest.mark.parametrize("threads", [1, 2, 5])
+    def test_each_is_what_one_would_be_to_the_last_bit(self, many, threads: int) -> None:
+        one = {ls.smooth_many: ls.smooth, ls.ilqr_many: ls.ilqr}[many]
+        problems = [ls.scenarios.quadrotor(query=query).problem for query in range(6)]
+        told: list[tuple[int, int]] = []
+        solutions = many(problems, threads=threads, progress=lambda done, of: told.append((done, of)))
+        assert told == [(done, 6) for done in range(1, 7)]
+        for problem, solution in zip(problems, solutions, strict=True):
+            alone = one(problem)
+            assert solution.status is alone.status
+            assert [row.cost for row in solution.iterations] == [row.cost for row in alone.iterations]
+            np.testing.assert_array_equal(solution.policy.gain, alone.policy.gain)
+            np.testing.assert_array_equal(solution.trajectory.states, alone.trajectory.states)
+
+    def test_each_has_a_status_of_its_own(self) -> None:
+        problems = [scalar_problem(), scalar_problem(bonus=1.0), scalar_problem(cubic=100.0)]
+        first, second, third = ls.smooth_many(problems, max_iterations=30)
+        assert first.status is Status.CONVERGED
+        assert second.status is Status.NOT_POSITIVE_DEFINITE
+        assert not third.success
+        assert ls.smooth_many([]) == []
+
+    def test_bad_input_is_named_by_its_place(self, differential_drive: ls.Scenario) -> None:
+        good = differential_drive.problem
+        fixed = dataclasses.replace(good, initial=ls.FixedState((0, -2.5, np.pi)))
+        with pytest.raises(ls.InputError, match=r"^problems\[1\]: initial: got a FixedState, want an initial cost"):
+            ls.smooth_many([good, fixed])
+        with pytest.raises(ls.InputError, match=r"^problems\[0\]: got str, want a Problem"):
+            ls.ilqr_many(["quadrotor"])  # pyright: ignore[reportArgumentType]
+        with pytest.raises(ls.InputError, match=r"^threads: got 0, want a whole number >= 1"):
+            ls.smooth_many([good], threads=0)
+        with pytest.raises(ls.InputError, match=r"^problems\[1\]: .*rate\(x, u, p\): got nan as entry 0"):
+            ls.smooth_many([scalar_problem(), scalar_problem(root=1.0, inside=-5.0)])
 
 
 def test_the_callback_sees_every_iteration_and_may_stop_the_solve(differential_drive: ls.Scenario) -> None:

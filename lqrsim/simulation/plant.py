@@ -1,13 +1,14 @@
-"""A robot in a scene: the MuJoCo model that is run, and where the robot is in it."""
+"""A robot in a scene: the MuJoCo model that is run, where the robot is in it, and whether it moves as it should."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim import compiled
-from lqrsim.errors import Array, InputError, check_number
+from lqrsim.errors import Array, InputError, check_array, check_count, check_number
 from lqrsim.robots.base import Robot
 from lqrsim.scenes import Scene, obstacle_geoms
 from lqrsim.world import World
@@ -94,6 +95,134 @@ class Plant:
                 intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
             )
         return spec.compile()
+
+
+@dataclass(frozen=True)
+class PlantCheck:
+    """How far MuJoCo moves a robot from where its dynamics say, over one control period.
+
+    Attributes:
+      names, units: of the states. errors: (n,) the largest difference of each over the samples, in its unit.
+      changes: (n,) the largest change that the dynamics predict for it. period: in seconds.
+      state, control: where the worst state of all was furthest off. simulated, predicted: (n,) what came of it.
+      tolerance: what `relative` must not exceed.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    errors: Array
+    changes: Array
+    period: float
+    state: Array
+    control: Array
+    simulated: Array
+    predicted: Array
+    tolerance: float
+
+    @property
+    def relative(self) -> Array:
+        """(n,) errors relative to the changes; where next to nothing changes, to the largest change of all."""
+        return self.errors / np.maximum(self.changes, 1e-3 * self.changes.max(initial=1e-12))
+
+    @property
+    def worst(self) -> str:
+        """The name of the state that is furthest off, relative to its change."""
+        return self.names[int(np.argmax(self.relative))]
+
+    @property
+    def good(self) -> bool:
+        """Whether every state is within the tolerance."""
+        return bool((self.relative <= self.tolerance).all())
+
+    def __str__(self) -> str:
+        i = self.names.index(self.worst)
+        width = max(len(name) for name in self.names)
+        lines = [f"{'state':<{width}} {'error':>10} {'of change':>10}  over one period of {self.period:.4g} s"]
+        lines += [
+            f"{name:<{width}} {error:>10.2e} {relative:>10.2e}  {unit}"
+            for name, unit, error, relative in zip(self.names, self.units, self.errors, self.relative, strict=True)
+        ]
+        lines.append(
+            f"{'agrees' if self.good else 'DISAGREES'} (tolerance {self.tolerance:g} of the change); worst state:"
+            f" {self.worst}, MuJoCo {self.simulated[i]:.6g}, dynamics {self.predicted[i]:.6g},"
+            f" from x = {np.array2string(self.state, precision=3)}, u = {np.array2string(self.control, precision=3)}"
+        )
+        return "\n".join(lines)
+
+
+def check_plant(
+    robot: Robot,
+    scene: Scene,
+    *,
+    period: float | None = None,
+    around: npt.ArrayLike | None = None,
+    spread: float = 0.3,
+    controls: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+    settle: float = 0.0,
+    samples: int = 50,
+    tolerance: float = 0.02,
+    seed: int = 0,
+) -> PlantCheck:
+    """Compare a robot's dynamics with its MJCF: from random states, one control period of each.
+
+    Obstacles are taken away for it. A mass, a sign or a unit that differs shows in the states that it acts on.
+
+    Args:
+      period: in seconds, a multiple of the physics step; by default that nearest to 0.02 s.
+      around: (n,) the middle of the random states, zero by default. spread: their standard deviation in each unit.
+      controls: lowest and highest random control (m,); by default the dynamics' limits.
+      settle: seconds under the control before the comparison, for velocities that MuJoCo has and the dynamics do not
+        (those of wheels, say).
+      samples: how many states. tolerance: of an error, relative to the largest change of that state. seed: of all.
+
+    Raises:
+      InputError: the robot is not in the scene, an argument is not as described, or the controls have no limits.
+    """
+    plant = Plant(robot, scene)
+    period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
+    substeps = plant.substeps(period)
+    dynamics = robot.dynamics
+    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+    middle = check_array("around", np.zeros(n) if around is None else around, (n,))
+    space = dynamics.control_coordinates
+    low, high = (space.low, space.high) if controls is None else controls
+    low, high = (
+        check_array("controls: lowest", low, (m,), infinite=True),
+        check_array("controls: highest", high, (m,), infinite=True),
+    )
+    if not np.isfinite([low, high]).all():
+        raise InputError(f"controls: got {robot.name}'s limits, which are infinite, want controls=(lowest, highest)")
+    for name in plant.world.names:
+        geom = plant.model.geom(name)
+        geom.contype[:], geom.conaffinity[:] = 0, 0
+    rng, data = np.random.default_rng(check_count("seed", seed, at_least=0)), mujoco.MjData(plant.model)
+    check_number("spread", spread, at_least=0.0)
+    waiting = round(check_number("settle", settle, at_least=0.0) / plant.timestep)
+    found = []
+    for _ in range(check_count("samples", samples)):
+        state, control = middle + spread * rng.normal(size=n), rng.uniform(low, high)
+        mujoco.mj_resetData(plant.model, data)
+        data.qpos[plant.qpos], data.qvel[plant.qvel] = robot.configuration(state)
+        data.ctrl[plant.ctrl] = robot.actuation(control)
+        for _ in range(waiting):
+            mujoco.mj_step(plant.model, data)
+        before = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=state)
+        for _ in range(substeps):
+            mujoco.mj_step(plant.model, data)
+        predicted = dynamics.step(before, control, period)
+        simulated = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=predicted)
+        found.append((before, control, simulated, predicted))
+    errors = np.array([np.abs(simulated - predicted) for _, _, simulated, predicted in found])
+    changes = np.array([np.abs(predicted - before) for before, _, _, predicted in found])
+    state, control, simulated, predicted = found[0]
+    check = PlantCheck(
+        names=dynamics.state_coordinates.names, units=dynamics.state_coordinates.units, errors=errors.max(axis=0),
+        changes=changes.max(axis=0), period=period, state=state, control=control, simulated=simulated,
+        predicted=predicted, tolerance=check_number("tolerance", tolerance, above=0.0),
+    )  # fmt: skip
+    at = int(errors[:, check.names.index(check.worst)].argmax())
+    state, control, simulated, predicted = found[at]
+    return replace(check, state=state, control=control, simulated=simulated, predicted=predicted)
 
 
 def _ranges(starts_and_sizes: Iterable[tuple[int, int]]) -> Indices:

@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import compiled
+from lqrsim.checks import check_start, functions_of
 from lqrsim.errors import Array, InputError, check_array, check_count, check_name, check_number
 from lqrsim.problem import Problem
 from lqrsim.results import AffinePolicy, Iteration, Quadratic, Solution, Status, Trajectory
@@ -63,12 +64,16 @@ class Settings:
 
 @dataclass(frozen=True)
 class Ending:
-    """How the iterations of `iterate` ended; `failed` is the step of the pass that failed, or -1."""
+    """How the iterations of `iterate` ended.
+
+    `failed` is the step of the pass that failed, or -1; `raised` what a user's function raised, if one did.
+    """
 
     iterations: tuple[Iteration, ...]
     outcome: int
     backward: bool
     failed: int
+    raised: str
 
     @property
     def status(self) -> Status:
@@ -83,13 +88,15 @@ class Ending:
         """What there is to say besides the status."""
         if self.pass_failed:
             which = "backward" if self.backward else "forward"
-            return f"{which} pass of iteration {len(self.iterations) + 1}, step {self.failed} of {steps}"
+            place = f"{which} pass of iteration {len(self.iterations) + 1}, step {self.failed} of {steps}"
+            return f"{place}: {self.raised}" if self.raised else place
         if self.outcome == interface.NO_START:
             return "rollout of the initial controls"
         return "the line search found no lower cost" if self.outcome == interface.STALLED else ""
 
 
 def iterate(
+    problem: Problem,
     run: Callable[[int, int], tuple[int, int, bool, int]],
     log: Array,
     max_iterations: int,
@@ -100,11 +107,15 @@ def iterate(
     """Run a loop of `solvers/loops.py` to its end.
 
     Args:
+      problem: whose functions may raise meanwhile.
       run: runs the iterations from its first argument up to its second.
       log: (any, 4), where `run` writes.
       each: come back after each iteration, to time it, to tell `callback` and to heed Ctrl-C; otherwise nothing but
         compiled code runs, and the seconds of an iteration are the average.
     """
+    functions = functions_of(problem)
+    for function in functions:
+        function.forget()
     iterations: list[Iteration] = []
     outcome, backward, failed = interface.RUNNING, False, -1
     while outcome == interface.RUNNING:
@@ -116,7 +127,11 @@ def iterate(
             iterations.append(Iteration(cost, improvement, gap, optimality, seconds))
             if callback is not None:
                 callback(iterations[-1])
-    return Ending(tuple(iterations), outcome, backward, failed)
+        for function in functions:
+            if function.raised is not None and not isinstance(function.raised, Exception):
+                raise function.raised  # Ctrl-C
+    raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
+    return Ending(tuple(iterations), outcome, backward, failed, "; ".join(raised))
 
 
 def solve_all(
@@ -144,16 +159,29 @@ def solve_all(
             for done, _ in enumerate(as_completed(futures), start=1):
                 if progress is not None:
                     progress(done, len(futures))
-            return [future.result() for future in futures]
+            return [_result(i, future) for i, future in enumerate(futures)]
         except BaseException:  # Ctrl-C, too: what runs is a matter of milliseconds, the rest is not begun
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _result(i: int, future: Future[Solution]) -> Solution:
+    try:
+        return future.result()
+    except InputError as error:
+        raise InputError(f"problems[{i}]: {error}") from None
 
 
 def processors() -> int:
     """How many processors this process may run on."""
     affinity = getattr(os, "sched_getaffinity", None)  # not on macOS and Windows
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+
+
+def check_outcome(problem: Problem, ending: Ending, x: Array, u: Array) -> None:
+    """Raises InputError if nothing was achieved because a function is not finite at the start (n,) and control (m,)."""
+    if not ending.iterations and ending.status is Status.NOT_FINITE:
+        check_start(problem, x, u)
 
 
 def assemble(

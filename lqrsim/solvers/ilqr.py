@@ -6,10 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import compiled
+from lqrsim.checks import check_functions
 from lqrsim.errors import InputError
 from lqrsim.problem import Problem
 from lqrsim.results import Quadratic, Solution
-from lqrsim.solvers.common import Callback, Settings, assemble, iterate, model, solve_all
+from lqrsim.solvers.common import Callback, Settings, assemble, check_outcome, iterate, model, solve_all
 
 
 def ilqr(
@@ -76,6 +77,8 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     assert problem.start is not None
     n, steps, zeros = len(problem.dynamics.state_coordinates), problem.steps, np.zeros
     controls = settings.controls(problem)
+    start, control = problem.start.copy(), controls[0].copy()
+    check_functions(problem, start, control)
     m = controls.shape[1]
     states = zeros((steps + 1, n))
     L, l = zeros((steps, m, n)), zeros((steps, m))
@@ -84,14 +87,16 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     core = compiled.core(problem)
     options = settings.max_iterations, settings.tolerance, settings.stop == "optimal"
     arrays = (
-        problem.start.copy(), L, l, *go, *model(problem),
+        start, L, l, *go, *model(problem),
         states, controls, states.copy(), controls.copy(), zeros(1), log,
     )  # fmt: skip
     loop = core.entry("ilqr_iterations", steps, 0, 0, *options, *arrays)
     ending = iterate(
+        problem,
         lambda first, last: loop(steps, first, last, *options, *arrays),
         log, settings.max_iterations, each=each, callback=callback,
     )  # fmt: skip
+    check_outcome(problem, ending, start, control)
     whole = ending.iterations != () and ending.failed < 0
     if not whole:
         L[:] = 0  # without a pass about the trajectory there is no feedback; what is left is to play the controls

@@ -6,10 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import compiled
+from lqrsim.checks import check_functions
 from lqrsim.errors import InputError
 from lqrsim.problem import FixedState, Problem
 from lqrsim.results import Quadratic, Solution
-from lqrsim.solvers.common import Callback, Settings, assemble, iterate, model, solve_all
+from lqrsim.solvers.common import Callback, Settings, assemble, check_outcome, iterate, model, solve_all
 
 
 def smooth(
@@ -100,6 +101,8 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     n, steps, zeros = len(problem.dynamics.state_coordinates), problem.steps, np.zeros
     x_hat = zeros(n) if problem.start is None else problem.start.copy()
     controls = settings.controls(problem)
+    start, control = x_hat.copy(), controls[0].copy()
+    check_functions(problem, start, control)
     m = controls.shape[1]
     x_hats, states = zeros((steps + 1, n)), zeros((steps + 1, n))
     L, Lbar, kept_L = zeros((steps, m, n)), zeros((steps, m, n)), zeros((steps, m, n))
@@ -124,9 +127,11 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     )  # fmt: skip
     loop = core.entry("smoother_iterations", steps, 0, 0, *options, *arrays)
     ending = iterate(
+        problem,
         lambda first, last: loop(steps, first, last, *options, *arrays),
         log, settings.max_iterations, each=each, callback=callback,
     )  # fmt: skip
+    check_outcome(problem, ending, start, control)
     whole = not ending.pass_failed
     return assemble(
         problem, solver="smooth", settings=settings, ending=ending, states=states, controls=controls,

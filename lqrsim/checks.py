@@ -1,0 +1,194 @@
+"""Looks at what a user's functions return: before the first iteration, and where derivatives are in doubt."""
+
+import inspect
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lqrsim import rotations, world
+from lqrsim.costs import Term, terms_of
+from lqrsim.dynamics import Dynamics
+from lqrsim.errors import Array, InputError, check_count, check_number
+from lqrsim.functions import External, brief
+from lqrsim.problem import FixedState, Problem
+from lqrsim.solvers import kernels
+
+
+def functions_of(problem: Problem) -> list[External]:
+    """The numba and plain Python functions of a problem."""
+    terms = [term for name in ("initial", "stage_cost", "final_cost") for term in problem.terms(name)]
+    return [function for part in (problem.dynamics, *terms) for function in part.functions]
+
+
+def check_functions(problem: Problem, x: Array, u: Array) -> None:
+    """Call each numba and plain Python function once. Raises InputError if one does not return what it should."""
+    for part in (problem.dynamics, *(term for _, term in _terms(problem))):
+        for function in part.functions:
+            parameters = dict(zip(function.parameters, part.data.tolist(), strict=True))
+            function.call(x, u, parameters)
+
+
+def check_start(problem: Problem, x: Array, u: Array) -> None:
+    """Raises InputError if the dynamics or a cost is not finite at a state (n,) and control (m,)."""
+    where = f"at the start, x = {brief(x)}, u = {brief(u)}"
+    names = problem.dynamics.state_coordinates.names
+    with np.errstate(all="ignore"):
+        for i, rate in enumerate(problem.dynamics.rate(x, u)):
+            if not np.isfinite(rate):
+                raise InputError(
+                    f"{problem.dynamics.name}(x, u, p): got {rate:g} as entry {i} ({names[i]}) {where},"
+                    " want a finite number"
+                )
+        for cost, term in _terms(problem):
+            value, gradient, hessian = evaluate(term, problem.dynamics, x, u)
+            for what, array in (("value", np.array(value)), ("gradient", gradient), ("Hessian", hessian)):
+                if not np.isfinite(array).all():
+                    entry = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
+                    place = f" at {entry}" if entry else ""
+                    raise InputError(
+                        f"{cost}: got {array[tuple(entry)]:g} as its {what}{place} {where}, want finite numbers"
+                    )
+
+
+def _terms(problem: Problem) -> Iterator[tuple[str, Term]]:
+    """The cost terms, with what messages call them."""
+    for name in ("initial", "stage_cost", "final_cost"):
+        cost = getattr(problem, name)
+        if not isinstance(cost, FixedState):
+            yield from ((f"{name}: {c.name}", t) for c, t in zip(terms_of(cost), problem.terms(name), strict=True))
+
+
+def evaluate(term: Term, dynamics: Dynamics, x: Array, u: Array) -> tuple[float, Array, Array]:
+    """A cost term in plain Python: its value, gradient (n+m,) and Hessian (n+m, n+m), before any projection."""
+    n, m = len(x), len(u)
+
+    def invoke(place: float, x: Array, u: Array, data: Array, *outputs: Array) -> None:
+        function = term.functions[int(place)]
+        parameters = dict(zip(function.parameters, term.data.tolist(), strict=True))
+        for output, value in zip(outputs, function.call(x, u, parameters), strict=True):
+            output[:] = value
+
+    names: dict[str, Any] = {"N": n, "M": m, "W": n + m, "stack": lambda *shape: np.empty(shape)}
+    names |= vars(math) | {name: getattr(np, name) for name in vars(math) if callable(getattr(np, name, None))}
+    for module in (rotations, world):
+        names |= {name: value for name, value in vars(module).items() if inspect.isfunction(value)}
+    names |= {"clear": kernels.clear, "invoke": invoke, "invoke_writing": invoke}
+    exec(compile(term.source, "<cost>", "exec"), names)
+    gradient, hessian = np.zeros(n + m), np.zeros((n + m, n + m))
+    # An address stands for a function here, too: its place among them.
+    data = np.concatenate([np.arange(len(term.functions), dtype=np.float64), term.data])
+    return float(names["derivatives"](x, u, 1, data, hessian, gradient)), gradient, hessian
+
+
+@dataclass(frozen=True)
+class DerivativeCheck:
+    """How far derivatives are from central differences, where they are furthest.
+
+    Attributes:
+      what: which derivative: `df/dx of ...`, say.
+      error: largest difference over entries and samples, relative to the largest entry (at least 1).
+      row, column: the names at that entry.
+      stated, difference: the two values there. state (n,), control (m,): where that was.
+      tolerance: what the error must not exceed.
+    """
+
+    what: str
+    error: float
+    row: str
+    column: str
+    stated: float
+    difference: float
+    state: Array
+    control: Array
+    tolerance: float
+
+    @property
+    def good(self) -> bool:
+        """Whether the error is within the tolerance; a NaN is not."""
+        return self.error <= self.tolerance
+
+    def __str__(self) -> str:
+        verdict = "agrees" if self.good else "DISAGREES"
+        return (
+            f"{self.what}: {verdict}; worst at row {self.row}, column {self.column}: {self.stated:.8g} stated,"
+            f" {self.difference:.8g} by central differences (error {self.error:.1e}, tolerance {self.tolerance:.0e};"
+            f" x = {brief(self.state)}, u = {brief(self.control)})"
+        )
+
+
+def check_derivatives(
+    subject: Problem | Dynamics, *, samples: int = 20, spread: float = 0.3, tolerance: float = 1e-5, seed: int = 0
+) -> list[DerivativeCheck]:
+    """Compare derivatives with central differences: of dynamics, or of a problem's dynamics and costs.
+
+    Derivatives of symbolic functions are exact, but a formula can still be singular where the robot goes; those of
+    compiled and plain functions are as right as who wrote them.
+
+    Args:
+      subject: dynamics, looked at around zero, or a problem, around its start and nominal control.
+      samples: how many points. spread: their standard deviation, in the units of states and controls.
+      tolerance: of the error, relative to the largest entry (at least 1). seed: of the points.
+
+    Returns:
+      One check a matrix of derivatives, with the worst entry by row and column; print it. `check.good` is the verdict.
+
+    Raises:
+      InputError: a function fails, or an argument is not as described.
+    """
+    check_count("samples", samples)
+    check_number("spread", spread, at_least=0.0)
+    check_number("tolerance", tolerance, above=0.0)
+    dynamics = subject.dynamics if isinstance(subject, Problem) else subject
+    if not isinstance(dynamics, Dynamics):
+        raise InputError(f"subject: got {type(subject).__name__}, want a Problem or Dynamics")
+    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+    x0, u0 = np.zeros(n), np.zeros(m)
+    if isinstance(subject, Problem):
+        x0, u0 = x0 if subject.start is None else subject.start, subject.nominal_control
+    rng = np.random.default_rng(seed)
+    points = [(x0 + spread * rng.normal(size=n), u0 + spread * rng.normal(size=m)) for _ in range(samples)]
+    states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
+    found: dict[str, list[DerivativeCheck]] = {}
+
+    def compare(what: str, stated: Array, difference: Array, rows: Any, columns: Any, x: Array, u: Array) -> None:
+        apart = np.abs(stated - difference) / max(1.0, float(np.abs(difference).max(initial=0.0)))
+        worst = int(np.argmax(np.where(np.isnan(apart), np.inf, apart)))
+        i, j = (int(k) for k in np.unravel_index(worst, apart.shape))
+        check = DerivativeCheck(
+            what, float(apart[i, j]), rows[i], columns[j], float(stated[i, j]), float(difference[i, j]), x, u, tolerance
+        )
+        found.setdefault(what, []).append(check)
+
+    with np.errstate(all="ignore"):
+        for x, u in points:
+            fx, fu = dynamics.rate_jacobian(x, u)
+            joint = _differences(lambda z: dynamics.rate(z[:n], z[n:]), np.concatenate([x, u]), 6e-6)
+            compare(f"df/dx of {dynamics.name}", fx, joint[:, :n], states, states, x, u)
+            compare(f"df/du of {dynamics.name}", fu, joint[:, n:], states, controls, x, u)
+        for cost, term in _terms(subject) if isinstance(subject, Problem) else ():
+            names = (*states, *controls)
+            for x, u in points:
+                _, gradient, hessian = evaluate(term, dynamics, x, u)
+                z = np.concatenate([x, u])
+                slope = _differences(lambda z, t=term: np.array([evaluate(t, dynamics, z[:n], z[n:])[0]]), z, 6e-6)
+                curve = _differences(lambda z, t=term: evaluate(t, dynamics, z[:n], z[n:])[1], z, 6e-6)
+                compare(f"gradient of {cost}", gradient[None], slope, ("cost",), names, x, u)
+                compare(f"Hessian of {cost}", hessian, curve, names, names, x, u)
+    return [
+        max(checks, key=lambda check: np.inf if np.isnan(check.error) else check.error) for checks in found.values()
+    ]
+
+
+def _differences(function: Any, z: Array, step: float) -> Array:
+    """The Jacobian of a function of a vector by central differences."""
+    columns = []
+    for i in range(len(z)):
+        h = step * max(1.0, abs(z[i]))
+        ahead, behind = z.copy(), z.copy()
+        ahead[i] += h
+        behind[i] -= h
+        columns.append((function(ahead) - function(behind)) / (2 * h))
+    return np.stack(columns, axis=1)

@@ -1,0 +1,131 @@
+"""A hash of what a function does, without running it: the key under which what is derived from it can be kept.
+
+It covers the function's code, constants, defaults and closure, and the functions, numbers and strings it refers to, as
+deep as that goes. What belongs to NumPy, SymPy or numba counts by that package's version. A function that refers to
+anything else (an object that may change, a module of the user's own) has no fingerprint, and nothing of it is kept.
+"""
+
+import dis
+import functools
+import importlib.metadata
+import inspect
+import sys
+import types
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from lqrsim import cache, rotations
+
+# What formulas may use without being read: by version, which the hash includes.
+_PACKAGES = ("math", "numba", "numpy", "sympy")
+_MODULES = ("lqrsim", "lqrsim.rotations")
+_PLAIN = (int, float, complex, str, bytes, bool, type(None), type(Ellipsis))
+
+
+class _NoFingerprint(Exception):
+    pass
+
+
+def fingerprint(function: Any) -> str | None:
+    """The hash, the same in every process; None if there is something that it could not cover."""
+    try:
+        return cache.key(*_versions(), *_function(function, set()))
+    except (_NoFingerprint, RecursionError):
+        return None
+
+
+@functools.cache
+def _versions() -> tuple[str, ...]:
+    installed = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES if name != "math")
+    return (sys.version, *installed, inspect.getsource(rotations))
+
+
+def _function(function: Any, seen: set[int]) -> Iterator[str]:
+    """What a Python or numba function is made of."""
+    function = getattr(function, "py_func", function)
+    if not isinstance(function, types.FunctionType):
+        raise _NoFingerprint
+    if id(function) in seen:  # it refers to itself
+        return
+    seen.add(id(function))
+    yield from _code(function.__code__)
+    yield from _value(function.__defaults__, seen)
+    for name, default in sorted((function.__kwdefaults__ or {}).items()):
+        yield name
+        yield from _value(default, seen)
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        yield name
+        try:
+            contents = cell.cell_contents
+        except ValueError:  # not assigned yet
+            raise _NoFingerprint from None
+        yield from _value(contents, seen)
+    for name in sorted(_names(function.__code__)):
+        if name in function.__globals__:
+            yield name
+            yield from _value(function.__globals__[name], seen)
+
+
+def _code(code: types.CodeType) -> Iterator[str]:
+    yield repr((code.co_code, code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars, code.co_flags))
+    yield repr((code.co_argcount, code.co_kwonlyargcount, code.co_posonlyargcount, code.co_exceptiontable))
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from _code(constant)
+        else:
+            yield from _value(constant, set())
+
+
+def _names(code: types.CodeType) -> set[str]:
+    """The global names that code reads, and that of functions inside it; refuses imports of what has no version."""
+    found = set()
+    for instruction in dis.get_instructions(code):
+        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+            found.add(instruction.argval)
+        elif instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL") or (
+            instruction.opname == "IMPORT_NAME" and not _known(instruction.argval)
+        ):
+            raise _NoFingerprint
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            found |= _names(constant)
+    return found
+
+
+def _known(module: str) -> bool:
+    return module in _MODULES or module.split(".")[0] in _PACKAGES
+
+
+def _value(value: Any, seen: set[int]) -> Iterator[str]:
+    """A value that a function refers to."""
+    if isinstance(value, _PLAIN):
+        yield f"{type(value).__name__} {value!r}"
+    elif isinstance(value, np.ndarray | np.generic) and value.dtype.hasobject is False:
+        yield repr((value.dtype.str, value.shape, np.asarray(value).tobytes()))
+    elif isinstance(value, tuple | list | frozenset | set):
+        yield f"{type(value).__name__} {len(value)}"
+        parts = ["\n".join(_value(part, seen)) for part in value]
+        yield from sorted(parts) if isinstance(value, frozenset | set) else parts
+    elif isinstance(value, dict):
+        yield f"dict {len(value)}"
+        for key, part in value.items():
+            yield from _value(key, seen)
+            yield from _value(part, seen)
+    elif _packaged(value):
+        owner = getattr(value, "__module__", None)
+        yield f"{owner}.{getattr(value, '__qualname__', getattr(value, '__name__', ''))}"
+    else:
+        yield from _function(value, seen)
+
+
+def _packaged(value: Any) -> bool:
+    """Whether a module, a function or a class is an installed package's, or Python's own."""
+    if isinstance(value, types.ModuleType):
+        return _known(value.__name__)
+    if isinstance(value, types.BuiltinFunctionType):
+        return True
+    named = isinstance(value, types.FunctionType | type | np.ufunc) or hasattr(value, "py_func")
+    home = getattr(value, "__module__", None) or ("numpy" if isinstance(value, np.ufunc) else "")
+    return named and (home.split(".")[0] in _PACKAGES or (home == "builtins" and isinstance(value, type)))

@@ -1,0 +1,191 @@
+"""A user's own function, numba's or plain Python's, at an address that compiled code can call.
+
+Compiled code knows only that there is a function, so a core serves all functions of the same sizes. A numba function is
+compiled once more behind C's calling convention, and kept on disk where it has a fingerprint; a plain one is called
+back through Python, microseconds a call.
+"""
+
+import collections
+import ctypes
+import inspect
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from lqrsim.errors import Array, InputError, check_name
+from lqrsim.fingerprint import fingerprint
+from lqrsim.tracing import Parameters
+
+LEVELS = ("symbolic", "compiled", "plain")
+
+
+def level_of(function: Any, asked: str | None) -> str:
+    """The level at which a function is stated: as asked, else compiled for a numba function and symbolic for others."""
+    if not callable(function):
+        raise InputError(f"function: got {function!r}, want a function of (x, u, p)")
+    is_compiled = hasattr(function, "py_func")
+    if asked is None:
+        return "compiled" if is_compiled else "symbolic"
+    if check_name("level", asked, LEVELS) != "compiled" and is_compiled:
+        raise InputError(f"level: got {asked!r} for {name_of(function)}, want 'compiled' for a numba function")
+    return asked
+
+
+def name_of(function: Any) -> str:
+    """What messages call a function."""
+    plain = getattr(function, "py_func", function)
+    return getattr(plain, "__qualname__", None) or type(plain).__name__
+
+
+@dataclass(frozen=True, kw_only=True)
+class External:
+    """One function, and how it is called.
+
+    With `values`, `function(x, u, p)` returns that many numbers (one: the number itself); with `writes`,
+    `function(x, u, p, a, b)` writes to arrays of those two shapes, which are zero when it is called.
+
+    Attributes:
+      level: compiled or plain.
+      states, controls: sizes of x and u. parameters: the names in p, whose values come after `offset` other numbers.
+      held: once it has an address, what must be kept alive for that, and the address.
+      entries: what each returned value is for, as messages name it; without, the value is returned bare.
+    """
+
+    function: Callable[..., Any]
+    level: str
+    states: int
+    controls: int
+    parameters: tuple[str, ...]
+    offset: int
+    values: int = 0
+    writes: tuple[tuple[int, ...], ...] = ()
+    entries: tuple[str, ...] = ()
+    held: list[tuple[Any, int]] = field(default_factory=list, init=False, repr=False, compare=False)
+    _thread: threading.local = field(default_factory=threading.local, init=False, repr=False, compare=False)
+
+    @property
+    def name(self) -> str:
+        """As messages have it."""
+        return f"{name_of(self.function)}(x, u, p{', ...' if self.writes else ''})"
+
+    @property
+    def identity(self) -> str:
+        """What tells it from other functions, in the digest of a problem."""
+        return fingerprint(self.function) or name_of(self.function)
+
+    def call(self, x: Array, u: Array, p: Mapping[str, float]) -> list[Array]:
+        """Call it in plain Python: the returned values as one vector, or the arrays that it wrote.
+
+        Raises:
+          InputError: it fails, or does not return what it should.
+        """
+        plain = getattr(self.function, "py_func", self.function)
+        written: list[Array] = [np.zeros(shape) for shape in self.writes]
+        try:
+            with np.errstate(all="ignore"):  # NaN and infinity are dealt with where they arrive
+                returned = plain(x.copy(), u.copy(), Parameters(**p), *written)
+        except InputError as error:
+            raise InputError(f"{self.name}: {error}") from None
+        except Exception as error:  # whatever a user's function may raise becomes one line
+            raise InputError(
+                f"{self.name}: got {type(error).__name__} ({error}), want it to work at x = {brief(x)}"
+            ) from error
+        return written or [self._vector(returned)]
+
+    def _vector(self, returned: Any) -> Array:
+        try:
+            vector = np.array(returned, dtype=np.float64).reshape(-1)
+        except (TypeError, ValueError):
+            raise InputError(f"{self.name}: got {returned!r}, want {self._wanted()}") from None
+        if len(vector) != self.values:
+            raise InputError(f"{self.name}: got {len(vector)} entries, want {self._wanted()}")
+        return vector
+
+    def _wanted(self) -> str:
+        return f"{self.values}: one for each of {', '.join(self.entries)}" if self.entries else "one number"
+
+    @cached_property
+    def called_back(self) -> tuple[Any, int]:
+        """A C function that calls this one through Python: what must be kept alive, and its address.
+
+        `f(x, u, data, out)` or `f(x, u, data, a, b)`, all pointers to float64.
+        """
+        count = 4 if self.values else 5
+        prototype = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * count)
+        sizes = [int(np.prod(shape)) for shape in self.writes] or [self.values]
+        end = self.offset + len(self.parameters)
+
+        def callback(x: int, u: int, data: int, *outputs: int) -> None:
+            arrays = [_view(address, size) for address, size in zip(outputs, sizes, strict=True)]
+            try:
+                if self.raised is not None:
+                    raise self.raised
+                values = _view(data, end)[self.offset :]
+                p = Parameters(**dict(zip(self.parameters, values.tolist(), strict=True)))
+                state, control = _view(x, self.states).copy(), _view(u, self.controls).copy()
+                with np.errstate(all="ignore"):
+                    if self.writes:
+                        shaped = [array.reshape(shape) for array, shape in zip(arrays, self.writes, strict=True)]
+                        self.function(state, control, p, *shaped)
+                    else:
+                        arrays[0][:] = self._vector(self.function(state, control, p))
+            except BaseException as error:  # Ctrl-C, too: C code can not pass it on, so the solver asks for it
+                self._thread.raised = error
+                for array in arrays:
+                    array[:] = np.nan
+
+        held = prototype(callback)
+        address = ctypes.cast(held, ctypes.c_void_p).value
+        assert address is not None
+        return held, address
+
+    @property
+    def raised(self) -> BaseException | None:
+        """What it raised in this thread, when it was called back; it is not called again until `forget`."""
+        return getattr(self._thread, "raised", None)
+
+    def forget(self) -> None:
+        """Start anew after an exception."""
+        self._thread.raised = None
+
+    def adapter(self) -> tuple[str, dict[str, Any]]:
+        """Source of what numba compiles around the function, and the names in it but `carray` and `readonly`."""
+        lines = [f"x, u = readonly(carray(x, {self.states})), readonly(carray(u, {self.controls}))"]
+        numbers = "".join(f"data[{self.offset + i}], " for i in range(len(self.parameters)))
+        lines.append(f"p = Parameters({numbers})")
+        if self.writes:
+            outputs = ("a", "b")
+            lines += [f"{name} = carray({name}, {shape})" for name, shape in zip(outputs, self.writes, strict=True)]
+            lines.append("function(x, u, p, a, b)")
+        else:
+            outputs = ("out",)
+            lines.append("returned = function(x, u, p)")
+            lines += [f"out[{i}] = returned{f'[{i}]' if self.entries else ''}" for i in range(self.values)]
+        body = "\n".join(f"    {line}" for line in lines)
+        source = f"def adapter(x, u, data, {', '.join(outputs)}):\n{body}\n"
+        return source, {"Parameters": collections.namedtuple("Parameters", self.parameters)}
+
+
+def _view(address: int, size: int) -> Array:
+    memory: Any = (ctypes.c_double * size).from_address(address)
+    return np.frombuffer(memory, dtype=np.float64)
+
+
+def brief(x: Array) -> str:
+    """A few of the numbers, for a message."""
+    return "(" + ", ".join(f"{value:g}" for value in x[:6]) + (", ...)" if len(x) > 6 else ")")
+
+
+def check_signature(function: Any, wanted: Sequence[str]) -> None:
+    """Raises InputError unless the function can be called with those arguments."""
+    plain = getattr(function, "py_func", function)
+    try:
+        inspect.signature(plain).bind(*wanted)
+    except TypeError as error:
+        raise InputError(f"{name_of(function)}: {error}, want a function of ({', '.join(wanted)})") from None
+    except ValueError:  # a built-in tells nothing about itself
+        return

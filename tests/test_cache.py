@@ -1,0 +1,190 @@
+"""What is kept on disk: found again, never stale, never an error; and the keys that make it so."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim import cache, compiled, rotations
+from lqrsim.fingerprint import fingerprint
+
+# The smallest problem there is, in a file of its own so that two processes trace the same function.
+SYSTEM = """
+import sys
+import lqrsim as ls
+from lqrsim import compiled
+
+def decay(x, u, p):
+    from sympy import exp
+    return [p.gain * u[0] - x[0] * exp(-x[0])]
+
+problem = ls.Problem(
+    dynamics=ls.Dynamics(decay, states={"x": ""}, controls={"u": ""}, parameters={"gain": 2.0}), dt=0.1, steps=10,
+    initial=ls.QuadraticCost([1.0], about=[1.0]), stage_cost=ls.ControlCost([1.0], about=[0.0]),
+    final_cost=ls.QuadraticCost([5.0], about=[0.0]),
+)
+solution = ls.smooth(problem)
+print(repr(solution.cost), len(compiled.compilations), "sympy" in sys.modules, solution.status.name)
+"""
+
+
+def start(tmp_path: Path, folder: Path) -> "subprocess.Popen[str]":
+    script = tmp_path / "system.py"
+    script.write_text(SYSTEM)
+    environment = {**os.environ, "LQRSIM_CACHE_DIR": str(folder)}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([sys.executable, str(script)], env=environment, **pipes)
+
+
+def finish(process: "subprocess.Popen[str]") -> tuple[list[str], str]:
+    out, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    return out.split(), errors
+
+
+def test_two_processes_compile_the_same_at_once_and_the_third_finds_it(tmp_path: Path) -> None:
+    folder = tmp_path / "cache"
+    first, second = (finish(process) for process in [start(tmp_path, folder), start(tmp_path, folder)])
+    assert "compiling smoother_iterations for decay (1 states, 1 controls)" in first[1]
+    third, silence = finish(start(tmp_path, folder))
+    # The same bits, whether compiled or loaded; loaded without compiling and without SymPy; nothing left over.
+    assert first[0][0] == second[0][0] == third[0]
+    assert third[1:] == ["0", "False", "CONVERGED"]
+    assert silence == ""
+    assert all(path.suffix == ".item" and not path.name.startswith(".") for path in folder.iterdir())
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda item: item[: len(item) // 2], lambda item: b"", lambda item: item[:-1] + b"x"]
+)
+def test_a_damaged_item_is_made_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, damage: Callable[[bytes], bytes]
+) -> None:
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+    source = "def double(x, out):\n    out[0] = 2 * x[0]\n"
+    x, out = np.array([21.0]), np.zeros(1)
+    for expected in (1, 0, 1, 0):
+        before = len(compiled.compilations)
+        compiled.Core(source, {}, "a test").double(x, out)
+        assert out[0] == 42
+        assert len(compiled.compilations) - before == expected
+        if len(compiled.compilations) - before == 0:
+            (item,) = tmp_path.iterdir()
+            item.write_bytes(damage(item.read_bytes()))
+
+
+def test_what_was_well_kept_and_can_not_be_used_is_made_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A checksum does not tell whether another version of the compiler wrote it."""
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+    source = "def triple(x, out):\n    out[0] = 3 * x[0]\n"
+    x, out = np.array([2.0]), np.zeros(1)
+    compiled.Core(source, {}, "a test").triple(x, out)
+    (item,) = tmp_path.iterdir()
+    cache.save(item.stem, b"not what numba writes", "a test")
+    compiled.Core(source, {}, "a test").triple(x, out)
+    assert out[0] == 6
+
+
+def test_a_cache_that_can_not_be_written_costs_only_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path / "file" / "cache"))
+    out = np.zeros(1)
+    for _ in range(2):
+        compiled.Core("def half(x, out):\n    out[0] = x[0] / 2\n", {}, "a test").half(np.array([4.0]), out)
+        assert out[0] == 2
+    assert cache.items() == []
+    assert cache.clear() == 0
+
+
+def test_a_cache_that_can_only_be_read_is_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+    cache.save("kept", b"contents", "a test")
+
+    def refuse(*arguments: object, **options: object) -> None:
+        raise PermissionError("read-only")
+
+    monkeypatch.setattr(os, "utime", refuse)
+    monkeypatch.setattr("tempfile.mkstemp", refuse)
+    cache.save("lost", b"contents", "a test")
+    assert cache.load("kept") == b"contents"
+    assert cache.load("lost") is None
+
+
+def test_the_cache_is_bounded_and_forgets_what_was_used_longest_ago(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(cache, "LIMIT", 3500)
+    for i in range(3):
+        cache.save(f"item{i}", bytes(1000), "a test")
+        os.utime(tmp_path / f"item{i}.item", (i, i))
+    assert cache.load("item0") is not None  # used now
+    cache.save("item3", bytes(1000), "a test")
+    assert {item.path.stem for item in cache.items()} == {"item0", "item2", "item3"}
+    assert cache.clear() == 3
+    assert list(tmp_path.iterdir()) == []
+
+
+def scale(x, u, p):
+    return [p.a * FACTOR * x[0]]
+
+
+FACTOR = 2.0
+
+
+def test_a_fingerprint_covers_what_a_function_refers_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = {fingerprint(scale)}
+    monkeypatch.setitem(globals(), "FACTOR", 3.0)
+    seen.add(fingerprint(scale))
+
+    def closure(power: float) -> Callable:
+        def inner(x, u, p):
+            return [x[0] ** power]
+
+        return inner
+
+    def calling(helper: Callable) -> Callable:
+        return lambda x, u, p: [helper(x[0])]
+
+    seen |= {fingerprint(closure(2.0)), fingerprint(closure(3.0))}
+    seen |= {fingerprint(calling(lambda y: y)), fingerprint(calling(lambda y: -y))}
+    seen |= {fingerprint(lambda x, u, p: rotations.rotate(x[:3], u)), fingerprint(lambda x, u, p, k=1: [k * x[0]])}
+    seen |= {fingerprint(lambda x, u, p, k=2: [k * x[0]])}
+    # Two functions of the same code that differ in what they enclose.
+    square, cube = closure(2.0), closure(3.0)
+    seen |= {fingerprint(lambda x, u, p: square(x, u, p) + cube(x, u, p))}
+    cube = closure(4.0)
+    seen |= {fingerprint(lambda x, u, p: square(x, u, p) + cube(x, u, p))}
+    assert len(seen) == 11
+    assert None not in seen
+    assert fingerprint(closure(2.0)) == fingerprint(closure(2.0))
+
+
+class Mass:
+    value = 1.0
+
+
+def test_what_may_change_unseen_has_no_fingerprint() -> None:
+    mass = Mass()
+
+    def imports(x, u, p):
+        import tests_helper_of_mine  # pyright: ignore[reportMissingImports]
+
+        return [tests_helper_of_mine.drag(x[0])]
+
+    assert fingerprint(lambda x, u, p: [mass.value * x[0]]) is None
+    assert fingerprint(imports) is None
+    assert fingerprint(lambda x, u, p: [pytest.approx(x[0])]) is None
+
+
+def test_a_formula_that_failed_is_not_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+    for _ in range(2):
+        with pytest.raises(ls.InputError, match="got 2 entries, want 1: one for each of x"):
+            _ = ls.Dynamics(lambda x, u, p: [x[0], u[0]], states={"x": ""}, controls={"u": ""}).source
+    assert list(tmp_path.iterdir()) == []

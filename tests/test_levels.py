@@ -1,0 +1,255 @@
+"""One system at every level of statement: the same numbers, and one line for what can not be right."""
+
+import threading
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime
+
+import lqrsim as ls
+from lqrsim import compiled
+from lqrsim.checks import evaluate
+from lqrsim.results import Status
+
+FIELDS: dict[str, Any] = {
+    "states": {"angle": "rad", "speed": "rad/s"},
+    "controls": {"torque": "N m"},
+    "parameters": {"inertia": 0.02, "gravity": 9.81, "length": 0.2},
+    "angles": ("angle",),
+}
+
+
+def symbolic(x, u, p):
+    from sympy import sin
+
+    return [x[1], u[0] / p.inertia - p.gravity / p.length * sin(x[0])]
+
+
+def pendulum(x, u, p):
+    return x[1], u[0] / p.inertia - p.gravity / p.length * np.sin(x[0])
+
+
+def pendulum_jacobian(x, u, p, fx, fu):
+    fx[0, 1] = 1.0
+    fx[1, 0] = -p.gravity / p.length * np.cos(x[0])
+    fu[1, 0] = 1 / p.inertia
+
+
+def symbolic_bump(x, u, p):
+    from sympy import exp
+
+    return p.height * exp(-4 * (x[0] - 1.5) ** 2) + x[1] ** 2 / 10
+
+
+def bump(x, u, p):
+    return p.height * np.exp(-4 * (x[0] - 1.5) ** 2) + x[1] ** 2 / 10
+
+
+def bump_derivatives(x, u, p, gradient, hessian):
+    away = x[0] - 1.5
+    height = p.height * np.exp(-4 * away**2)
+    gradient[0], gradient[1] = -8 * away * height, x[1] / 5
+    hessian[0, 0], hessian[1, 1] = (64 * away**2 - 8) * height, 0.2
+
+
+HEIGHT: dict[str, Any] = {"parameters": {"height": 0.5}}
+DYNAMICS = {
+    "symbolic": ls.Dynamics(symbolic, **FIELDS),
+    "compiled": ls.Dynamics(numba.njit(pendulum), **FIELDS),
+    "compiled with Jacobian": ls.Dynamics(numba.njit(pendulum), jacobian=numba.njit(pendulum_jacobian), **FIELDS),
+    "compiled here": ls.Dynamics(pendulum, level="compiled", **FIELDS),
+    "plain": ls.Dynamics(pendulum, level="plain", **FIELDS),
+    "plain with Jacobian": ls.Dynamics(pendulum, jacobian=pendulum_jacobian, level="plain", **FIELDS),
+}
+COSTS = {
+    "symbolic": ls.SymbolicCost(symbolic_bump, **HEIGHT),
+    "compiled": ls.FunctionCost(numba.njit(bump), depends_on=("angle", "speed"), **HEIGHT),
+    "plain with derivatives": ls.FunctionCost(
+        bump, derivatives=bump_derivatives, depends_on=("angle", "speed"), **HEIGHT
+    ),
+}
+
+
+def swing(dynamics: ls.Dynamics, cost: ls.Cost, **changes: object) -> ls.Problem:
+    fields: dict = {
+        "dynamics": dynamics,
+        "dt": 0.05,
+        "steps": 40,
+        "initial": ls.QuadraticCost([100.0, 100.0], about=[0.0, 0.0]),
+        "stage_cost": ls.ControlCost([5.0], about=[0.0]) + cost,
+        "final_cost": ls.QuadraticCost([10.0, 1.0], about=[np.pi, 0.0]),
+    }
+    return ls.Problem(**{**fields, **changes})
+
+
+# Every level of dynamics with one level of cost, and the other way round: each pair is a structure to compile.
+PAIRS = [
+    ("symbolic", "symbolic"),
+    ("compiled", "compiled"),
+    ("compiled here", "compiled"),
+    ("plain", "compiled"),
+    ("compiled with Jacobian", "plain with derivatives"),
+    ("plain with Jacobian", "plain with derivatives"),
+]
+
+
+@pytest.mark.parametrize(("dynamics", "cost"), PAIRS)
+@pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+def test_every_level_finds_the_same(solver, dynamics: str, cost: str) -> None:
+    """To the rounding of central differences, 1e-9, where derivatives are such; exact ones agree to 1e-12."""
+    want = solver(swing(DYNAMICS["symbolic"], COSTS["symbolic"]))
+    found = solver(swing(DYNAMICS[dynamics], COSTS[cost]))
+    assert found.status is want.status is Status.CONVERGED
+    assert len(found.iterations) == len(want.iterations)
+    exact = "Jacobian" in dynamics or dynamics == "symbolic"
+    assert found.cost == pytest.approx(want.cost, rel=1e-12 if exact else 1e-9)
+    tolerance = 1e-9 if exact else 1e-5
+    np.testing.assert_allclose(found.policy.gain, want.policy.gain, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("name", DYNAMICS)
+def test_derivatives_of_every_level(name: str) -> None:
+    """The plain-Python face of each level against SciPy's differences, whose error is some 1e-7 here."""
+    dynamics, rng = DYNAMICS[name], np.random.default_rng(0)
+    for _ in range(5):
+        x, u = rng.normal(size=2), rng.normal(size=1)
+        np.testing.assert_allclose(dynamics.rate(x, u), DYNAMICS["symbolic"].rate(x, u), rtol=0, atol=1e-13)
+        fx, fu = dynamics.rate_jacobian(x, u)
+        slope: Any = approx_fprime(x, lambda y, u=u: dynamics.rate(y, u))
+        np.testing.assert_allclose(fx, slope, rtol=0, atol=1e-5)
+        slope = approx_fprime(u, lambda v, x=x: dynamics.rate(x, v))
+        np.testing.assert_allclose(fu, slope, rtol=0, atol=1e-5)
+        a, b, c = dynamics.linearize(x, u, 0.05)
+        np.testing.assert_allclose(a @ x + b @ u + c, dynamics.step(x, u, 0.05), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", COSTS)
+def test_derivatives_of_costs_of_every_level(name: str) -> None:
+    """Second differences with a step of 1e-4 are good to 1e-6 here; the exact ones are compared as strictly."""
+    dynamics = DYNAMICS["symbolic"]
+    term = COSTS[name].bind(dynamics)
+    x, u = np.array([1.2, -0.3]), np.array([0.4])
+    value, gradient, hessian = evaluate(term, dynamics, x, u)
+    wanted_gradient, wanted_hessian = np.zeros(3), np.zeros((3, 3))
+    p = type("P", (), HEIGHT["parameters"])
+    bump_derivatives(x, u, p, wanted_gradient, wanted_hessian)
+    assert value == pytest.approx(bump(x, u, p), rel=1e-14)
+    np.testing.assert_allclose(gradient, wanted_gradient, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(hessian, wanted_hessian, rtol=0, atol=1e-6)
+
+
+def test_numbers_and_plain_functions_are_data() -> None:
+    """Other goals, weights, parameters, lengths, and plain functions compile nothing."""
+    ls.smooth(swing(DYNAMICS["plain"], COSTS["compiled"]))
+    before = len(compiled.compilations)
+    heavy = ls.Dynamics(pendulum, level="plain", **{**FIELDS, "parameters": {**FIELDS["parameters"], "inertia": 0.03}})
+    other = ls.Dynamics(lambda x, u, p: [x[1], u[0] - x[0]], level="plain", **{**FIELDS, "parameters": {}})
+    goal = ls.QuadraticCost([20.0, 2.0], about=[1.0, 0.0])
+    costs = {
+        ls.smooth(problem).cost
+        for problem in (
+            swing(heavy, COSTS["compiled"]),
+            swing(other, COSTS["compiled"]),
+            swing(DYNAMICS["plain"], COSTS["compiled"], final_cost=goal, steps=30, dt=0.04),
+        )
+    }
+    assert len(costs) == 3
+    assert compiled.compilations[before:] == []
+
+
+def test_what_a_plain_function_raises_ends_the_solve_with_its_words() -> None:
+    calls = []
+
+    def fragile(x, u, p):
+        calls.append(threading.get_ident())
+        if x[0] > 0.5:
+            raise ZeroDivisionError("the angle is beyond me")
+        return pendulum(x, u, p)
+
+    solution = ls.smooth(swing(ls.Dynamics(fragile, level="plain", **FIELDS), COSTS["compiled"]))
+    assert solution.status is Status.NOT_FINITE
+    assert "fragile(x, u, p) raised ZeroDivisionError: the angle is beyond me" in solution.detail
+    assert set(calls) == {threading.get_ident()}
+
+
+def test_ctrl_c_in_a_plain_function_stops_the_solve() -> None:
+    calls = []
+
+    def interrupted(x, u, p):
+        calls.append(None)
+        if len(calls) > 100:
+            raise KeyboardInterrupt
+        return pendulum(x, u, p)
+
+    dynamics = ls.Dynamics(interrupted, level="plain", **FIELDS)
+    with pytest.raises(KeyboardInterrupt):
+        ls.smooth(swing(dynamics, COSTS["compiled"]))
+    assert len(calls) == 101  # it was not called again
+
+
+def _index(x, u, p):
+    return x[1], x[5]
+
+
+def _writes(x, u, p):
+    x[0] = 0.0
+    return x[1], u[0]
+
+
+def _root(x, u, p):
+    return x[1], np.sqrt(-1 - x[0] ** 2)
+
+
+def _jacobian_out_of_bounds(x, u, p, fx, fu):
+    fx[2, 0] = 1.0
+
+
+@pytest.mark.parametrize("level", ["compiled", "plain"])
+@pytest.mark.parametrize(
+    ("function", "fields", "message"),
+    [
+        (lambda x, u, p: (x[1],), {}, "got 1 entries, want 2: one for each of angle, speed"),
+        (lambda x, u, p: (x[1], "fast"), {}, "got .*fast.*, want 2: one for each of angle, speed"),
+        (lambda x, u, p: (x[1], p.drag), {}, r"parameter: got 'drag', want one of: inertia, gravity, length"),
+        (_index, {}, r"_index\(x, u, p\): got IndexError .* at x = \(0, 0\)"),
+        (_root, {}, r"_root\(x, u, p\): got nan as entry 1 \(speed\) at the start, x = \(0, 0\), u = \(0\)"),
+        (pendulum, {"jacobian": _jacobian_out_of_bounds}, r"_jacobian_out_of_bounds.*got IndexError"),
+        (lambda x, u: x, {}, r"too many positional arguments, want a function of \(x, u, p\)"),
+    ],
+)
+def test_bad_functions_get_one_line(level: str, function, fields: dict, message: str) -> None:
+    with pytest.raises(ls.InputError, match=message) as caught:
+        ls.smooth(swing(ls.Dynamics(function, level=level, **FIELDS, **fields), COSTS["compiled"]))
+    assert "\n" not in str(caught.value)
+
+
+def test_what_numba_can_not_compile_gets_one_line() -> None:
+    with pytest.raises(ls.InputError, match=r"_writes\(x, u, p\): got what numba can not compile, want .*readonly"):
+        ls.smooth(swing(ls.Dynamics(_writes, level="compiled", **FIELDS), COSTS["compiled"]))
+    with pytest.raises(ls.InputError, match="jacobian: got one for symbolic, which is symbolic, want none"):
+        ls.Dynamics(symbolic, jacobian=pendulum_jacobian, **FIELDS)
+    with pytest.raises(ls.InputError, match="level: got 'fast', want one of: symbolic, compiled, plain"):
+        ls.Dynamics(symbolic, level="fast", **FIELDS)
+    with pytest.raises(ls.InputError, match="level: got 'plain' for pendulum, want 'compiled' for a numba function"):
+        ls.Dynamics(numba.njit(pendulum), level="plain", **FIELDS)
+    with pytest.raises(ls.InputError, match="depends_on: got 'angel', want one of: angle, speed, torque"):
+        swing(DYNAMICS["symbolic"], ls.FunctionCost(bump, depends_on=("angel",)))
+    with pytest.raises(ls.InputError, match="final_cost: got a cost that depends on the control"):
+        swing(DYNAMICS["symbolic"], COSTS["symbolic"], final_cost=ls.FunctionCost(bump))
+
+
+def test_check_derivatives_names_the_worst_entry() -> None:
+    def wrong(x, u, p, fx, fu):
+        pendulum_jacobian(x, u, p, fx, fu)
+        fx[1, 1] = 0.25
+
+    dynamics = ls.Dynamics(pendulum, jacobian=wrong, level="plain", **FIELDS)
+    good = ls.check_derivatives(swing(DYNAMICS["symbolic"], COSTS["plain with derivatives"]))
+    assert all(check.good for check in good)
+    assert {check.what for check in good} >= {"df/dx of symbolic", "Hessian of stage_cost: bump(x, u, p)"}
+    bad = [check for check in ls.check_derivatives(dynamics) if not check.good]
+    assert [(check.what, check.row, check.column) for check in bad] == [("df/dx of pendulum", "speed", "speed")]
+    assert bad[0].stated == 0.25
+    assert "DISAGREES; worst at row speed, column speed: 0.25 stated" in str(bad[0])
