@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim import cache, compiled, rotations
+from lqrsim import cache, core, rotations
 from lqrsim.fingerprint import fingerprint
 
 # The smallest problem there is, in a file of its own so that two processes trace the same function.
 SYSTEM = """
 import sys
 import lqrsim as ls
-from lqrsim import compiled
+from lqrsim import core
 
 def decay(x, u, p):
     from sympy import exp
@@ -29,7 +29,7 @@ problem = ls.Problem(
     final_cost=ls.QuadraticCost([5.0], about=[0.0]),
 )
 solution = ls.smooth(problem)
-print(repr(solution.cost), len(compiled.compilations), "sympy" in sys.modules, solution.status.name)
+print(repr(solution.cost), len(core.compilations), "sympy" in sys.modules, solution.status.name)
 """
 
 
@@ -69,11 +69,11 @@ def test_a_damaged_item_is_made_again(
     source = "def double(x, out):\n    out[0] = 2 * x[0]\n"
     x, out = np.array([21.0]), np.zeros(1)
     for expected in (1, 0, 1, 0):
-        before = len(compiled.compilations)
-        compiled.Core(source, {}, "a test").double(x, out)
+        before = len(core.compilations)
+        core.Core(source, {}, "a test").double(x, out)
         assert out[0] == 42
-        assert len(compiled.compilations) - before == expected
-        if len(compiled.compilations) - before == 0:
+        assert len(core.compilations) - before == expected
+        if len(core.compilations) - before == 0:
             (item,) = tmp_path.iterdir()
             item.write_bytes(damage(item.read_bytes()))
 
@@ -83,10 +83,10 @@ def test_what_was_well_kept_and_can_not_be_used_is_made_again(monkeypatch: pytes
     monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
     source = "def triple(x, out):\n    out[0] = 3 * x[0]\n"
     x, out = np.array([2.0]), np.zeros(1)
-    compiled.Core(source, {}, "a test").triple(x, out)
+    core.Core(source, {}, "a test").triple(x, out)
     (item,) = tmp_path.iterdir()
     cache.save(item.stem, b"not what numba writes", "a test")
-    compiled.Core(source, {}, "a test").triple(x, out)
+    core.Core(source, {}, "a test").triple(x, out)
     assert out[0] == 6
 
 
@@ -95,7 +95,7 @@ def test_a_cache_that_can_not_be_written_costs_only_time(monkeypatch: pytest.Mon
     monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path / "file" / "cache"))
     out = np.zeros(1)
     for _ in range(2):
-        compiled.Core("def half(x, out):\n    out[0] = x[0] / 2\n", {}, "a test").half(np.array([4.0]), out)
+        core.Core("def half(x, out):\n    out[0] = x[0] / 2\n", {}, "a test").half(np.array([4.0]), out)
         assert out[0] == 2
     assert cache.items() == []
     assert cache.clear() == 0

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import approx_fprime
 
 import lqrsim as ls
-from lqrsim import compiled
+from lqrsim import core
 from lqrsim.checks import evaluate
 from lqrsim.results import Status
 
@@ -143,7 +143,7 @@ def test_derivatives_of_costs_of_every_level(name: str) -> None:
 def test_numbers_and_plain_functions_are_data() -> None:
     """Other goals, weights, parameters, lengths, and plain functions compile nothing."""
     ls.smooth(swing(DYNAMICS["plain"], COSTS["compiled"]))
-    before = len(compiled.compilations)
+    before = len(core.compilations)
     heavy = ls.Dynamics(pendulum, level="plain", **{**FIELDS, "parameters": {**FIELDS["parameters"], "inertia": 0.03}})
     other = ls.Dynamics(lambda x, u, p: [x[1], u[0] - x[0]], level="plain", **{**FIELDS, "parameters": {}})
     goal = ls.QuadraticCost([20.0, 2.0], about=[1.0, 0.0])
@@ -156,7 +156,7 @@ def test_numbers_and_plain_functions_are_data() -> None:
         )
     }
     assert len(costs) == 3
-    assert compiled.compilations[before:] == []
+    assert core.compilations[before:] == []
 
 
 def test_what_a_plain_function_raises_ends_the_solve_with_its_words() -> None:

@@ -12,11 +12,12 @@ from linear_quadratic import LinearQuadratic, random_problem, solve_dense
 
 import lqrsim as ls
 from lqrsim import compiled
+from lqrsim.core import Core
 from lqrsim.errors import Array
 from lqrsim.results import Quadratic
 
 
-def integrator(n: int, m: int) -> compiled.Core:
+def integrator(n: int, m: int) -> Core:
     """The core of some problem with n states and m controls; the Riccati steps in it know no more than the sizes."""
     dynamics = ls.Dynamics(
         lambda x, u, p: [u[i % m] - x[i] for i in range(n)],
@@ -37,7 +38,7 @@ def integrator(n: int, m: int) -> compiled.Core:
 class Smoothed:
     """LQR smoothing of a linear-quadratic problem, step by step with the compiled kernels."""
 
-    def __init__(self, core: compiled.Core, problem: LinearQuadratic) -> None:
+    def __init__(self, core: Core, problem: LinearQuadratic) -> None:
         steps, n, m = problem.B.shape
         self.L, self.l = np.zeros((steps, m, n)), np.zeros((steps, m))
         self.Lbar, self.lbar = np.zeros((steps, m, n)), np.zeros((steps, m))
@@ -157,10 +158,10 @@ def _project(matrix: Array) -> Array:
     return hessian[:3, :3]
 
 
-_cores: dict[tuple[int, int], compiled.Core] = {}
+_cores: dict[tuple[int, int], Core] = {}
 
 
-def _core(n: int, m: int) -> compiled.Core:
+def _core(n: int, m: int) -> Core:
     if (n, m) not in _cores:
         _cores[n, m] = integrator(n, m)
     return _cores[n, m]

@@ -1,0 +1,325 @@
+"""Text in the numba subset to machine code, kept on disk by content.
+
+A core is one text. Each function in it that Python calls is compiled when it is first needed, together with all that it
+calls, and kept under a hash of that text and its own name, so nothing kept can be stale.
+"""
+
+import ast
+import contextlib
+import gc
+import logging
+import platform
+import re
+import threading
+from collections.abc import Callable, Iterator
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lqrsim import cache as disk
+from lqrsim.errors import InputError
+from lqrsim.fingerprint import fingerprint
+from lqrsim.functions import External
+
+logger = logging.getLogger("lqrsim")
+
+# `contract` and the like let LLVM fuse and reorder sums, but keep NaN and infinity meaningful.
+_FAST = ("contract", "reassoc", "nsz", "arcp")
+
+# The functions that take long to compile, which is worth a message.
+LONG = ("smoother_iterations", "ilqr_iterations")
+
+# Compilations in this process; what was loaded from disk does not count.
+compilations: list[str] = []
+_compiling = threading.RLock()
+
+
+class Core:
+    """The functions of one text, compiled for what they are called with.
+
+    Calling `core.name(...)` calls the function of that name: arrays of float64, C-ordered, go in as pointers to blocks
+    of constant shape; numbers and tuples of vectors as they are. `core.entry(name, ...)` only compiles it.
+
+    Args:
+      what: what it is for, as the progress message and `lqrsim cache` say it.
+    """
+
+    def __init__(self, source: str, sizes: dict[str, int], what: str) -> None:
+        self.source = ast.unparse(ast.fix_missing_locations(_Specialise(sizes).visit(ast.parse(source))))
+        self.what = what
+        self._entries: dict[tuple[Any, ...], Any] = {}
+        self._compilable: dict[str, Any] = {}
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return lambda *arguments: self.entry(name, *arguments)(*arguments)
+
+    def entry(self, name: str, *arguments: Any) -> Callable[..., Any]:
+        """The compiled function for arguments like these."""
+        kinds = tuple(_kind(argument) for argument in arguments)
+        found = self._entries.get((name, kinds))
+        if found is None:
+            with _compiling:
+                found = self._entries.get((name, kinds)) or self._make(name, kinds)
+                self._entries[name, kinds] = found
+        return found
+
+    def _make(self, name: str, kinds: tuple[Any, ...]) -> Callable[..., Any]:
+        import numba
+
+        text = self._entry_source(name, kinds)
+        key = disk.key(_machine(), self.source, text, repr(kinds))
+        namespace: dict[str, Any] = {"__name__": __name__}
+        exec(compile(text, "<lqrsim>", "exec"), namespace)
+        dispatcher: Any = numba.njit(namespace["entry"], nogil=True, **_options())
+        stored = disk.load(key)
+        if stored is None or not _restore(dispatcher, stored):
+            what = f"{name} for {self.what}"
+            compilations.append(what)
+            # A warning is what a script shows that has not set up logging, and half a minute of silence is worse.
+            log = logger.warning if name in LONG else logger.debug
+            log(f"compiling {what}: some 10 seconds, once for this kind of problem ...")
+            namespace.update(self._namespace())
+            with _uncollected(), _as_one():
+                dispatcher.compile(_signature(kinds))
+            disk.save(key, _serialise(dispatcher), what)
+        dispatcher.disable_compile()
+        return dispatcher
+
+    def _entry_source(self, name: str, kinds: tuple[Any, ...]) -> str:
+        """The function of that name under the name `entry`, which turns arrays into pointers first."""
+        functions = {node.name: node for node in ast.parse(self.source).body if isinstance(node, ast.FunctionDef)}
+        node = functions[name]
+        lines = []
+        for name, kind in zip((argument.arg for argument in node.args.args), kinds, strict=True):
+            if kind[0] == "array":
+                lines.append(f"{name} = pointer({name}, {kind[1:]})")
+            elif kind[0] == "vectors":
+                lines.append(f"{name} = ({' '.join(f'pointer({name}[{i}], ()),' for i in range(kind[1]))})")
+        node.name, node.decorator_list = "entry", []
+        node.body = [*ast.parse("\n".join(lines)).body, *node.body]
+        return ast.unparse(node)
+
+    def _namespace(self) -> dict[str, Any]:
+        """The names that the entries call."""
+        if not self._compilable:
+            import math
+
+            import numba
+
+            from lqrsim import pointers
+
+            jit: Any = numba.njit
+            inner = jit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
+            inlined = jit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
+            names = {**vars(math), "__name__": __name__, "inner": inner, "inlined": inlined}
+            names |= {name: getattr(pointers, name) for name in ("stack", "pointer", "invoke", "invoke_writing")}
+            exec(compile(self.source, "<lqrsim core>", "exec"), names)
+            self._compilable.update(names)
+        return self._compilable
+
+
+def address_of(function: External) -> float:
+    """Where compiled code finds a user's function."""
+    with _compiling:
+        if not function.held:
+            function.held.append(_compile(function) if function.level == "compiled" else function.called_back)
+    return float(function.held[0][1])
+
+
+def _compile(function: External) -> tuple[Any, int]:
+    """A numba function behind C's calling convention: what must be kept alive, and its address.
+
+    Raises:
+      InputError: numba can not compile it.
+    """
+    import numba
+    from numba import carray  # pyright: ignore[reportPrivateImportUsage]
+    from numba.core.errors import NumbaError
+
+    from lqrsim.pointers import readonly
+
+    options = getattr(function.function, "targetoptions", {})
+    own: Any = function.function if options else numba.njit(**_options())(function.function)
+    text, names = function.adapter()
+    names |= {"function": own, "carray": carray, "readonly": readonly, "__name__": __name__}
+    exec(compile(text, "<lqrsim>", "exec"), names)
+    dispatcher: Any = numba.njit(names["adapter"], **_options())
+    print_of_it = fingerprint(own)
+    key = disk.key(
+        _machine(), print_of_it or "", repr(sorted(options.items(), key=str)), text, repr(function.parameters)
+    )
+    stored = disk.load(key) if print_of_it else None
+    if stored is None or not _restore(dispatcher, stored):
+        what = f"{function.name}"
+        compilations.append(what)
+        logger.debug(f"compiling {what} ...")
+        pointer = numba.types.CPointer(numba.types.float64)
+        try:
+            with _uncollected():
+                dispatcher.compile((pointer,) * (3 + (len(function.writes) or 1)))
+        except NumbaError as error:
+            raise InputError(f"{function.name}: got what numba can not compile, want {_reason(error)}") from error
+        if print_of_it:
+            disk.save(key, _serialise(dispatcher), what)
+    (result,) = dispatcher.overloads.values()
+    return result, result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
+
+
+def _reason(error: Exception) -> str:
+    """The line of numba's pages of explanation that says what is wrong."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    telling = [
+        line for line in lines if not re.match(r"Failed in|During:|File |\^|- Resolution|<source|raised from", line)
+    ]
+    return f"its subset of Python ({' '.join(telling[:3])})"
+
+
+class _Specialise(ast.NodeTransformer):
+    """Puts the sizes in as constants and shapes as tuples; drops docstrings and annotations; decorates."""
+
+    def __init__(self, sizes: dict[str, int]) -> None:
+        self.sizes = sizes
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        return ast.Constant(self.sizes[node.id]) if node.id in self.sizes else node
+
+    def visit_Call(self, node: ast.Call) -> ast.expr:
+        self.generic_visit(node)
+        if isinstance(node.func, ast.Name) and node.func.id == "stack":
+            shape = tuple(ast.literal_eval(argument) for argument in node.args)
+            return ast.parse(f"stack({shape})", mode="eval").body
+        return node
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef:
+        self.generic_visit(node)
+        if ast.get_docstring(node) is not None:
+            node.body = node.body[1:]
+        node.returns = None
+        for argument in node.args.args:
+            argument.annotation = None
+        node.decorator_list = [ast.Name("inlined" if node.name in _INLINED else "inner")]
+        return node
+
+
+def _options() -> dict[str, Any]:
+    return {"fastmath": set(_FAST), "error_model": "numpy"}
+
+
+# LLVM finds most of what is worth inlining, and to force all of it doubles the time to compile. These are small, and
+# called at every stage of every step.
+_INLINED = ("rate", "rate_jacobian", "signed_distance", "signed_distance_derivatives")
+
+
+@contextlib.contextmanager
+def _uncollected() -> Iterator[None]:
+    """Without garbage collection, which takes a sixth of the time to compile."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@contextlib.contextmanager
+def _as_one() -> Iterator[None]:
+    """Make machine code of the entry alone, into which all that it calls is linked, and none of each part by itself.
+
+    numba makes both, which takes a quarter longer, and then it is up to the linker which of two copies of a part runs:
+    they differ in the last bit, so the run that compiles and the one that loads would not give the same numbers.
+    """
+    from numba.core import codegen, registry
+    from numba.core.compiler_lock import global_compiler_lock
+
+    class Part(codegen.JITCodeLibrary):
+        def _finalize_final_module(self) -> None:
+            if self.name == "entry":
+                super()._finalize_final_module()
+            else:
+                self._finalize_dynamic_globals()
+                self._verify_declare_only_symbols()
+                self._finalized = True
+
+    target: Any = registry.cpu_target
+    generator = target.target_context.codegen()
+    usual, set_env = generator._library_class, generator.set_env
+
+    def set_env_if_there(name: str, env: Any) -> None:
+        if generator._engine.get_global_value_address(name):  # parts have no memory of their own
+            set_env(name, env)
+
+    with global_compiler_lock:  # so that nothing else is compiled meanwhile
+        generator._library_class, generator.set_env = Part, set_env_if_there
+        try:
+            yield
+        finally:
+            generator._library_class, generator.set_env = usual, set_env
+
+
+def _kind(argument: Any) -> tuple[Any, ...]:
+    """What the type of an argument is to be: an array's is its block, for the number of blocks is not known."""
+    if isinstance(argument, np.ndarray):
+        return ("array", *argument.shape[1:])
+    if isinstance(argument, tuple):
+        return ("vectors", len(argument))
+    kinds = ((bool, np.bool_), "bool"), ((int, np.integer), "int"), ((float, np.floating), "float")
+    return (next(name for types, name in kinds if isinstance(argument, types)),)
+
+
+def _signature(kinds: tuple[tuple[Any, ...], ...]) -> Any:
+    from numba import types
+
+    def one(kind: tuple[Any, ...]) -> Any:
+        match kind[0]:
+            case "array":
+                return types.Array(types.float64, len(kind), "C")
+            case "vectors":
+                return types.UniTuple(types.Array(types.float64, 1, "C"), kind[1])
+            case "bool":
+                return types.boolean
+            case "int":
+                return types.int64
+        return types.float64
+
+    return tuple(one(kind) for kind in kinds)
+
+
+@cache
+def _machine() -> str:
+    """What compiled code depends on besides its source: the compiler, the processor, and how pointers are compiled."""
+    from numba.core import registry
+
+    from lqrsim import pointers
+
+    target: Any = registry.cpu_target
+    parts = [version("numba"), version("llvmlite"), platform.python_version(), *_FAST]
+    parts.append(repr(target.target_context.codegen().magic_tuple()))
+    return "\n".join([*parts, Path(pointers.__file__).read_text(encoding="utf-8")])
+
+
+def _serialise(dispatcher: Any) -> bytes:
+    from numba.core import serialize
+
+    (result,) = dispatcher.overloads.values()
+    return serialize.dumps(result._reduce())
+
+
+def _restore(dispatcher: Any, stored: bytes) -> bool:
+    """Give the dispatcher what `_serialise` kept; False if that does not work out."""
+    import pickle
+
+    from numba.core.compiler import CompileResult
+
+    try:
+        dispatcher.targetctx.refresh()
+        dispatcher.add_overload(CompileResult._rebuild(dispatcher.targetctx, *pickle.loads(stored)))
+    except Exception as error:  # whatever is wrong with it, it can be compiled again
+        logger.debug(f"a compiled function in the cache could not be used ({error})")
+        return False
+    return True
