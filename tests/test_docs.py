@@ -59,6 +59,16 @@ def test_a_robot_scene_cost_and_disturbance_of_ones_own(
         assert ls.render(rollout, tmp_path / "rink.mp4", size=(320, 240), fps=5).stat().st_size > 1000
 
 
+def test_one_system_at_three_levels() -> None:
+    names = run_page("stating_a_system.md")
+    assert names["solution"].status is names["same"].status is ls.Status.CONVERGED
+    # The compiled statement has central differences: eight digits of a derivative, twice that of a minimum.
+    assert names["same"].cost == pytest.approx(names["solution"].cost, rel=1e-7)
+    assert names["rough_solution"].cost > names["solution"].cost
+    assert all(check.good for check in ls.check_derivatives(names["pendulum"]))
+    assert all(found.status is ls.Status.CONVERGED for found in names["solutions"])
+
+
 def test_a_policy_is_loaded_with_numpy_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, drive_solution: ls.Solution
 ) -> None:
