@@ -248,6 +248,9 @@ def _as_one() -> Iterator[None]:
 
     target: Any = registry.cpu_target
     generator = target.target_context.codegen()
+    if not hasattr(generator, "_library_class") or not hasattr(generator, "set_env"):
+        yield  # another numba, arranged otherwise: slower, and those last bits, but right
+        return
     usual, set_env = generator._library_class, generator.set_env
 
     def set_env_if_there(name: str, env: Any) -> None:

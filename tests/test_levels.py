@@ -1,5 +1,6 @@
 """One system at every level of statement: the same numbers, and one line for what can not be right."""
 
+import dataclasses
 import threading
 from typing import Any
 
@@ -138,6 +139,28 @@ def test_derivatives_of_costs_of_every_level(name: str) -> None:
     assert value == pytest.approx(bump(x, u, p), rel=1e-14)
     np.testing.assert_allclose(gradient, wanted_gradient, rtol=0, atol=1e-6)
     np.testing.assert_allclose(hessian, wanted_hessian, rtol=0, atol=1e-6)
+
+
+def test_goals_masses_obstacles_and_horizons_are_data(quadrotor: ls.Scenario) -> None:
+    given = quadrotor.problem
+    ls.smooth(given, max_iterations=2)
+    before = len(core.compilations)
+    heavy, world = ls.Quadrotor(mass=0.7), quadrotor.scene.world
+    fewer = ls.ObstacleCost(ls.World(world.obstacles[3:]), radius=0.25, sharpness=8.0, weight=2.0)
+    control = ls.ControlCost([10.0] * 4, about=[heavy.hover_force] * 4)
+    elsewhere = ls.QuadraticCost([400.0] * 12, about=[1.0, 0.5, -2.0, *[0.0] * 9])
+    costs = {
+        ls.smooth(problem, max_iterations=2).cost
+        for problem in (
+            given,
+            dataclasses.replace(given, dynamics=heavy.dynamics),
+            dataclasses.replace(given, stage_cost=control + fewer),
+            dataclasses.replace(given, final_cost=elsewhere),
+            dataclasses.replace(given, steps=100, dt=0.04, prior=None),
+        )
+    }
+    assert len(costs) == 5
+    assert core.compilations[before:] == []
 
 
 def test_numbers_and_plain_functions_are_data() -> None:
