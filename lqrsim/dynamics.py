@@ -115,6 +115,10 @@ class Dynamics:
             high=tuple(np.broadcast_to(np.asarray(high, dtype=float), len(controls)).tolist()),
         )
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is derived and can not be pickled."""
+        return {name: value for name, value in vars(self).items() if name not in ("_plain", "functions")}
+
     @property
     def name(self) -> str:
         """What messages call the dynamics: the name of `f`."""

@@ -10,8 +10,8 @@ import ctypes
 import inspect
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, fields
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -66,6 +66,11 @@ class External:
     entries: tuple[str, ...] = ()
     held: list[tuple[Any, int]] = field(default_factory=list, init=False, repr=False, compare=False)
     _thread: threading.local = field(default_factory=threading.local, init=False, repr=False, compare=False)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Without its address, which another process has no use for."""
+        stated = {field.name: getattr(self, field.name) for field in fields(self) if field.init}
+        return partial(External, **stated), ()
 
     @property
     def name(self) -> str:

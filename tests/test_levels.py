@@ -1,6 +1,8 @@
 """One system at every level of statement: the same numbers, and one line for what can not be right."""
 
+import copy
 import dataclasses
+import pickle
 import threading
 from typing import Any
 
@@ -180,6 +182,15 @@ def test_numbers_and_plain_functions_are_data() -> None:
     }
     assert len(costs) == 3
     assert core.compilations[before:] == []
+
+
+@pytest.mark.parametrize("level", ["compiled here", "plain with Jacobian"])
+def test_a_problem_can_be_copied_and_sent_to_another_process(level: str) -> None:
+    problem = swing(DYNAMICS[level], COSTS["plain with derivatives"])
+    want = ls.smooth(problem, max_iterations=2)
+    for other in (pickle.loads(pickle.dumps(problem)), copy.deepcopy(problem)):
+        assert other.digest == problem.digest
+        np.testing.assert_array_equal(ls.smooth(other, max_iterations=2).policy.gain, want.policy.gain)
 
 
 def test_what_a_plain_function_raises_ends_the_solve_with_its_words() -> None:
