@@ -114,10 +114,12 @@ class Dynamics:
             low=tuple(np.broadcast_to(np.asarray(low, dtype=float), len(controls)).tolist()),
             high=tuple(np.broadcast_to(np.asarray(high, dtype=float), len(controls)).tolist()),
         )
+        # At once and not when first needed: several threads may need them, and addresses are not to change.
+        self.functions = self._functions()
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is derived and can not be pickled."""
-        return {name: value for name, value in vars(self).items() if name not in ("_plain", "functions")}
+        return {name: value for name, value in vars(self).items() if name != "_plain"}
 
     @property
     def name(self) -> str:
@@ -129,8 +131,7 @@ class Dynamics:
         """The parameters' values, in order."""
         return np.array(list(self.parameters.values()), dtype=np.float64)
 
-    @cached_property
-    def functions(self) -> tuple[External, ...]:
+    def _functions(self) -> tuple[External, ...]:
         """What compiled code calls: nothing if the dynamics are symbolic, else f and the Jacobian, if there is one."""
         if self.level == "symbolic":
             return ()
