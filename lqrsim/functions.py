@@ -77,10 +77,11 @@ class External:
         """As messages have it."""
         return f"{name_of(self.function)}(x, u, p{', ...' if self.writes else ''})"
 
-    @property
+    @cached_property
     def identity(self) -> str:
-        """What tells it from other functions, in the digest of a problem."""
-        return fingerprint(self.function) or name_of(self.function)
+        """What tells it from other functions, in the digest of a problem: its fingerprint, or else its code."""
+        code = getattr(getattr(self.function, "py_func", self.function), "__code__", None)
+        return fingerprint(self.function) or f"{name_of(self.function)} {getattr(code, 'co_code', b'').hex()}"
 
     def call(self, x: Array, u: Array, p: Mapping[str, float]) -> list[Array]:
         """Call it in plain Python: the returned values as one vector, or the arrays that it wrote.
