@@ -35,7 +35,7 @@ class Item:
 def folder() -> Path:
     """Where the items are: $LQRSIM_CACHE_DIR, or the user's cache folder."""
     override = os.environ.get("LQRSIM_CACHE_DIR")
-    return Path(override) if override else Path(platformdirs.user_cache_dir("lqrsim", appauthor=False))
+    return Path(override).expanduser() if override else Path(platformdirs.user_cache_dir("lqrsim", appauthor=False))
 
 
 def key(*parts: str | bytes) -> str:
@@ -74,7 +74,7 @@ def save(name: str, contents: bytes, what: str) -> None:
 def items() -> list[Item]:
     """What there is, the last used first."""
     found = []
-    for path in folder().glob(f"[!.]*{_SUFFIX}"):
+    for path in _files(f"[!.]*{_SUFFIX}"):
         with contextlib.suppress(OSError):  # another process may remove it meanwhile
             status = path.stat()
             with path.open("rb") as file:
@@ -105,10 +105,17 @@ def _shrink() -> None:
         path.unlink(missing_ok=True)
 
 
+def _files(pattern: str) -> list[Path]:
+    try:
+        return list(folder().glob(pattern))
+    except OSError:  # a folder that may not be looked into
+        return []
+
+
 def _unfinished(age: float) -> list[Path]:
     """What a process that was killed did not finish, at least `age` seconds ago."""
     found = []
-    for path in folder().glob(f".*{_SUFFIX}"):
+    for path in _files(f".*{_SUFFIX}"):
         with contextlib.suppress(OSError):
             if time.time() - path.stat().st_mtime >= age:
                 found.append(path)

@@ -42,6 +42,13 @@ def check_start(problem: Problem, x: Array, u: Array) -> None:
                     f"{problem.dynamics.name}(x, u, p): got {rate:g} as entry {i} ({names[i]}) {where},"
                     " want a finite number"
                 )
+        columns = names, problem.dynamics.control_coordinates.names
+        for what, slopes, column in zip(("df/dx", "df/du"), problem.dynamics.rate_jacobian(x, u), columns, strict=True):
+            for i, j in np.argwhere(~np.isfinite(slopes)):
+                raise InputError(
+                    f"{problem.dynamics.name}(x, u, p): got {slopes[i, j]:g} in {what}, row {names[i]}, column"
+                    f" {column[j]}, {where}, want finite derivatives"
+                )
         for cost, term in _terms(problem):
             value, gradient, hessian = evaluate(term, problem.dynamics, x, u)
             for what, array in (("value", np.array(value)), ("gradient", gradient), ("Hessian", hessian)):
@@ -89,7 +96,7 @@ class DerivativeCheck:
 
     Attributes:
       what: which derivative: `df/dx of ...`, say.
-      error: largest difference over entries and samples, relative to the largest entry (at least 1).
+      error: largest difference over entries and samples, relative to the entry and the differences' own rounding.
       row, column: the names at that entry.
       stated, difference: the two values there. state (n,), control (m,): where that was.
       tolerance: what the error must not exceed.
@@ -125,12 +132,13 @@ def check_derivatives(
     """Compare derivatives with central differences: of dynamics, or of a problem's dynamics and costs.
 
     Derivatives of symbolic functions are exact, but a formula can still be singular where the robot goes; those of
-    compiled and plain functions are as right as who wrote them.
+    compiled and plain functions are as right as who wrote them. Costs without derivatives are left out, for theirs are
+    central differences themselves.
 
     Args:
       subject: dynamics, looked at around zero, or a problem, around its start and nominal control.
       samples: how many points. spread: their standard deviation, in the units of states and controls.
-      tolerance: of the error, relative to the largest entry (at least 1). seed: of the points.
+      tolerance: of the error, relative to each entry. seed: of the points.
 
     Returns:
       One check a matrix of derivatives, with the worst entry by row and column; print it. `check.good` is the verdict.
@@ -153,8 +161,12 @@ def check_derivatives(
     states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     found: dict[str, list[DerivativeCheck]] = {}
 
-    def compare(what: str, stated: Array, difference: Array, rows: Any, columns: Any, x: Array, u: Array) -> None:
-        apart = np.abs(stated - difference) / max(1.0, float(np.abs(difference).max(initial=0.0)))
+    def compare(
+        what: str, stated: Array, differences: tuple[Array, Array], rows: Any, columns: Any, x: Array, u: Array
+    ) -> None:
+        difference, noise = differences
+        size = np.maximum(np.abs(stated), np.abs(difference)) + noise / tolerance
+        apart = np.abs(stated - difference) / np.maximum(size, np.finfo(float).tiny)
         worst = int(np.argmax(np.where(np.isnan(apart), np.inf, apart)))
         i, j = (int(k) for k in np.unravel_index(worst, apart.shape))
         check = DerivativeCheck(
@@ -166,11 +178,12 @@ def check_derivatives(
         for x, u in points:
             fx, fu = dynamics.rate_jacobian(x, u)
             joint = _differences(lambda z: dynamics.rate(z[:n], z[n:]), np.concatenate([x, u]), 6e-6)
-            compare(f"df/dx of {dynamics.name}", fx, joint[:, :n], states, states, x, u)
-            compare(f"df/du of {dynamics.name}", fu, joint[:, n:], states, controls, x, u)
+            left, right = (joint[0][:, :n], joint[1][:, :n]), (joint[0][:, n:], joint[1][:, n:])
+            compare(f"df/dx of {dynamics.name}", fx, left, states, states, x, u)
+            compare(f"df/du of {dynamics.name}", fu, right, states, controls, x, u)
         for cost, term in _terms(subject) if isinstance(subject, Problem) else ():
             names = (*states, *controls)
-            for x, u in points:
+            for x, u in points if len(term.functions) != 1 else ():
                 _, gradient, hessian = evaluate(term, dynamics, x, u)
                 z = np.concatenate([x, u])
                 slope = _differences(lambda z, t=term: np.array([evaluate(t, dynamics, z[:n], z[n:])[0]]), z, 6e-6)
@@ -182,13 +195,16 @@ def check_derivatives(
     ]
 
 
-def _differences(function: Any, z: Array, step: float) -> Array:
-    """The Jacobian of a function of a vector by central differences."""
-    columns = []
+def _differences(function: Any, z: Array, step: float) -> tuple[Array, Array]:
+    """The Jacobian of a function of a vector by central differences, and what rounding may have done to each entry."""
+    columns, noise = [], []
     for i in range(len(z)):
         h = step * max(1.0, abs(z[i]))
         ahead, behind = z.copy(), z.copy()
         ahead[i] += h
         behind[i] -= h
-        columns.append((function(ahead) - function(behind)) / (2 * h))
-    return np.stack(columns, axis=1)
+        above, below = function(ahead), function(behind)
+        columns.append((above - below) / (2 * h))
+        # A thousand roundings of a number of that size, or of one.
+        noise.append(1e3 * np.finfo(float).eps * np.maximum(np.maximum(np.abs(above), np.abs(below)), 1.0) / h)
+    return np.stack(columns, axis=1), np.stack(noise, axis=1)

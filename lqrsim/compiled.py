@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import integration, rotations, world
-from lqrsim.core import Core, address_of
+from lqrsim.core import Core, address_of, compiling
 from lqrsim.costs import Term
 from lqrsim.dynamics import Dynamics
 from lqrsim.errors import Array
@@ -33,10 +33,15 @@ _FIELDS = {"initial": "initial", "stage": "stage_cost", "final": "final_cost"}
 
 def core(problem: Problem) -> Core:
     """The compiled passes for problems of this structure; see `solvers/loops.py` and `passes.py` for what it offers."""
+    with compiling:  # not only against doing it twice: Python 3.11 can not parse in two threads at once
+        return _core(*_structure(problem))
+
+
+def _structure(problem: Problem) -> tuple[Any, ...]:
     dynamics = problem.dynamics
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     costs = [(name, tuple((t.source, t.bends) for t in problem.terms(field))) for name, field in _FIELDS.items()]
-    return _core(n, m, dynamics.source, tuple(costs), f"{dynamics.name} ({n} states, {m} controls)")
+    return n, m, dynamics.source, tuple(costs), f"{dynamics.name} ({n} states, {m} controls)"
 
 
 @cache
@@ -66,7 +71,9 @@ def signed_distance(world_seen: World, points: npt.ArrayLike) -> Array:
     flat[:, : points.shape[-1]] = points.reshape(-1, points.shape[-1])
     out = np.empty(len(flat))
     table = np.array(world_seen.table)
-    _distance_core().nearest(len(table), len(flat), table.ravel(), flat, out)
+    with compiling:
+        distances = _distance_core()
+    distances.nearest(len(table), len(flat), table.ravel(), flat, out)
     return out.reshape(points.shape[:-1])
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from lqrsim import cache as disk
 from lqrsim.errors import InputError
-from lqrsim.fingerprint import fingerprint
+from lqrsim.fingerprint import fingerprint, helpers
 from lqrsim.functions import External
 
 logger = logging.getLogger("lqrsim")
@@ -34,7 +34,7 @@ LONG = ("smoother_iterations", "ilqr_iterations")
 
 # Compilations in this process; what was loaded from disk does not count.
 compilations: list[str] = []
-_compiling = threading.RLock()
+compiling = threading.RLock()
 
 
 class Core:
@@ -63,7 +63,7 @@ class Core:
         kinds = tuple(_kind(argument) for argument in arguments)
         found = self._entries.get((name, kinds))
         if found is None:
-            with _compiling:
+            with compiling:
                 found = self._entries.get((name, kinds)) or self._make(name, kinds)
                 self._entries[name, kinds] = found
         return found
@@ -86,7 +86,8 @@ class Core:
             namespace.update(self._namespace())
             with _uncollected(), _as_one():
                 dispatcher.compile(_signature(kinds))
-            disk.save(key, _serialise(dispatcher), what)
+            if _lasting(dispatcher):
+                disk.save(key, _serialise(dispatcher), what)
         dispatcher.disable_compile()
         return dispatcher
 
@@ -125,7 +126,7 @@ class Core:
 
 def address_of(function: External) -> float:
     """Where compiled code finds a user's function."""
-    with _compiling:
+    with compiling:
         if not function.held:
             function.held.append(_compile(function) if function.level == "compiled" else function.called_back)
     return float(function.held[0][1])
@@ -139,32 +140,36 @@ def _compile(function: External) -> tuple[Any, int]:
     """
     import numba
     from numba import carray  # pyright: ignore[reportPrivateImportUsage]
-    from numba.core.errors import NumbaError
 
     from lqrsim.pointers import readonly
 
-    options = getattr(function.function, "targetoptions", {})
-    own: Any = function.function if options else numba.njit(**_options())(function.function)
+    # Compiled anew, for numba keeps the globals of a function as they were when it was first compiled.
+    plain = getattr(function.function, "py_func", function.function)
+    options = getattr(function.function, "targetoptions", _options())
+    try:
+        own: Any = numba.njit(**{name: value for name, value in options.items() if name != "nopython"})(plain)
+    except Exception as error:
+        raise InputError(f"{function.name}: got what numba can not compile ({error}), want a function") from error
     text, names = function.adapter()
-    names |= {"function": own, "carray": carray, "readonly": readonly, "__name__": __name__}
+    names |= {"function": own, "carray": carray, "readonly": readonly, "nan": float("nan"), "__name__": __name__}
     exec(compile(text, "<lqrsim>", "exec"), names)
     dispatcher: Any = numba.njit(names["adapter"], **_options())
-    print_of_it = fingerprint(own)
-    key = disk.key(
-        _machine(), print_of_it or "", repr(sorted(options.items(), key=str)), text, repr(function.parameters)
-    )
+    print_of_it = fingerprint(function.function)
+    key = disk.key(_machine(), print_of_it or "", text, repr(function.parameters))
     stored = disk.load(key) if print_of_it else None
     if stored is None or not _restore(dispatcher, stored):
         what = f"{function.name}"
         compilations.append(what)
         logger.debug(f"compiling {what} ...")
+        stale = print_of_it is not None and any(helper.overloads for helper in helpers(function.function))
         pointer = numba.types.CPointer(numba.types.float64)
         try:
             with _uncollected():
                 dispatcher.compile((pointer,) * (3 + (len(function.writes) or 1)))
-        except NumbaError as error:
+        except Exception as error:  # mostly NumbaError, and whatever else goes wrong within numba
             raise InputError(f"{function.name}: got what numba can not compile, want {_reason(error)}") from error
-        if print_of_it:
+        # The same holds of the functions it calls, which are as they were: what was made of them is not kept then.
+        if print_of_it and not stale and _lasting(dispatcher):
             disk.save(key, _serialise(dispatcher), what)
     (result,) = dispatcher.overloads.values()
     return result, result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
@@ -304,6 +309,12 @@ def _machine() -> str:
     parts = [version("numba"), version("llvmlite"), platform.python_version(), *_FAST]
     parts.append(repr(target.target_context.codegen().magic_tuple()))
     return "\n".join([*parts, Path(pointers.__file__).read_text(encoding="utf-8")])
+
+
+def _lasting(dispatcher: Any) -> bool:
+    """Whether another process can use the machine code: not if there are addresses of this one in it."""
+    (result,) = dispatcher.overloads.values()
+    return not result.library.has_dynamic_globals and not result.lifted
 
 
 def _serialise(dispatcher: Any) -> bytes:

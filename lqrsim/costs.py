@@ -157,6 +157,8 @@ class SymbolicCost(Cost):
         parameters: Mapping[str, float] | None = None,
         convex: bool = False,
     ) -> None:
+        if level_of(function, None) == "compiled":
+            raise InputError(f"SymbolicCost: got the numba function {name_of(function)}, want FunctionCost for it")
         self.function = function
         self.parameters = tracing.check_parameters(parameters or {})
         self.convex = convex
@@ -168,7 +170,7 @@ class SymbolicCost(Cost):
 
     def bind(self, dynamics: Dynamics) -> Term:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-        details = ("cost", n, m, *self.parameters)
+        details = ("cost", n, m, tuple(self.parameters))
         made = tracing.kept(self.function, details, lambda: self._trace(n, m))
         return Term(
             made["source"],
@@ -187,9 +189,9 @@ class SymbolicCost(Cost):
         targets = {"cost": cost}
         targets |= {f"gradient[{i}]+": slope for i, slope in enumerate(slopes) if slope != 0}
         targets |= {f"hessian[{i}, {j}]+": curve for (i, j), curve in curves.items() if curve != 0}
-        value = tracing.write_function("value", "x, u, t, data", "data", {"cost": cost}, returns="cost")
+        value = tracing.write_function("value", "x, u, t, data", "data", {"cost": cost}, of=self.name, returns="cost")
         derivatives = tracing.write_function(
-            "derivatives", "x, u, t, data, hessian, gradient", "data", targets, returns="cost"
+            "derivatives", "x, u, t, data, hessian, gradient", "data", targets, of=self.name, returns="cost"
         )
         return {
             "source": f"{value}\n\n{derivatives}",

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lqrsim import differences, integration, rotations, tracing
 from lqrsim.coordinates import Coordinates
-from lqrsim.errors import Array, InputError, check_array, check_name, check_number
+from lqrsim.errors import Array, InputError, check_array, check_name, check_number, excerpt
 from lqrsim.functions import External, check_signature, level_of, name_of
 from lqrsim.solvers import kernels
 
@@ -73,6 +73,10 @@ class Dynamics:
         jacobian: Callable[..., None] | None = None,
         level: str | None = None,
     ) -> None:
+        for field, given in (("states", states), ("controls", controls), ("parameters", parameters or {})):
+            if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
+                wanted = "value" if field == "parameters" else "unit"
+                raise InputError(f"{field}: got {excerpt(given)}, want a dictionary of name: {wanted}")
         if not states or not controls:
             raise InputError(
                 f"dynamics: got {len(states)} states and {len(controls)} controls, want at least one of each"
@@ -88,7 +92,12 @@ class Dynamics:
             if len(indices) != 3 or indices != list(range(indices[0], indices[0] + 3)):
                 raise InputError(f"rotation_vectors: got {tuple(triple)}, want three neighbouring states")
             starts.append(indices[0])
-        low, high = control_limits if control_limits is not None else (-np.inf, np.inf)
+        limits = control_limits if control_limits is not None else (-np.inf, np.inf)
+        try:
+            low, high = (np.broadcast_to(np.asarray(side, dtype=float), len(controls)).tolist() for side in limits)
+        except (TypeError, ValueError):
+            wanted = f"(lowest, highest), each a number or ({len(controls)},)"
+            raise InputError(f"control_limits: got {excerpt(control_limits)}, want {wanted}") from None
         self.f, self.jacobian = f, jacobian
         self.level = level_of(f, level)
         if jacobian is not None and self.level == "symbolic":
@@ -111,8 +120,8 @@ class Dynamics:
         self.control_coordinates = Coordinates(
             names=tuple(controls),
             units=tuple(controls.values()),
-            low=tuple(np.broadcast_to(np.asarray(low, dtype=float), len(controls)).tolist()),
-            high=tuple(np.broadcast_to(np.asarray(high, dtype=float), len(controls)).tolist()),
+            low=tuple(low),
+            high=tuple(high),
         )
         # At once and not when first needed: several threads may need them, and addresses are not to change.
         self.functions = self._functions()
@@ -148,7 +157,8 @@ class Dynamics:
         """Source of `rate` and `rate_jacobian` of `solvers/interface.py`; symbolic dynamics are traced for it, once."""
         if self.level != "symbolic":
             return _CALL + (inspect.getsource(differences.rate_jacobian) if self.jacobian is None else _CALL_JACOBIAN)
-        details = ("dynamics", *self.state_coordinates.names, *self.control_coordinates.names, *self.parameters)
+        names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
+        details = ("dynamics", *names)
         return tracing.kept(self.f, details, lambda: {"source": self._trace()})["source"]
 
     def _trace(self) -> str:
@@ -161,10 +171,11 @@ class Dynamics:
         slopes = {f"fx[{i}, {j}]": rate.diff(xj) for i, rate in enumerate(rates) for j, xj in enumerate(x)}
         slopes |= {f"fu[{i}, {j}]": rate.diff(uj) for i, rate in enumerate(rates) for j, uj in enumerate(u)}
         slopes = {target: slope for target, slope in slopes.items() if slope != 0}
+        of = f"{self.name}(x, u, p)"
         return "\n\n".join(
             [
-                tracing.write_function("rate", "x, u, p, out", "p", values),
-                tracing.write_function("rate_jacobian", "x, u, p, out, fx, fu", "p", values | slopes),
+                tracing.write_function("rate", "x, u, p, out", "p", values, of=of),
+                tracing.write_function("rate_jacobian", "x, u, p, out, fx, fu", "p", values | slopes, of=of),
                 tracing.write_chain(n, slopes),
             ]
         )

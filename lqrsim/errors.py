@@ -16,6 +16,9 @@ Array = npt.NDArray[np.floating]
 class InputError(ValueError):
     """Something a caller passed is wrong; the message is one line that says what and what to do."""
 
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.splitlines()))  # what a user's function says may have several
+
 
 def check_array(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...], *, infinite: bool = False) -> Array:
     """`value` as a read-only C-ordered float64 copy of the given shape (None matches any length).
@@ -26,7 +29,7 @@ def check_array(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...],
     try:
         array = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError):
-        raise InputError(f"{field}: got {_brief(value)}, want numbers of shape {_shape(shape)}") from None
+        raise InputError(f"{field}: got {excerpt(value)}, want numbers of shape {_shape(shape)}") from None
     if len(array.shape) != len(shape) or any(
         want is not None and got != want for got, want in zip(array.shape, shape, strict=True)
     ):
@@ -64,14 +67,14 @@ def check_number(
         and (at_most is None or number <= at_most)
     )
     if not good:
-        raise InputError(f"{field}: got {_brief(value)}, want {' '.join(wants)}")
+        raise InputError(f"{field}: got {excerpt(value)}, want {' '.join(wants)}")
     return number
 
 
 def check_count(field: str, value: object, *, at_least: int = 1) -> int:
     """`value` as an int that is not smaller than `at_least`. Raises InputError otherwise."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < at_least:
-        raise InputError(f"{field}: got {_brief(value)}, want a whole number >= {at_least}")
+        raise InputError(f"{field}: got {excerpt(value)}, want a whole number >= {at_least}")
     return int(value)
 
 
@@ -84,7 +87,7 @@ def check_weight(field: str, value: npt.ArrayLike, size: int | None = None, *, d
     try:
         raw = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InputError(f"{field}: got {_brief(value)}, want a matrix of numbers or its diagonal") from None
+        raise InputError(f"{field}: got {excerpt(value)}, want a matrix of numbers or its diagonal") from None
     matrix = check_array(field, np.diag(raw) if raw.ndim == 1 else raw, (size, size))
     if matrix.shape[0] != matrix.shape[1]:
         raise InputError(f"{field}: got shape {_shape(matrix.shape)}, want a square matrix or its diagonal")
@@ -120,6 +123,7 @@ def _shape(shape: tuple[int | None, ...]) -> str:
     return f"({', '.join(sizes)}{',' if len(sizes) == 1 else ''})"
 
 
-def _brief(value: object) -> str:
+def excerpt(value: object) -> str:
+    """A value for a message, cut where it gets long."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,8 +1,9 @@
 """A hash of what a function does, without running it: the key under which what is derived from it can be kept.
 
-It covers the function's code, constants, defaults and closure, and the functions, numbers and strings it refers to, as
-deep as that goes. What belongs to NumPy, SymPy or numba counts by that package's version. A function that refers to
-anything else (an object that may change, a module of the user's own) has no fingerprint, and nothing of it is kept.
+It covers the function's code, constants, defaults and closure, numba's options, and the functions, numbers and strings
+it refers to, as deep as that goes. What belongs to NumPy, SymPy or numba counts by that package's version. A function
+that refers to anything else (an object that may change, a module of the user's own, a file) has no fingerprint, and
+nothing of it is kept.
 """
 
 import dis
@@ -21,6 +22,11 @@ from lqrsim import cache, rotations
 # What formulas may use without being read: by version, which the hash includes.
 _PACKAGES = ("math", "numba", "numpy", "sympy")
 _MODULES = ("lqrsim", "lqrsim.rotations")
+# What reads files, other names or chance: a function that mentions these does more than can be covered.
+_REFUSED = {
+    "open", "input", "eval", "exec", "compile", "globals", "locals", "vars", "getattr", "setattr", "__import__",
+    "random", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "frompyfunc", "vectorize",
+}  # fmt: skip
 _PLAIN = (int, float, complex, str, bytes, bool, type(None), type(Ellipsis))
 
 
@@ -31,7 +37,7 @@ class _NoFingerprint(Exception):
 def fingerprint(function: Any) -> str | None:
     """The hash, the same in every process; None if there is something that it could not cover."""
     try:
-        return cache.key(*_versions(), *_function(function, set()))
+        return cache.key(*_versions(), *_function(function, {}))
     except (_NoFingerprint, RecursionError):
         return None
 
@@ -42,14 +48,26 @@ def _versions() -> tuple[str, ...]:
     return (sys.version, *installed, inspect.getsource(rotations))
 
 
-def _function(function: Any, seen: set[int]) -> Iterator[str]:
+def helpers(function: Any) -> list[Any]:
+    """The numba functions that a function with a fingerprint refers to, at any depth."""
+    seen: dict[int, Any] = {}
+    for _ in _function(function, seen):
+        pass
+    return [found for found in seen.values() if found is not function and hasattr(found, "py_func")]
+
+
+def _function(function: Any, seen: dict[int, Any]) -> Iterator[str]:
     """What a Python or numba function is made of."""
-    function = getattr(function, "py_func", function)
-    if not isinstance(function, types.FunctionType):
-        raise _NoFingerprint
-    if id(function) in seen:  # it refers to itself
+    if id(function) in seen:  # by its number, for another one would be another function
+        yield f"seen {list(seen).index(id(function))}"
         return
-    seen.add(id(function))
+    seen[id(function)] = function
+    if hasattr(function, "py_func"):
+        yield from _value(getattr(function, "targetoptions", {}), seen)
+        yield repr(getattr(function, "locals", {}))
+        function = function.py_func
+    if not isinstance(function, types.FunctionType) or vars(function):
+        raise _NoFingerprint
     yield from _code(function.__code__)
     yield from _value(function.__defaults__, seen)
     for name, default in sorted((function.__kwdefaults__ or {}).items()):
@@ -75,19 +93,24 @@ def _code(code: types.CodeType) -> Iterator[str]:
         if isinstance(constant, types.CodeType):
             yield from _code(constant)
         else:
-            yield from _value(constant, set())
+            yield from _value(constant, {})
 
 
 def _names(code: types.CodeType) -> set[str]:
     """The global names that code reads, and that of functions inside it; refuses imports of what has no version."""
+    if _REFUSED & set(code.co_names):
+        raise _NoFingerprint
     found = set()
-    for instruction in dis.get_instructions(code):
+    instructions = list(dis.get_instructions(code))
+    for i, instruction in enumerate(instructions):
         if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
             found.add(instruction.argval)
-        elif instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL") or (
-            instruction.opname == "IMPORT_NAME" and not _known(instruction.argval)
-        ):
+        elif instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
             raise _NoFingerprint
+        elif instruction.opname == "IMPORT_NAME":
+            absolute = instructions[i - 2].argval == 0  # the level of the import
+            if not (absolute and _known(instruction.argval)):
+                raise _NoFingerprint
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
             found |= _names(constant)
@@ -98,12 +121,12 @@ def _known(module: str) -> bool:
     return module in _MODULES or module.split(".")[0] in _PACKAGES
 
 
-def _value(value: Any, seen: set[int]) -> Iterator[str]:
+def _value(value: Any, seen: dict[int, Any]) -> Iterator[str]:
     """A value that a function refers to."""
     if isinstance(value, _PLAIN):
         yield f"{type(value).__name__} {value!r}"
-    elif isinstance(value, np.ndarray | np.generic) and value.dtype.hasobject is False:
-        yield repr((value.dtype.str, value.shape, np.asarray(value).tobytes()))
+    elif (type(value) is np.ndarray or isinstance(value, np.generic)) and not value.dtype.hasobject:
+        yield repr((value.dtype.descr, value.shape, value.tobytes()))
     elif isinstance(value, tuple | list | frozenset | set):
         yield f"{type(value).__name__} {len(value)}"
         parts = ["\n".join(_value(part, seen)) for part in value]
@@ -126,6 +149,8 @@ def _packaged(value: Any) -> bool:
         return _known(value.__name__)
     if isinstance(value, types.BuiltinFunctionType):
         return True
-    named = isinstance(value, types.FunctionType | type | np.ufunc) or hasattr(value, "py_func")
-    home = getattr(value, "__module__", None) or ("numpy" if isinstance(value, np.ufunc) else "")
+    if isinstance(value, np.ufunc):
+        return getattr(np, value.__name__, None) is value
+    named = isinstance(value, types.FunctionType | type) or hasattr(value, "py_func")
+    home = getattr(value, "__module__", None) or ""
     return named and (home.split(".")[0] in _PACKAGES or (home == "builtins" and isinstance(value, type)))

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_name
+from lqrsim.errors import Array, InputError, check_name, excerpt
 from lqrsim.fingerprint import fingerprint
 from lqrsim.tracing import Parameters
 
@@ -28,6 +28,8 @@ def level_of(function: Any, asked: str | None) -> str:
     if not callable(function):
         raise InputError(f"function: got {function!r}, want a function of (x, u, p)")
     is_compiled = hasattr(function, "py_func")
+    if asked is not None and not isinstance(asked, str):
+        raise InputError(f"level: got {asked!r}, want one of: {', '.join(LEVELS)}")
     if asked is None:
         return "compiled" if is_compiled else "symbolic"
     if check_name("level", asked, LEVELS) != "compiled" and is_compiled:
@@ -52,6 +54,7 @@ class External:
       level: compiled or plain.
       states, controls: sizes of x and u. parameters: the names in p, whose values come after `offset` other numbers.
       held: once it has an address, what must be kept alive for that, and the address.
+      stopped: set it to end the solves that call back, in whatever thread they are.
       entries: what each returned value is for, as messages name it; without, the value is returned bare.
     """
 
@@ -65,6 +68,7 @@ class External:
     writes: tuple[tuple[int, ...], ...] = ()
     entries: tuple[str, ...] = ()
     held: list[tuple[Any, int]] = field(default_factory=list, init=False, repr=False, compare=False)
+    stopped: threading.Event = field(default_factory=threading.Event, init=False, repr=False, compare=False)
     _thread: threading.local = field(default_factory=threading.local, init=False, repr=False, compare=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -94,6 +98,8 @@ class External:
         try:
             with np.errstate(all="ignore"):  # NaN and infinity are dealt with where they arrive
                 returned = plain(x.copy(), u.copy(), Parameters(**p), *written)
+                if self.writes and returned is not None:
+                    raise InputError(f"got {excerpt(returned)} returned, want it written to the last two arguments")
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from None
         except Exception as error:  # whatever a user's function may raise becomes one line
@@ -104,9 +110,12 @@ class External:
 
     def _vector(self, returned: Any) -> Array:
         try:
-            vector = np.array(returned, dtype=np.float64).reshape(-1)
+            array = np.array(returned)
+            if array.dtype.kind not in "biufO":  # no text, no complex numbers
+                raise TypeError
+            vector = np.array([float(entry) for entry in array.reshape(-1)])
         except (TypeError, ValueError):
-            raise InputError(f"{self.name}: got {returned!r}, want {self._wanted()}") from None
+            raise InputError(f"{self.name}: got {excerpt(returned)}, want {self._wanted()}") from None
         if len(vector) != self.values:
             raise InputError(f"{self.name}: got {len(vector)} entries, want {self._wanted()}")
         return vector
@@ -128,6 +137,8 @@ class External:
         def callback(x: int, u: int, data: int, *outputs: int) -> None:
             arrays = [_view(address, size) for address, size in zip(outputs, sizes, strict=True)]
             try:
+                if self.stopped.is_set():
+                    raise KeyboardInterrupt
                 if self.raised is not None:
                     raise self.raised
                 values = _view(data, end)[self.offset :]
@@ -135,8 +146,11 @@ class External:
                 state, control = _view(x, self.states).copy(), _view(u, self.controls).copy()
                 with np.errstate(all="ignore"):
                     if self.writes:
-                        shaped = [array.reshape(shape) for array, shape in zip(arrays, self.writes, strict=True)]
-                        self.function(state, control, p, *shaped)
+                        # Not the memory itself, which is gone when this returns; the user's function may keep them.
+                        written = [np.zeros(shape) for shape in self.writes]
+                        self.function(state, control, p, *written)
+                        for array, values_written in zip(arrays, written, strict=True):
+                            array[:] = values_written.reshape(-1)
                     else:
                         arrays[0][:] = self._vector(self.function(state, control, p))
             except BaseException as error:  # Ctrl-C, too: C code can not pass it on, so the solver asks for it
@@ -159,18 +173,24 @@ class External:
         self._thread.raised = None
 
     def adapter(self) -> tuple[str, dict[str, Any]]:
-        """Source of what numba compiles around the function, and the names in it but `carray` and `readonly`."""
+        """Source of what numba compiles around the function, and the names in it that are its own."""
         lines = [f"x, u = readonly(carray(x, {self.states})), readonly(carray(u, {self.controls}))"]
         numbers = "".join(f"data[{self.offset + i}], " for i in range(len(self.parameters)))
         lines.append(f"p = Parameters({numbers})")
         if self.writes:
             outputs = ("a", "b")
             lines += [f"{name} = carray({name}, {shape})" for name, shape in zip(outputs, self.writes, strict=True)]
-            lines.append("function(x, u, p, a, b)")
+            # A function that raises leaves NaN, which the solver sees, and not half of its numbers.
+            lines += ["try:", "    function(x, u, p, a, b)", "except Exception:", "    a[:] = nan", "    b[:] = nan"]
         else:
             outputs = ("out",)
-            lines.append("returned = function(x, u, p)")
-            lines += [f"out[{i}] = returned{f'[{i}]' if self.entries else ''}" for i in range(self.values)]
+            lines += ["try:", "    returned = function(x, u, p)"]
+            copies = [f"out[{i}] = returned{f'[{i}]' if self.entries else ''}" for i in range(self.values)]
+            if self.entries:  # an array may have another length at another time
+                lines.append(f"    if len(returned) == {self.values}:")
+                copies = [f"    {line}" for line in copies]
+            lines += [f"    {line}" for line in copies]
+            lines += ["except Exception:", "    out[0] = nan"]
         body = "\n".join(f"    {line}" for line in lines)
         source = f"def adapter(x, u, data, {', '.join(outputs)}):\n{body}\n"
         return source, {"Parameters": collections.namedtuple("Parameters", self.parameters)}

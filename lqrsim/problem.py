@@ -115,7 +115,7 @@ class Problem:
     def digest(self) -> str:
         """Hash of everything that defines the problem: structure and numbers. The prior does not."""
         hasher = hashlib.sha256(f"{self.dynamics.source} {self.dt!r} {self.steps}".encode())
-        hasher.update(self.dynamics.data.tobytes())
+        hasher.update(repr(self.dynamics.parameters).encode())
         functions = [*self.dynamics.functions]
         if isinstance(self.initial, FixedState):
             hasher.update(np.asarray(self.initial.state).tobytes())

@@ -1,15 +1,17 @@
 """From a plain Python function of symbols to the source of a compiled one. SymPy is imported only when this runs."""
 
 import contextlib
+import functools
 import json
 import keyword
+import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 from lqrsim import cache
-from lqrsim.errors import InputError, check_number
+from lqrsim.errors import InputError, check_number, excerpt
 from lqrsim.fingerprint import fingerprint
 from lqrsim.rotations import RATIOS
 
@@ -26,9 +28,13 @@ class Parameters(SimpleNamespace):
 def check_parameters(parameters: Mapping[str, float]) -> dict[str, float]:
     """The parameters as floats. Raises InputError unless each is finite and its name can be written `p.name`."""
     for name in parameters:
-        if not name.isidentifier() or keyword.iskeyword(name):
-            raise InputError(f"parameters: got the name {name!r}, want a Python name, to be read as p.name")
-    return {name: check_number(f"parameters: {name}", value) for name, value in parameters.items()}
+        if not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):
+            raise InputError(
+                f"parameters: got the name {name!r}, want a Python name without a leading underscore, for p.name"
+            )
+    # Python reads p.µ by the normal form of the name.
+    normal = {unicodedata.normalize("NFKC", name): value for name, value in parameters.items()}
+    return {name: check_number(f"parameters: {name}", value) for name, value in normal.items()}
 
 
 def kept(function: Callable[..., Any], details: object, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -39,8 +45,7 @@ def kept(function: Callable[..., Any], details: object, make: Callable[[], dict[
     print_of_it = fingerprint(function)
     if print_of_it is None:
         return make()
-    own = Path(__file__).read_text(encoding="utf-8")
-    key = cache.key("derivatives", own, print_of_it, repr(details))
+    key = cache.key("derivatives", _writers(), print_of_it, repr(details))
     stored = cache.load(key)
     if stored is not None:
         with contextlib.suppress(ValueError):
@@ -49,6 +54,13 @@ def kept(function: Callable[..., Any], details: object, make: Callable[[], dict[
     name = getattr(function, "__qualname__", repr(function))
     cache.save(key, json.dumps(made).encode(), f"derivatives of {name}(x, u, p)")
     return made
+
+
+@functools.cache
+def _writers() -> str:
+    """The code that writes what is kept: with other code, something else may be right."""
+    files = (Path(__file__).with_name(name) for name in ("tracing.py", "dynamics.py", "costs.py"))
+    return "".join(file.read_text(encoding="utf-8") for file in files)
 
 
 def trace(
@@ -69,7 +81,7 @@ def trace(
     p = Parameters(**{name: sympy.Symbol(f"p{i}", real=True) for i, name in enumerate(parameters)})
     name = getattr(function, "__qualname__", repr(function))
     try:
-        returned = function(x, u, p)
+        returned = function(tuple(x), tuple(u), p)
     except InputError as error:
         raise InputError(f"{name}(x, u, p): {error}") from None
     except Exception as error:  # whatever a user's function may raise becomes one line
@@ -77,34 +89,46 @@ def trace(
             f"{name}(x, u, p): got {type(error).__name__} ({error}) when called with symbols, want plain arithmetic and"
             " functions of SymPy (from sympy import sin, exp, ...)"
         ) from None
+    if hasattr(returned, "tolist"):  # an array of NumPy's, or a matrix of SymPy's
+        returned = [entry for row in returned.tolist() for entry in (row if isinstance(row, list) else [row])]
     listed = returned if isinstance(returned, (list, tuple)) else [returned]
     expressions = []
     for i, entry in enumerate(listed):
         try:
             expression = sympy.sympify(entry, strict=True)
         except sympy.SympifyError:
-            raise InputError(f"{name}(x, u, p): got {entry!r} as entry {i}, want an expression") from None
+            raise InputError(f"{name}(x, u, p): got {excerpt(entry)} as entry {i}, want an expression") from None
+        if not isinstance(expression, sympy.Expr):
+            raise InputError(f"{name}(x, u, p): got {excerpt(entry)} as entry {i}, want an expression")
         known = {*x, *u, *vars(p).values()}
         strange = sorted(str(symbol) for symbol in expression.free_symbols - known)
         if strange:
             raise InputError(f"{name}(x, u, p): got the unknown symbol {strange[0]} in entry {i}, want x, u and p only")
-        if expression.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo):
-            raise InputError(f"{name}(x, u, p): got {expression} as entry {i}, want a finite expression")
+        if expression.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo, sympy.I):
+            raise InputError(f"{name}(x, u, p): got {expression} as entry {i}, want a finite real expression")
+        for piecewise in expression.atoms(sympy.Piecewise):
+            last: Any = piecewise.args[-1]
+            if last[1] != sympy.true:
+                raise InputError(
+                    f"{name}(x, u, p): got {piecewise} in entry {i}, want its last case to be (expression, True)"
+                )
         expressions.append(expression)
     return expressions, x, u
 
 
 def write_function(
-    name: str, arguments: str, data: str, assignments: Mapping[str, Any], *, returns: str | None = None
+    name: str, arguments: str, data: str, assignments: Mapping[str, Any], *, of: str, returns: str | None = None
 ) -> str:
     """Source of a function that evaluates SymPy expressions, with common subexpressions shared.
 
     Args:
       arguments: the signature. data: the argument that holds the parameters p0, p1, ...; x and u are those named so.
       assignments: target (`out[0]`, `hessian[1, 2]`, ...; `+=` if it ends in `+`) -> expression.
+      of: what messages call the user's function.
       returns: the target, among `assignments`, that is returned instead of stored.
     """
     import sympy
+    from sympy.printing.codeprinter import PrintMethodNotImplementedError
     from sympy.printing.pycode import PythonCodePrinter
 
     class Printer(PythonCodePrinter):
@@ -122,6 +146,16 @@ def write_function(
                 return f"({product})" if exponent > 0 else f"(1/({product}))"
             return super()._print_Pow(expr, rational=rational)
 
+    def smooth_almost_everywhere(expression: Any) -> Any:
+        """A kink or a jump has no derivative there, and where it has one its delta is zero."""
+        expression = expression.replace(sympy.DiracDelta, lambda *arguments: sympy.Integer(0))
+        for kind in (sympy.sign, sympy.Heaviside):
+            expression = expression.replace(
+                kind, lambda *arguments, kind=kind: kind(*arguments).rewrite(sympy.Piecewise)
+            )
+        return expression
+
+    assignments = {target: smooth_almost_everywhere(value) for target, value in assignments.items()}
     printer = Printer({"fully_qualified_modules": False})
     shared, reduced = sympy.cse(list(assignments.values()), symbols=sympy.numbered_symbols("s"))
     used = set().union(*(e.free_symbols for e in [*reduced, *(value for _, value in shared)]))
@@ -129,15 +163,15 @@ def write_function(
     for symbol in sorted((s for s in used if str(s)[0] in "xup"), key=lambda s: (str(s)[0], int(str(s)[1:]))):
         letter, index = str(symbol)[0], str(symbol)[1:]
         lines.append(f"    {symbol} = {data if letter == 'p' else letter}[{index}]")
-    lines += [f"    {symbol} = {printer.doprint(value)}" for symbol, value in shared]
-    for target, value in zip(assignments, reduced, strict=True):
-        sign = "+=" if target.endswith("+") else "="
-        lines.append(f"    {target.rstrip('+')} {sign} {printer.doprint(value)}")
+    try:
+        lines += [f"    {symbol} = {printer.doprint(value)}" for symbol, value in shared]
+        for target, value in zip(assignments, reduced, strict=True):
+            sign = "+=" if target.endswith("+") else "="
+            lines.append(f"    {target.rstrip('+')} {sign} {printer.doprint(value)}")
+    except PrintMethodNotImplementedError as error:
+        raise InputError(f"{of}: got what can not be compiled ({error}), want elementary functions") from None
     if returns is not None:
         lines.append(f"    return {returns}")
-    if printer._not_supported:  # pyright: ignore[reportAttributeAccessIssue]
-        heads = sorted({type(e).__name__ for e in printer._not_supported})  # pyright: ignore[reportAttributeAccessIssue]
-        raise InputError(f"{name}: got the unsupported function {heads[0]}, want elementary functions")
     return "\n".join(lines) + "\n"
 
 

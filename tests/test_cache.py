@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
@@ -160,7 +161,15 @@ def test_a_fingerprint_covers_what_a_function_refers_to(monkeypatch: pytest.Monk
     seen |= {fingerprint(lambda x, u, p: square(x, u, p) + cube(x, u, p))}
     cube = closure(4.0)
     seen |= {fingerprint(lambda x, u, p: square(x, u, p) + cube(x, u, p))}
-    assert len(seen) == 11
+
+    # Which of two functions stands in the third place, when both were seen before.
+    def three(a: Callable, b: Callable, c: Callable) -> Callable:
+        return lambda x, u, p: a(x, u, p) + b(x, u, p) + c(x, u, p)
+
+    seen |= {fingerprint(three(square, cube, square)), fingerprint(three(square, cube, cube))}
+    # A helper with other options of numba's.
+    seen |= {fingerprint(calling(numba.njit(fastmath=fast)(lambda y: y))) for fast in (False, True)}
+    assert len(seen) == 15
     assert None not in seen
     assert fingerprint(closure(2.0)) == fingerprint(closure(2.0))
 
@@ -178,8 +187,63 @@ def test_what_may_change_unseen_has_no_fingerprint() -> None:
         return [tests_helper_of_mine.drag(x[0])]
 
     assert fingerprint(lambda x, u, p: [mass.value * x[0]]) is None
+
+    def counts(x, u, p):
+        return [x[0] * vars(counts)["calls"]]
+
+    vars(counts)["calls"] = 1
     assert fingerprint(imports) is None
+    assert fingerprint(counts) is None
+    assert fingerprint(lambda x, u, p: [eval("MASS") * x[0]]) is None
+    assert fingerprint(lambda x, u, p: [x[0] * np.random.default_rng().normal()]) is None
     assert fingerprint(lambda x, u, p: [pytest.approx(x[0])]) is None
+
+
+TABLE = np.linspace(0, 1, 200_000)  # numba refers to what is over a megabyte by its address
+
+
+def test_code_with_addresses_of_this_process_is_not_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+    dynamics = ls.Dynamics(
+        numba.njit(lambda x, u, p: (u[0] - TABLE[min(int(abs(x[0]) * 1000), 199_999)],)),
+        states={"x": ""}, controls={"u": ""},
+    )  # fmt: skip
+    assert fingerprint(dynamics.f) is not None
+    assert core.address_of(dynamics.functions[0]) > 0
+    assert cache.items() == []
+
+
+GAIN = 1.0
+
+
+def test_what_numba_compiled_with_an_old_global_is_not_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+
+    @numba.njit
+    def drag(v):
+        return GAIN * v
+
+    def kept(gain: float) -> int:
+        monkeypatch.setitem(globals(), "GAIN", gain)
+        function = numba.njit(lambda x, u, p: (u[0] - drag(x[0]),))
+        dynamics = ls.Dynamics(function, states={"x": ""}, controls={"u": ""})
+        core.address_of(dynamics.functions[0])
+        return len(cache.items())
+
+    assert kept(1.0) == 1
+    assert kept(50.0) == 1  # numba's drag still has a gain of 1: under the name of 50 it would be wrong elsewhere
+
+
+def test_sources_are_kept_by_what_each_name_is() -> None:
+    """One control more, or one parameter: the same names, in other places."""
+
+    def falling(x, u, p):
+        return [sum(u) - xi for xi in x]
+
+    two = ls.Dynamics(falling, states={"a": ""}, controls={"b": "", "c": ""})
+    assert two.rate([1.0], [3.0, 4.0]) == [6.0]
+    one = ls.Dynamics(falling, states={"a": ""}, controls={"b": ""}, parameters={"c": 5.0})
+    assert one.rate([1.0], [3.0]) == [2.0]
 
 
 def test_a_formula_that_failed_is_not_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -125,6 +125,18 @@ def _pendulum(x, u, p):
     return [speed, u[0] - p.stiffness * sin(angle)]
 
 
+def _tangled(x, u, p):
+    import sympy
+
+    return [x[1], sympy.besselj(0, x[0]) + u[0]]
+
+
+def _piece(x, u, p):
+    import sympy
+
+    return [x[1], sympy.Piecewise((x[0], x[0] > 1)) + u[0]]
+
+
 FIELDS = {
     "states": {"angle": "rad", "speed": "rad/s"},
     "controls": {"torque": "N m"},
@@ -147,7 +159,16 @@ FIELDS = {
         (lambda x, u, p: [x[1], float(x[0])], {}, "got TypeError .* when called with symbols"),
         (lambda x, u, p: [x[1], x[2]], {}, "got IndexError"),
         (lambda x, u, p: [x[1], "fast"], {}, "got 'fast' as entry 1, want an expression"),
-        (lambda x, u, p: [x[1], x[0] / (u[0] - u[0])], {}, "as entry 1, want a finite expression"),
+        (lambda x, u, p: [x[1], x[0] / (u[0] - u[0])], {}, "as entry 1, want a finite real expression"),
+        (lambda x, u, p: [x[1], x[0] > 0], {}, "got x0 > 0 as entry 1, want an expression"),
+        (lambda x, u, p: [x[1], x[0] * (-1) ** 0.5], {}, "as entry 1, want a finite real expression"),
+        (_tangled, {}, r"_tangled\(x, u, p\): got what can not be compiled .*besselj.*, want elementary functions"),
+        (_piece, {}, r"_piece\(x, u, p\): got Piecewise.* in entry 1, want its last case to be \(expression, True\)"),
+        (_pendulum, {"parameters": {"_k": 1.0}}, "got the name '_k', want a Python name without a leading underscore"),
+        (_pendulum, {"parameters": {1: 1.0}}, "parameters: got {1: 1.0}, want a dictionary of name: value"),
+        (_pendulum, {"states": ["angle", "speed"]}, "states: got .*, want a dictionary of name: unit"),
+        (_pendulum, {"control_limits": ("a", "b")}, r"control_limits: got .*, want \(lowest, highest\), each a number"),
+        (_pendulum, {"level": 3}, "level: got 3, want one of: symbolic, compiled, plain"),
         (_pendulum, {"control_limits": (1.0, -1.0)}, "limits of torque: got 1 to -1, want the first below the second"),
     ],
 )

@@ -236,8 +236,32 @@ def _root(x, u, p):
     return x[1], np.sqrt(-1 - x[0] ** 2)
 
 
+def _nan_jacobian(x, u, p, fx, fu):
+    fx[0, 1], fx[1, 0], fu[1, 0] = 1.0, np.nan, 1 / p.inertia
+
+
 def _jacobian_out_of_bounds(x, u, p, fx, fu):
     fx[2, 0] = 1.0
+
+
+def _raising_jacobian(x, u, p, fx, fu):
+    fx[0, 1], fx[1, 0], fu[1, 0] = 1.0, -p.gravity / p.length * np.cos(x[0]), 1 / p.inertia
+    if x[0] > 0.3:
+        raise ValueError("no further")
+
+
+def _shrinking(x, u, p) -> Any:
+    return np.array([x[1], u[0]]) if x[0] < 0.3 else np.zeros(1)
+
+
+@pytest.mark.parametrize("level", ["compiled", "plain"])
+def test_what_a_function_does_only_later_is_not_taken_for_numbers(level: str) -> None:
+    """A Jacobian that raises, and an array of another length: not finite, at either level."""
+    raising = ls.Dynamics(pendulum, jacobian=_raising_jacobian, level=level, **FIELDS)
+    shrinking = ls.Dynamics(_shrinking, level=level, **FIELDS)
+    for dynamics in (raising, shrinking):
+        solution = ls.smooth(swing(dynamics, COSTS["compiled"]))
+        assert solution.status is Status.NOT_FINITE
 
 
 @pytest.mark.parametrize("level", ["compiled", "plain"])
@@ -250,6 +274,11 @@ def _jacobian_out_of_bounds(x, u, p, fx, fu):
         (_index, {}, r"_index\(x, u, p\): got IndexError .* at x = \(0, 0\)"),
         (_root, {}, r"_root\(x, u, p\): got nan as entry 1 \(speed\) at the start, x = \(0, 0\), u = \(0\)"),
         (pendulum, {"jacobian": _jacobian_out_of_bounds}, r"_jacobian_out_of_bounds.*got IndexError"),
+        (lambda x, u, p: (x[1], 1j), {}, "got .*1j.*, want 2: one for each of angle, speed"),
+        (lambda x, u, p: ("1", "2"), {}, "got .*, want 2: one for each of angle, speed"),
+        (lambda x, u, p: None, {}, "got None, want 2: one for each of angle, speed"),
+        (pendulum, {"jacobian": lambda x, u, p, fx, fu: (fx, fu)}, "returned, want it written to the last two"),
+        (pendulum, {"jacobian": _nan_jacobian}, r"got nan in df/dx, row speed, column angle, at the start"),
         (lambda x, u: x, {}, r"too many positional arguments, want a function of \(x, u, p\)"),
     ],
 )
@@ -272,6 +301,51 @@ def test_what_numba_can_not_compile_gets_one_line() -> None:
         swing(DYNAMICS["symbolic"], ls.FunctionCost(bump, depends_on=("angel",)))
     with pytest.raises(ls.InputError, match="final_cost: got a cost that depends on the control"):
         swing(DYNAMICS["symbolic"], COSTS["symbolic"], final_cost=ls.FunctionCost(bump))
+
+
+def test_kinks_and_jumps_have_derivatives_almost_everywhere() -> None:
+    def hinge(x, u, p):
+        import sympy
+
+        return sympy.Max(x[0], 0) ** 2 + sympy.Abs(x[1]) ** 3 + sympy.sign(x[1]) * x[1]
+
+    cost = ls.SymbolicCost(hinge)
+    for x in ([0.7, -0.4], [-0.7, 0.4]):
+        term = cost.bind(DYNAMICS["symbolic"])
+        value, gradient, hessian = evaluate(term, DYNAMICS["symbolic"], np.array(x), np.zeros(1))
+        a, b = x
+        assert value == pytest.approx(max(a, 0) ** 2 + abs(b) ** 3 + abs(b), rel=1e-14)
+        np.testing.assert_allclose(gradient[:2], [2 * max(a, 0), 3 * b * abs(b) + np.sign(b)], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(hessian[:2, :2], np.diag([2.0 * (a > 0), 6 * abs(b)]), rtol=0, atol=1e-12)
+    assert np.isfinite(ls.smooth(swing(DYNAMICS["symbolic"], cost), max_iterations=3).cost)  # and it compiles
+
+
+def test_a_cost_that_is_not_a_number_at_the_start_is_refused() -> None:
+    def logarithm(x, u, p):
+        from sympy import log
+
+        return -log(x[0] - 5)
+
+    for solver in (ls.smooth, ls.ilqr):
+        with pytest.raises(ls.InputError, match=r"logarithm\(x, u, p\): got nan as its value at the start"):
+            solver(swing(DYNAMICS["symbolic"], ls.SymbolicCost(logarithm)))
+    with pytest.raises(ls.InputError, match="SymbolicCost: got the numba function bump, want FunctionCost"):
+        ls.SymbolicCost(numba.njit(bump))
+
+
+def test_check_derivatives_weighs_each_entry() -> None:
+    def steep(x, u, p, fx, fu):
+        fx[0, 1], fx[1, 0] = 1e6, np.cos(x[0])  # the second has the wrong sign
+
+    rate = ls.Dynamics(lambda x, u, p: [1e6 * x[1], -np.sin(x[0])], jacobian=steep, level="plain", **FIELDS)
+    bad = [check for check in ls.check_derivatives(rate) if not check.good]
+    assert [(check.row, check.column) for check in bad] == [("speed", "angle")]
+
+    def offset_derivatives(x, u, p, gradient, hessian):
+        gradient[0], hessian[0, 0] = 2 * x[0], 2.0
+
+    offset = ls.FunctionCost(lambda x, u, p: 1e4 + x[0] ** 2, derivatives=offset_derivatives)
+    assert all(check.good for check in ls.check_derivatives(swing(DYNAMICS["symbolic"], offset)))
 
 
 def test_check_derivatives_names_the_worst_entry() -> None:

@@ -303,12 +303,17 @@ class TestMany:
         fixed = dataclasses.replace(good, initial=ls.FixedState((0, -2.5, np.pi)))
         with pytest.raises(ls.InputError, match=r"^problems\[1\]: initial: got a FixedState, want an initial cost"):
             ls.smooth_many([good, fixed])
-        with pytest.raises(ls.InputError, match=r"^problems\[0\]: got str, want a Problem"):
+        with pytest.raises(ls.InputError, match=r"^problems\[0\]: problem: got str, want a Problem"):
             ls.ilqr_many(["quadrotor"])  # pyright: ignore[reportArgumentType]
         with pytest.raises(ls.InputError, match=r"^threads: got 0, want a whole number >= 1"):
             ls.smooth_many([good], threads=0)
-        with pytest.raises(ls.InputError, match=r"^problems\[1\]: .*rate\(x, u, p\): got nan as entry 0"):
-            ls.smooth_many([scalar_problem(), scalar_problem(root=1.0, inside=-5.0)])
+        for many in (ls.smooth_many, ls.ilqr_many):
+            good, lost = many([scalar_problem(), scalar_problem(root=1.0, inside=-5.0)])
+            assert good.status is Status.CONVERGED
+            assert lost.status is Status.NOT_FINITE
+            assert "rate(x, u, p): got nan as entry 0 (x) at the start" in lost.detail
+        with pytest.raises(ls.InputError, match=r"^problem: got NoneType, want a Problem"):
+            ls.smooth(None)  # pyright: ignore[reportArgumentType]
 
 
 def test_the_callback_sees_every_iteration_and_may_stop_the_solve(differential_drive: ls.Scenario) -> None:

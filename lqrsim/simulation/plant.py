@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import compiled
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number
+from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt
 from lqrsim.robots.base import Robot
 from lqrsim.scenes import Scene, obstacle_geoms
 from lqrsim.world import World
@@ -122,7 +122,7 @@ class PlantCheck:
     @property
     def relative(self) -> Array:
         """(n,) errors relative to the changes; where next to nothing changes, to the largest change of all."""
-        return self.errors / np.maximum(self.changes, 1e-3 * self.changes.max(initial=1e-12))
+        return self.errors / np.maximum(self.changes, 1e-3 * np.nanmax(self.changes, initial=1e-12))
 
     @property
     def worst(self) -> str:
@@ -185,11 +185,15 @@ def check_plant(
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     middle = check_array("around", np.zeros(n) if around is None else around, (n,))
     space = dynamics.control_coordinates
+    if controls is not None and (not isinstance(controls, tuple | list) or len(controls) != 2):
+        raise InputError(f"controls: got {excerpt(controls)}, want (lowest, highest), each ({m},)")
     low, high = (space.low, space.high) if controls is None else controls
     low, high = (
         check_array("controls: lowest", low, (m,), infinite=True),
         check_array("controls: highest", high, (m,), infinite=True),
     )
+    if not (low <= high).all():
+        raise InputError(f"controls: got {low.tolist()} to {high.tolist()}, want the lowest first")
     if not np.isfinite([low, high]).all():
         raise InputError(f"controls: got {robot.name}'s limits, which are infinite, want controls=(lowest, highest)")
     for name in plant.world.names:

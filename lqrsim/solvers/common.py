@@ -3,15 +3,15 @@
 import os
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim import compiled
-from lqrsim.checks import check_start, functions_of
+from lqrsim.checks import check_functions, check_start, functions_of
 from lqrsim.errors import Array, InputError, check_array, check_count, check_name, check_number
 from lqrsim.problem import Problem
 from lqrsim.results import AffinePolicy, Iteration, Quadratic, Solution, Status, Trajectory
@@ -48,6 +48,8 @@ class Settings:
         if self.gap_tolerance is not None:
             check_number("gap_tolerance", self.gap_tolerance, above=0.0)
         check_count("max_iterations", self.max_iterations)
+        if self.max_iterations > 1_000_000:  # the log of so many takes 32 MB
+            raise InputError(f"max_iterations: got {self.max_iterations}, want at most 1000000")
 
     def controls(self, problem: Problem) -> Array:
         """The controls (T, m) that the first pass starts from: the nominal control unless told otherwise."""
@@ -88,6 +90,8 @@ class Ending:
         """What there is to say besides the status."""
         if self.pass_failed:
             which = "backward" if self.backward else "forward"
+            if self.iterations and self.failed < 0:
+                return self.raised
             place = f"{which} pass of iteration {len(self.iterations) + 1}, step {self.failed} of {steps}"
             return f"{place}: {self.raised}" if self.raised else place
         if self.outcome == interface.NO_START:
@@ -146,30 +150,35 @@ def solve_all(
     """Solve each problem with `solve(problem, settings, each=False)`, on several threads; the answers in order."""
     threads = processors() if threads is None else check_count("threads", threads)
     for i, problem in enumerate(problems):
-        if not isinstance(problem, Problem):
-            raise InputError(f"problems[{i}]: got {type(problem).__name__}, want a Problem")
         try:
             check(problem)
-            settings.controls(problem)
+            start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start
+            check_functions(problem, start, settings.controls(problem)[0])
+            compiled.core(problem)
+            compiled.arguments(problem)  # compiles numba functions
         except InputError as error:
             raise InputError(f"problems[{i}]: {error}") from None
+    functions = [function for problem in problems for function in functions_of(problem)]
     with ThreadPoolExecutor(threads, thread_name_prefix="lqrsim") as pool:
         futures = [pool.submit(solve, problem, settings, each=False) for problem in problems]
         try:
             for done, _ in enumerate(as_completed(futures), start=1):
                 if progress is not None:
                     progress(done, len(futures))
-            return [_result(i, future) for i, future in enumerate(futures)]
-        except BaseException:  # Ctrl-C, too: what runs is a matter of milliseconds, the rest is not begun
-            pool.shutdown(wait=False, cancel_futures=True)
+            return [future.result() for future in futures]
+        except BaseException:  # Ctrl-C, too: what is compiled ends in a moment, plain functions are told to
+            for function in functions:
+                function.stopped.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+            for function in functions:
+                function.stopped.clear()
             raise
 
 
-def _result(i: int, future: Future[Solution]) -> Solution:
-    try:
-        return future.result()
-    except InputError as error:
-        raise InputError(f"problems[{i}]: {error}") from None
+def check_problem(problem: Problem) -> None:
+    """Raises InputError unless it is a problem."""
+    if not isinstance(problem, Problem):
+        raise InputError(f"problem: got {type(problem).__name__}, want a Problem")
 
 
 def processors() -> int:
@@ -178,10 +187,21 @@ def processors() -> int:
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
-def check_outcome(problem: Problem, ending: Ending, x: Array, u: Array) -> None:
-    """Raises InputError if nothing was achieved because a function is not finite at the start (n,) and control (m,)."""
-    if not ending.iterations and ending.status is Status.NOT_FINITE:
-        check_start(problem, x, u)
+def check_outcome(problem: Problem, ending: Ending, x: Array, u: Array, *, refuse: bool) -> Ending:
+    """Look for the cause if the first iteration led nowhere: a function that is not finite at the start (n,), (m,).
+
+    Raises:
+      InputError: that is so, and `refuse` is set; otherwise the returned ending says it.
+    """
+    lost = not ending.iterations and ending.status is Status.NOT_FINITE
+    if lost or (ending.iterations and not np.isfinite(ending.iterations[0].cost)):
+        try:
+            check_start(problem, x, u)
+        except InputError as error:
+            if refuse:
+                raise
+            return replace(ending, outcome=interface.NOT_FINITE, raised=str(error))
+    return ending
 
 
 def assemble(

@@ -10,7 +10,7 @@ from lqrsim.checks import check_functions
 from lqrsim.errors import InputError
 from lqrsim.problem import Problem
 from lqrsim.results import Quadratic, Solution
-from lqrsim.solvers.common import Callback, Settings, assemble, check_outcome, iterate, model, solve_all
+from lqrsim.solvers.common import Callback, Settings, assemble, check_outcome, check_problem, iterate, model, solve_all
 
 
 def ilqr(
@@ -66,6 +66,7 @@ def ilqr_many(
 
 
 def _check(problem: Problem) -> None:
+    check_problem(problem)
     if problem.start is None:
         raise InputError(
             "initial: got a cost that names no start, want FixedState(x) or QuadraticCost(weight, about=x)"
@@ -96,7 +97,7 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
         lambda first, last: loop(steps, first, last, *options, *arrays),
         log, settings.max_iterations, each=each, callback=callback,
     )  # fmt: skip
-    check_outcome(problem, ending, start, control)
+    ending = check_outcome(problem, ending, start, control, refuse=each)
     whole = ending.iterations != () and ending.failed < 0
     if not whole:
         L[:] = 0  # without a pass about the trajectory there is no feedback; what is left is to play the controls

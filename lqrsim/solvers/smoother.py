@@ -10,7 +10,7 @@ from lqrsim.checks import check_functions
 from lqrsim.errors import InputError
 from lqrsim.problem import FixedState, Problem
 from lqrsim.results import Quadratic, Solution
-from lqrsim.solvers.common import Callback, Settings, assemble, check_outcome, iterate, model, solve_all
+from lqrsim.solvers.common import Callback, Settings, assemble, check_outcome, check_problem, iterate, model, solve_all
 
 
 def smooth(
@@ -79,7 +79,8 @@ def smooth_many(
       One Solution a problem, in their order.
 
     Raises:
-      InputError: an argument is not as described; a problem that is refused is named by its place in the list.
+      InputError: an argument is not as described; a problem that is refused is named by its place in the list. One that
+        is only not finite at its start ends as NOT_FINITE, and its detail says where.
     """
     settings = Settings(
         stop=stop, tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations,
@@ -89,6 +90,7 @@ def smooth_many(
 
 
 def _check(problem: Problem) -> None:
+    check_problem(problem)
     if isinstance(problem.initial, FixedState):
         raise InputError(
             "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start);"
@@ -131,7 +133,7 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
         lambda first, last: loop(steps, first, last, *options, *arrays),
         log, settings.max_iterations, each=each, callback=callback,
     )  # fmt: skip
-    check_outcome(problem, ending, start, control)
+    ending = check_outcome(problem, ending, start, control, refuse=each)
     whole = not ending.pass_failed
     return assemble(
         problem, solver="smooth", settings=settings, ending=ending, states=states, controls=controls,
