@@ -61,7 +61,7 @@ class Dynamics:
 
     def __init__(
         self,
-        f: Callable[[Any, Any, Any], Sequence[Any]],
+        f: Callable[[Any, Any, Any], Any],
         *,
         states: Mapping[str, str],
         controls: Mapping[str, str],

@@ -250,7 +250,7 @@ def _raising_jacobian(x, u, p, fx, fu):
         raise ValueError("no further")
 
 
-def _shrinking(x, u, p) -> Any:
+def _shrinking(x, u, p):
     return np.array([x[1], u[0]]) if x[0] < 0.3 else np.zeros(1)
 
 
