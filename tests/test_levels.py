@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import pickle
 import threading
+import time
 from typing import Any
 
 import numba
@@ -221,6 +222,28 @@ def test_ctrl_c_in_a_plain_function_stops_the_solve() -> None:
     with pytest.raises(KeyboardInterrupt):
         ls.smooth(swing(dynamics, COSTS["compiled"]))
     assert len(calls) == 101  # it was not called again
+
+
+def test_ctrl_c_stops_plain_functions_in_other_threads() -> None:
+    calls = []
+
+    def slow(x, u, p):
+        calls.append(None)
+        time.sleep(1e-4)
+        return pendulum(x, u, p)
+
+    dynamics = ls.Dynamics(slow, level="plain", **FIELDS)
+    problems = [swing(DYNAMICS["compiled"], COSTS["compiled"]), *[swing(dynamics, COSTS["compiled"])] * 3]
+
+    def interrupt(done: int, of: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ls.smooth_many(problems, threads=2, progress=interrupt)
+    stopped = len(calls)
+    time.sleep(0.05)
+    assert len(calls) == stopped  # nothing runs on
+    assert ls.smooth(problems[1], max_iterations=1).iterations  # and nothing is left stopped
 
 
 def _index(x, u, p):

@@ -30,4 +30,11 @@ def test_commands_exist() -> None:
     """Every `python3 run.py X` and `lqrsim X` that it shows is a command."""
     text = README.read_text(encoding="utf-8")
     assert {"demo", "test"} <= set(re.findall(r"python3 run\.py (\w+)", text)) <= {"demo", "test", "check", "setup"}
-    assert set(re.findall(r"^\$? ?lqrsim (\w+)", text, re.MULTILINE)) <= {"list", "solve", "simulate", "render", "demo", "cache"}
+    assert set(re.findall(r"^\$? ?lqrsim (\w+)", text, re.MULTILINE)) <= {
+        "list",
+        "solve",
+        "simulate",
+        "render",
+        "demo",
+        "cache",
+    }
