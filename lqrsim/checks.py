@@ -28,7 +28,12 @@ def check_functions(problem: Problem, x: Array, u: Array) -> None:
     for part in (problem.dynamics, *(term for _, term in _terms(problem))):
         for function in part.functions:
             parameters = dict(zip(function.parameters, part.data.tolist(), strict=True))
-            function.call(x, u, parameters)
+            values = function.call(x, u, parameters)
+            for i, name in function.unused:
+                z = np.concatenate([x, u])
+                z[i] += 1e-2 * max(1.0, abs(z[i]))
+                if not np.array_equal(function.call(z[: len(x)], z[len(x) :], parameters), values, equal_nan=True):
+                    raise InputError(f"{function.name}: got a value that depends on {name}, want it in depends_on")
 
 
 def check_start(problem: Problem, x: Array, u: Array) -> None:

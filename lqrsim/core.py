@@ -21,7 +21,7 @@ import numpy as np
 
 from lqrsim import cache as disk
 from lqrsim.errors import InputError
-from lqrsim.fingerprint import fingerprint, helpers
+from lqrsim.fingerprint import fingerprint, note_helpers, stale
 from lqrsim.functions import External
 
 logger = logging.getLogger("lqrsim")
@@ -87,7 +87,7 @@ class Core:
             with _uncollected(), _as_one():
                 dispatcher.compile(_signature(kinds))
             if _lasting(dispatcher):
-                disk.save(key, _serialise(dispatcher), what)
+                _keep(key, dispatcher, what)
         dispatcher.disable_compile()
         return dispatcher
 
@@ -161,7 +161,8 @@ def _compile(function: External) -> tuple[Any, int]:
         what = f"{function.name}"
         compilations.append(what)
         logger.debug(f"compiling {what} ...")
-        stale = print_of_it is not None and any(helper.overloads for helper in helpers(function.function))
+        note_helpers(function.function)
+        lasting = print_of_it is not None and not stale(function.function)
         pointer = numba.types.CPointer(numba.types.float64)
         try:
             with _uncollected():
@@ -169,14 +170,18 @@ def _compile(function: External) -> tuple[Any, int]:
         except Exception as error:  # mostly NumbaError, and whatever else goes wrong within numba
             raise InputError(f"{function.name}: got what numba can not compile, want {_reason(error)}") from error
         # The same holds of the functions it calls, which are as they were: what was made of them is not kept then.
-        if print_of_it and not stale and _lasting(dispatcher):
-            disk.save(key, _serialise(dispatcher), what)
+        if print_of_it and lasting and _lasting(dispatcher):
+            _keep(key, dispatcher, what)
     (result,) = dispatcher.overloads.values()
     return result, result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
 
 
 def _reason(error: Exception) -> str:
     """The line of numba's pages of explanation that says what is wrong."""
+    if isinstance(error, AttributeError) and "NoneType" in str(error):
+        return "a function that returns on every path, and does not change x and u"
+    if "readonly" in str(error) and "setitem" in str(error):
+        return "a function that does not change x and u, which are readonly"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     telling = [
         line for line in lines if not re.match(r"Failed in|During:|File |\^|- Resolution|<source|raised from", line)
@@ -317,15 +322,16 @@ def _lasting(dispatcher: Any) -> bool:
     return not result.library.has_dynamic_globals and not result.lifted
 
 
-def _serialise(dispatcher: Any) -> bytes:
+def _keep(key: str, dispatcher: Any, what: str) -> None:
     from numba.core import serialize
 
     (result,) = dispatcher.overloads.values()
-    return serialize.dumps(result._reduce())
+    with contextlib.suppress(Exception):  # what can not be kept is made again; a Ctrl-C within LLVM can be the cause
+        disk.save(key, serialize.dumps(result._reduce()), what)
 
 
 def _restore(dispatcher: Any, stored: bytes) -> bool:
-    """Give the dispatcher what `_serialise` kept; False if that does not work out."""
+    """Give the dispatcher what `_keep` kept; False if that does not work out."""
     import pickle
 
     from numba.core.compiler import CompileResult

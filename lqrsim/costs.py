@@ -230,6 +230,8 @@ class FunctionCost(Cost):
             if level is not None:
                 raise InputError("FunctionCost: level: got 'symbolic', want 'compiled', 'plain', or a SymbolicCost")
             self.level = "plain"
+        if isinstance(depends_on, str):
+            raise InputError(f"FunctionCost: depends_on: got {depends_on!r}, want a tuple of names: ({depends_on!r},)")
         self.depends_on = None if depends_on is None else tuple(depends_on)
         self.parameters = tracing.check_parameters(parameters or {})
         check_signature(function, ("x", "u", "p"))
@@ -249,7 +251,8 @@ class FunctionCost(Cost):
         axes = tuple(sorted({names.index(check_name("FunctionCost: depends_on", name, names)) for name in wanted}))
         rest: dict[str, Any] = {"level": self.level, "states": n, "controls": m, "parameters": tuple(self.parameters)}
         rest["offset"] = 1 if self.derivatives is None else 2
-        functions = (External(function=self.function, values=1, **rest),)
+        unused = tuple((i, name) for i, name in enumerate(names) if i not in axes)
+        functions = (External(function=self.function, values=1, unused=unused, **rest),)
         if self.derivatives is not None:
             functions += (External(function=self.derivatives, writes=((n + m,), (n + m, n + m)), **rest),)
         source = _FUNCTION + (_DIFFERENCES if self.derivatives is None else _DERIVATIVES)

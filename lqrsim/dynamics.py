@@ -82,6 +82,9 @@ class Dynamics:
                 f"dynamics: got {len(states)} states and {len(controls)} controls, want at least one of each"
             )
         names = tuple(states)
+        for field, listed in (("position", position), ("angles", angles), ("rotation_vectors", rotation_vectors)):
+            if isinstance(listed, str):
+                raise InputError(f"{field}: got {listed!r}, want a tuple of names: ({listed!r},)")
 
         def index(field: str, name: str) -> int:
             return names.index(check_name(field, name, names))

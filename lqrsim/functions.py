@@ -11,14 +11,13 @@ import inspect
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from lqrsim.errors import Array, InputError, check_name, excerpt
-from lqrsim.fingerprint import fingerprint
-from lqrsim.tracing import Parameters
+from lqrsim.fingerprint import fingerprint, note_helpers
 
 LEVELS = ("symbolic", "compiled", "plain")
 
@@ -43,6 +42,18 @@ def name_of(function: Any) -> str:
     return getattr(plain, "__qualname__", None) or type(plain).__name__
 
 
+@cache
+def parameters_class(names: tuple[str, ...]) -> Any:
+    """The class of `p`: a named tuple, which numba knows, too, so that helpers of numba's can be given p."""
+
+    def unknown(self: Any, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        raise InputError(f"parameter: got {name!r}, want one of: {', '.join(names) or '(there are none)'}")
+
+    return type("Parameters", (collections.namedtuple("Parameters", names),), {"__slots__": (), "__getattr__": unknown})
+
+
 @dataclass(frozen=True, kw_only=True)
 class External:
     """One function, and how it is called.
@@ -53,6 +64,7 @@ class External:
     Attributes:
       level: compiled or plain.
       states, controls: sizes of x and u. parameters: the names in p, whose values come after `offset` other numbers.
+      unused: the entries of (x, u), and their names, that the value is said not to depend on.
       held: once it has an address, what must be kept alive for that, and the address.
       stopped: set it to end the solves that call back, in whatever thread they are.
       entries: what each returned value is for, as messages name it; without, the value is returned bare.
@@ -67,6 +79,7 @@ class External:
     values: int = 0
     writes: tuple[tuple[int, ...], ...] = ()
     entries: tuple[str, ...] = ()
+    unused: tuple[tuple[int, str], ...] = ()
     held: list[tuple[Any, int]] = field(default_factory=list, init=False, repr=False, compare=False)
     stopped: threading.Event = field(default_factory=threading.Event, init=False, repr=False, compare=False)
     _thread: threading.local = field(default_factory=threading.local, init=False, repr=False, compare=False)
@@ -94,10 +107,11 @@ class External:
           InputError: it fails, or does not return what it should.
         """
         plain = getattr(self.function, "py_func", self.function)
+        note_helpers(self.function)
         written: list[Array] = [np.zeros(shape) for shape in self.writes]
         try:
             with np.errstate(all="ignore"):  # NaN and infinity are dealt with where they arrive
-                returned = plain(x.copy(), u.copy(), Parameters(**p), *written)
+                returned = plain(x.copy(), u.copy(), parameters_class(tuple(p))(*p.values()), *written)
                 if self.writes and returned is not None:
                     raise InputError(f"got {excerpt(returned)} returned, want it written to the last two arguments")
         except InputError as error:
@@ -142,7 +156,7 @@ class External:
                 if self.raised is not None:
                     raise self.raised
                 values = _view(data, end)[self.offset :]
-                p = Parameters(**dict(zip(self.parameters, values.tolist(), strict=True)))
+                p = parameters_class(self.parameters)(*values.tolist())
                 state, control = _view(x, self.states).copy(), _view(u, self.controls).copy()
                 with np.errstate(all="ignore"):
                     if self.writes:
@@ -193,7 +207,7 @@ class External:
             lines += ["except Exception:", "    out[0] = nan"]
         body = "\n".join(f"    {line}" for line in lines)
         source = f"def adapter(x, u, data, {', '.join(outputs)}):\n{body}\n"
-        return source, {"Parameters": collections.namedtuple("Parameters", self.parameters)}
+        return source, {"Parameters": parameters_class(self.parameters)}
 
 
 def _view(address: int, size: int) -> Array:

@@ -86,9 +86,12 @@ def trace(
         raise InputError(f"{name}(x, u, p): {error}") from None
     except Exception as error:  # whatever a user's function may raise becomes one line
         raise InputError(
-            f"{name}(x, u, p): got {type(error).__name__} ({error}) when called with symbols, want plain arithmetic and"
-            " functions of SymPy (from sympy import sin, exp, ...)"
+            f"{name}(x, u, p): got {type(error).__name__} ({error}) when called with symbols, {states} in x and"
+            f" {controls} in u, want plain arithmetic and functions of SymPy (from sympy import sin, Max, ...);"
+            " for NumPy's functions and for branches there is level='compiled' or 'plain'"
         ) from None
+    if returned is None:
+        raise InputError(f"{name}(x, u, p): got None, want what it computes: is a return missing?")
     if hasattr(returned, "tolist"):  # an array of NumPy's, or a matrix of SymPy's
         returned = [entry for row in returned.tolist() for entry in (row if isinstance(row, list) else [row])]
     listed = returned if isinstance(returned, (list, tuple)) else [returned]

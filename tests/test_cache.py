@@ -227,6 +227,7 @@ def test_what_numba_compiled_with_an_old_global_is_not_kept(monkeypatch: pytest.
         monkeypatch.setitem(globals(), "GAIN", gain)
         function = numba.njit(lambda x, u, p: (u[0] - drag(x[0]),))
         dynamics = ls.Dynamics(function, states={"x": ""}, controls={"u": ""})
+        dynamics.functions[0].call(np.ones(1), np.ones(1), {})  # as the solvers do first
         core.address_of(dynamics.functions[0])
         return len(cache.items())
 

@@ -166,6 +166,29 @@ def test_goals_masses_obstacles_and_horizons_are_data(quadrotor: ls.Scenario) ->
     assert core.compilations[before:] == []
 
 
+@numba.njit
+def swing_back(x, p):
+    return p.gravity / p.length * np.sin(x[0])
+
+
+def test_helpers_of_numba_can_be_given_p() -> None:
+    def using_a_helper(x, u, p):
+        return x[1], u[0] / p.inertia - swing_back(x, p)
+
+    want = ls.smooth(swing(DYNAMICS["compiled"], COSTS["compiled"]))
+    for level in ("compiled", "plain"):
+        found = ls.smooth(swing(ls.Dynamics(using_a_helper, level=level, **FIELDS), COSTS["compiled"]))
+        assert found.cost == pytest.approx(want.cost, rel=1e-12)
+
+
+def test_a_cost_must_name_all_that_it_depends_on() -> None:
+    forgetful = ls.FunctionCost(bump, depends_on=("angle",), **HEIGHT)
+    with pytest.raises(
+        ls.InputError, match=r"bump\(x, u, p\): got a value that depends on speed, want it in depends_on"
+    ):
+        ls.smooth(swing(DYNAMICS["plain"], forgetful))
+
+
 def test_numbers_and_plain_functions_are_data() -> None:
     """Other goals, weights, parameters, lengths, and plain functions compile nothing."""
     ls.smooth(swing(DYNAMICS["plain"], COSTS["compiled"]))

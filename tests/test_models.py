@@ -168,7 +168,9 @@ def test_check_plant_agrees_for_our_own_and_names_what_differs():
     quadrotor = check_plant(Quadrotor(), load_scene("cage"))
     assert quadrotor.good
     assert quadrotor.relative.max() < 1e-4  # one Runge-Kutta step each
-    assert check_plant(DifferentialDrive(), load_scene("arena"), period=1 / 6, settle=0.3).good
+    assert check_plant(DifferentialDrive(), load_scene("arena")).good
+    with pytest.raises(InputError, match="want a robot and a scene"):
+        check_plant(Quadrotor, "cage")  # pyright: ignore[reportArgumentType]
     heavy = check_plant(Quadrotor(mass=0.6), load_scene("cage"))
     assert not heavy.good
     assert heavy.worst in ("vx", "vy", "vz", "x", "y", "z")

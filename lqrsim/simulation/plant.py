@@ -158,7 +158,7 @@ def check_plant(
     around: npt.ArrayLike | None = None,
     spread: float = 0.3,
     controls: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
-    settle: float = 0.0,
+    settle: float | None = None,
     samples: int = 50,
     tolerance: float = 0.02,
     seed: int = 0,
@@ -172,12 +172,17 @@ def check_plant(
       around: (n,) the middle of the random states, zero by default. spread: their standard deviation in each unit.
       controls: lowest and highest random control (m,); by default the dynamics' limits.
       settle: seconds under the control before the comparison, for velocities that MuJoCo has and the dynamics do not
-        (those of wheels, say).
+        (those of wheels, say); by default 0.5 where MuJoCo has more of them than the dynamics have states, else 0.
       samples: how many states. tolerance: of an error, relative to the largest change of that state. seed: of all.
 
     Raises:
       InputError: the robot is not in the scene, an argument is not as described, or the controls have no limits.
     """
+    if not isinstance(robot, Robot) or not isinstance(scene, Scene):
+        got = f"{excerpt(robot)} and {excerpt(scene)}"
+        raise InputError(
+            f"check_plant: got {got}, want a robot and a scene, such as Quadrotor() and load_scene('cage')"
+        )
     plant = Plant(robot, scene)
     period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
     substeps = plant.substeps(period)
@@ -201,6 +206,8 @@ def check_plant(
         geom.contype[:], geom.conaffinity[:] = 0, 0
     rng, data = np.random.default_rng(check_count("seed", seed, at_least=0)), mujoco.MjData(plant.model)
     check_number("spread", spread, at_least=0.0)
+    if settle is None:
+        settle = 0.5 if 2 * len(plant.qvel) > n else 0.0
     waiting = round(check_number("settle", settle, at_least=0.0) / plant.timestep)
     found = []
     for _ in range(check_count("samples", samples)):

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -148,6 +148,8 @@ def solve_all(
     progress: Callable[[int, int], object] | None,
 ) -> list[Solution]:
     """Solve each problem with `solve(problem, settings, each=False)`, on several threads; the answers in order."""
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress: got {progress!r}, want a function of how many are done, of how many")
     threads = processors() if threads is None else check_count("threads", threads)
     for i, problem in enumerate(problems):
         try:
@@ -173,6 +175,13 @@ def solve_all(
             for function in functions:
                 function.stopped.clear()
             raise
+
+
+def list_of(problems: Iterable[Problem]) -> list[Problem]:
+    """The problems as a list. Raises InputError for what is no collection."""
+    if not isinstance(problems, Iterable):
+        raise InputError(f"problems: got {type(problems).__name__}, want a list of Problem")
+    return list(problems)
 
 
 def check_problem(problem: Problem) -> None:

@@ -10,7 +10,17 @@ from lqrsim.checks import check_functions
 from lqrsim.errors import InputError
 from lqrsim.problem import Problem
 from lqrsim.results import Quadratic, Solution
-from lqrsim.solvers.common import Callback, Settings, assemble, check_outcome, check_problem, iterate, model, solve_all
+from lqrsim.solvers.common import (
+    Callback,
+    Settings,
+    assemble,
+    check_outcome,
+    check_problem,
+    iterate,
+    list_of,
+    model,
+    solve_all,
+)
 
 
 def ilqr(
@@ -62,7 +72,7 @@ def ilqr_many(
     settings = Settings(
         stop=stop, tolerance=tolerance, max_iterations=max_iterations, initial_controls=initial_controls
     )
-    return solve_all(list(problems), settings, _check, _solve, threads=threads, progress=progress)
+    return solve_all(list_of(problems), settings, _check, _solve, threads=threads, progress=progress)
 
 
 def _check(problem: Problem) -> None:

@@ -10,7 +10,17 @@ from lqrsim.checks import check_functions
 from lqrsim.errors import InputError
 from lqrsim.problem import FixedState, Problem
 from lqrsim.results import Quadratic, Solution
-from lqrsim.solvers.common import Callback, Settings, assemble, check_outcome, check_problem, iterate, model, solve_all
+from lqrsim.solvers.common import (
+    Callback,
+    Settings,
+    assemble,
+    check_outcome,
+    check_problem,
+    iterate,
+    list_of,
+    model,
+    solve_all,
+)
 
 
 def smooth(
@@ -86,7 +96,7 @@ def smooth_many(
         stop=stop, tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations,
         initial_controls=initial_controls,
     )  # fmt: skip
-    return solve_all(list(problems), settings, _check, _solve, threads=threads, progress=progress)
+    return solve_all(list_of(problems), settings, _check, _solve, threads=threads, progress=progress)
 
 
 def _check(problem: Problem) -> None:
