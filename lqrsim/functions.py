@@ -107,7 +107,8 @@ class External:
           InputError: it fails, or does not return what it should.
         """
         plain = getattr(self.function, "py_func", self.function)
-        note_helpers(self.function)
+        if not self.held:  # before the first call compiles them
+            note_helpers(self.function)
         written: list[Array] = [np.zeros(shape) for shape in self.writes]
         try:
             with np.errstate(all="ignore"):  # NaN and infinity are dealt with where they arrive
