@@ -1,20 +1,16 @@
 """Looks at what a user's functions return: before the first iteration, and where derivatives are in doubt."""
 
-import inspect
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from lqrsim import rotations, world
 from lqrsim.costs import Term, terms_of
 from lqrsim.dynamics import Dynamics
 from lqrsim.errors import Array, InputError, check_count, check_number
-from lqrsim.functions import External, brief
+from lqrsim.functions import External, brief, plain_names
 from lqrsim.problem import FixedState, Problem
-from lqrsim.solvers import kernels
 
 
 def functions_of(problem: Problem) -> list[External]:
@@ -76,21 +72,10 @@ def _terms(problem: Problem) -> Iterator[tuple[str, Term]]:
 def evaluate(term: Term, dynamics: Dynamics, x: Array, u: Array) -> tuple[float, Array, Array]:
     """A cost term in plain Python: its value, gradient (n+m,) and Hessian (n+m, n+m), before any projection."""
     n, m = len(x), len(u)
-
-    def invoke(place: float, x: Array, u: Array, data: Array, *outputs: Array) -> None:
-        function = term.functions[int(place)]
-        parameters = dict(zip(function.parameters, term.data.tolist(), strict=True))
-        for output, value in zip(outputs, function.call(x, u, parameters), strict=True):
-            output[:] = value
-
-    names: dict[str, Any] = {"N": n, "M": m, "W": n + m, "stack": lambda *shape: np.empty(shape)}
-    names |= vars(math) | {name: getattr(np, name) for name in vars(math) if callable(getattr(np, name, None))}
-    for module in (rotations, world):
-        names |= {name: value for name, value in vars(module).items() if inspect.isfunction(value)}
-    names |= {"clear": kernels.clear, "invoke": invoke, "invoke_writing": invoke}
+    parameters = dict(zip(term.functions[0].parameters, term.data.tolist(), strict=True)) if term.functions else {}
+    names = plain_names(n, m, term.functions, parameters)
     exec(compile(term.source, "<cost>", "exec"), names)
     gradient, hessian = np.zeros(n + m), np.zeros((n + m, n + m))
-    # An address stands for a function here, too: its place among them.
     data = np.concatenate([np.arange(len(term.functions), dtype=np.float64), term.data])
     return float(names["derivatives"](x, u, 1, data, hessian, gradient)), gradient, hessian
 

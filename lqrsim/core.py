@@ -220,14 +220,14 @@ def _options() -> dict[str, Any]:
     return {"fastmath": set(_FAST), "error_model": "numpy"}
 
 
-# LLVM finds most of what is worth inlining, and to force all of it doubles the time to compile. These are small, and
+# LLVM finds most of what is worth inlining, and to force all of it takes longer to compile. These are small, and
 # called at every stage of every step.
 _INLINED = ("rate", "rate_jacobian", "signed_distance", "signed_distance_derivatives")
 
 
 @contextlib.contextmanager
 def _uncollected() -> Iterator[None]:
-    """Without garbage collection, which takes a sixth of the time to compile."""
+    """Without garbage collection, which takes its share of the time to compile."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -241,7 +241,7 @@ def _uncollected() -> Iterator[None]:
 def _as_one() -> Iterator[None]:
     """Make machine code of the entry alone, into which all that it calls is linked, and none of each part by itself.
 
-    numba makes both, which takes a quarter longer, and then it is up to the linker which of two copies of a part runs:
+    numba makes both, which takes longer, and then it is up to the linker which of two copies of a part runs:
     they differ in the last bit, so the run that compiles and the one that loads would not give the same numbers.
     """
     from numba.core import codegen, registry

@@ -1,7 +1,6 @@
 """The dynamics of a system, stated as a function: of symbols, of arrays for numba, or of NumPy arrays."""
 
 import inspect
-import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -9,11 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim import differences, integration, rotations, tracing
+from lqrsim import differences, integration, tracing
 from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array, check_name, check_number, excerpt
-from lqrsim.functions import External, check_signature, level_of, name_of
-from lqrsim.solvers import kernels
+from lqrsim.functions import External, check_signature, level_of, name_of, plain_names
 
 Limits = tuple[npt.ArrayLike, npt.ArrayLike]
 
@@ -38,8 +36,8 @@ class Dynamics:
 
       symbolic  called once with SymPy symbols; exact derivatives follow. As fast as it gets, and the default.
       compiled  a numba function, or one that numba can compile, of arrays. Without `jacobian`, derivatives are central
-                differences, good to some eight digits, and an iteration takes two or three times as long.
-      plain     any Python function of NumPy arrays, called back some microseconds a call, hundreds of times slower.
+                differences, good to some eight digits, and an iteration takes longer.
+      plain     any Python function of NumPy arrays, called back through Python at every evaluation, and slow.
 
     Args:
       f: `f(x, u, p)`; returns one entry a state. x (n,) and u (m,) must not be changed; p has the parameters as
@@ -226,12 +224,7 @@ class Dynamics:
     def _plain(self) -> dict[str, Any]:
         """The very source that gets compiled, run as plain Python."""
         n, m = len(self.state_coordinates), len(self.control_coordinates)
-        names = {"N": n, "M": m, "W": n + m, "stack": lambda *shape: np.empty(shape), "clear": kernels.clear}
-        # NumPy's functions and not those of math, which raise where compiled code goes on with NaN or infinity.
-        names |= vars(math) | {name: getattr(np, name) for name in vars(math) if callable(getattr(np, name, None))}
-        names |= {name: value for name, value in vars(rotations).items() if inspect.isfunction(value)}
-        names |= {"invoke": self._invoke, "invoke_writing": self._invoke}
-        # An address stands for a function here, too: its place among them.
+        names = plain_names(n, m, self.functions, self.parameters)
         exec(compile(self.source, f"<{self.name}>", "exec"), names)
         for function in (integration.step, integration.step_jacobian):
             exec(compile(inspect.getsource(function), "<integration>", "exec"), names)
@@ -242,10 +235,6 @@ class Dynamics:
     def _numbers(self) -> Array:
         """What `p` is in the compiled functions, with the places of the functions for their addresses."""
         return np.concatenate([np.arange(len(self.functions), dtype=np.float64), self.data])
-
-    def _invoke(self, place: float, x: Array, u: Array, p: Array, *outputs: Array) -> None:
-        for output, value in zip(outputs, self.functions[int(place)].call(x, u, self.parameters), strict=True):
-            output[:] = value
 
 
 _CALL = """\

@@ -8,6 +8,7 @@ back through Python, microseconds a call.
 import collections
 import ctypes
 import inspect
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -16,8 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from lqrsim import rotations, world
 from lqrsim.errors import Array, InputError, check_name, excerpt
 from lqrsim.fingerprint import fingerprint, note_helpers
+from lqrsim.solvers import kernels
 
 LEVELS = ("symbolic", "compiled", "plain")
 
@@ -209,6 +212,25 @@ class External:
         body = "\n".join(f"    {line}" for line in lines)
         source = f"def adapter(x, u, data, {', '.join(outputs)}):\n{body}\n"
         return source, {"Parameters": parameters_class(self.parameters)}
+
+
+def plain_names(states: int, controls: int, functions: Sequence[External], parameters: Mapping[str, float]) -> dict:
+    """The names that sources in the numba subset are run with as plain Python, instead of being compiled.
+
+    An address stands for a function here, too: its place among `functions`.
+    """
+
+    def invoke(place: float, x: Array, u: Array, data: Array, *outputs: Array) -> None:
+        for output, value in zip(outputs, functions[int(place)].call(x, u, parameters), strict=True):
+            output[:] = value
+
+    names: dict[str, Any] = {"N": states, "M": controls, "W": states + controls, "clear": kernels.clear}
+    names |= {"stack": lambda *shape: np.empty(shape), "invoke": invoke, "invoke_writing": invoke}
+    # NumPy's functions and not those of math, which raise where compiled code goes on with NaN or infinity.
+    names |= vars(math) | {name: getattr(np, name) for name in vars(math) if callable(getattr(np, name, None))}
+    for module in (rotations, world):
+        names |= {name: value for name, value in vars(module).items() if inspect.isfunction(value)}
+    return names
 
 
 def _view(address: int, size: int) -> Array:

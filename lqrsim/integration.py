@@ -43,7 +43,7 @@ def chain(fx, fu, previous, a, out):
 def step_jacobian(x, u, p, h, fx, fu, out, jacobian):
     """Write the step as above and its Jacobian `[A B]` (N, W); `fx`, `fu` are work arrays whose zeros are set.
 
-    The four stages are written out: a loop over them takes a quarter longer.
+    The four stages are written out: a loop over them takes longer.
     """
     k, z = stack(N), stack(N)
     first, second = stack(N, W), stack(N, W)

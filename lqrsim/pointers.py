@@ -2,7 +2,7 @@
 
 `a[i, j]` of a numba array unpacks a structure, wraps negative indices and counts references; LLVM removes all that
 again, in seconds. A `Pointer` to blocks of constant shape is one address, and indexing it is one multiplication and one
-addition; the compiled functions are as fast, and compiled in half the time. Imported by compiled cores only.
+addition; the compiled functions are as fast, and sooner compiled. Imported by compiled cores only.
 """
 
 import math

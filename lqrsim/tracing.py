@@ -181,7 +181,7 @@ def write_function(
 def write_chain(states: int, slopes: Iterable[str]) -> str:
     """Source of `chain` of `integration.py` for a Jacobian of which only these targets (`fx[0, 3]`, ...) are not zero.
 
-    Knowing the zeros beforehand makes an iteration a fifth faster than finding them while running.
+    Knowing the zeros beforehand makes an iteration faster than finding them while running.
     """
     entries = [(target[:2], *map(int, target[3:-1].split(", "))) for target in slopes]
     inner = [(i, k) for matrix, i, k in entries if matrix == "fx"]

@@ -1,6 +1,6 @@
 """What a compiled core knows about its problem: the names that the kernels are written against.
 
-`integration.py`, `kernels.py`, `passes.py` and the sources that dynamics and costs write are joined into one file for
+`integration.py`, `kernels.py`, `passes.py` and the sources that dynamics and costs write are joined into one text for
 each structure (see `compiled.py`), with these sizes as constants and these functions filled in. This module only
 declares them, so that each of those files can be read, linted and type-checked on its own.
 """
