@@ -33,14 +33,17 @@ if TYPE_CHECKING:
     from lqrsim.files import load_rollout as load_rollout
     from lqrsim.files import load_solution as load_solution
     from lqrsim.files import save as save
+    from lqrsim.linear_quadratic import Stage as Stage
     from lqrsim.problem import FixedState as FixedState
     from lqrsim.problem import InitialPrior as InitialPrior
     from lqrsim.problem import Problem as Problem
     from lqrsim.results import AffinePolicy as AffinePolicy
     from lqrsim.results import Iteration as Iteration
+    from lqrsim.results import Moments as Moments
     from lqrsim.results import Quadratic as Quadratic
     from lqrsim.results import Solution as Solution
     from lqrsim.results import Status as Status
+    from lqrsim.results import TotalCost as TotalCost
     from lqrsim.results import Trajectory as Trajectory
     from lqrsim.robots.base import Robot as Robot
     from lqrsim.robots.differential_drive import DifferentialDrive as DifferentialDrive
@@ -58,8 +61,12 @@ if TYPE_CHECKING:
     from lqrsim.simulation.plant import Plant as Plant
     from lqrsim.simulation.plant import PlantCheck as PlantCheck
     from lqrsim.simulation.plant import check_plant as check_plant
+    from lqrsim.solvers.continuous import ContinuousSolution as ContinuousSolution
+    from lqrsim.solvers.continuous import smooth_continuous as smooth_continuous
+    from lqrsim.solvers.continuous import smooth_lq_continuous as smooth_lq_continuous
     from lqrsim.solvers.ilqr import ilqr as ilqr
     from lqrsim.solvers.ilqr import ilqr_many as ilqr_many
+    from lqrsim.solvers.linear_quadratic import smooth_lq as smooth_lq
     from lqrsim.solvers.smoother import smooth as smooth
     from lqrsim.solvers.smoother import smooth_many as smooth_many
     from lqrsim.view.plots import plot_run as plot_run
@@ -75,8 +82,9 @@ _HOME = {
     "dynamics": ["Dynamics"],
     "errors": ["InputError"],
     "files": ["load_rollout", "load_solution", "save"],
+    "linear_quadratic": ["Stage"],
     "problem": ["FixedState", "InitialPrior", "Problem"],
-    "results": ["AffinePolicy", "Iteration", "Quadratic", "Solution", "Status", "Trajectory"],
+    "results": ["AffinePolicy", "Iteration", "Moments", "Quadratic", "Solution", "Status", "TotalCost", "Trajectory"],
     "robots.base": ["Robot"],
     "robots.differential_drive": ["DifferentialDrive"],
     "robots.quadrotor": ["Quadrotor"],
@@ -86,7 +94,9 @@ _HOME = {
     "simulation.closed_loop": ["simulate"],
     "simulation.disturbances": ["ControlNoise", "Disturbance", "ForceNoise", "MeasurementNoise", "Push"],
     "simulation.plant": ["Plant", "PlantCheck", "check_plant"],
+    "solvers.continuous": ["ContinuousSolution", "smooth_continuous", "smooth_lq_continuous"],
     "solvers.ilqr": ["ilqr", "ilqr_many"],
+    "solvers.linear_quadratic": ["smooth_lq"],
     "solvers.smoother": ["smooth", "smooth_many"],
     "view.plots": ["plot_run"],
     "view.render": ["render", "still"],

@@ -22,7 +22,7 @@ from lqrsim.costs import Term
 from lqrsim.dynamics import Dynamics
 from lqrsim.errors import Array
 from lqrsim.problem import Problem
-from lqrsim.solvers import interface, kernels, loops, passes, projection
+from lqrsim.solvers import dual, interface, kernels, loops, lq_passes, passes, primal, projection, safeguard
 from lqrsim.world import World
 
 # The terms of a cost as far as they are structure: the source of each, and what it may bend in (see `Term`).
@@ -31,10 +31,14 @@ Structure = tuple[tuple[str, tuple[int, ...] | None], ...]
 _FIELDS = {"initial": "initial", "stage": "stage_cost", "final": "final_cost"}
 
 
-def core(problem: Problem) -> Core:
+# The forms of the cost-to-come, and what brings each.
+FORMS = {"dual": dual, "primal": primal}
+
+
+def core(problem: Problem, form: str = "dual") -> Core:
     """The compiled passes for problems of this structure; see `solvers/loops.py` and `passes.py` for what it offers."""
     with compiling:  # not only against doing it twice: Python 3.11 can not parse in two threads at once
-        return _core(*_structure(problem))
+        return _core(form, *_structure(problem))
 
 
 def _structure(problem: Problem) -> tuple[Any, ...]:
@@ -45,10 +49,21 @@ def _structure(problem: Problem) -> tuple[Any, ...]:
 
 
 @cache
-def _core(n: int, m: int, dynamics: str, costs: tuple[tuple[str, Structure], ...], what: str) -> Core:
-    parts = [_functions(module) for module in (rotations, world, kernels, integration, passes, loops)]
+def _core(form: str, n: int, m: int, dynamics: str, costs: tuple[tuple[str, Structure], ...], what: str) -> Core:
+    parts = [_functions(module) for module in (rotations, world, kernels, integration, FORMS[form], *_SHARED)]
     parts += [dynamics, *(_cost_source(name, structure) for name, structure in costs)]
     return Core("\n\n".join(parts), {"N": n, "M": m, "W": n + m, **_OUTCOMES}, what)
+
+
+_SHARED = passes, loops, safeguard
+
+
+@cache
+def linear_quadratic(n: int, m: int, form: str) -> Core:
+    """The compiled passes for linear-quadratic problems of n states and m controls; see `solvers/lq_passes.py`."""
+    with compiling:
+        parts = [_functions(module) for module in (kernels, FORMS[form], lq_passes)]
+        return Core("\n\n".join(parts), {"N": n, "M": m, "W": n + m}, f"linear-quadratic, {n} states, {m} controls")
 
 
 _OUTCOMES = {name: value for name, value in vars(interface).items() if name.isupper() and len(name) > 1}

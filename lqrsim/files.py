@@ -10,7 +10,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, astuple
+from dataclasses import asdict, astuple, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,10 @@ import numpy.typing as npt
 
 from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array
-from lqrsim.results import AffinePolicy, Iteration, Quadratic, Solution, Status, Trajectory
+from lqrsim.results import AffinePolicy, Iteration, Moments, Quadratic, Solution, Status, Trajectory
 from lqrsim.rollout import Rollout
 
-VERSIONS = {"solution": 1, "rollout": 1}
+VERSIONS = {"solution": 2, "rollout": 1}
 
 
 def save(result: Solution | Rollout, path: str | os.PathLike[str]) -> Path:
@@ -88,20 +88,27 @@ def load_solution(path: str | os.PathLike[str]) -> Solution:
                 control_coordinates=controls,
             )
 
-        def quadratic(name: str) -> Quadratic:
-            parts = {"hessian": (steps + 1, n, n), "gradient": (steps + 1, n), "constant": (steps + 1,)}
-            return Quadratic(**{key: _array(arrays, f"{name}.{key}", shape) for key, shape in parts.items()})
+        def value(kind: type[Quadratic] | type[Moments], name: str) -> Any:
+            shapes = (steps + 1, n, n), (steps + 1, n), (steps + 1,)
+            keys = [field.name for field in fields(kind)]
+            return kind(*(_array(arrays, f"{name}.{key}", shape) for key, shape in zip(keys, shapes, strict=True)))
 
-        log = _array(arrays, "iterations", (None, 5))
+        def cost_to_come() -> Quadratic | Moments | None:
+            if "cost_to_come.covariance" in arrays:
+                return value(Moments, "cost_to_come")
+            return value(Quadratic, "cost_to_come") if "cost_to_come.hessian" in arrays else None
+
+        log = _array(arrays, "iterations", (None, 6))
+        rows = zip(log.tolist(), meta["methods"], strict=True)
         return Solution(
             status=Status(meta["status"]),
             detail=meta["detail"],
             policy=policy("policy"),
             inverse_policy=policy("inverse_policy") if "inverse_policy.gain" in arrays else None,
-            cost_to_go=quadratic("cost_to_go") if "cost_to_go.hessian" in arrays else None,
-            cost_to_come=quadratic("cost_to_come") if "cost_to_come.hessian" in arrays else None,
+            cost_to_go=value(Quadratic, "cost_to_go") if "cost_to_go.hessian" in arrays else None,
+            cost_to_come=cost_to_come(),
             trajectory=_trajectory(arrays, steps, n, m, dt),
-            iterations=tuple(Iteration(*(float(value) for value in row)) for row in log),
+            iterations=tuple(Iteration(*numbers, method=str(method)) for numbers, method in rows),
             clearance=_array(arrays, "clearance", (steps + 1,)) if "clearance" in arrays else None,
             solver=meta["solver"],
             options=meta["options"],
@@ -148,14 +155,14 @@ def _solution_parts(solution: Solution) -> tuple[str, dict[str, npt.NDArray[Any]
     arrays: dict[str, npt.NDArray[Any]] = {
         "trajectory.states": solution.trajectory.states,
         "trajectory.controls": solution.trajectory.controls,
-        "iterations": np.array([astuple(iteration) for iteration in solution.iterations]).reshape(-1, 5),
+        "iterations": np.array([astuple(iteration)[:-1] for iteration in solution.iterations]).reshape(-1, 6),
     }
     for name, law in {"policy": solution.policy, "inverse_policy": solution.inverse_policy}.items():
         if law is not None:
             arrays |= {f"{name}.gain": law.gain, f"{name}.offset": law.offset, f"{name}.nominal": law.nominal}
     for name, value in {"cost_to_go": solution.cost_to_go, "cost_to_come": solution.cost_to_come}.items():
         if value is not None:
-            arrays |= {f"{name}.{key}": getattr(value, key) for key in ("hessian", "gradient", "constant")}
+            arrays |= {f"{name}.{field.name}": getattr(value, field.name) for field in fields(value)}
     if solution.clearance is not None:
         arrays["clearance"] = solution.clearance
     texts = {
@@ -163,6 +170,7 @@ def _solution_parts(solution: Solution) -> tuple[str, dict[str, npt.NDArray[Any]
         "states": asdict(solution.policy.state_coordinates), "controls": asdict(solution.policy.control_coordinates),
         "solver": solution.solver, "options": dict(solution.options), "problem_digest": solution.problem_digest,
         "versions": dict(solution.versions), "scenario": solution.scenario,
+        "methods": [iteration.method for iteration in solution.iterations],
     }  # fmt: skip
     return "solution", arrays, texts
 

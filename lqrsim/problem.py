@@ -28,14 +28,16 @@ class InitialPrior:
     local optimum is found.
 
     Args:
-      weight: (n,) not negative. about: (n,) where it is zero. iterations: how many it acts in.
+      weight: (n,) not negative. iterations: how many it acts in.
+      about: where it is zero: (n,), or (T+1, n) for a trajectory to be drawn to.
     """
 
     def __init__(self, weight: npt.ArrayLike, *, about: npt.ArrayLike, iterations: int = 1) -> None:
         self.weight = check_array("InitialPrior: weight", weight, (None,))
         if (self.weight < 0).any():
             raise InputError(f"InitialPrior: weight: got {self.weight.min():g}, want numbers >= 0")
-        self.about = check_array("InitialPrior: about", about, (len(self.weight),))
+        time = () if np.ndim(about) == 1 else (None,)
+        self.about = check_array("InitialPrior: about", about, (*time, len(self.weight)))
         self.iterations = check_count("InitialPrior: iterations", iterations)
 
 
@@ -84,7 +86,10 @@ class Problem:
             if any(term.uses_control for term in bound[name]):
                 raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
         if self.prior is not None:
-            check_array("prior", self.prior.weight, (len(self.dynamics.state_coordinates),))
+            n = len(self.dynamics.state_coordinates)
+            check_array("prior: weight", self.prior.weight, (n,))
+            if self.prior.about.ndim == 2:
+                check_array("prior: about", self.prior.about, (self.steps + 1, n))
         object.__setattr__(self, "_terms", bound)
         self._check_start_clear()
 

@@ -40,12 +40,12 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Quadratic:
-    """Quadratic functions of the state, one a knot: `1/2 x'Hx + x'g + const`.
+    """A quadratic function of the state, or one a knot: `1/2 x'Hx + x'g + const`.
 
     Paper: Eqs. (8), (14), (20).
 
     Attributes:
-      hessian: (T+1, n, n), symmetric; S, Sbar.
+      hessian: (T+1, n, n), symmetric; S, Sbar. A single function has no leading axis, here and below.
       gradient: (T+1, n), the slope at the origin; bold s, bold sbar.
       constant: (T+1,); s, sbar.
     """
@@ -58,10 +58,10 @@ class Quadratic:
         return Quadratic(self.hessian + other.hessian, self.gradient + other.gradient, self.constant + other.constant)
 
     def __call__(self, states: npt.ArrayLike) -> Array:
-        """The values (T+1,) at states (T+1, n)."""
+        """The values (T+1,) at states (T+1, n), one a knot."""
         x = np.asarray(states, dtype=np.float64)
-        curved = 0.5 * np.einsum("ti,tij,tj->t", x, self.hessian, x)
-        return curved + np.einsum("ti,ti->t", x, self.gradient) + self.constant
+        curved = 0.5 * np.einsum("...i,...ij,...j->...", x, self.hessian, x)
+        return curved + np.einsum("...i,...i->...", x, self.gradient) + self.constant
 
     def minimizer(self) -> Array:
         """The states (T+1, n) of least value. Paper: Eq. (21). Raises LinAlgError where a Hessian is singular."""
@@ -70,6 +70,71 @@ class Quadratic:
     def minimum(self) -> Array:
         """The least value at each knot, (T+1,)."""
         return self(self.minimizer())
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Quadratic functions of the state by moments, one a knot: `1/2 (x - mean)' covariance^-1 (x - mean) + const`.
+
+    What the dual form has for the cost-to-come: a state that can not be reached at all has no covariance in that
+    direction, and costs infinitely much. For the terms see Kalman smoothing, to which LQR smoothing is dual.
+
+    Attributes:
+      covariance: (T+1, n, n), symmetric, positive semidefinite; zero at 0 after a fixed start. Sbar^-1.
+      mean: (T+1, n), where the least cost is; -Sbar^-1 sbar.
+      constant: (T+1,), the least cost.
+    """
+
+    covariance: Array
+    mean: Array
+    constant: Array
+
+    def quadratic(self) -> Quadratic:
+        """The same functions by their coefficients. Raises LinAlgError where a covariance is singular."""
+        hessian = np.linalg.inv(self.covariance)
+        hessian = 0.5 * (hessian + np.swapaxes(hessian, -1, -2))
+        gradient = -np.einsum("...ij,...j->...i", hessian, self.mean)
+        return Quadratic(hessian, gradient, self.constant - 0.5 * np.einsum("...i,...i->...", gradient, self.mean))
+
+    def minimizer(self) -> Array:
+        """The states (T+1, n) of least value: the means."""
+        return self.mean
+
+    def minimum(self) -> Array:
+        """The least value at each knot, (T+1,)."""
+        return self.constant
+
+
+@dataclass(frozen=True)
+class TotalCost:
+    """Cost-to-go plus cost-to-come: the least cost of a trajectory through a state, at each knot. Paper: Eq. (20)."""
+
+    cost_to_go: Quadratic
+    cost_to_come: Quadratic | Moments
+
+    def minimizer(self) -> Array:
+        """The states (T+1, n) of least total cost; x_hat. Paper: Eq. (21). Raises LinAlgError where there is none."""
+        if isinstance(self.cost_to_come, Quadratic):
+            return (self.cost_to_go + self.cost_to_come).minimizer()
+        moved = np.einsum("...ij,...j->...i", self.cost_to_come.covariance, self.costate())
+        return self.cost_to_come.mean - moved
+
+    def costate(self) -> Array:
+        """The slopes (T+1, n) of the cost-to-go at the minimisers: what a unit more of each state would cost."""
+        go = self.cost_to_go
+        if isinstance(self.cost_to_come, Quadratic):
+            return np.einsum("...ij,...j->...i", go.hessian, self.minimizer()) + go.gradient
+        covariance, mean = self.cost_to_come.covariance, self.cost_to_come.mean
+        slope = np.einsum("...ij,...j->...i", go.hessian, mean) + go.gradient
+        return np.linalg.solve(np.eye(mean.shape[-1]) + go.hessian @ covariance, slope[..., None])[..., 0]
+
+    def minimum(self) -> Array:
+        """The least total cost at each knot, (T+1,): for a linear-quadratic problem the same number at all."""
+        if isinstance(self.cost_to_come, Quadratic):
+            return (self.cost_to_go + self.cost_to_come).minimum()
+        costate, covariance = self.costate(), self.cost_to_come.covariance
+        come = 0.5 * np.einsum("...i,...ij,...j->...", costate, covariance, costate) + self.cost_to_come.constant
+        return come + self.cost_to_go(self.minimizer())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,16 +226,16 @@ _STATUS_TEXT = {
     ),
     Status.MAX_ITERATIONS: (
         "the iteration limit came first",
-        "raise max_iterations if the improvements still shrink; if they do not, try other initial_controls or a prior",
+        "raise max_iterations if the improvements still shrink; if they do not, try another start or a prior",
     ),
     Status.INFEASIBLE: ("no trajectory meets the constraints", "relax the constraint that is named, or give more time"),
     Status.DIVERGED: (
         "the cost of the policy grew beyond all bounds",
-        "add a prior, try initial_controls nearer to a solution, shorten dt, or try the other solver",
+        "add a prior, try a start nearer to a solution, shorten dt, or try the other solver",
     ),
     Status.NOT_FINITE: (
         "a NaN or an infinity appeared",
-        "check the dynamics and the cost at the step that is named; try other initial_controls; shorten dt",
+        "check the dynamics and the cost at the step that is named; try another start; shorten dt",
     ),
     Status.NOT_POSITIVE_DEFINITE: (
         "a matrix that must be inverted was not positive definite",
@@ -190,24 +255,31 @@ class Iteration:
         range along the rollout (at least 1 unit).
       optimality: the decrease that a linear-quadratic model about the rollout still predicts, relative to the cost; NaN
         where it was not evaluated (it is once the other tests pass, and after the last iteration).
+      dynamics_residual: how far one step of the true dynamics takes a minimal-total-cost state from the next one, at
+        most; relative as the gap is, and evaluated where the optimality is. The plan itself is a rollout, and has none.
       seconds: time this iteration took.
+      method: "smooth", the paper's; of the safeguard's: "damped", "rejected" (damped, but it would have cost more, or a
+        pass failed; cost is that of the plan that was kept), or "ilqr".
     """
 
     cost: float
     improvement: float
     gap: float
     optimality: float
+    dynamics_residual: float
     seconds: float
+    method: str
 
-    HEADER = f"{'iteration':>9} {'cost':>14} {'improvement':>12} {'gap':>10} {'optimality':>11} {'ms':>8}"
+    HEADER = f"{'iteration':>9} {'cost':>14} {'improvement':>12} {'gap':>10} {'optimality':>11} {'ms':>8}  method"
 
     def row(self, number: int) -> str:
         """This iteration as a line under `HEADER`."""
         optimality = "-" if np.isnan(self.optimality) else f"{self.optimality:.1e}"
         improvement = "-" if np.isinf(self.improvement) else f"{self.improvement:.2e}"
+        gap = "-" if np.isnan(self.gap) else f"{self.gap:.1e}"
         return (
-            f"{number:>9} {self.cost:>14.9g} {improvement:>12} {self.gap:>10.1e} {optimality:>11}"
-            f" {1e3 * self.seconds:>8.2f}"
+            f"{number:>9} {self.cost:>14.9g} {improvement:>12} {gap:>10} {optimality:>11}"
+            f" {1e3 * self.seconds:>8.2f}  {self.method}"
         )
 
 
@@ -217,11 +289,12 @@ class Solution:
 
     Attributes:
       status: how the solve ended; only CONVERGED and COST_CONVERGED are success.
-      detail: where and why, if it is not.
+      detail: where and why, if it is not; and where the safeguard had to step in.
       policy: the feedback law, from the last backward pass that was completed.
-      inverse_policy: the law that traces the optimum backwards from a state of arrival; None from `ilqr`.
+      inverse_policy: the law that traces the optimum backwards from a state of arrival; None from `ilqr`, and where
+        states of arrival can not be chosen freely, as after a fixed start.
       cost_to_go, cost_to_come: the value functions of the last passes; None where a pass failed, the latter also from
-        `ilqr`.
+        `ilqr`. The cost-to-come is a `Quadratic` in the primal form and `Moments` in the dual.
       trajectory: the plan: the rollout of the policy under the true dynamics from its first state.
       iterations: the log.
       clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,);
@@ -237,7 +310,7 @@ class Solution:
     policy: AffinePolicy
     inverse_policy: AffinePolicy | None
     cost_to_go: Quadratic | None
-    cost_to_come: Quadratic | None
+    cost_to_come: Quadratic | Moments | None
     trajectory: Trajectory
     iterations: tuple[Iteration, ...]
     clearance: Array | None
@@ -268,13 +341,18 @@ class Solution:
         return self.iterations[-1].optimality if self.iterations else float("nan")
 
     @property
-    def total_cost(self) -> Quadratic:
+    def dynamics_residual(self) -> float:
+        """Dynamics residual of the last iteration; see `Iteration.dynamics_residual`."""
+        return self.iterations[-1].dynamics_residual if self.iterations else float("nan")
+
+    @property
+    def total_cost(self) -> TotalCost:
         """Cost-to-go plus cost-to-come, Eq. (20). Raises InputError where there is no cost-to-come, as from `ilqr`."""
         if self.cost_to_go is None or self.cost_to_come is None:
             raise InputError(
                 f"total_cost: got a solution of {self.solver} without both value functions, want one of smooth"
             )
-        return self.cost_to_go + self.cost_to_come
+        return TotalCost(self.cost_to_go, self.cost_to_come)
 
     def iteration_table(self) -> str:
         """The log as text, a line an iteration."""

@@ -23,6 +23,7 @@ class LinearQuadratic:
     QT: Array
     qT: Array
     kT: float
+    fixed: Array | None = None  # an initial state that is given, in place of Q0, q0, k0
 
 
 def random_problem(seed: int, n: int, m: int, steps: int) -> LinearQuadratic:
@@ -62,8 +63,9 @@ def solve_dense(problem: LinearQuadratic) -> tuple[Array, Array, float]:
 
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
     constraint, right = np.zeros((steps * n, size)), np.zeros(steps * n)
-    hessian[state(0), state(0)] += problem.Q0
-    gradient[state(0)] += problem.q0
+    if problem.fixed is None:
+        hessian[state(0), state(0)] += problem.Q0
+        gradient[state(0)] += problem.q0
     hessian[state(steps), state(steps)] += problem.QT
     gradient[state(steps)] += problem.qT
     for t in range(steps):
@@ -74,11 +76,15 @@ def solve_dense(problem: LinearQuadratic) -> tuple[Array, Array, float]:
         constraint[state(t), control(t)] = -problem.B[t]
         constraint[state(t), state(t + 1)] = np.eye(n)
         right[state(t)] = problem.c[t]
-    zeros = np.zeros((steps * n, steps * n))
+    if problem.fixed is not None:
+        given = np.zeros((n, size))
+        given[:, state(0)] = np.eye(n)
+        constraint, right = np.vstack([constraint, given]), np.concatenate([right, problem.fixed])
+    zeros = np.zeros((len(right), len(right)))
     solution = np.linalg.solve(
         np.block([[hessian, constraint.T], [constraint, zeros]]), np.concatenate([-gradient, right])
     )[:size]
     cost = 0.5 * solution @ hessian @ solution + gradient @ solution
-    cost += problem.k0 + problem.kT + problem.k.sum()
+    cost += problem.kT + problem.k.sum() + (problem.k0 if problem.fixed is None else 0.0)
     states = solution[: (steps + 1) * n].reshape(steps + 1, n)
     return states, solution[(steps + 1) * n :].reshape(steps, m), float(cost)

@@ -43,7 +43,7 @@ def test_a_symbolic_cost_is_the_built_in_one(differential_drive: ls.Scenario) ->
     stage = ls.SymbolicCost(effort, parameters={"weight": 60.0, "cruise": 0.25}, convex=True)
     stage += ls.ObstacleCost(scene.world, radius=robot.radius)
     other = dataclasses.replace(problem, stage_cost=stage)
-    solution = ls.smooth(other, initial_controls=(0.25, 0.25))
+    solution = ls.smooth(other, start=(0.25, 0.25))
     assert solution.cost == pytest.approx(ls.smooth(problem).cost, rel=1e-9)
 
 
@@ -91,7 +91,7 @@ FIELDS = {
         ),
         ({"stage_cost": ls.SymbolicCost(lambda x, u, p: [x[0], x[1]])}, "got 2 entries, want one: the cost"),
         ({"stage_cost": ls.SymbolicCost(lambda x, u, p: p.gain * x[0])}, "parameter: got 'gain', want one of"),
-        ({"prior": ls.InitialPrior(np.ones(2), about=np.zeros(2))}, r"prior: got shape \(2,\), want \(3,\)"),
+        ({"prior": ls.InitialPrior(np.ones(2), about=np.zeros(2))}, r"prior: weight: got shape \(2,\), want \(3,\)"),
     ],
 )
 def test_bad_problems_get_one_line(fields: dict, message: str) -> None:

@@ -1,8 +1,10 @@
-"""The Riccati steps against one dense KKT solve, and what the paper proves of them.
+"""smooth_lq() and its Riccati steps, in both forms, against one dense KKT solve, and what the paper proves of them.
 
 Tolerance 1e-9, relative to the size of what is compared: the problems are well conditioned (by construction, at
 horizons up to 12), and two ways of solving the same linear system differ by rounding alone.
 """
+
+import dataclasses
 
 import numpy as np
 import pytest
@@ -12,63 +14,54 @@ from linear_quadratic import LinearQuadratic, random_problem, solve_dense
 
 import lqrsim as ls
 from lqrsim import compiled
-from lqrsim.core import Core
 from lqrsim.errors import Array
-from lqrsim.results import Quadratic
 
 
-def integrator(n: int, m: int) -> Core:
-    """The core of some problem with n states and m controls; the Riccati steps in it know no more than the sizes."""
-    dynamics = ls.Dynamics(
-        lambda x, u, p: [u[i % m] - x[i] for i in range(n)],
-        states={f"x{i}": "" for i in range(n)},
-        controls={f"u{i}": "" for i in range(m)},
+def stage_of(problem: LinearQuadratic) -> ls.Stage:
+    n = problem.A.shape[-1]
+    return ls.Stage(
+        A=problem.A, B=problem.B, c=problem.c, Q=problem.H[:, :n, :n], P=problem.H[:, n:, :n], R=problem.H[:, n:, n:],
+        q=problem.h[:, :n], r=problem.h[:, n:], constant=problem.k,
+    )  # fmt: skip
+
+
+def smoothed(problem: LinearQuadratic, form: str) -> ls.Solution:
+    initial = problem.fixed if problem.fixed is not None else (problem.Q0, problem.q0, problem.k0)
+    solution = ls.smooth_lq(
+        stage_of(problem),
+        initial=ls.FixedState(initial) if problem.fixed is not None else ls.Quadratic(*initial),
+        final=ls.Quadratic(problem.QT, problem.qT, problem.kT),
+        form=form,
     )
-    problem = ls.Problem(
-        dynamics=dynamics,
-        dt=1.0,
-        steps=1,
-        initial=ls.QuadraticCost(np.ones(n), about=np.zeros(n)),
-        stage_cost=ls.ControlCost(np.ones(m), about=np.zeros(m)),
-        final_cost=ls.QuadraticCost(np.ones(n), about=np.zeros(n)),
-    )
-    return compiled.core(problem)
-
-
-class Smoothed:
-    """LQR smoothing of a linear-quadratic problem, step by step with the compiled kernels."""
-
-    def __init__(self, core: Core, problem: LinearQuadratic) -> None:
-        steps, n, m = problem.B.shape
-        self.L, self.l = np.zeros((steps, m, n)), np.zeros((steps, m))
-        self.Lbar, self.lbar = np.zeros((steps, m, n)), np.zeros((steps, m))
-        S, s, k = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
-        Sbar, sbar, kbar = S.copy(), s.copy(), k.copy()
-        S[steps], s[steps], k[steps] = problem.QT, problem.qT, problem.kT
-        Sbar[0], sbar[0], kbar[0] = problem.Q0, problem.q0, problem.k0
-        for t in reversed(range(steps)):
-            jacobian = np.hstack([problem.A[t], problem.B[t]])
-            k[t], good = core.riccati_backward(
-                jacobian, problem.c[t].copy(), problem.H[t].copy(), problem.h[t].copy(), problem.k[t],
-                S[t + 1], s[t + 1], k[t + 1], self.L[t], self.l[t], S[t], s[t],
-            )  # fmt: skip
-            assert good
-        for t in range(steps):
-            inverse = np.linalg.inv(problem.A[t])
-            jacobian = np.ascontiguousarray(np.hstack([inverse, -inverse @ problem.B[t]]))
-            kbar[t + 1], good = core.riccati_forward(
-                jacobian, -inverse @ problem.c[t], problem.H[t].copy(), problem.h[t].copy(), problem.k[t],
-                Sbar[t], sbar[t], kbar[t], self.Lbar[t], self.lbar[t], Sbar[t + 1], sbar[t + 1],
-            )  # fmt: skip
-            assert good
-        self.cost_to_go, self.cost_to_come = Quadratic(S, s, k), Quadratic(Sbar, sbar, kbar)
-        self.x_hat = np.zeros((steps + 1, n))
-        for t in range(steps + 1):
-            assert core.minimizer(S[t], s[t], Sbar[t], sbar[t], self.x_hat[t])
+    assert solution.status is ls.Status.CONVERGED
+    return solution
 
 
 def assert_close(actual: Array, expected: Array) -> None:
     np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * max(1.0, float(np.abs(expected).max())))
+
+
+def assert_solves(problem: LinearQuadratic, form: str) -> ls.Solution:
+    """What must hold of every linear-quadratic problem, against the dense KKT solution."""
+    solution = smoothed(problem, form)
+    states, controls, cost = solve_dense(problem)
+    x_hat = solution.total_cost.minimizer()
+    assert_close(x_hat, states)
+    # The minimum of the total cost is the optimal cost, at every step: constants included.
+    assert_close(solution.total_cost.minimum(), np.full(len(states), cost))
+    for t in range(len(controls)):
+        control = solution.policy.control(x_hat[t], t)
+        assert_close(control, controls[t])
+        # Lemma 1: the minimisers satisfy the dynamics.
+        assert_close(problem.A[t] @ x_hat[t] + problem.B[t] @ control + problem.c[t], x_hat[t + 1])
+        if solution.inverse_policy is not None:  # Eq. (22): both policies agree
+            assert_close(solution.inverse_policy.control(x_hat[t + 1], t), control)
+    # What is reported of it.
+    assert_close(solution.trajectory.states, states)
+    assert_close(solution.trajectory.controls, controls)
+    assert abs(solution.cost - cost) <= 1e-9 * max(1.0, abs(cost))
+    assert max(solution.gap, solution.dynamics_residual, solution.optimality) < 1e-9
+    return solution
 
 
 SIZES = [(1, 1), (3, 2), (2, 3), (5, 2)]
@@ -77,51 +70,114 @@ SIZES = [(1, 1), (3, 2), (2, 3), (5, 2)]
 @pytest.mark.parametrize(("n", "m"), SIZES)
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 12))
-def test_smoothing_solves_the_kkt_system(n: int, m: int, seed: int, steps: int) -> None:
+def test_both_forms_solve_the_kkt_system_and_agree(n: int, m: int, seed: int, steps: int) -> None:
+    """With each other to 1e-10: the same numbers by two ways."""
     problem = random_problem(seed, n, m, steps)
-    smoothed = Smoothed(_core(n, m), problem)
-    states, controls, cost = solve_dense(problem)
+    primal, dual = (assert_solves(problem, form) for form in ("primal", "dual"))
+    for one, other in ((primal.cost_to_go, dual.cost_to_go), (primal.cost_to_come, dual.cost_to_come)):
+        other = other.quadratic() if isinstance(other, ls.Moments) else other
+        assert one is not None
+        assert other is not None
+        for name in ("hessian", "gradient", "constant"):
+            a, b = getattr(one, name), getattr(other, name)
+            # As quadratics the costs-to-come are inverses, and no better than their condition.
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-8 * max(1.0, float(np.abs(a).max())))
+    scale = max(1.0, float(np.abs(primal.trajectory.states).max()))
+    np.testing.assert_allclose(primal.trajectory.states, dual.trajectory.states, rtol=0, atol=1e-10 * scale)
+    np.testing.assert_allclose(primal.policy.gain, dual.policy.gain, rtol=0, atol=1e-10 * 10)
+    again, once = dual.total_cost.minimizer(), primal.total_cost.minimizer()
+    np.testing.assert_allclose(again, once, rtol=0, atol=1e-10 * scale)
 
-    assert_close(smoothed.x_hat, states)
-    # The minimum of the total cost is the optimal cost, at every step: constants included.
-    total = smoothed.cost_to_go + smoothed.cost_to_come
-    assert_close(total.minimum(), np.full(steps + 1, cost))
-    assert_close(total.minimizer(), states)
+
+@pytest.mark.parametrize(("n", "m"), SIZES)
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 12), rank=st.integers(0, 4))
+def test_the_dual_form_takes_a_fixed_start_singular_steps_and_singular_costs(
+    n: int, m: int, seed: int, steps: int, rank: int
+) -> None:
+    """A of low rank, the joint cost of a stage singular but for R, cross terms, a final cost of low rank or none."""
+    rng = np.random.default_rng(seed)
+    problem = random_problem(seed, n, m, steps)
     for t in range(steps):
-        forward = smoothed.L[t] @ smoothed.x_hat[t] + smoothed.l[t]
-        backward = smoothed.Lbar[t] @ smoothed.x_hat[t + 1] + smoothed.lbar[t]
-        assert_close(forward, controls[t])
-        # Lemma 1 and Eq. (22): both policies agree, and the minimisers satisfy the dynamics.
-        assert_close(backward, forward)
-        step = problem.A[t] @ smoothed.x_hat[t] + problem.B[t] @ forward + problem.c[t]
-        assert_close(step, smoothed.x_hat[t + 1])
+        u, values, v = np.linalg.svd(problem.A[t])
+        values[min(rank, n - 1) :] = 0
+        problem.A[t] = (u * values) @ v
+        R, P = problem.H[t, n:, n:], 0.3 * rng.normal(size=(m, n))
+        Q = P.T @ np.linalg.solve(R, P)  # just enough: the joint cost has rank m
+        problem.H[t] = np.block([[0.5 * (Q + Q.T), P.T], [P, R]])
+    root = rng.normal(size=(n, min(rank, n)))
+    final = root @ root.T
+    assert_solves(
+        dataclasses.replace(problem, fixed=rng.normal(size=n), QT=final, qT=final @ rng.normal(size=n)), "dual"
+    )
+    assert_solves(dataclasses.replace(problem, QT=final, qT=final @ rng.normal(size=n)), "dual")
 
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), steps=st.integers(1, 8))
 def test_value_functions_are_the_cost_of_the_rest_of_the_way(seed: int, steps: int) -> None:
     problem = random_problem(seed, 3, 2, steps)
-    smoothed = Smoothed(_core(3, 2), problem)
+    solution = smoothed(problem, "dual")
     rng = np.random.default_rng(seed)
     x = start = rng.normal(size=3)
     cost = 0.0
     for t in range(steps):
-        z = np.concatenate([x, smoothed.L[t] @ x + smoothed.l[t]])
+        z = np.concatenate([x, solution.policy.control(x, t)])
         cost += 0.5 * z @ problem.H[t] @ z + problem.h[t] @ z + problem.k[t]
         x = problem.A[t] @ x + problem.B[t] @ z[3:] + problem.c[t]
     cost += 0.5 * x @ problem.QT @ x + problem.qT @ x + problem.kT
-    value = smoothed.cost_to_go
+    value = solution.cost_to_go
+    assert value is not None
     at_start = 0.5 * start @ value.hessian[0] @ start + value.gradient[0] @ start + value.constant[0]
     assert abs(at_start - cost) <= 1e-9 * max(1.0, abs(cost))
 
 
-def test_a_control_that_costs_nothing_and_does_nothing_is_refused() -> None:
-    core = _core(3, 2)
-    cost = np.diag([1.0, 1.0, 1.0, 0.0, 0.0])
-    out = np.zeros((2, 3)), np.zeros(2), np.zeros((3, 3)), np.zeros(3)
-    jacobian = np.hstack([np.eye(3), np.zeros((3, 2))])
-    _, good = core.riccati_backward(jacobian, np.zeros(3), cost, np.zeros(5), 0.0, np.eye(3), np.zeros(3), 0.0, *out)
-    assert not good
+@pytest.mark.parametrize("form", ["dual", "primal"])
+def test_a_control_that_costs_nothing_and_does_nothing_is_refused(form: str) -> None:
+    stage = ls.Stage(A=np.eye(3), B=np.zeros((4, 3, 2)), R=np.zeros((2, 2)), Q=np.eye(3))
+    end = ls.Quadratic(np.eye(3), np.zeros(3), np.array(0.0))
+    solution = ls.smooth_lq(stage, initial=end, final=end, form=form)
+    assert solution.status is ls.Status.NOT_POSITIVE_DEFINITE
+    assert solution.detail == "backward pass, step 3 of 4"
+    assert not solution.iterations
+
+
+END = ls.Quadratic(np.eye(2), np.zeros(2), np.array(0.0))
+FLAT = ls.Quadratic(np.diag([1.0, 0.0]), np.zeros(2), np.array(0.0))
+STEP = ls.Stage(A=np.eye(2), B=np.ones((4, 2, 1)), R=[[1.0]])
+
+
+def lq(stage: ls.Stage = STEP, *, initial=END, final=END, form: str = "dual", dt: float = 1.0) -> ls.Solution:
+    return ls.smooth_lq(stage, initial=initial, final=final, form=form, dt=dt)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: lq(form="both"), "form: got 'both', want one of: dual, primal"),
+        (lambda: lq(dt=0.0), "dt: got 0.0, want a finite number > 0"),
+        (lambda: lq(initial=FLAT), "initial: hessian: got smallest eigenvalue 0, want"),
+        (lambda: lq(initial=ls.FixedState([0, 0]), form="primal"), "initial: got a FixedState, want"),
+        (lambda: lq(initial=ls.FixedState([0])), r"initial: state: got shape \(1,\), want \(2,\)"),
+        (lambda: lq(final=np.eye(2)), "final: got ndarray, want a Quadratic"),
+        (
+            lambda: lq(ls.Stage(A=FLAT.hessian, B=np.ones((4, 2, 1)), R=[[1.0]]), form="primal"),
+            r'stage: A: got a singular matrix at step 0, want an invertible one, or form="dual"',
+        ),
+        (lambda: lq(ls.Stage(A=np.eye(2), B=np.ones((2, 1)), R=[[1.0]])), "stage: got one stage, want one a step"),
+        (
+            lambda: ls.Stage(A=np.eye(3), B=np.ones((4, 2, 1)), R=[[1.0]]),
+            r"Stage: A: got shape \(4, 3, 3\), want \(4, 2, 2\)",
+        ),
+        (
+            lambda: ls.Stage(A=np.eye(2), B=np.ones((2, 1)), R=[[1.0]], Q=[[0, 1], [0, 0]]),
+            "Stage: Q: got a matrix that is not symmetric",
+        ),
+    ],
+)
+def test_bad_problems_get_one_line(wrong, message: str) -> None:
+    with pytest.raises(ls.InputError, match=message):
+        wrong()
 
 
 @settings(max_examples=50, deadline=None)
@@ -157,12 +213,3 @@ def _project(matrix: Array) -> Array:
     core, data = compiled.core(problem), compiled.arguments(problem)
     core.stage_quadratic(np.zeros(3), np.zeros(1), 1, data["stage"], hessian, gradient)
     return hessian - np.diag([0.0, 0.0, 0.0, 1.0])  # less the control cost, which is convex and added as it is
-
-
-_cores: dict[tuple[int, int], Core] = {}
-
-
-def _core(n: int, m: int) -> Core:
-    if (n, m) not in _cores:
-        _cores[n, m] = integrator(n, m)
-    return _cores[n, m]

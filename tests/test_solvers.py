@@ -62,12 +62,13 @@ def drive_rollout(start: Array, controls: Array) -> Array:
     return np.array(states)
 
 
+@pytest.mark.parametrize("form", ["dual", "primal"])
 @pytest.mark.parametrize(("controls", "cost", "iterations"), [(None, 30.14, 4), ((0.0, 0.0), 54.98, 11)])
 def test_the_differential_drive_reproduces_the_known_costs(
-    differential_drive: ls.Scenario, controls: tuple[float, float] | None, cost: float, iterations: int
+    differential_drive: ls.Scenario, form: str, controls: tuple[float, float] | None, cost: float, iterations: int
 ) -> None:
     """0.5 %: costs found by an independent implementation at the paper's stop test."""
-    solution = ls.smooth(differential_drive.problem, stop="cost", initial_controls=controls)
+    solution = ls.smooth(differential_drive.problem, form=form, stop="cost", start=controls)
     assert solution.status is Status.COST_CONVERGED
     assert solution.cost == pytest.approx(cost, rel=5e-3)
     assert len(solution.iterations) == iterations
@@ -234,7 +235,7 @@ class TestEndings:
         assert solution.status.remedy in str(solution)
 
     def test_a_cost_without_a_minimum(self) -> None:
-        solution = ls.smooth(scalar_problem(bonus=1.0))
+        solution = ls.smooth(scalar_problem(bonus=1.0), safeguard=False)
         assert solution.status is Status.NOT_POSITIVE_DEFINITE
         assert solution.detail == "forward pass of iteration 1, step 0 of 20"
         assert solution.iterations == ()
@@ -258,11 +259,14 @@ class TestEndings:
         assert solution.status is Status.NOT_FINITE
         assert solution.detail == "rollout of the initial controls"
 
-    @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
-    def test_too_few_iterations(self, differential_drive: ls.Scenario, solver) -> None:
-        solution = solver(differential_drive.problem, max_iterations=2)
+    @pytest.mark.parametrize(
+        ("solver", "options", "rows"), [(ls.smooth, {}, 4), (ls.smooth, {"safeguard": False}, 2), (ls.ilqr, {}, 2)]
+    )
+    def test_too_few_iterations(self, differential_drive: ls.Scenario, solver, options: dict, rows: int) -> None:
+        """The safeguard has as many again."""
+        solution = solver(differential_drive.problem, max_iterations=2, **options)
         assert solution.status is Status.MAX_ITERATIONS
-        assert len(solution.iterations) == 2
+        assert len(solution.iterations) == rows
         assert np.isfinite(solution.optimality)
 
     def test_the_cost_test_alone_is_not_called_converged(self, differential_drive: ls.Scenario) -> None:
@@ -302,7 +306,7 @@ class TestMany:
         good = differential_drive.problem
         fixed = dataclasses.replace(good, initial=ls.FixedState((0, -2.5, np.pi)))
         with pytest.raises(ls.InputError, match=r"^problems\[1\]: initial: got a FixedState, want an initial cost"):
-            ls.smooth_many([good, fixed])
+            ls.smooth_many([good, fixed], form="primal")
         with pytest.raises(ls.InputError, match=r"^problems\[0\]: problem: got str, want a Problem"):
             ls.ilqr_many(["quadrotor"])  # pyright: ignore[reportArgumentType]
         with pytest.raises(ls.InputError, match=r"^threads: got 0, want a whole number >= 1"):
@@ -335,8 +339,12 @@ def test_the_callback_sees_every_iteration_and_may_stop_the_solve(differential_d
         ({"tolerance": 0.0}, "tolerance: got 0.0, want a finite number > 0"),
         ({"gap_tolerance": -1.0}, "gap_tolerance: got -1.0, want a finite number > 0"),
         ({"max_iterations": 0}, "max_iterations: got 0, want a whole number >= 1"),
-        ({"initial_controls": (0.1,) * 3}, r"initial_controls: got shape \(3,\), want \(2,\) or \(150, 2\)"),
-        ({"initial_controls": (np.inf, 0)}, r"initial_controls: got inf at index \[0, 0\], want finite numbers"),
+        ({"start": (0.1,) * 3}, r"start: got shape \(3,\), want controls \(2,\) or \(150, 2\), a Trajectory"),
+        ({"start": (np.inf, 0)}, r"start: got inf at index \[0, 0\], want finite numbers"),
+        ({"start": "hover"}, r"start: got str, want controls \(2,\) or \(150, 2\), a Trajectory"),
+        ({"form": "Dual"}, r"form: got 'Dual', want one of: dual, primal \(did you mean dual\?\)"),
+        ({"first_pass": "back"}, "first_pass: got 'back', want one of: forward, backward"),
+        ({"safeguard": "yes"}, "safeguard: got 'yes', want True or False"),
     ],
 )
 def test_bad_options_get_one_line(differential_drive: ls.Scenario, options: dict, message: str) -> None:
@@ -344,10 +352,10 @@ def test_bad_options_get_one_line(differential_drive: ls.Scenario, options: dict
         ls.smooth(differential_drive.problem, **options)
 
 
-def test_the_smoother_wants_a_soft_start(differential_drive: ls.Scenario) -> None:
+def test_the_primal_form_wants_a_soft_start(differential_drive: ls.Scenario) -> None:
     problem = dataclasses.replace(differential_drive.problem, initial=ls.FixedState((0, -2.5, np.pi)))
     with pytest.raises(ls.InputError, match="initial: got a FixedState, want an initial cost"):
-        ls.smooth(problem)
+        ls.smooth(problem, form="primal")
 
 
 def test_the_summary_says_what_matters(drive_solution: ls.Solution) -> None:

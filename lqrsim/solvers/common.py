@@ -4,18 +4,18 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim import compiled
 from lqrsim.checks import check_functions, check_start, functions_of
-from lqrsim.errors import Array, InputError, check_array, check_count, check_name, check_number
+from lqrsim.errors import Array, InputError, check_count, check_name, check_number
 from lqrsim.problem import Problem
-from lqrsim.results import AffinePolicy, Iteration, Quadratic, Solution, Status, Trajectory
+from lqrsim.results import AffinePolicy, Iteration, Moments, Quadratic, Solution, Status, Trajectory
 from lqrsim.solvers import interface
+from lqrsim.solvers.start import Start, StartLike, resolve
 from lqrsim.versions import versions
 
 Callback = Callable[[Iteration], object]
@@ -32,15 +32,27 @@ _STATUS = {
 }
 
 
+_METHODS = {
+    interface.SMOOTH: "smooth",
+    interface.DAMPED: "damped",
+    interface.REJECTED: "rejected",
+    interface.ILQR: "ilqr",
+}
+LOG_COLUMNS = 6
+
+
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """When to stop, and from where to start; see `smooth` for what each means."""
+    """When to stop, and from where to start; see `smooth` for what each means. None where a solver has none."""
 
     stop: str
     tolerance: float
     max_iterations: int
-    initial_controls: npt.ArrayLike | None
-    gap_tolerance: float | None = None  # None where there can be no gap
+    start: StartLike
+    gap_tolerance: float | None = None
+    form: str | None = None
+    first_pass: str | None = None
+    safeguard: bool | None = None
 
     def __post_init__(self) -> None:
         check_name("stop", self.stop, ("optimal", "cost"))
@@ -48,20 +60,19 @@ class Settings:
         if self.gap_tolerance is not None:
             check_number("gap_tolerance", self.gap_tolerance, above=0.0)
         check_count("max_iterations", self.max_iterations)
-        if self.max_iterations > 1_000_000:  # the log of so many takes 32 MB
+        if self.max_iterations > 1_000_000:  # the log of so many takes 48 MB
             raise InputError(f"max_iterations: got {self.max_iterations}, want at most 1000000")
+        if self.form is not None:
+            check_name("form", self.form, tuple(compiled.FORMS))
+        if self.first_pass is not None:
+            check_name("first_pass", self.first_pass, ("forward", "backward"))
+        if self.safeguard not in (None, True, False):
+            raise InputError(f"safeguard: got {self.safeguard!r}, want True or False")
 
-    def controls(self, problem: Problem) -> Array:
-        """The controls (T, m) that the first pass starts from: the nominal control unless told otherwise."""
-        shape = (problem.steps, len(problem.dynamics.control_coordinates))
-        given = problem.nominal_control if self.initial_controls is None else self.initial_controls
-        try:
-            controls = np.broadcast_to(np.asarray(given, dtype=np.float64), shape)
-        except (TypeError, ValueError):
-            raise InputError(
-                f"initial_controls: got shape {np.shape(given)}, want ({shape[1]},) or ({shape[0]}, {shape[1]})"
-            ) from None
-        return check_array("initial_controls", controls, shape).copy()
+    def options(self, start: Start) -> dict[str, object]:
+        """The settings as a solution keeps them."""
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in given.items() if value is not None} | {"start": start.summary}
 
 
 @dataclass(frozen=True)
@@ -105,6 +116,7 @@ def iterate(
     log: Array,
     max_iterations: int,
     *,
+    before: tuple[Iteration, ...] = (),
     each: bool,
     callback: Callback | None = None,
 ) -> Ending:
@@ -113,7 +125,8 @@ def iterate(
     Args:
       problem: whose functions may raise meanwhile.
       run: runs the iterations from its first argument up to its second.
-      log: (any, 4), where `run` writes.
+      log: (any, LOG_COLUMNS), where `run` writes.
+      before: the iterations of what ran before, which come first in the ending's.
       each: come back after each iteration, to time it, to tell `callback` and to heed Ctrl-C; otherwise nothing but
         compiled code runs, and the seconds of an iteration are the average.
     """
@@ -127,21 +140,21 @@ def iterate(
         clock = time.perf_counter()
         done, outcome, backward, failed = run(first, first + 1 if each else max_iterations)
         seconds = (time.perf_counter() - clock) / max(done - first, 1)
-        for cost, improvement, gap, optimality in log[first:done].tolist():
-            iterations.append(Iteration(cost, improvement, gap, optimality, seconds))
+        for cost, improvement, gap, optimality, residual, method in log[first:done].tolist():
+            iterations.append(Iteration(cost, improvement, gap, optimality, residual, seconds, _METHODS[int(method)]))
             if callback is not None:
                 callback(iterations[-1])
         for function in functions:
             if function.raised is not None and not isinstance(function.raised, Exception):
                 raise function.raised  # Ctrl-C
     raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
-    return Ending(tuple(iterations), outcome, backward, failed, "; ".join(raised))
+    return Ending((*before, *iterations), outcome, backward, failed, "; ".join(raised))
 
 
 def solve_all(
     problems: list[Problem],
     settings: Settings,
-    check: Callable[[Problem], None],
+    check: Callable[[Problem, Settings], None],
     solve: Callable[..., Solution],
     *,
     threads: int | None,
@@ -153,10 +166,10 @@ def solve_all(
     threads = processors() if threads is None else check_count("threads", threads)
     for i, problem in enumerate(problems):
         try:
-            check(problem)
+            check(problem, settings)
             start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start
-            check_functions(problem, start, settings.controls(problem)[0])
-            compiled.core(problem)
+            check_functions(problem, start, resolve(settings.start, problem).offset[0])
+            compiled.core(problem, settings.form or "dual")
             compiled.arguments(problem)  # compiles numba functions
         except InputError as error:
             raise InputError(f"problems[{i}]: {error}") from None
@@ -217,14 +230,16 @@ def assemble(
     problem: Problem,
     *,
     solver: str,
-    settings: Settings,
-    ending: Ending,
+    options: dict[str, object],
+    status: Status,
+    detail: str,
+    iterations: tuple[Iteration, ...],
     states: Array,
     controls: Array,
     law: tuple[Array, Array],
-    inverse_law: tuple[Array, Array] | None,
-    cost_to_go: Quadratic | None,
-    cost_to_come: Quadratic | None,
+    inverse_law: tuple[Array, Array] | None = None,
+    cost_to_go: Quadratic | None = None,
+    cost_to_come: Quadratic | Moments | None = None,
 ) -> Solution:
     """The Solution of what a solver found."""
 
@@ -235,18 +250,15 @@ def assemble(
             control_coordinates=problem.dynamics.control_coordinates,
         )  # fmt: skip
 
-    options: dict[str, object] = {key: value for key, value in asdict(settings).items() if key != "initial_controls"}
-    started = settings.controls(problem)
-    options["initial_controls"] = (started[0] if (started == started[0]).all() else started).tolist()
     return Solution(
-        status=ending.status,
-        detail=ending.detail(problem.steps),
+        status=status,
+        detail=detail,
         policy=policy(*law, states[:-1]),
         inverse_policy=policy(*inverse_law, states[1:]) if inverse_law is not None else None,
         cost_to_go=cost_to_go,
         cost_to_come=cost_to_come,
         trajectory=Trajectory(states, controls, problem.dt),
-        iterations=ending.iterations,
+        iterations=iterations,
         clearance=_clearance(problem, states),
         solver=solver,
         options=options,

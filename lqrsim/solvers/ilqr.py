@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim import compiled
 from lqrsim.checks import check_functions
@@ -11,6 +10,7 @@ from lqrsim.errors import InputError
 from lqrsim.problem import Problem
 from lqrsim.results import Quadratic, Solution
 from lqrsim.solvers.common import (
+    LOG_COLUMNS,
     Callback,
     Settings,
     assemble,
@@ -21,6 +21,7 @@ from lqrsim.solvers.common import (
     model,
     solve_all,
 )
+from lqrsim.solvers.start import StartLike, resolve
 
 
 def ilqr(
@@ -29,7 +30,7 @@ def ilqr(
     stop: str = "optimal",
     tolerance: float = 1e-4,
     max_iterations: int = 500,
-    initial_controls: npt.ArrayLike | None = None,
+    start: StartLike = None,
     callback: Callback | None = None,
 ) -> Solution:
     """Compute a locally optimal feedback policy by iterative LQR with a line search that halves the step.
@@ -39,7 +40,8 @@ def ilqr(
 
     Args:
       stop, tolerance, max_iterations, callback: as in `smooth`; the gap is zero here, for every iterate is feasible.
-      initial_controls: (m,) or (T, m), what the first trajectory applies; the problem's nominal control by default.
+      start: what the first trajectory applies: controls (m,) or (T, m), by default the problem's nominal control; the
+        controls of a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
 
     Returns:
       The same Solution as `smooth`, without cost-to-come and inverse policy. A hard problem does not raise.
@@ -47,10 +49,8 @@ def ilqr(
     Raises:
       InputError: an argument is not as described, or the problem names no start.
     """
-    settings = Settings(
-        stop=stop, tolerance=tolerance, max_iterations=max_iterations, initial_controls=initial_controls
-    )
-    _check(problem)
+    settings = Settings(stop=stop, tolerance=tolerance, max_iterations=max_iterations, start=start)
+    _check(problem, settings)
     return _solve(problem, settings, each=True, callback=callback)
 
 
@@ -61,7 +61,7 @@ def ilqr_many(
     stop: str = "optimal",
     tolerance: float = 1e-4,
     max_iterations: int = 500,
-    initial_controls: npt.ArrayLike | None = None,
+    start: StartLike = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> list[Solution]:
     """Solve many problems as `ilqr` does, on several threads; see `smooth_many`.
@@ -69,13 +69,11 @@ def ilqr_many(
     Raises:
       InputError: an argument is not as described; a problem that is refused is named by its place in the list.
     """
-    settings = Settings(
-        stop=stop, tolerance=tolerance, max_iterations=max_iterations, initial_controls=initial_controls
-    )
+    settings = Settings(stop=stop, tolerance=tolerance, max_iterations=max_iterations, start=start)
     return solve_all(list_of(problems), settings, _check, _solve, threads=threads, progress=progress)
 
 
-def _check(problem: Problem) -> None:
+def _check(problem: Problem, settings: Settings) -> None:
     check_problem(problem)
     if problem.start is None:
         raise InputError(
@@ -86,15 +84,14 @@ def _check(problem: Problem) -> None:
 def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callback | None = None) -> Solution:
     """Solve; with `each`, a look after each iteration (see `iterate`)."""
     assert problem.start is not None
-    n, steps, zeros = len(problem.dynamics.state_coordinates), problem.steps, np.zeros
-    controls = settings.controls(problem)
-    start, control = problem.start.copy(), controls[0].copy()
+    begin = resolve(settings.start, problem)
+    start, control = problem.start.copy(), begin.offset[0].copy()
     check_functions(problem, start, control)
-    m = controls.shape[1]
-    states = zeros((steps + 1, n))
-    L, l = zeros((steps, m, n)), zeros((steps, m))
+    n, steps, zeros = len(start), problem.steps, np.zeros
+    L, l = begin.gain.copy(), begin.offset.copy()
+    states, controls = zeros((steps + 1, n)), zeros(l.shape)
     go = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
-    log = zeros((settings.max_iterations + 1, 4))
+    log = zeros((settings.max_iterations + 1, LOG_COLUMNS))
     core = compiled.core(problem)
     options = settings.max_iterations, settings.tolerance, settings.stop == "optimal"
     arrays = (
@@ -113,6 +110,7 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
         L[:] = 0  # without a pass about the trajectory there is no feedback; what is left is to play the controls
     offset = controls - np.einsum("tij,tj->ti", L, states[:-1]) if whole else controls.copy()
     return assemble(
-        problem, solver="ilqr", settings=settings, ending=ending, states=states, controls=controls,
-        law=(L, offset), inverse_law=None, cost_to_go=Quadratic(*go) if whole else None, cost_to_come=None,
+        problem, solver="ilqr", options=settings.options(begin), status=ending.status,
+        detail=ending.detail(problem.steps), iterations=ending.iterations, states=states, controls=controls,
+        law=(L, offset), cost_to_go=Quadratic(*go) if whole else None,
     )  # fmt: skip

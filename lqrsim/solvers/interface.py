@@ -1,8 +1,9 @@
 """What a compiled core knows about its problem: the names that the kernels are written against.
 
-`integration.py`, `kernels.py`, `passes.py` and the sources that dynamics and costs write are joined into one text for
-each structure (see `compiled.py`), with these sizes as constants and these functions filled in. This module only
-declares them, so that each of those files can be read, linted and type-checked on its own.
+`integration.py`, `kernels.py`, `passes.py`, `loops.py`, one of `dual.py` and `primal.py`, and the sources that dynamics
+and costs write are joined into one text for each structure (see `compiled.py`), with these sizes as constants and these
+functions filled in. This module only declares them, so that each of those files can be read, linted and type-checked on
+its own.
 """
 
 import numpy as np
@@ -16,6 +17,9 @@ K = 0  # of these, how many entries a cost is not convex in
 # finite, and STALLED a line search that found no lower cost.
 RUNNING, CONVERGED, COST_CONVERGED, MAX_ITERATIONS, DIVERGED = 0, 1, 2, 3, 4
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED = 5, 6, 7, 8
+
+# What an iteration was; see `Iteration.method`.
+SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
 
 
 def stack(*shape: int) -> np.ndarray:
@@ -59,3 +63,31 @@ def final_value(x, u, t, data) -> float:
 def final_quadratic(x, u, t, data, hessian, gradient) -> float:
     """As `stage_quadratic`, of the final cost."""
     return 0.0
+
+
+# What the form of the cost-to-come brings; see `dual.py` and `primal.py`.
+
+
+def begin(Q, q, constant, x, C, b) -> tuple[float, bool]:
+    """Write the cost-to-come at 0."""
+    return 0.0, True
+
+
+def linearize(x, u, p, dt, fx, fu, x_next, jacobian, c) -> None:
+    """Write where (x, u) leads, and the linearised step that `riccati_forward` takes."""
+
+
+def riccati_forward(
+    jacobian, c, cost, slope, constant, C0, b0, k0, smoothing, updated, gain, feedforward, C, b
+) -> tuple[float, bool]:
+    """One step of the cost-to-come."""
+    return 0.0, True
+
+
+def minimizer(S, s, C, b, costate, x) -> bool:
+    """Write the minimiser of the total cost, and the costate there."""
+    return True
+
+
+def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, x, u) -> None:
+    """Write the state and control on the way to the minimiser at t + 1."""

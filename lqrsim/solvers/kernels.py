@@ -186,58 +186,6 @@ def riccati_backward(jacobian, c, cost, slope, constant, S1, s1, k1, gain, feedf
     return shifted - decrease, decrease >= 0
 
 
-def riccati_forward(jacobian, c, cost, slope, constant, S0, s0, k0, gain, feedforward, S, s):
-    """One step of the cost-to-come, Eqs. (15)-(17), (19): from (S0, s0, k0) at t to (S, s) at t + 1.
-
-    `jacobian` = [Abar Bbar] and c are the linearised inverse step x_t = Abar x_{t+1} + Bbar u_t + cbar; the rest as
-    above. Returns the constant and whether the step succeeded.
-    """
-    z, a, v, b = stack(N, N), stack(N), stack(N), stack(W)
-    joint = stack(W, W)
-    crossed = 0.0
-    for i in range(N):
-        a[i] = s0[i] + slope[i]
-        v[i] = a[i]
-        for j in range(N):
-            z[i, j] = S0[i, j] + cost[i, j]
-            v[i] += z[i, j] * c[j]
-        for j in range(M):
-            crossed += abs(cost[i, N + j])
-    clear(joint, W, W)
-    for i in range(N):
-        b[i] = 0.0
-    for i in range(M):
-        b[N + i] = slope[N + i]
-        for j in range(M):
-            joint[N + i, N + j] = cost[N + i, N + j]
-    if crossed != 0:
-        # What the cross term u'P x_t becomes in (x_{t+1}, u): P Abar, P Bbar + its transpose, P cbar.
-        for i in range(M):
-            for k in range(N):
-                factor = cost[N + i, k]
-                b[N + i] += factor * c[k]
-                for j in range(W):
-                    joint[N + i, j] += factor * jacobian[k, j]
-                    joint[j, N + i] += factor * jacobian[k, j]
-    shifted = k0 + constant + quadratic_at(z, a, c)
-    congruence(jacobian, z, v, joint, b)
-    decrease = minimize_control(joint, b, gain, feedforward, S, s)
-    return shifted - decrease, decrease >= 0
-
-
-def minimizer(S, s, Sbar, sbar, x):
-    """Write x = -(S + Sbar)^-1 (s + sbar), Eq. (21); False unless the sum is positive definite."""
-    total = stack(N, N)
-    for i in range(N):
-        x[i] = -(s[i] + sbar[i])
-        for j in range(N):
-            total[i, j] = S[i, j] + Sbar[i, j]
-    if not cholesky(total, N):
-        return False
-    cholesky_solve(total, N, x)
-    return True
-
-
 def affine(gain, feedforward, x, u):
     """Write u = gain x + feedforward, (M,)."""
     for i in range(M):

@@ -1,9 +1,9 @@
 """The iterations of the solvers, with nothing but compiled code between them. The numba subset; see `interface.py`.
 
 Each function runs the iterations `first` to `last` - 1 and can be called again to go on: what it needs to remember is
-in its arrays. `log` (any, 4) gets a row an iteration: cost, relative improvement, gap, optimality (NaN where it was not
-worked out). Both return how many iterations there are now, the outcome (a name in `interface.py`), and for a pass that
-failed whether it was the backward one and its step, else -1.
+in its arrays. `log` (any, 6) gets a row an iteration: cost, relative improvement, gap, optimality and dynamics residual
+(NaN where they were not worked out), method. All return how many iterations there are now, the outcome (a name in
+`interface.py`), and for a pass that failed whether it was the backward one and its step, else -1.
 """
 
 from math import inf, isnan, nan
@@ -12,11 +12,13 @@ from lqrsim.solvers.interface import (
     CONVERGED,
     COST_CONVERGED,
     DIVERGED,
+    ILQR,
     MAX_ITERATIONS,
     NO_START,
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
     RUNNING,
+    SMOOTH,
     STALLED,
     M,
     N,
@@ -24,11 +26,14 @@ from lqrsim.solvers.interface import (
 )
 from lqrsim.solvers.passes import (
     backward_pass,
+    copy,
     differential_pass,
+    dynamics_residual,
     forward_pass,
-    initial_decrease,
+    initial_step,
     largest_gap,
     line_search,
+    opening_pass,
     rollout,
 )
 
@@ -36,61 +41,118 @@ from lqrsim.solvers.passes import (
 # and only then, changes of the controls get a weight; it falls again by the same steps.
 
 
-def relative_improvement(old, cost):
+def relative_improvement(old, cost, nothing):
     """The decrease of cost relative to what is left; 0 for no change, at a cost of zero too."""
-    return 0.0 if old == cost else (old - cost) / abs(cost)
+    return 0.0 if old == cost else (old - cost) / max(abs(cost), nothing)
+
+
+def nothing_left(x, S, s, k):
+    """What is as good as a cost of zero, given the cost-to-go at a start x.
+
+    Where the least cost is zero, what remains are squares of rounding errors, which never settle. They are measured by
+    the terms that cancel in the cost-to-go.
+    """
+    scale = abs(k)
+    for i in range(N):
+        curved = 0.0
+        for j in range(N):
+            curved += S[i, j] * x[j]
+        scale += abs(0.5 * curved * x[i]) + abs(s[i] * x[i])
+    return max(1e-20 * scale, 1e-300) if scale < inf else 1e-300
 
 
 def smoother_iterations(
-    steps, first, last, max_iterations, tolerance, gap_tolerance, optimal,
-    x_hat, x_hats, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, final,
-    prior_weight, prior_about, prior_iterations, states, controls, kept_L, kept_l, log,
+    steps, first, last, max_iterations, tolerance, gap_tolerance, optimal, fixed, guided, opening,
+    start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
+    prior_weight, prior_about, prior_iterations, plan_x, plan_u, states, controls, kept_L, kept_l, best, log,
 ):  # fmt: skip
     """Iterated LQR smoothing: a forward pass, a backward pass and the rollout of the new policy, again and again.
 
-    `x_hat` is the wished start, L and l a policy that plays the initial controls. `states`, `controls`, `kept_L`,
-    `kept_l` are what the last iteration that was completed found; before any, where the initial controls lead.
+    L, l, S, s are the policy and the cost-to-go to begin with. With `guided`, the first pass linearises about the plan;
+    with `opening`, a backward pass comes first, on its own. `states`, `controls`, `kept_L`, `kept_l` are what the last
+    iteration that was completed found; before any, where the first policy leads. From the first iteration on the plan
+    is the rollout of least cost so far, and best[0] that cost: no business of the method, but the safeguard's.
     """
-    A, a, B, b, c = stack(1, M, N), stack(1, M), stack(1, N, N), stack(1, N), stack(1)
     no_weight = stack(N)
     for i in range(N):
         no_weight[i] = 0.0
     if first == 0:
-        rollout(steps, x_hat, L, l, p, dt, initial, stage, final, states, controls)
+        best[0] = rollout(steps, start, L, l, p, dt, initial, stage, final, states, controls)
         keep_law(steps, L, l, kept_L, kept_l)
+        if guided or opening or not best[0] < inf:
+            best[0] = inf  # a plan that is needed first, or cannot be rolled out
+        else:
+            keep_plan(steps, states, controls, plan_x, plan_u)
+        copy(start, N, x_hat)
+        if opening:
+            failed, good = opening_pass(
+                steps, guided, plan_x, plan_u, L, l, S, s, k, p, dt, stage, final, prior_weight, prior_about
+            )
+            if failed >= 0:
+                return 0, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, True, failed
+        elif guided and not fixed:
+            copy(plan_x[0], N, x_hat)
     for done in range(first, last):
         weight = prior_weight if done < prior_iterations else no_weight
         failed, good = forward_pass(
-            steps, x_hat, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, final, weight, prior_about
-        )
+            steps, fixed, guided and not opening and done == 0, 0.0, plan_x, plan_u,
+            x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final, weight, prior_about,
+        )  # fmt: skip
         if failed >= 0:
             return done, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, False, failed
         failed, good = backward_pass(
-            steps, x_hat, x_hats, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage,
-            weight, prior_about,
+            steps, fixed, 1.0, 0.0, plan_x, plan_u,
+            x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, weight, prior_about,
         )  # fmt: skip
         if failed >= 0:
             return done, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, True, failed
         cost = rollout(steps, x_hat, L, l, p, dt, initial, stage, final, states, controls)
         keep_law(steps, L, l, kept_L, kept_l)
-        improvement = relative_improvement(log[done - 1, 0] if done > 0 else inf, cost)
+        if cost < best[0]:
+            best[0] = cost
+            keep_plan(steps, states, controls, plan_x, plan_u)
+        nothing = nothing_left(x_hat, S[0], s[0], k[0])
+        improvement = relative_improvement(log[done - 1, 0] if done > 0 else inf, cost, nothing)
         gap = largest_gap(steps, x_hats, states)
         settled = abs(improvement) < tolerance and (gap < gap_tolerance or not optimal)
-        left = nan
-        if settled or done + 1 == max_iterations:
-            failed, _, left = differential_pass(steps, states, controls, p, dt, stage, final, 0.0, 0, A, a, B, b, c)
-            left += initial_decrease(states[0], initial, B[0], b[0])
-            left = relative_optimality(failed, left, cost)
-        log[done, 0], log[done, 1], log[done, 2], log[done, 3] = cost, improvement, gap, left
-        outcome = ending(settled, optimal, left, tolerance, cost, done + 1 == max_iterations)
+        full = done + 1 == max_iterations
+        left, residual = nan, nan
+        if settled or full:
+            left = optimality(steps, fixed, states, controls, cost, nothing, p, dt, initial, stage, final)
+            residual = dynamics_residual(steps, x_hats, L, l, p, dt, states)
+        write_row(log, done, cost, improvement, gap, left, residual, SMOOTH)
+        outcome = ending(settled, optimal, left, tolerance, cost, full)
         if outcome != RUNNING:
             return done + 1, outcome, False, -1
     return last, RUNNING, False, -1
 
 
-def relative_optimality(failed, decrease, cost):
+def optimality(steps, fixed, states, controls, cost, nothing, p, dt, initial, stage, final):
     """What a linear-quadratic model about a trajectory promises, relative to its cost; infinite if there is none."""
-    return decrease / max(abs(cost), 1e-300) if failed < 0 and decrease < inf else inf
+    A, B, at, slope, constant, shift = stack(1, M, N), stack(1, N, N), stack(1, M), stack(1, N), stack(1), stack(N)
+    failed, _, left = differential_pass(steps, states, controls, p, dt, stage, final, 0.0, 0, A, at, B, slope, constant)
+    if not fixed:
+        left += initial_step(states[0], initial, B[0], slope[0], shift)
+    return relative_optimality(failed, left, cost, nothing)
+
+
+def write_row(log, row, cost, improvement, gap, left, residual, method):
+    """Write a line of the log."""
+    log[row, 0], log[row, 1], log[row, 2], log[row, 3] = cost, improvement, gap, left
+    log[row, 4], log[row, 5] = residual, method
+
+
+def keep_plan(steps, states, controls, plan_x, plan_u):
+    """Copy a trajectory."""
+    for t in range(steps + 1):
+        copy(states[t], N, plan_x[t])
+    for t in range(steps):
+        copy(controls[t], M, plan_u[t])
+
+
+def relative_optimality(failed, decrease, cost, nothing):
+    """A promised decrease relative to the cost; infinite where the pass failed that was to tell it."""
+    return decrease / max(abs(cost), nothing) if failed < 0 and decrease < inf else inf
 
 
 def ending(settled, optimal, left, tolerance, cost, full):
@@ -120,16 +182,14 @@ def ilqr_iterations(
 ):  # fmt: skip
     """Iterative LQR: a backward pass about a feasible trajectory and a line search, again and again.
 
-    `controls` are the initial ones; afterwards `states` and `controls` are the best trajectory, and L, l (relative to
-    it), S, s, k are about it. `damping` (1,) is the weight on changes of the controls; `log` has, in its last row, the
-    cost that the first iteration improves on.
+    L, l are the policy that makes the first trajectory, from x0; afterwards `states` and `controls` are the best one,
+    and L, l (relative to it), S, s, k are about it. `damping` (1,) is the weight on changes of the controls; `log` has,
+    in its last row, the cost that the first iteration improves on.
     """
+    no_shift = stack(N)
+    for i in range(N):
+        no_shift[i] = 0.0
     if first == 0:
-        for t in range(steps):
-            for i in range(M):
-                l[t, i] = controls[t, i]
-                for j in range(N):
-                    L[t, i, j] = 0.0
         cost = rollout(steps, x0, L, l, p, dt, initial, stage, final, states, controls)
         log[max_iterations, 0] = cost
         if not abs(cost) < inf:
@@ -149,22 +209,18 @@ def ilqr_iterations(
             damping[0] = 0.0
         old = cost
         cost, fraction = line_search(
-            steps, states, controls, L, l, p, dt, initial, stage, final, old, new_states, new_controls
+            steps, states, controls, no_shift, L, l, p, dt, initial, stage, final, old, 1e-8, new_states, new_controls
         )
         if fraction > 0:
-            for t in range(steps + 1):
-                for i in range(N):
-                    states[t, i] = new_states[t, i]
-            for t in range(steps):
-                for i in range(M):
-                    controls[t, i] = new_controls[t, i]
-        improvement = relative_improvement(old, cost)
+            keep_plan(steps, new_states, new_controls, states, controls)
+        nothing = nothing_left(states[0], S[0], s[0], k[0])
+        improvement = relative_improvement(old, cost, nothing)
         settled = abs(improvement) < tolerance
         left = nan
         if settled or done + 1 == max_iterations:
             failed, _, left = differential_pass(steps, states, controls, p, dt, stage, final, 0.0, 1, L, l, S, s, k)
-            left = relative_optimality(failed, left, cost)
-        log[done, 0], log[done, 1], log[done, 2], log[done, 3] = cost, improvement, 0.0, left
+            left = relative_optimality(failed, left, cost, nothing)
+        write_row(log, done, cost, improvement, 0.0, left, 0.0, ILQR)
         outcome = ending(settled, optimal, left, tolerance, cost, done + 1 == max_iterations)
         if outcome == RUNNING and fraction == 0:
             outcome = STALLED

@@ -8,15 +8,22 @@ The prior is `1/2 (x - prior_about[t])' diag(prior_weight) (x - prior_about[t])`
 added to its quadratic model in the first iterations, where it keeps the linearisations sensible.
 """
 
+from math import nan
+
 from lqrsim.integration import step, step_jacobian
 from lqrsim.solvers.interface import (
     M,
     N,
     W,
+    begin,
+    depart,
     final_quadratic,
     final_value,
     initial_quadratic,
     initial_value,
+    linearize,
+    minimizer,
+    riccati_forward,
     stack,
     stage_quadratic,
     stage_value,
@@ -30,10 +37,8 @@ from lqrsim.solvers.kernels import (
     congruence,
     finite,
     minimize_control,
-    minimizer,
     offset,
     riccati_backward,
-    riccati_forward,
 )
 
 
@@ -51,14 +56,23 @@ def rollout(steps, x0, gain, feedforward, p, dt, initial, stage, final, states, 
     return cost + final_value(states[steps], u, steps, final)
 
 
-def stage_model(x, u, t, stage, prior_weight, prior_about, hessian, gradient):
-    """Write the stage about (x, u) as a quadratic about the origin, Eqs. (26)-(27); return its constant."""
+def stage_model(x, u, t, stage, prior_weight, prior_about, damping, plan_u, hessian, gradient):
+    """Write the stage about (x, u) as a quadratic about the origin, Eqs. (26)-(27); return its constant.
+
+    `damping` weighs how far the control moves from the plan's, in units of the control's own curvature.
+    """
     value = stage_quadratic(x, u, t, stage, hessian, gradient)
     if t > 0:
         for i in range(N):
             weight, error = prior_weight[i], x[i] - prior_about[t, i]
             hessian[i, i] += weight
             gradient[i] += weight * error
+            value += 0.5 * weight * error * error
+    if damping > 0:
+        for i in range(M):
+            weight, error = damping * hessian[N + i, N + i], u[i] - plan_u[t, i]
+            hessian[N + i, N + i] += weight
+            gradient[N + i] += weight * error
             value += 0.5 * weight * error * error
     return about_origin(hessian, gradient, x, u, value)
 
@@ -79,77 +93,169 @@ def end_model(hessian, gradient, value, x, S, s):
     return constant
 
 
+def begin_model(x, initial, fixed, damping, plan_x, C, b):
+    """Write the cost-to-come at 0, with c_0 quadratised at x, and return its constant; or of a start that is given.
+
+    Returns also whether there is one.
+    """
+    hessian, gradient, Q, q, none = stack(W, W), stack(W), stack(N, N), stack(N), stack(M)
+    if fixed:
+        clear(C, N, N)
+        for i in range(N):
+            b[i] = x[i]
+        return 0.0, True
+    value = initial_quadratic(x, none, 0, initial, hessian, gradient)
+    if damping > 0:
+        for i in range(N):
+            weight, error = damping * hessian[i, i], x[i] - plan_x[0, i]
+            hessian[i, i] += weight
+            gradient[i] += weight * error
+            value += 0.5 * weight * error * error
+    constant = end_model(hessian, gradient, value, x, Q, q)
+    return begin(Q, q, constant, x, C, b)
+
+
 def forward_pass(
-    steps, x_hat, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, final, prior_weight, prior_about
+    steps, fixed, guided, damping, plan_x, plan_u, x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar,
+    p, dt, initial, stage, final, prior_weight, prior_about,
 ):  # fmt: skip
     """The forward extended LQR pass, Sec. V-B: from the cost-to-go and its policy, the cost-to-come and its own.
 
-    `x_hat` (N,) is where c_0 is quadratised, and on return the minimiser at T, where c_l was. S[T], s[T], k[T] are set.
+    C, b, kbar are the cost-to-come and G, a, Lbar, lbar what `depart` needs, as the form has them. `x_hat` (N,) is
+    where c_0 is quadratised, and on return the minimiser at T, where c_l was. S[T], s[T], k[T] are set. With `guided`
+    the plan is what is linearised about, and not the minimisers.
     """
     hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
-    fx, fu, x_next, x_back, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(M)
+    fx, fu, x_next, costate, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(M)
     clear(fx, N, N)
     clear(fu, N, M)
-    value = initial_quadratic(x_hat, u, 0, initial, hessian, gradient)
-    kbar[0] = end_model(hessian, gradient, value, x_hat, Sbar[0], sbar[0])
+    kbar[0], good = begin_model(x_hat, initial, fixed, damping, plan_x, C[0], b[0])
+    if not good:
+        return 0, finite(C[0], N, N)
     for t in range(steps):
-        affine(L[t], l[t], x_hat, u)
-        step(x_hat, u, p, dt, x_next)
-        step_jacobian(x_next, u, p, -dt, fx, fu, x_back, jacobian)
-        offset(jacobian, x_next, u, x_back, c)
-        constant = stage_model(x_hat, u, t, stage, prior_weight, prior_about, hessian, gradient)
+        if guided:
+            copy(plan_x[t], N, x_hat)
+            copy(plan_u[t], M, u)
+        else:
+            affine(L[t], l[t], x_hat, u)
+        linearize(x_hat, u, p, dt, fx, fu, x_next, jacobian, c)
+        constant = stage_model(
+            x_hat, u, t, stage, prior_weight, prior_about, damping, plan_u, hessian, gradient
+        )  # fmt: skip
         kbar[t + 1], good = riccati_forward(
-            jacobian, c, hessian, gradient, constant, Sbar[t], sbar[t], kbar[t], Lbar[t], lbar[t],
-            Sbar[t + 1], sbar[t + 1],
+            jacobian, c, hessian, gradient, constant, C[t], b[t], kbar[t], G[t], a[t], Lbar[t], lbar[t],
+            C[t + 1], b[t + 1],
         )  # fmt: skip
         if not good:
             return t, finite(hessian, W, W) and finite(jacobian, N, W)
-        if t + 1 < steps and not minimizer(S[t + 1], s[t + 1], Sbar[t + 1], sbar[t + 1], x_hat):
-            return t + 1, finite(S[t + 1], N, N) and finite(Sbar[t + 1], N, N)
-        if t + 1 == steps:
-            if not minimizer(S[steps], s[steps], Sbar[steps], sbar[steps], x_hat):
-                # In the first iteration there may be no minimum without c_l, and the state of arrival is what we have.
-                for i in range(N):
-                    x_hat[i] = x_next[i]
-            value = final_quadratic(x_hat, u, steps, final, hessian, gradient)
-            k[steps] = end_model(hessian, gradient, value, x_hat, S[steps], s[steps])
-            if not minimizer(S[steps], s[steps], Sbar[steps], sbar[steps], x_hat):
-                return steps, finite(S[steps], N, N) and finite(Sbar[steps], N, N)
+        if t + 1 < steps and not guided and not minimizer(S[t + 1], s[t + 1], C[t + 1], b[t + 1], costate, x_hat):
+            return t + 1, finite(S[t + 1], N, N) and finite(C[t + 1], N, N)
+    if guided:
+        copy(plan_x[steps], N, x_hat)
+    elif not minimizer(S[steps], s[steps], C[steps], b[steps], costate, x_hat):
+        # In the first iteration there may be no minimum without c_l, and the state of arrival is what we have.
+        copy(x_next, N, x_hat)
+    value = final_quadratic(x_hat, u, steps, final, hessian, gradient)
+    k[steps] = end_model(hessian, gradient, value, x_hat, S[steps], s[steps])
+    if not minimizer(S[steps], s[steps], C[steps], b[steps], costate, x_hat):
+        return steps, finite(S[steps], N, N) and finite(C[steps], N, N)
     return -1, True
 
 
 def backward_pass(
-    steps, x_hat, x_hats, L, l, S, s, k, Lbar, lbar, Sbar, sbar, kbar, p, dt, initial, stage, prior_weight, prior_about
+    steps, fixed, reach, damping, plan_x, plan_u, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar,
+    p, dt, initial, stage, prior_weight, prior_about,
 ):  # fmt: skip
     """The backward extended LQR pass, Sec. V-A: from the cost-to-come and its policy, the cost-to-go and its own.
 
-    `x_hat` (N,) is the minimiser at T, and on return that at 0, where c_0 was quadratised anew. Writes all the
-    minimisers to `x_hats` (T+1, N).
+    `x_hat` (N,) is, on return, the minimiser at 0, where c_0 was quadratised anew. Writes all the minimisers to
+    `x_hats` (T+1, N). What is linearised about lies a fraction `reach` of the way from the plan to where the minimisers
+    lead: all of it in the paper's method. The rest is as in `forward_pass`.
     """
     hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
-    fx, fu, x_next, x_back, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(M)
+    fx, fu, x_next, x, u, costate = stack(N, N), stack(N, M), stack(N), stack(N), stack(M), stack(N)
     clear(fx, N, N)
     clear(fu, N, M)
+    if not minimizer(S[steps], s[steps], C[steps], b[steps], costate, x_hat):
+        return steps, finite(S[steps], N, N) and finite(C[steps], N, N)
     for t in range(steps - 1, -1, -1):
-        for i in range(N):
-            x_hats[t + 1, i] = x_hat[i]
-        affine(Lbar[t], lbar[t], x_hat, u)
-        step(x_hat, u, p, -dt, x_back)
-        step_jacobian(x_back, u, p, dt, fx, fu, x_next, jacobian)
-        offset(jacobian, x_back, u, x_next, c)
-        constant = stage_model(x_back, u, t, stage, prior_weight, prior_about, hessian, gradient)
+        copy(x_hat, N, x_hats[t + 1])
+        depart(x_hat, costate, G[t], a[t], Lbar[t], lbar[t], p, dt, x, u)
+        if reach < 1:
+            for i in range(N):
+                x[i] = plan_x[t, i] + reach * (x[i] - plan_x[t, i]) if reach > 0 else plan_x[t, i]
+            for i in range(M):
+                u[i] = plan_u[t, i] + reach * (u[i] - plan_u[t, i]) if reach > 0 else plan_u[t, i]
+        step_jacobian(x, u, p, dt, fx, fu, x_next, jacobian)
+        offset(jacobian, x, u, x_next, c)
+        constant = stage_model(x, u, t, stage, prior_weight, prior_about, damping, plan_u, hessian, gradient)
         k[t], good = riccati_backward(
             jacobian, c, hessian, gradient, constant, S[t + 1], s[t + 1], k[t + 1], L[t], l[t], S[t], s[t]
         )
-        if not good or not minimizer(S[t], s[t], Sbar[t], sbar[t], x_hat):
-            return t, finite(hessian, W, W) and finite(jacobian, N, W) and finite(Sbar[t], N, N)
-    value = initial_quadratic(x_hat, u, 0, initial, hessian, gradient)
-    kbar[0] = end_model(hessian, gradient, value, x_hat, Sbar[0], sbar[0])
-    if not minimizer(S[0], s[0], Sbar[0], sbar[0], x_hat):
-        return 0, finite(S[0], N, N) and finite(Sbar[0], N, N)
-    for i in range(N):
-        x_hats[0, i] = x_hat[i]
+        if not good or not minimizer(S[t], s[t], C[t], b[t], costate, x_hat):
+            return t, finite(hessian, W, W) and finite(jacobian, N, W) and finite(C[t], N, N)
+    good = True
+    if not fixed:
+        kbar[0], good = begin_model(x_hat, initial, fixed, damping, plan_x, C[0], b[0])
+    if not good or not minimizer(S[0], s[0], C[0], b[0], costate, x_hat):
+        return 0, finite(S[0], N, N) and finite(C[0], N, N)
+    copy(x_hat, N, x_hats[0])
     return -1, True
+
+
+def opening_pass(
+    steps, guided, plan_x, plan_u, L, l, S, s, k, p, dt, stage, final, prior_weight, prior_about
+):  # fmt: skip
+    """A backward pass before any forward one: there is no cost-to-come, and the minimisers are of the cost-to-go alone.
+
+    Without a plan to be guided by, the dynamics run backwards from the minimiser of c_l, with the controls `plan_u`;
+    c_l is first quadratised at plan_x[T].
+    """
+    hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
+    fx, fu, x_next, x, x_hat, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(N), stack(M)
+    clear(fx, N, N)
+    clear(fu, N, M)
+    copy(plan_x[steps], N, x_hat)
+    for _ in range(2):
+        value = final_quadratic(x_hat, u, steps, final, hessian, gradient)
+        k[steps] = end_model(hessian, gradient, value, x_hat, S[steps], s[steps])
+        if not guided:
+            lowest(S[steps], s[steps], x_hat)
+    for t in range(steps - 1, -1, -1):
+        copy(plan_u[t], M, u)
+        if guided:
+            copy(plan_x[t], N, x)
+        else:
+            step(x_hat, u, p, -dt, x)
+        step_jacobian(x, u, p, dt, fx, fu, x_next, jacobian)
+        offset(jacobian, x, u, x_next, c)
+        constant = stage_model(x, u, t, stage, prior_weight, prior_about, 0.0, plan_u, hessian, gradient)
+        k[t], good = riccati_backward(
+            jacobian, c, hessian, gradient, constant, S[t + 1], s[t + 1], k[t + 1], L[t], l[t], S[t], s[t]
+        )
+        if not good:
+            return t, finite(hessian, W, W) and finite(jacobian, N, W)
+        copy(x, N, x_hat)
+        lowest(S[t], s[t], x_hat)
+    return -1, True
+
+
+def lowest(S, s, x):
+    """Write the minimiser of a cost-to-go, if it has one; leave x as it is if not."""
+    factor, least = stack(N, N), stack(N)
+    for i in range(N):
+        least[i] = -s[i]
+        for j in range(N):
+            factor[i, j] = S[i, j]
+    if cholesky(factor, N):
+        cholesky_solve(factor, N, least)
+        copy(least, N, x)
+
+
+def copy(source, size, target):
+    """Copy a vector."""
+    for i in range(size):
+        target[i] = source[i]
 
 
 def differential_pass(steps, states, controls, p, dt, stage, final, damping, keep, L, l, S, s, k):
@@ -198,10 +304,10 @@ def differential_pass(steps, states, controls, p, dt, stage, final, damping, kee
     return -1, True, predicted
 
 
-def initial_decrease(x0, initial, S, s):
-    """The decrease that moving the soft start x0 adds to the prediction, given the cost-to-go at 0; NaN if none."""
+def initial_step(x0, initial, S, s, direction):
+    """Write where the soft start x0 would best move, given the cost-to-go at 0; return what that promises, or NaN."""
     hessian, gradient, none = stack(W, W), stack(W), stack(M)
-    total, slope, direction = stack(N, N), stack(N), stack(N)
+    total, slope = stack(N, N), stack(N)
     for i in range(M):
         none[i] = 0.0
     initial_quadratic(x0, none, 0, initial, hessian, gradient)
@@ -210,13 +316,13 @@ def initial_decrease(x0, initial, S, s):
         for j in range(N):
             slope[i] += S[i, j] * x0[j]
             total[i, j] = hessian[i, j] + S[i, j]
-        direction[i] = slope[i]
+        direction[i] = -slope[i]
     if not cholesky(total, N):
-        return float("nan")
+        return nan
     cholesky_solve(total, N, direction)
     decrease = 0.0
     for i in range(N):
-        decrease += 0.5 * slope[i] * direction[i]
+        decrease -= 0.5 * slope[i] * direction[i]
     return decrease
 
 
@@ -236,17 +342,38 @@ def largest_gap(steps, x_hats, states):
     return gap
 
 
-def line_search(
-    steps, states, controls, L, l, p, dt, initial, stage, final, old, new_states, new_controls
-):  # fmt: skip
-    """Try steps 1, 1/2, 1/4, ... along the change l of the controls until the true cost falls below `old`.
+def dynamics_residual(steps, x_hats, L, l, p, dt, states):
+    """The largest step x_{t+1} - g(x_t, u_t) of a sequence of states under a policy, relative as the gap is."""
+    u, ahead, low, high, worst = stack(M), stack(N), stack(N), stack(N), stack(N)
+    for i in range(N):
+        low[i], high[i], worst[i] = states[0, i], states[0, i], 0.0
+    for t in range(steps):
+        affine(L[t], l[t], x_hats[t], u)
+        step(x_hats[t], u, p, dt, ahead)
+        for i in range(N):
+            difference = abs(x_hats[t + 1, i] - ahead[i])
+            if not difference <= worst[i]:  # a NaN too
+                worst[i] = difference
+            low[i], high[i] = min(low[i], states[t + 1, i]), max(high[i], states[t + 1, i])
+    residual = 0.0
+    for i in range(N):
+        relative = worst[i] / max(high[i] - low[i], 1.0)
+        if not relative <= residual:
+            residual = relative
+    return residual
 
-    Writes the trajectory. Returns its cost and the step, which is 0 if none above 1e-8 lowers the cost.
+
+def line_search(
+    steps, states, controls, shift, L, l, p, dt, initial, stage, final, old, smallest, new_states, new_controls
+):  # fmt: skip
+    """Try steps 1, 1/2, 1/4, ... along the changes of start and controls until the true cost falls below `old`.
+
+    Writes the trajectory. Returns its cost and the step, which is 0 if none down to `smallest` lowers the cost.
     """
     fraction = 1.0
-    while fraction >= 1e-8:
+    while fraction >= smallest:
         for i in range(N):
-            new_states[0, i] = states[0, i]
+            new_states[0, i] = states[0, i] + fraction * shift[i]
         cost = initial_value(new_states[0], new_controls[0], 0, initial)
         for t in range(steps):
             x, u = new_states[t], new_controls[t]

@@ -1,17 +1,21 @@
-"""Iterated LQR smoothing: Sec. V of the paper, in its primal form."""
+"""Iterated LQR smoothing: Sec. V of the paper, with a safeguard for where it would fail."""
 
+import contextlib
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim import compiled
 from lqrsim.checks import check_functions
-from lqrsim.errors import InputError
+from lqrsim.errors import Array, InputError
 from lqrsim.problem import FixedState, Problem
-from lqrsim.results import Quadratic, Solution
+from lqrsim.results import Moments, Quadratic, Solution, Status
+from lqrsim.solvers import interface
 from lqrsim.solvers.common import (
+    LOG_COLUMNS,
     Callback,
+    Ending,
     Settings,
     assemble,
     check_outcome,
@@ -21,16 +25,20 @@ from lqrsim.solvers.common import (
     model,
     solve_all,
 )
+from lqrsim.solvers.start import Start, StartLike, resolve
 
 
 def smooth(
     problem: Problem,
     *,
+    form: str = "dual",
+    first_pass: str = "forward",
+    safeguard: bool = True,
     stop: str = "optimal",
     tolerance: float = 1e-4,
     gap_tolerance: float = 1e-3,
-    max_iterations: int = 200,
-    initial_controls: npt.ArrayLike | None = None,
+    max_iterations: int = 500,
+    start: StartLike = None,
     callback: Callback | None = None,
 ) -> Solution:
     """Compute a locally optimal feedback policy by iterated LQR smoothing.
@@ -39,14 +47,19 @@ def smooth(
     passes linearise about the states of least total cost. No trajectory is needed to start from. Paper: Sec. V.
 
     Args:
-      problem: with an initial cost, the paper's soft start.
+      problem: with an initial cost, the paper's soft start, or a `FixedState`, which only the dual form takes.
+      form: "dual" has the cost-to-come by its moments and needs no inverse dynamics; "primal" is the paper's.
+      first_pass: "forward" or "backward"; each iteration ends with a backward pass, so the latter is one pass more.
+      safeguard: where the method fails, go on from the best plan so far by steps that lower its cost; see
+        `solvers/safeguard.py`. Where it converges, the safeguard changes nothing, to the last bit.
       stop: "optimal" (change of cost, gap and first-order optimality all within tolerance) or "cost", the paper's
         test, which looks at the change of cost alone and can pass early.
       tolerance: of the relative change of cost, and of the optimality (see `Iteration`).
       gap_tolerance: of the gap (see `Iteration`).
-      max_iterations: when to give up.
-      initial_controls: (m,) or (T, m), what the first pass applies; the problem's nominal control by default. It has a
-        say in which local optimum is found.
+      max_iterations: when to give up the method; the safeguard, if it steps in, has as many again.
+      start: what to begin with; it has a say in which local optimum is found. Controls (m,) or (T, m) to apply in the
+        first pass, by default the problem's nominal control; an AffinePolicy; a Trajectory, feasible or not, about
+        which the first pass linearises; or a Solution of a similar problem, whose policy and cost-to-go it takes up.
       callback: called with each `Iteration` as it ends.
 
     Returns:
@@ -56,10 +69,10 @@ def smooth(
       InputError: an argument is not as described.
     """
     settings = Settings(
-        stop=stop, tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations,
-        initial_controls=initial_controls,
+        form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
+        gap_tolerance=gap_tolerance, max_iterations=max_iterations, start=start,
     )  # fmt: skip
-    _check(problem)
+    _check(problem, settings)
     return _solve(problem, settings, each=True, callback=callback)
 
 
@@ -67,11 +80,14 @@ def smooth_many(
     problems: Iterable[Problem],
     *,
     threads: int | None = None,
+    form: str = "dual",
+    first_pass: str = "forward",
+    safeguard: bool = True,
     stop: str = "optimal",
     tolerance: float = 1e-4,
     gap_tolerance: float = 1e-3,
-    max_iterations: int = 200,
-    initial_controls: npt.ArrayLike | None = None,
+    max_iterations: int = 500,
+    start: StartLike = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> list[Solution]:
     """Solve many problems as `smooth` does, on several threads, without Python between the iterations.
@@ -82,7 +98,7 @@ def smooth_many(
     Args:
       problems: of one structure or of many; each structure is compiled once.
       threads: how many to use; by default all processors that this process may run on.
-      stop, tolerance, gap_tolerance, max_iterations, initial_controls: as in `smooth`, for all problems.
+      form, first_pass, safeguard, stop, tolerance, gap_tolerance, max_iterations, start: as in `smooth`, for all.
       progress: called with how many are done, of how many, as each one ends.
 
     Returns:
@@ -93,60 +109,162 @@ def smooth_many(
         is only not finite at its start ends as NOT_FINITE, and its detail says where.
     """
     settings = Settings(
-        stop=stop, tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations,
-        initial_controls=initial_controls,
+        form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
+        gap_tolerance=gap_tolerance, max_iterations=max_iterations, start=start,
     )  # fmt: skip
     return solve_all(list_of(problems), settings, _check, _solve, threads=threads, progress=progress)
 
 
-def _check(problem: Problem) -> None:
+def _check(problem: Problem, settings: Settings) -> None:
     check_problem(problem)
-    if isinstance(problem.initial, FixedState):
+    if settings.form == "primal" and isinstance(problem.initial, FixedState):
         raise InputError(
-            "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start);"
-            " ilqr() takes a FixedState"
+            "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start):"
+            ' the primal form has no other start; form="dual" has'
         )
+
+
+class _Arrays:
+    """What the loops read and write; see `solvers/loops.py` and `safeguard.py` for what each is."""
+
+    def __init__(self, problem: Problem, settings: Settings, begin: Start, start: Array) -> None:
+        n, steps, zeros = len(start), problem.steps, np.zeros
+        m = begin.offset.shape[1]
+        self.dual = settings.form == "dual"
+        self.fixed = isinstance(problem.initial, FixedState)
+        self.start = start
+        self.x_hat, self.x_hats = self.start.copy(), zeros((steps + 1, n))
+        self.law = begin.gain.copy(), begin.offset.copy()
+        self.go = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
+        if begin.cost_to_go is not None:
+            value = begin.cost_to_go
+            self.go = value.hessian.copy(), value.gradient.copy(), value.constant.copy()
+        self.come = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
+        kept = steps if self.dual else 1  # the primal form finds its way back without
+        self.back = zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))
+        self.no_prior = zeros(n), zeros((steps + 1, n))
+        self.prior = (*self.no_prior, 0)
+        if problem.prior is not None:
+            about = np.broadcast_to(problem.prior.about, (steps + 1, n)).copy()
+            self.prior = problem.prior.weight.copy(), about, problem.prior.iterations
+        # Without a trajectory to begin with: the start, and the controls with which the dynamics can run backwards.
+        self.plan = np.tile(self.start, (steps + 1, 1)), begin.offset.copy()
+        if begin.trajectory is not None:
+            self.plan = begin.trajectory.states.copy(), begin.trajectory.controls.copy()
+        self.states, self.controls = zeros((steps + 1, n)), zeros((steps, m))
+        self.kept = zeros((steps, m, n)), zeros((steps, m))
+        self.best = zeros(6)
+        self.model = model(problem)
+
+    @property
+    def passes(self) -> tuple[Any, ...]:
+        """The part that all loops have."""
+        return (
+            self.start, self.x_hat, self.x_hats, *self.law, *self.go, *self.come, *self.back, *self.model
+        )  # fmt: skip
+
+    def value_functions(self) -> dict[str, Any]:
+        """Cost-to-go, cost-to-come and inverse law of the last passes, as `assemble` takes them."""
+        if not self.dual:
+            inverse = self.back[2], self.back[3]
+            return {"cost_to_go": Quadratic(*self.go), "cost_to_come": Quadratic(*self.come), "inverse_law": inverse}
+        covariance, mean, _ = self.come
+        inverse = None
+        if not self.fixed:  # or the first covariances are singular
+            # u = gain costate + offset, where the costate at a state of arrival x is -covariance^-1 (x - mean).
+            with contextlib.suppress(np.linalg.LinAlgError):
+                gain = -np.linalg.solve(covariance[1:], np.swapaxes(self.back[2], 1, 2))
+                gain = np.ascontiguousarray(np.swapaxes(gain, 1, 2))
+                inverse = gain, self.back[3] - np.einsum("tij,tj->ti", gain, mean[1:])
+        return {"cost_to_go": Quadratic(*self.go), "cost_to_come": Moments(*self.come), "inverse_law": inverse}
 
 
 def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callback | None = None) -> Solution:
     """Solve; with `each`, a look after each iteration (see `iterate`)."""
-    n, steps, zeros = len(problem.dynamics.state_coordinates), problem.steps, np.zeros
-    x_hat = zeros(n) if problem.start is None else problem.start.copy()
-    controls = settings.controls(problem)
-    start, control = x_hat.copy(), controls[0].copy()
+    begin = resolve(settings.start, problem)
+    start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
+    control = begin.offset[0].copy()
     check_functions(problem, start, control)
-    m = controls.shape[1]
-    x_hats, states = zeros((steps + 1, n)), zeros((steps + 1, n))
-    L, Lbar, kept_L = zeros((steps, m, n)), zeros((steps, m, n)), zeros((steps, m, n))
-    l, lbar, kept_l = controls.copy(), zeros((steps, m)), zeros((steps, m))
-    go = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
-    come = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
-    prior_weight, prior_about, prior_iterations = zeros(n), zeros((steps + 1, n)), 0
-    if problem.prior is not None:
-        prior_weight, prior_iterations = problem.prior.weight.copy(), problem.prior.iterations
-        prior_about[:] = problem.prior.about
-    log = zeros((settings.max_iterations, 4))
-    core = compiled.core(problem)
-    options = (
-        settings.max_iterations,
-        settings.tolerance,
-        float(settings.gap_tolerance or 0),
-        settings.stop == "optimal",
-    )
-    arrays = (
-        x_hat, x_hats, L, l, *go, Lbar, lbar, *come, *model(problem),
-        prior_weight, prior_about, prior_iterations, states, controls, kept_L, kept_l, log,
+    arrays = _Arrays(problem, settings, begin, start)
+    ending = _undamped(problem, settings, begin, arrays, each=each, callback=callback)
+    checked = check_outcome(problem, ending, start, control, refuse=each)
+    lost = checked is not ending  # a function that is not finite at the start: nothing can help
+    failed = ending.status not in (Status.CONVERGED, Status.COST_CONVERGED)
+    options = settings.options(begin)
+    detail = checked.detail(problem.steps)
+    if settings.safeguard and failed and not lost:
+        why = detail or ending.status.meaning
+        return _rescue(problem, settings, arrays, ending, options, why, each=each, callback=callback)
+    values = {} if ending.pass_failed else arrays.value_functions()
+    return assemble(
+        problem, solver="smooth", options=options, status=checked.status, detail=detail, iterations=checked.iterations,
+        states=arrays.states, controls=arrays.controls, law=arrays.kept, **values,
     )  # fmt: skip
-    loop = core.entry("smoother_iterations", steps, 0, 0, *options, *arrays)
-    ending = iterate(
+
+
+def _undamped(
+    problem: Problem, settings: Settings, begin: Start, arrays: _Arrays, *, each: bool, callback: Callback | None
+) -> Ending:
+    """The method of the paper."""
+    core = compiled.core(problem, settings.form or "dual")
+    log = np.zeros((settings.max_iterations, LOG_COLUMNS))
+    options = (
+        settings.max_iterations, settings.tolerance, float(settings.gap_tolerance or 0), settings.stop == "optimal",
+        arrays.fixed, begin.trajectory is not None, settings.first_pass == "backward",
+    )  # fmt: skip
+    more = *arrays.prior, *arrays.plan, arrays.states, arrays.controls, *arrays.kept, arrays.best, log
+    loop = core.entry("smoother_iterations", problem.steps, 0, 0, *options, *arrays.passes, *more)
+    return iterate(
         problem,
-        lambda first, last: loop(steps, first, last, *options, *arrays),
+        lambda first, last: loop(problem.steps, first, last, *options, *arrays.passes, *more),
         log, settings.max_iterations, each=each, callback=callback,
     )  # fmt: skip
-    ending = check_outcome(problem, ending, start, control, refuse=each)
-    whole = not ending.pass_failed
+
+
+def _rescue(
+    problem: Problem,
+    settings: Settings,
+    arrays: _Arrays,
+    ending: Ending,
+    options: dict[str, object],
+    why: str,
+    *,
+    each: bool,
+    callback: Callback | None,
+) -> Solution:
+    """The safeguard: iterations from the best plan so far."""
+    core = compiled.core(problem, settings.form or "dual")
+    log = np.zeros((settings.max_iterations, LOG_COLUMNS))
+    stops = (
+        settings.max_iterations, settings.tolerance, float(settings.gap_tolerance or 0), settings.stop == "optimal",
+        arrays.fixed,
+    )  # fmt: skip
+    arrays.best[1:] = 1.0, 0.0, 0.0, 0.0, 2.0  # all of the way, and no weight
+    more = *arrays.no_prior, *arrays.plan, arrays.states, arrays.controls, arrays.best, log
+    loop = core.entry("damped_iterations", problem.steps, 0, 0, *stops, *arrays.passes, *more)
+    damped = iterate(
+        problem,
+        lambda first, last: loop(problem.steps, first, last, *stops, *arrays.passes, *more),
+        log, settings.max_iterations, before=ending.iterations, each=each, callback=callback,
+    )  # fmt: skip
+    states, controls = arrays.plan
+    detail = f"the undamped method failed ({why})"
+    if not np.isfinite(arrays.best[0]):
+        # Nothing that was tried leads anywhere. What is left is how it failed, and the controls that it began with.
+        return assemble(
+            problem, solver="smooth", options=options, status=ending.status, detail=detail,
+            iterations=damped.iterations, states=states, controls=controls,
+            law=(np.zeros_like(arrays.law[0]), controls.copy()),
+        )  # fmt: skip
+    status = damped.status
+    if damped.outcome == interface.STALLED:
+        status, detail = ending.status, f"{detail}; from the best plan, no step lowers the cost any more"
+    # The last iteration ended with both passes about the plan, if they can be done there at all.
+    whole = np.isfinite(damped.iterations[-1].optimality)
+    gain = arrays.law[0] if whole else np.zeros_like(arrays.law[0])
     return assemble(
-        problem, solver="smooth", settings=settings, ending=ending, states=states, controls=controls,
-        law=(kept_L, kept_l), inverse_law=(Lbar, lbar) if whole else None,
-        cost_to_go=Quadratic(*go) if whole else None, cost_to_come=Quadratic(*come) if whole else None,
+        problem, solver="smooth", options=options, status=status, detail=detail,
+        iterations=damped.iterations, states=states, controls=controls,
+        law=(gain, controls - np.einsum("tij,tj->ti", gain, states[:-1])),
+        **(arrays.value_functions() if whole else {}),
     )  # fmt: skip

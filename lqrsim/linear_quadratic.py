@@ -1,0 +1,68 @@
+"""The linear-quadratic problem of Sec. IV: what `smooth_lq` solves, and an iteration of `smooth` sets up."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import InputError, check_array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """Linear dynamics and a quadratic cost.
+
+        step (discrete) or rate (continuous) of x:   A x + B u + c
+        cost of the step, or a second of it:         1/2 x'Q x + 1/2 u'R u + u'P x + q'x + r'u + constant
+
+    A leading axis of T, if there is one, is time: one stage a step. Everything but A, B and R may be left out and is
+    zero then. Paper: Eqs. (4), (7).
+
+    Attributes:
+      A: (..., n, n). B: (..., n, m). c: (..., n).
+      Q: (..., n, n) symmetric. P: (..., m, n). R: (..., m, m) symmetric, positive definite.
+      q: (..., n). r: (..., m). constant: (...).
+
+    Raises:
+      InputError: shapes that do not fit together, numbers that are not finite, Q or R not symmetric.
+    """
+
+    A: npt.ArrayLike
+    B: npt.ArrayLike
+    R: npt.ArrayLike
+    c: npt.ArrayLike | None = None
+    Q: npt.ArrayLike | None = None
+    P: npt.ArrayLike | None = None
+    q: npt.ArrayLike | None = None
+    r: npt.ArrayLike | None = None
+    constant: npt.ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.B)
+        if len(shape) not in (2, 3):
+            raise InputError(f"Stage: B: got {len(shape)} dimensions, want (n, m) or, one a step, (T, n, m)")
+        time, (n, m) = shape[:-2], shape[-2:]
+        shapes = {
+            "A": (n, n), "B": (n, m), "c": (n,), "Q": (n, n), "P": (m, n), "R": (m, m), "q": (n,), "r": (m,),
+            "constant": (),
+        }  # fmt: skip
+        for field in fields(self):
+            value, want = getattr(self, field.name), shapes[field.name]
+            if value is None:
+                value = np.zeros(want)
+            if time and np.ndim(value) == len(want):  # the same at each step
+                value = np.broadcast_to(value, (*time, *np.shape(value)))
+            array = check_array(f"Stage: {field.name}", value, (*time, *want))
+            if field.name in ("Q", "R") and not np.allclose(array, np.swapaxes(array, -1, -2), rtol=1e-9, atol=0):
+                raise InputError(f"Stage: {field.name}: got a matrix that is not symmetric, want a symmetric one")
+            object.__setattr__(self, field.name, array)
+
+    @property
+    def states(self) -> int:
+        """n, the number of states."""
+        return np.shape(self.B)[-2]
+
+    @property
+    def controls(self) -> int:
+        """m, the number of controls."""
+        return np.shape(self.B)[-1]

@@ -1,0 +1,400 @@
+"""LQR smoothing and its iteration in continuous time: Secs. IV and V as the paper writes them.
+
+`differential.py` has the equations and integrates them.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import PPoly
+
+from lqrsim.checks import check_functions, check_start, functions_of
+from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt
+from lqrsim.functions import External
+from lqrsim.linear_quadratic import Stage
+from lqrsim.problem import FixedState, Problem
+from lqrsim.results import Iteration, Quadratic, Status
+from lqrsim.solvers.differential import (
+    NO_MINIMUM,
+    Model,
+    Pass,
+    System,
+    Tolerances,
+    Trouble,
+    bordered,
+    homogeneous,
+    minimizer,
+    riccati_pass,
+    tolerances_of,
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ContinuousSolution:
+    """A policy and the value functions as functions of time, in seconds from 0 to the horizon.
+
+    Wherever a time is asked for, an array of times does as well: what comes back has their axes in front.
+
+    Attributes:
+      status: how the solve ended; only CONVERGED is success.
+      detail: in which pass, at what time and why, if it is not.
+      horizon: the paper's l, in seconds.
+      iterations: the log of the iterations; empty for a linear-quadratic problem, which takes none.
+    """
+
+    status: Status
+    detail: str
+    horizon: float
+    iterations: tuple[Iteration, ...] = ()
+    _backward: "Pass | None" = field(repr=False)
+    _forward: "Pass | None" = field(repr=False)
+
+    @property
+    def success(self) -> bool:
+        """True for CONVERGED."""
+        return self.status is Status.CONVERGED
+
+    @property
+    def cost(self) -> float:
+        """True cost of the rollout from x_hat(0), or the least cost of a linear-quadratic problem; NaN if not found."""
+        if self.iterations or not self.success:
+            return self.iterations[-1].cost if self.iterations else float("nan")
+        return float(self.total_cost(0.0).minimum())
+
+    def policy(self, x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
+        """The control (..., m) to apply in the states (..., n) at time t, without saturation. Paper: Eq. (13)."""
+        return self._law("policy", self._backward, x, t)
+
+    def inverse_policy(self, x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
+        """The control (..., m) that led to the states (..., n) at time t at least cost. Paper: Eq. (19)."""
+        return self._law("inverse_policy", self._forward, x, t)
+
+    def cost_to_go(self, t: npt.ArrayLike) -> Quadratic:
+        """v: the least cost from time t on, of the state then. Paper: Eqs. (8)-(11)."""
+        return self._value("cost_to_go", self._backward, t)
+
+    def cost_to_come(self, t: npt.ArrayLike) -> Quadratic:
+        """vbar: the least cost up to time t, of the state then. Paper: Eqs. (14)-(17)."""
+        return self._value("cost_to_come", self._forward, t)
+
+    def total_cost(self, t: npt.ArrayLike) -> Quadratic:
+        """vhat: the least cost of visiting a state at time t. Paper: Eq. (20)."""
+        return self.cost_to_go(t) + self.cost_to_come(t)
+
+    def x_hat(self, t: npt.ArrayLike) -> Array:
+        """The state (..., n) of least total cost at time t. Paper: Eq. (21)."""
+        return self.total_cost(t).minimizer()
+
+    def u_hat(self, t: npt.ArrayLike) -> Array:
+        """The control (..., m) of the policy there; once converged also that of the inverse policy. Paper: Eq. (22)."""
+        return self.policy(self.x_hat(t), t)
+
+    def summary(self) -> str:
+        """The status with its remedy, and what came out, in a few lines."""
+        lines = [f"{self.status.name} after {len(self.iterations)} iterations: {self.status.meaning}"]
+        if not self.iterations and self.success:
+            lines = [f"{self.status.name}: a linear-quadratic problem is solved by one pass each way"]
+        if self.detail:
+            lines.append(f"  where:     {self.detail}")
+        if self.status.remedy:
+            lines.append(f"  remedy:    {self.status.remedy}")
+        line = f"  cost:      {self.cost:.9g}"
+        if self.iterations:
+            line += f"   gap: {self.iterations[-1].gap:.1e}   optimality: {self.iterations[-1].optimality:.1e}"
+        return "\n".join([*lines, line])
+
+    def __str__(self) -> str:
+        rows = [iteration.row(number) for number, iteration in enumerate(self.iterations, start=1)]
+        return "\n".join([*([Iteration.HEADER, *rows] if rows else []), self.summary()])
+
+    def _at(self, what: str, found: "Pass | None", t: npt.ArrayLike) -> tuple["Pass", Array]:
+        if found is None:
+            raise InputError(f"{what}: got a solution that is {self.status.value} before a pass ended, want a success")
+        times, slack = _numbers("t", t), 1e-9 * self.horizon  # a time may be out by rounding
+        outside = ~((times >= -slack) & (times <= self.horizon + slack))
+        if outside.any():
+            raise InputError(f"t: got {times[outside].flat[0]:g}, want seconds from 0 to {self.horizon:g}")
+        return found, np.clip(times, 0.0, self.horizon)
+
+    def _value(self, what: str, found: "Pass | None", t: npt.ArrayLike) -> Quadratic:
+        found, times = self._at(what, found, t)
+        value, _ = found.at(times)
+        return Quadratic(value[..., :-1, :-1], value[..., :-1, -1], 0.5 * value[..., -1, -1])
+
+    def _law(self, what: str, found: "Pass | None", x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
+        found, times = self._at(what, found, t)
+        states, want = _numbers("x", x), f"(..., {found.states}), one state or one for each of the times"
+        if states.shape[-1:] != (found.states,) or (times.ndim and states.shape[:-1] not in ((), times.shape)):
+            raise InputError(f"x: got shape {states.shape}, want {want}")
+        if not np.isfinite(states).all():
+            raise InputError(f"x: got {states}, want finite numbers")
+        _, law = found.at(times)
+        return np.einsum("...ij,...j->...i", law[..., :-1], states) + law[..., -1]
+
+
+def _numbers(field: str, value: npt.ArrayLike) -> Array:
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{field}: got {excerpt(value)}, want numbers") from None
+
+
+def smooth_lq_continuous(
+    stage: Stage | Callable[[float], Stage],
+    *,
+    horizon: float,
+    initial: Quadratic,
+    final: Quadratic,
+    rtol: float = 1e-9,
+    atol: float = 1e-9,
+) -> ContinuousSolution:
+    """Solve a linear-quadratic problem in continuous time by LQR smoothing. Paper: Sec. IV, Eqs. (4)-(22).
+
+    Args:
+      stage: the dynamics and the cost of a second, without a leading axis; where they change with time, a function
+        t [s] -> Stage. Where that jumps, the integrator takes many short steps.
+      horizon: l, in seconds.
+      initial, final: c_0 and c_l: hessian (n, n), gradient (n,), constant. Together with the stage they must give every
+        state a total cost with one minimum.
+      rtol, atol: how accurately the Riccati equations are integrated, relative and absolute.
+
+    Returns:
+      A ContinuousSolution. A problem without a minimum does not raise: the status says where it was noticed.
+
+    Raises:
+      InputError: an argument is not as described.
+    """
+    horizon = check_number("horizon", horizon, above=0.0)
+    tolerances = tolerances_of(rtol, atol)
+
+    def at(t: float) -> Stage:
+        given = stage(t) if callable(stage) else stage
+        if not isinstance(given, Stage) or np.ndim(given.B) != 2:
+            got = f"one with {np.ndim(given.B)} dimensions in B" if isinstance(given, Stage) else type(given).__name__
+            raise InputError(
+                f"stage: got {got}, want a Stage without a leading axis, or a function of t that gives one"
+            )
+        return given
+
+    first = at(0.0)
+    n, m = first.states, first.controls
+
+    def model(t: float, _: Array) -> Model:
+        return whole if whole is not None else _model(at(t), n, m)
+
+    whole = None if callable(stage) else _model(first, n, m)
+    c_0, c_l = _end("initial", initial, n), _end("final", final, n)
+    backward, forward, status, detail = None, None, Status.CONVERGED, ""
+    where = "backward pass"
+    try:
+        backward = riccati_pass(model, c_l, horizon, backward=True, tolerances=tolerances)
+        where = "forward pass"
+        forward = riccati_pass(model, c_0, horizon, backward=False, tolerances=tolerances)
+        where = "total cost"
+        _check_minimum(backward, forward)
+    except Trouble as trouble:
+        status, detail = trouble.status, _place(where, trouble)
+    return ContinuousSolution(status=status, detail=detail, horizon=horizon, _backward=backward, _forward=forward)
+
+
+def _model(stage: Stage, n: int, m: int) -> Model:
+    A, B, c, Q, P, R, q, r = (np.asarray(getattr(stage, name)) for name in "ABcQPRqr")
+    if B.shape != (n, m):
+        raise InputError(f"stage: got B of shape {B.shape}, want ({n}, {m}) at all times")
+    hessian, gradient = np.block([[Q, P.T], [P, R]]), np.concatenate([q, r])
+    return homogeneous(A, B, c, hessian, gradient, float(np.asarray(stage.constant)), np.zeros(n), np.zeros(m))
+
+
+def _end(field: str, cost: Quadratic, n: int) -> Array:
+    """An initial or final cost as V (n+1, n+1). Raises InputError if it is none of n states."""
+    if not isinstance(cost, Quadratic):
+        raise InputError(f"{field}: got {type(cost).__name__}, want a Quadratic")
+    hessian = check_array(f"{field}: hessian", cost.hessian, (n, n))
+    if not np.allclose(hessian, hessian.T, rtol=1e-9, atol=0):
+        raise InputError(f"{field}: hessian: got a matrix that is not symmetric, want a symmetric one")
+    gradient = check_array(f"{field}: gradient", cost.gradient, (n,))
+    return bordered(hessian, gradient, float(check_array(f"{field}: constant", cost.constant, ())))
+
+
+def _check_minimum(backward: Pass, forward: Pass) -> None:
+    """Look at the total cost wherever a pass stopped. Raises Trouble where it has no single minimum."""
+    times = np.union1d(backward.times, forward.times)
+    total = backward.at(times)[0] + forward.at(times)[0]
+    spectrum = np.linalg.eigvalsh(total[:, :-1, :-1])
+    flat = spectrum[:, 0] <= spectrum.shape[1] * np.finfo(float).eps * spectrum[:, -1]
+    if flat.any():
+        raise Trouble(Status.NOT_POSITIVE_DEFINITE, NO_MINIMUM, float(times[flat][0]))
+
+
+def smooth_continuous(
+    problem: Problem,
+    *,
+    tolerance: float = 1e-4,
+    gap_tolerance: float = 1e-3,
+    max_iterations: int = 50,
+    start: npt.ArrayLike | None = None,
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+    callback: Callable[[Iteration], object] | None = None,
+) -> ContinuousSolution:
+    """Compute a locally optimal feedback policy by iterated LQR smoothing in continuous time. Paper: Sec. V.
+
+    The horizon is `steps * dt`, the cost of a second is `stage_cost / dt`, and the control is not held over a step: as
+    dt shrinks and the weights with it, `smooth` comes to this, at first order. A stage cost that depends on the step is
+    given the one in which the time lies, and at least 1: what is off at the first instant costs nothing there.
+
+    Args:
+      problem: with an initial cost, the paper's soft start.
+      tolerance: of the relative change of cost, and of the optimality (see `Iteration`). A cost below `atol` counts as
+        that.
+      gap_tolerance: of the gap (see `Iteration`), looked at every dt. The dynamics residual is not evaluated.
+      max_iterations: when to give up.
+      start: (m,), the control that the first pass applies; the problem's nominal control by default. It has a say in
+        which local optimum is found.
+      rtol, atol: how accurately everything is integrated, relative and absolute.
+      callback: called with each `Iteration` as it ends.
+
+    Returns:
+      A ContinuousSolution, of the last iteration that was completed. A hard problem does not raise: the status says how
+      it ended, and the detail where.
+
+    Raises:
+      InputError: an argument is not as described; the dynamics or a cost is not finite at the start.
+    """
+    if not isinstance(problem, Problem):
+        raise InputError(f"problem: got {type(problem).__name__}, want a Problem")
+    if isinstance(problem.initial, FixedState):
+        raise InputError(
+            "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start);"
+            " the primal form has no other start"
+        )
+    check_number("tolerance", tolerance, above=0.0)
+    check_number("gap_tolerance", gap_tolerance, above=0.0)
+    check_count("max_iterations", max_iterations)
+    tolerances = tolerances_of(rtol, atol)
+    m = len(problem.dynamics.control_coordinates)
+    control = check_array("start", problem.nominal_control if start is None else start, (m,))
+    state = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
+    check_functions(problem, state, control)
+    check_start(problem, state, control)
+
+    functions = functions_of(problem)
+    for function in functions:
+        function.forget()
+    solver = _Smoother(problem, state, control, tolerances)
+    iterations: list[Iteration] = []
+    status, detail = Status.MAX_ITERATIONS, ""
+    for number in range(1, max_iterations + 1):
+        clock = time.perf_counter()
+        try:
+            solver.passes()
+        except Trouble as trouble:
+            status, detail = trouble.status, _place(f"{solver.where} of iteration {number}", trouble)
+            break
+        escape = solver.rollout()
+        old, cost = iterations[-1].cost if iterations else math.inf, solver.cost
+        improvement = (old - cost) / max(abs(cost), atol)  # what is less is the integrator's noise
+        settled = abs(improvement) < tolerance and solver.gap < gap_tolerance
+        left = solver.optimality() if settled or number == max_iterations else math.nan
+        row = Iteration(
+            cost=cost, improvement=improvement, gap=solver.gap, optimality=left, dynamics_residual=math.nan,
+            seconds=time.perf_counter() - clock, method="smooth",
+        )  # fmt: skip
+        iterations.append(row)
+        if callback is not None:
+            callback(row)
+        _heed_interrupts(functions)
+        if settled and left < tolerance:
+            status = Status.CONVERGED
+            break
+        if number == max_iterations and escape is not None:
+            status, detail = Status.DIVERGED, _place(f"rollout of iteration {number}", escape)
+    _heed_interrupts(functions)
+    raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
+    return ContinuousSolution(
+        status=status, detail="; ".join([detail, *raised]) if detail else "", horizon=solver.system.horizon,
+        iterations=tuple(iterations), _backward=solver.backward, _forward=solver.forward,
+    )  # fmt: skip
+
+
+class _Smoother:
+    """The passes of one iteration after another, and what each leaves to the next.
+
+    Attributes:
+      forward, backward: the passes of the last iteration of which both were completed; None before.
+      where: what was under way when there was trouble.
+      cost, gap: of the last rollout; see `Iteration`.
+    """
+
+    def __init__(self, problem: Problem, state: Array, control: Array, tolerances: Tolerances) -> None:
+        n, m = len(state), len(control)
+        self.system, self._tolerances = System(problem), tolerances
+        self._prior, self._prior_left = problem.prior, problem.prior.iterations if problem.prior is not None else 0
+        self._x_hat = state  # at 0
+        # Before the first pass: no cost-to-go, and a policy that plays the initial control.
+        law = np.hstack([np.zeros((m, n)), control[:, None]])
+        self._to_go = Pass.constant(np.zeros((n + 1, n + 1)), law, self.system.horizon)
+        self.forward: Pass | None = None
+        self.backward: Pass | None = None
+        self.where, self.cost, self.gap = "", math.nan, math.nan
+        self._states: PPoly | None = None
+
+    def passes(self) -> None:
+        """One pass forward and one backward. Paper: Secs. V-A and V-B. Raises Trouble."""
+        system, horizon, tolerances = self.system, self.system.horizon, self._tolerances
+        prior, self._prior_left = self._prior if self._prior_left > 0 else None, self._prior_left - 1
+        self.where = "forward pass"
+        come = riccati_pass(
+            system.model(self._to_go, prior), system.end_model("initial", self._x_hat), horizon, backward=False,
+            tolerances=tolerances,
+        )  # fmt: skip
+        # Eq. (33). With c_l quadratised there, the next pass begins at the minimiser anew, by Eq. (28) at l.
+        x_end = minimizer(self._to_go.at(horizon)[0] + come.at(horizon)[0], horizon)
+        self.where = "backward pass"
+        go = riccati_pass(
+            system.model(come, prior), system.end_model("final", x_end), horizon, backward=True, tolerances=tolerances
+        )
+        ahead = go.at(0.0)[0]
+        x_hat = minimizer(ahead + come.at(0.0)[0], 0.0)  # Eq. (30)
+        self._x_hat = minimizer(ahead + system.end_model("initial", x_hat), 0.0)
+        self._to_go, self.forward, self.backward = go, come, go
+
+    def rollout(self) -> Trouble | None:
+        """Run the new policy and set `cost` and `gap`, which are infinite if it escapes; returns how it did."""
+        assert self.forward is not None
+        try:
+            self.cost, self._states = self.system.rollout(self._x_hat, self._to_go, self._tolerances)
+            times = self.system.knots
+            total = self.forward.at(times)[0] + self._to_go.at(times)[0]
+            x_hats = np.array([minimizer(V, t) for V, t in zip(total, times.tolist(), strict=True)])
+        except Trouble as trouble:
+            self.cost, self.gap, self._states = math.inf, math.inf, None
+            return trouble
+        states = self._states(times)
+        self.gap = float((np.abs(x_hats - states).max(axis=0) / np.maximum(np.ptp(states, axis=0), 1.0)).max())
+        return None
+
+    def optimality(self) -> float:
+        """See `Iteration.optimality`; infinite where a model about the rollout has no minimum."""
+        if self._states is None:
+            return math.inf
+        try:
+            decrease = self.system.decrease(self._states, self._to_go, self._tolerances)
+        except Trouble:
+            return math.inf
+        return decrease / max(abs(self.cost), self._tolerances.atol)
+
+
+def _place(where: str, trouble: Trouble) -> str:
+    return f"{where}, at {trouble.time:.4g} s: {trouble}"
+
+
+def _heed_interrupts(functions: list[External]) -> None:
+    """Raise what is not an error, such as Ctrl-C, that compiled code met in a function of Python's."""
+    for function in functions:
+        if function.raised is not None and not isinstance(function.raised, Exception):
+            raise function.raised

@@ -1,0 +1,178 @@
+"""LQR smoothing of linear-quadratic problems: Sec. IV of the paper."""
+
+import hashlib
+import time
+
+import numpy as np
+
+from lqrsim import compiled
+from lqrsim.coordinates import Coordinates
+from lqrsim.errors import Array, InputError, check_array, check_name, check_number
+from lqrsim.linear_quadratic import Stage
+from lqrsim.problem import FixedState
+from lqrsim.results import AffinePolicy, Iteration, Moments, Quadratic, Solution, Status, TotalCost, Trajectory
+from lqrsim.versions import versions
+
+
+def smooth_lq(
+    stage: Stage, *, initial: Quadratic | FixedState, final: Quadratic, form: str = "dual", dt: float = 1.0
+) -> Solution:
+    """Solve a linear-quadratic problem exactly, by one backward pass and one forward pass. Paper: Sec. IV.
+
+    The states of least total cost are the optimal trajectory, x_hat: Eqs. (21)-(22), Lemma 1.
+
+    Args:
+      stage: one stage a step, each of its arrays with a leading axis T; see `Stage`.
+      initial: c_0, a `Quadratic` of arrays (n, n), (n,), (); or a `FixedState`, which only the dual form takes.
+      final: c_l, a `Quadratic` likewise.
+      form: "dual" has the cost-to-come by its moments and needs a positive-definite initial Hessian; "primal" is the
+        paper's and needs an invertible A.
+      dt: seconds a step, for the times of the trajectory and the policy.
+
+    Returns:
+      A Solution with one iteration: status CONVERGED, or NOT_POSITIVE_DEFINITE where a step has no unique minimum, and
+      its detail says which. The trajectory is the rollout of the policy; its gap to x_hat is rounding.
+
+    Raises:
+      InputError: arrays that do not fit together, or that the form does not take.
+    """
+    clock = time.perf_counter()
+    check_name("form", form, tuple(compiled.FORMS))
+    dt = check_number("dt", dt, above=0.0)
+    if not isinstance(stage, Stage):
+        raise InputError(f"stage: got {type(stage).__name__}, want a Stage")
+    if np.ndim(stage.B) != 3:
+        raise InputError("stage: got one stage, want one a step: B of shape (T, n, m)")
+    A, B, c, Q, P, R, q, r, constant = (
+        np.asarray(getattr(stage, name)) for name in ("A", "B", "c", *"QPRqr", "constant")
+    )
+    steps, n, m = B.shape
+    jacobian = np.ascontiguousarray(np.concatenate([A, B], axis=2))
+    cost = np.ascontiguousarray(np.block([[Q, np.swapaxes(P, 1, 2)], [P, R]]))
+    slope = np.ascontiguousarray(np.concatenate([q, r], axis=1))
+    inverse, c_inverse = (jacobian, c) if form == "dual" else _inverse(A, B, c)
+    go = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
+    come = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
+    go[0][-1], go[1][-1], go[2][-1] = _end("final", final, n)
+    come[0][0], come[1][0], come[2][0] = _begin(initial, n, form)
+    law = np.zeros((steps, m, n)), np.zeros((steps, m))
+    back = np.zeros((steps, n, n)), np.zeros((steps, n)), np.zeros((steps, m, n)), np.zeros((steps, m))
+    x_hat = np.zeros((steps + 1, n))
+    failed, which = compiled.linear_quadratic(n, m, form).lq_passes(
+        steps, jacobian, c.copy(), inverse, c_inverse.copy(), cost, slope, constant.copy(),
+        *law, *go, *come, *back, x_hat,
+    )  # fmt: skip
+    detail = ""
+    status = Status.CONVERGED
+    if failed >= 0:
+        part = ("backward pass", "forward pass", "minimum of the total cost")[which]
+        status, detail = Status.NOT_POSITIVE_DEFINITE, f"{part}, step {failed} of {steps}"
+    states, controls, spent = _rollout(stage, law, x_hat[0] if failed < 0 else np.zeros(n))
+    value = spent + float(final(states[-1]))
+    if isinstance(initial, Quadratic):
+        value += float(initial(states[0]))
+    to_go, to_come = Quadratic(*go), (Moments(*come) if form == "dual" else Quadratic(*come))
+    iterations = ()
+    if failed < 0:
+        scale = np.maximum(np.ptp(states, axis=0), 1.0)
+        least = float(TotalCost(to_go, to_come).minimum()[0])
+        ahead = np.einsum("tij,tj->ti", A, x_hat[:-1]) + np.einsum("tij,tj->ti", B, _controls(law, x_hat)) + c
+        iterations = (
+            Iteration(
+                cost=value, improvement=np.inf, gap=float((np.abs(x_hat - states) / scale).max()),
+                optimality=abs(value - least) / max(abs(value), 1e-300),
+                dynamics_residual=float((np.abs(x_hat[1:] - ahead) / scale).max()),
+                seconds=time.perf_counter() - clock, method="smooth",
+            ),
+        )  # fmt: skip
+    digest = hashlib.sha256(b"".join(array.tobytes() for array in (jacobian, c, cost, slope, constant)))
+    for end in (initial, final):
+        for array in (end.state,) if isinstance(end, FixedState) else (end.hessian, end.gradient, end.constant):
+            digest.update(np.asarray(array, dtype=np.float64).tobytes())
+
+    def coordinates(letter: str, size: int) -> Coordinates:
+        return Coordinates(names=tuple(f"{letter}{i}" for i in range(size)), units=("",) * size)
+
+    def policy(gain: Array, offset: Array, nominal: Array) -> AffinePolicy:
+        return AffinePolicy(
+            gain=gain, offset=offset, nominal=nominal, dt=dt,
+            state_coordinates=coordinates("x", n), control_coordinates=coordinates("u", m),
+        )  # fmt: skip
+
+    return Solution(
+        status=status,
+        detail=detail,
+        policy=policy(*law, states[:-1]),
+        inverse_policy=policy(*back[2:], states[1:]) if form == "primal" and failed < 0 else None,
+        cost_to_go=to_go if failed < 0 else None,
+        cost_to_come=to_come if failed < 0 else None,
+        trajectory=Trajectory(states, controls, dt),
+        iterations=iterations,
+        clearance=None,
+        solver="smooth_lq",
+        options={"form": form},
+        problem_digest=digest.hexdigest()[:16],
+        versions=versions(),
+    )
+
+
+def _end(field: str, end: Quadratic, n: int) -> tuple[Array, Array, float]:
+    if not isinstance(end, Quadratic):
+        raise InputError(f"{field}: got {type(end).__name__}, want a Quadratic")
+    hessian = check_array(f"{field}: hessian", end.hessian, (n, n))
+    if not np.allclose(hessian, hessian.T, rtol=1e-9, atol=0):
+        raise InputError(f"{field}: hessian: got a matrix that is not symmetric, want a symmetric one")
+    gradient = check_array(f"{field}: gradient", end.gradient, (n,))
+    return hessian, gradient, float(check_array(f"{field}: constant", end.constant, ()))
+
+
+def _begin(initial: Quadratic | FixedState, n: int, form: str) -> tuple[Array, Array, float]:
+    """The cost-to-come at 0, as the form has it."""
+    if isinstance(initial, FixedState):
+        if form == "primal":
+            raise InputError(
+                'initial: got a FixedState, want a Quadratic: the primal form has no fixed start; "dual" has'
+            )
+        return np.zeros((n, n)), check_array("initial: state", initial.state, (n,)), 0.0
+    hessian, gradient, constant = _end("initial", initial, n)
+    if form == "primal":
+        return hessian, gradient, constant
+    values = np.linalg.eigvalsh(hessian)
+    if not values[0] > 1e-12 * max(values[-1], 0.0):
+        raise InputError(
+            f'initial: hessian: got smallest eigenvalue {values[0]:g}, want a positive-definite one; or form="primal"'
+        )
+    covariance = np.linalg.inv(hessian)
+    covariance = 0.5 * (covariance + covariance.T)
+    mean = -covariance @ gradient
+    return covariance, mean, constant + 0.5 * float(gradient @ mean)
+
+
+def _inverse(A: Array, B: Array, c: Array) -> tuple[Array, Array]:
+    """The steps backwards, (T, n, n + m) and (T, n): x_t = Abar x_{t+1} + Bbar u_t + cbar."""
+    condition = np.linalg.cond(A)
+    if not condition.max() < 1e12:
+        step = int(np.argmax(condition))
+        raise InputError(f'stage: A: got a singular matrix at step {step}, want an invertible one, or form="dual"')
+    inverse = np.linalg.inv(A)
+    return np.ascontiguousarray(np.concatenate([inverse, -inverse @ B], axis=2)), -np.einsum("tij,tj->ti", inverse, c)
+
+
+def _controls(law: tuple[Array, Array], states: Array) -> Array:
+    return np.einsum("tij,tj->ti", law[0], states[:-1]) + law[1]
+
+
+def _rollout(stage: Stage, law: tuple[Array, Array], start: Array) -> tuple[Array, Array, float]:
+    """States and controls of the policy, and what the stages cost."""
+    A, B, c, Q, P, R, q, r, constant = (
+        np.asarray(getattr(stage, name)) for name in ("A", "B", "c", *"QPRqr", "constant")
+    )
+    steps, n, m = B.shape
+    states, controls, spent = np.zeros((steps + 1, n)), np.zeros((steps, m)), 0.0
+    states[0] = start
+    for t in range(steps):
+        x = states[t]
+        u = controls[t] = law[0][t] @ x + law[1][t]
+        spent += 0.5 * x @ Q[t] @ x + 0.5 * u @ R[t] @ u + u @ P[t] @ x + q[t] @ x + r[t] @ u + constant[t]
+        states[t + 1] = A[t] @ x + B[t] @ u + c[t]
+    return states, controls, float(spent)

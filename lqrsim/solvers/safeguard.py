@@ -1,0 +1,142 @@
+"""The safeguard: LQR smoothing held near the best plan so far, for when it fails on its own. The numba subset.
+
+Rollouts on the way to an optimum can be worse than the first one by any factor, so there is no merit by which to tell
+early that the method will fail, and it is left alone until it does: in a pass, or by not ending. So it changes nothing
+where the method converges. What Levenberg-Marquardt is to Gauss-Newton, the damped iterations are to LQR smoothing.
+"""
+
+from math import inf, isnan, nan
+
+from lqrsim.solvers.interface import DAMPED, ILQR, MAX_ITERATIONS, REJECTED, RUNNING, STALLED, M, N, stack
+from lqrsim.solvers.kernels import affine
+from lqrsim.solvers.loops import ending, keep_plan, nothing_left, optimality, relative_improvement, write_row
+from lqrsim.solvers.passes import backward_pass, copy, dynamics_residual, forward_pass, largest_gap, line_search
+
+
+def damped_iterations(
+    steps, first, last, max_iterations, tolerance, gap_tolerance, optimal, fixed,
+    start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
+    no_weight, no_about, plan_x, plan_u, states, controls, best, log,
+):  # fmt: skip
+    """Iterations from the best plan so far, each of which lowers its cost or leaves it as it is.
+
+    The forward pass linearises about the plan, the backward pass part of the way (`reach`) to where the minimisers
+    lead, and the new policy is followed as far as lowers the cost, by halves. Where a tenth of the way does not, the
+    next iteration reaches less far. At reach 0 both passes linearise about the plan, and the step is that of iLQR: it
+    points downhill, and some part of it lowers the cost, unless the plan is stationary or rounding spoils the matrices.
+    If so, changes of the controls (and of a soft start) get a weight in both passes, relative to the cost's own
+    curvature, which grows tenfold until it helps.
+
+    A small change of cost can come from a short step, so two in a row are wanted. Then both passes are done once more,
+    about the plan and without a weight, to tell how far it is from optimal; that also gives the policy and the value
+    functions of the answer.
+
+    `best` (6,) is the cost of the plan, reach, weight, how many small changes there were in a row, and of iterations at
+    reach 0 how many are left, and how many there will be the next time.
+    """
+    shift = stack(N)
+    for done in range(first, last):
+        reach, weight = best[1], best[2]
+        copy(start if fixed else plan_x[0], N, x_hat)
+        failed, _ = forward_pass(
+            steps, fixed, True, weight, plan_x, plan_u,
+            x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final, no_weight, no_about,
+        )  # fmt: skip
+        if failed < 0:
+            failed, _ = backward_pass(
+                steps, fixed, reach, weight, plan_x, plan_u, x_hat, x_hats,
+                L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, no_weight, no_about,
+            )  # fmt: skip
+        cost, fraction = inf, 0.0
+        if failed < 0:
+            for i in range(N):
+                shift[i] = x_hat[i] - plan_x[0, i]
+            about_plan(steps, plan_x, plan_u, L, l)
+            smallest = 0.1 if reach > 0 else 1e-8
+            bound = best[0] + 1e-12 * abs(best[0])  # what differs by rounding is not refused
+            cost, fraction = line_search(
+                steps, plan_x, plan_u, shift, L, l, p, dt, initial, stage, final, bound, smallest, states, controls
+            )
+        full = done + 1 == max_iterations
+        if fraction > 0:
+            improvement = relative_improvement(best[0], cost, nothing_left(x_hat, S[0], s[0], k[0]))
+            follow(steps, fraction, plan_x, x_hats)
+            # At reach 0 as for iLQR: nothing but a rollout was linearised about.
+            gap = largest_gap(steps, x_hats, states) if reach > 0 else 0.0
+            keep_plan(steps, states, controls, plan_x, plan_u)
+            best[0] = cost
+            best[3] = best[3] + 1 if abs(improvement) < tolerance and (gap < gap_tolerance or not optimal) else 0
+            settled, stalled = best[3] > 1, False
+            if weight > 0:
+                best[2] = 0.1 * weight if weight > 1e-6 else 0.0
+            elif reach > 0:
+                best[1] = min(2 * reach, 1.0) if fraction == 1 else reach
+            else:
+                best[4] -= 1
+                best[1] = 0.25 if best[4] <= 0 else 0.0
+            write_row(log, done, cost, improvement, gap, nan, nan, DAMPED if reach > 0 else ILQR)
+        else:
+            if reach > 0.25:
+                best[1] = 0.25
+            elif reach > 0:
+                best[1], best[4], best[5] = 0.0, best[5], 2 * best[5]
+            else:
+                best[2] = max(10 * weight, 1e-3)
+            stalled = best[2] > 1e12
+            settled = stalled
+            write_row(log, done, best[0], 0.0, nan, nan, nan, REJECTED)
+        if settled or full:
+            outcome = relinearize(
+                steps, fixed, tolerance, gap_tolerance, optimal, settled,
+                start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
+                no_weight, no_about, plan_x, plan_u, best, log, done,
+            )  # fmt: skip
+            if outcome == RUNNING and (stalled or full):
+                outcome = STALLED if stalled else MAX_ITERATIONS
+            if outcome != RUNNING:
+                return done + 1, outcome, False, -1
+    return last, RUNNING, False, -1
+
+
+def follow(steps, fraction, plan_x, x_hats):
+    """Make of the states that a whole step was to lead to those that a part of it was."""
+    if fraction < 1:
+        for t in range(steps + 1):
+            for i in range(N):
+                x_hats[t, i] = plan_x[t, i] + fraction * (x_hats[t, i] - plan_x[t, i])
+
+
+def about_plan(steps, plan_x, plan_u, L, l):
+    """Make the policy relative to the plan: l becomes L x + l - u, the change of the controls that it asks for."""
+    u = stack(M)
+    for t in range(steps):
+        affine(L[t], l[t], plan_x[t], u)
+        for i in range(M):
+            l[t, i] = u[i] - plan_u[t, i]
+
+
+def relinearize(
+    steps, fixed, tolerance, gap_tolerance, optimal, settled,
+    start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
+    no_weight, no_about, plan_x, plan_u, best, log, done,
+):  # fmt: skip
+    """Both passes about the plan, without a weight. Writes optimality and residual to the log; returns the outcome."""
+    copy(start if fixed else plan_x[0], N, x_hat)
+    failed, _ = forward_pass(
+        steps, fixed, True, 0.0, plan_x, plan_u,
+        x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final, no_weight, no_about,
+    )  # fmt: skip
+    if failed < 0:
+        failed, _ = backward_pass(
+            steps, fixed, 0.0, 0.0, plan_x, plan_u, x_hat, x_hats,
+            L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, no_weight, no_about,
+        )  # fmt: skip
+    if failed >= 0:
+        return RUNNING
+    nothing = nothing_left(plan_x[0], S[0], s[0], k[0])
+    left = optimality(steps, fixed, plan_x, plan_u, best[0], nothing, p, dt, initial, stage, final)
+    log[done, 3], log[done, 4] = left, dynamics_residual(steps, x_hats, L, l, p, dt, plan_x)
+    if isnan(log[done, 2]):  # of an iteration that was rejected
+        log[done, 2] = largest_gap(steps, x_hats, plan_x)
+        settled = settled and (log[done, 2] < gap_tolerance or not optimal)
+    return ending(settled and left < tolerance, optimal, left, tolerance, best[0], False)
