@@ -54,7 +54,8 @@ def main() -> int:
     if options.command == "demo":
         return run([PYTHON, "-m", "lqrsim.cli", "demo", *rest])
     if options.command == "test":
-        return run([PYTHON, "-m", "pytest", *rest])
+        # All of them: on every processor, each file on one, so that what its tests share is made once.
+        return run([PYTHON, "-m", "pytest", *(rest or ["-n", "auto", "--dist", "loadfile"])])
     if options.command == "check":
         steps = (["ruff", "check"], ["ruff", "format", "--check"], ["basedpyright", "--pythonpath", str(PYTHON)])
         return max([run([PYTHON, "-m", *step]) for step in steps])

@@ -47,12 +47,12 @@ class Quadratic:
     Attributes:
       hessian: (T+1, n, n), symmetric; S, Sbar. A single function has no leading axis, here and below.
       gradient: (T+1, n), the slope at the origin; bold s, bold sbar.
-      constant: (T+1,); s, sbar.
+      constant: (T+1,), or a number; s, sbar.
     """
 
     hessian: Array
     gradient: Array
-    constant: Array
+    constant: Array | float
 
     def __add__(self, other: "Quadratic") -> "Quadratic":
         return Quadratic(self.hessian + other.hessian, self.gradient + other.gradient, self.constant + other.constant)

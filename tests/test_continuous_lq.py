@@ -224,7 +224,7 @@ def test_problems_without_a_minimum() -> None:
 def test_times_come_in_any_shape() -> None:
     solution = smooth_lq_continuous(STAGE, horizon=2.0, initial=UNIT, final=UNIT)
     assert solution.cost_to_go(1.0).hessian.shape == (1, 1)
-    assert solution.cost_to_go(np.zeros((4, 3))).constant.shape == (4, 3)
+    assert np.shape(solution.cost_to_go(np.zeros((4, 3))).constant) == (4, 3)
     assert solution.policy(np.zeros((5, 1)), 1.0).shape == (5, 1)
     assert solution.policy(np.zeros(1), np.ones(5)).shape == (5, 1)
     # S = 1 / (1 + l - t), by hand.

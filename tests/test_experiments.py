@@ -69,9 +69,9 @@ def test_benchmark_of_speed_compares_the_same_iterations(results: dict[str, Any]
     assert results["versions"]["lqrsim"]
     speed = results["speed"]
     assert speed["derivative_difference"] < 1e-10
-    for solver in ("smooth", "ilqr"):
+    for solver in ("smooth", "primal", "ilqr"):
         found = speed[solver]
-        for name in ("by hand", "compiled level"):
+        for name in ("by hand", "compiled level") if solver != "primal" else ():
             assert found[name]["iterations"] == found["symbolic"]["iterations"]
             np.testing.assert_allclose(found[name]["cost"], found["symbolic"]["cost"], rtol=1e-8)
             assert found[name]["milliseconds"] >= found[name]["milliseconds_loop"] > 0
@@ -79,7 +79,8 @@ def test_benchmark_of_speed_compares_the_same_iterations(results: dict[str, Any]
             assert speed["reference"]["skipped"]
         else:
             assert found["same_iterations"]
-            assert found["cost_difference"] < 1e-8
+            # The reference has the primal form; the dual takes another way to the same optimum.
+            assert found["cost_difference"] < (1e-4 if solver == "smooth" else 1e-8)
 
 
 def test_benchmark_of_peers_recomputes_what_they_claim(results: dict[str, Any]) -> None:
@@ -89,9 +90,9 @@ def test_benchmark_of_peers_recomputes_what_they_claim(results: dict[str, Any]) 
         assert "installed" in peers["skipped"]
         return
     assert set(peers) == {"smooth, hover", "ilqr, hover", "FDDP, hover", "FDDP, line"}
-    for name, found in peers.items():
+    for found in peers.values():
         assert found["converged"] == [True, True]
-        assert name.startswith("smooth") or found["cost_difference"] < 1e-8
+        assert found["cost_difference"] < 1e-8
     # From a trajectory FDDP is iLQR, but for how it regularises and how far its line search looks.
     np.testing.assert_allclose(peers["FDDP, hover"]["cost"], peers["ilqr, hover"]["cost"], rtol=1e-3)
 
@@ -117,3 +118,32 @@ def test_benchmark_says_what_it_skips(tmp_path: Path) -> None:
     with pytest.raises(script.Unavailable, match="name its folder with --reference"):
         script.speed.load_reference(script.Config(reference=tmp_path))
     assert script.report({"peers": {"skipped": "no such thing"}}) == "peers: skipped: no such thing"
+
+
+def test_benchmark_of_reliability() -> None:
+    """On few problems: bad advice breaks the bare method and not the guarded one, which changes nothing elsewhere."""
+    sys.path.insert(0, str(FOLDER))  # it imports its neighbours
+    try:
+        script = load("benchmark_reliability")
+        # What else there is of random problems has tests of its own.
+        result = script.main(script.Config(quick=True, kinds=("linear_2_1", "drive")))
+    finally:
+        sys.path.remove(str(FOLDER))
+    assert result["versions"]["lqrsim"]
+    for found in result["stiff"].values():
+        assert found["status"] == ["CONVERGED"] * 8
+        assert max(found["improvement"]) < 1e-3
+    assert result["fragile"]["1, without"]["status"].count("CONVERGED") < 8
+    assert result["fragile"]["1, with"]["status"] == ["CONVERGED"] * 8
+    assert list(result["random"]) == ["linear_2_1", "drive"]
+    for found in result["random"].values():
+        assert set(found["status"]) == {"CONVERGED"}
+    for found in result["overhead"].values():
+        assert all(found["same_bits"])
+        assert all(bare == guarded for bare, guarded in found["iterations"])
+    ablation = result["ablation"]
+    assert len(ablation) == 16
+    assert sum("skipped" in found for found in ablation.values()) == 4
+    exact = ablation["dual, fixed, prior, safeguard"]
+    np.testing.assert_allclose(exact["cost_from_start"], exact["cost"], rtol=1e-9)
+    assert "handed over" in script.report(result)

@@ -105,8 +105,9 @@ def test_converged_means_that_first_order_conditions_hold(reports: list[tuple[Ca
         assert report.cost == pytest.approx(solution.cost, rel=1e-9, abs=1e-13 * report.scale), case
         assert report.residual < 1e-12, case
         assert report.decrease < TOLERANCE, case
-        assert report.stationarity < CANCELS * TOLERANCE**0.5, case
-        if solution.cost > 1e-20 * report.scale:  # of less, it is a share of rounding; at a box's edge curvature jumps
+        if solution.cost > 1e-20 * report.scale:  # of less, they are shares of rounding
+            assert report.stationarity < CANCELS * TOLERANCE**0.5, case
+            # 1 %: at a box's edge, curvature jumps.
             assert solution.optimality == pytest.approx(report.decrease, rel=1e-2, abs=1e-9), case
         last = solution.iterations[-1]
         assert abs(last.improvement) < TOLERANCE, case
@@ -134,7 +135,7 @@ def test_what_other_endings_claim_is_so(cases: list[Case]) -> None:
         ), case  # fmt: skip
         assert solution.status.remedy
         if solution.status is Status.MAX_ITERATIONS:
-            assert len(solution.iterations) >= 200 or "line search" in solution.detail, case
+            assert len(solution.iterations) >= 500 or "line search" in solution.detail, case
             last = solution.iterations[-1]
             passed = (abs(last.improvement) < TOLERANCE, last.gap < 1e-3, solution.optimality < TOLERANCE)
             assert not all(passed), case
@@ -183,7 +184,7 @@ class TestOracle:
                     continue
                 states, controls, cost = solve_dense(discretise(problem))
                 # From anywhere at all: the model of such a problem is the problem.
-                report = kkt.check(problem, ls.smooth(problem, max_iterations=1))
+                report = kkt.check(problem, ls.smooth(problem, max_iterations=1, safeguard=False))
                 np.testing.assert_allclose(report.states, states, rtol=0, atol=1e-8 * max(1.0, np.abs(states).max()))
                 np.testing.assert_allclose(
                     report.controls, controls, rtol=0, atol=1e-8 * max(1.0, np.abs(controls).max())

@@ -5,6 +5,7 @@ horizons up to 12), and two ways of solving the same linear system differ by rou
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,10 +27,10 @@ def stage_of(problem: LinearQuadratic) -> ls.Stage:
 
 
 def smoothed(problem: LinearQuadratic, form: str) -> ls.Solution:
-    initial = problem.fixed if problem.fixed is not None else (problem.Q0, problem.q0, problem.k0)
+    start = ls.Quadratic(problem.Q0, problem.q0, problem.k0)
     solution = ls.smooth_lq(
         stage_of(problem),
-        initial=ls.FixedState(initial) if problem.fixed is not None else ls.Quadratic(*initial),
+        initial=start if problem.fixed is None else ls.FixedState(problem.fixed),
         final=ls.Quadratic(problem.QT, problem.qT, problem.kT),
         form=form,
     )
@@ -128,7 +129,7 @@ def test_value_functions_are_the_cost_of_the_rest_of_the_way(seed: int, steps: i
     cost += 0.5 * x @ problem.QT @ x + problem.qT @ x + problem.kT
     value = solution.cost_to_go
     assert value is not None
-    at_start = 0.5 * start @ value.hessian[0] @ start + value.gradient[0] @ start + value.constant[0]
+    at_start = 0.5 * start @ value.hessian[0] @ start + value.gradient[0] @ start + np.asarray(value.constant)[0]
     assert abs(at_start - cost) <= 1e-9 * max(1.0, abs(cost))
 
 
@@ -147,7 +148,7 @@ FLAT = ls.Quadratic(np.diag([1.0, 0.0]), np.zeros(2), np.array(0.0))
 STEP = ls.Stage(A=np.eye(2), B=np.ones((4, 2, 1)), R=[[1.0]])
 
 
-def lq(stage: ls.Stage = STEP, *, initial=END, final=END, form: str = "dual", dt: float = 1.0) -> ls.Solution:
+def lq(stage: ls.Stage = STEP, *, initial: Any = END, final: Any = END, form: str = "dual", dt: float = 1.0) -> Any:
     return ls.smooth_lq(stage, initial=initial, final=final, form=form, dt=dt)
 
 

@@ -10,6 +10,8 @@ from tqdm import tqdm
 
 import lqrsim as ls
 from lqrsim.costs import terms_of
+from lqrsim.errors import check_name
+from reliability.problems import KINDS
 
 Section = Literal["stiff", "fragile", "random", "overhead", "ablation"]
 
@@ -24,6 +26,8 @@ class Config:
     """Of the queries, and of the random problems."""
     share: float = 1.0
     """Of the thousand random problems."""
+    kinds: tuple[str, ...] = KINDS
+    """Of random problems."""
     sample: int = 10
     """How many random problems of each kind iLQR tries to improve on."""
     rounds: int = 5
@@ -34,6 +38,10 @@ class Config:
     """8 queries, a fiftieth of the random problems, 2 rounds."""
     json: bool = False
     """Print everything, query by query, as JSON instead of the tables."""
+
+    def __post_init__(self) -> None:
+        for kind in self.kinds:
+            check_name("kinds", kind, KINDS)
 
 
 def queries(config: Config, count: int | None = None, *, soft: bool = False) -> list[ls.Problem]:

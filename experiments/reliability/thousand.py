@@ -3,14 +3,14 @@
 from typing import Any
 
 from reliability.common import Config, converged, endings, improvements, mean, solve, summary, worst
-from reliability.problems import KINDS, thousand
+from reliability.problems import thousand
 
 
 def measure(config: Config) -> dict[str, Any]:
-    drawn = list(thousand(config.seed, share=config.share))
+    drawn = [(kind, problem) for kind, problem in thousand(config.seed, share=config.share) if kind in config.kinds]
     solutions = solve(config, [problem for _, problem in drawn], "random")
     found: dict[str, Any] = {}
-    for kind in KINDS:
+    for kind in config.kinds:
         pairs = [(problem, solution) for (of, problem), solution in zip(drawn, solutions, strict=True) if of == kind]
         found[kind] = summary([solution for _, solution in pairs]) | {
             "improvement": improvements(pairs[: config.sample], f"random, improving {kind}")

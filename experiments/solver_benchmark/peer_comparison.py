@@ -1,5 +1,6 @@
 """lqrsim against other people's solvers: time of a query, and what the plan costs from a start given exactly."""
 
+import dataclasses
 import time
 from collections import namedtuple
 from collections.abc import Callable
@@ -26,12 +27,13 @@ class Solved:
     gain: Array
     offset: Array
     cost: float
-    """As the solver has it; the smoother's is of another start."""
+    """As the solver has it."""
 
 
 def measure(config: Config) -> dict[str, Any]:
     """Query by query: lqrsim's solvers and Crocoddyl's, and what the plan of each costs from the given start."""
-    problems = make_problems(config)
+    # All from exactly the same start.
+    problems = [exactly(problem) for problem in make_problems(config)]
     crocoddyl = peers.Crocoddyl(problems[0])
 
     def ours(solver: str) -> Callable[[ls.Problem], Solved]:
@@ -74,11 +76,16 @@ def measure(config: Config) -> dict[str, Any]:
             "converged": [solved.converged for solved in first],
             "iterations": [solved.iterations for solved in first],
             "cost": costs,
-            # The smoother's own cost includes its soft start.
-            "cost_difference": None if name.startswith("smooth") else float(np.abs(own / costs - 1).max()),
+            "cost_difference": float(np.abs(own / costs - 1).max()),
             "milliseconds": [1e3 * value for value in seconds],
         }
     return result
+
+
+def exactly(problem: ls.Problem) -> ls.Problem:
+    """The same from the start that is asked for, given."""
+    assert problem.start is not None
+    return dataclasses.replace(problem, initial=ls.FixedState(problem.start))
 
 
 def true_cost(problem: ls.Problem, solved: Solved) -> float:

@@ -17,6 +17,9 @@ import numpy as np
 import lqrsim as ls
 from solver_benchmark.common import MANY, Config, median, progress
 
+# As many iterations as are asked for, and no safeguard that goes on after.
+SOLVERS: dict[str, Callable[..., ls.Solution]] = {"smooth": partial(ls.smooth, safeguard=False), "ilqr": ls.ilqr}
+
 
 def measure(config: Config) -> dict[str, Any]:
     """Both solvers on chains of masses: more of them, and more steps."""
@@ -31,7 +34,7 @@ def measure(config: Config) -> dict[str, Any]:
                 nothing_cached = {} if config.quick else {"LQRSIM_CACHE_DIR": folder}
                 with mock.patch.dict(os.environ, nothing_cached):
                     clock = time.perf_counter()
-                    getattr(ls, solver)(problem, max_iterations=1)
+                    SOLVERS[solver](problem, max_iterations=1)
                     compiling = time.perf_counter() - clock
             seconds = _iteration_seconds(solver, problem, 10, config.rounds)
             result["states"].append(
@@ -41,7 +44,7 @@ def measure(config: Config) -> dict[str, Any]:
         problem = dataclasses.replace(chain_of_masses(1 if config.quick else 4), steps=count)
         for solver in ("smooth", "ilqr"):
             seconds = _iteration_seconds(solver, problem, 3, config.rounds)
-            solve = partial(getattr(ls, solver), problem, max_iterations=3, stop="cost")
+            solve = partial(SOLVERS[solver], problem, max_iterations=3, stop="cost")
             result["steps"].append(
                 {
                     "solver": solver,
@@ -58,7 +61,7 @@ def _iteration_seconds(solver: str, problem: ls.Problem, iterations: int, rounds
     """Median time of the iterations between: the first meets untouched memory, the last works out the optimality."""
     seconds: list[float] = []
     for _ in range(rounds):
-        solution = getattr(ls, solver)(problem, max_iterations=iterations, stop="cost", tolerance=1e-300)
+        solution = SOLVERS[solver](problem, max_iterations=iterations, stop="cost", tolerance=1e-300)
         if not math.isfinite(solution.cost):
             raise AssertionError(f"{solver}, {problem.steps} steps: {solution.status}")
         seconds += [iteration.seconds for iteration in solution.iterations[1:-1]]

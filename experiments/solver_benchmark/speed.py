@@ -17,7 +17,17 @@ from peers import Unavailable
 
 import lqrsim as ls
 from solver_benchmark import by_hand
-from solver_benchmark.common import MANY, TARGETS, Config, judge, make_batches, make_problems, median, take_turns
+from solver_benchmark.common import (
+    MANY,
+    PRIMAL,
+    TARGETS,
+    Config,
+    judge,
+    make_batches,
+    make_problems,
+    median,
+    take_turns,
+)
 
 
 @dataclass(frozen=True)
@@ -30,6 +40,7 @@ class Turn:
     costs: list[float]
 
 
+SOLVERS = MANY | PRIMAL
 # Whose time is divided by whose.
 PAIRS = ("symbolic / reference", "symbolic / by hand", "compiled level / symbolic")
 
@@ -53,7 +64,7 @@ def measure(config: Config) -> dict[str, Any]:
     def ours(solver: str, queries: list[ls.Problem]) -> Callable[[slice], Turn]:
         def run(batch: slice) -> Turn:
             clock = time.perf_counter()
-            solutions = MANY[solver](queries[batch], threads=1, stop="cost")
+            solutions = SOLVERS[solver](queries[batch], threads=1, stop="cost")
             seconds = time.perf_counter() - clock
             loop = sum(iteration.seconds for solution in solutions for iteration in solution.iterations)
             counts = [len(solution.iterations) for solution in solutions]
@@ -61,8 +72,8 @@ def measure(config: Config) -> dict[str, Any]:
 
         return run
 
-    for solver in MANY:
-        contestants = {name: ours(solver, one) for name, one in stated.items()}
+    for solver in SOLVERS:
+        contestants = {name: ours(solver, one) for name, one in stated.items() if name == "symbolic" or solver in MANY}
         if reference is not None:
             contestants["reference"] = _reference_turn(reference, solver, config)
         for run in contestants.values():
@@ -89,7 +100,7 @@ def _compare(turns: Mapping[str, list[list[Turn]]]) -> dict[str, Any]:
 
     for pair in PAIRS:
         one, other = pair.split(" / ")
-        if other in turns:
+        if one in turns and other in turns:
             found[pair] = ratio(one, other, "seconds")
             found[f"{pair}, loop"] = ratio(one, other, "loop")
     if "reference" in turns:
@@ -102,12 +113,12 @@ def _compare(turns: Mapping[str, list[list[Turn]]]) -> dict[str, Any]:
 def _reference_turn(reference: ModuleType, solver: str, config: Config) -> Callable[[slice], Turn]:
     starts, goals = ls.scenarios.quadrotor_queries(config.queries, seed=config.seed)
     # The prior is a hint to the smoother; lqrsim's iLQR has none.
-    name, prior = ("smoother", 0.3) if solver == "smooth" else ("ilqr", 0.0)
+    name, prior = ("ilqr", 0.0) if solver == "ilqr" else ("smoother", 0.3)
 
     def run(batch: slice) -> Turn:
         iterations, costs, seconds = reference.solve(starts[batch], goals[batch], name, prior=prior)
         # Its iLQR logs the cost of the first rollout too, before the iterations.
-        last = iterations - 1 if solver == "smooth" else iterations
+        last = iterations if solver == "ilqr" else iterations - 1
         return Turn(seconds, seconds, iterations.tolist(), [costs[i, k] for i, k in enumerate(last)])
 
     return run
@@ -136,7 +147,7 @@ def load_reference(config: Config) -> ModuleType:
 
 def table(found: dict[str, Any]) -> str:
     rows = [f"speed, one thread: {'ms/iteration':>22} {'in the loop':>12} {'iterations':>11} {'mean cost':>10}"]
-    for solver in MANY:
+    for solver in SOLVERS:
         for name in ("reference", "symbolic", "by hand", "compiled level"):
             if name in found[solver]:
                 one = found[solver][name]
@@ -144,7 +155,7 @@ def table(found: dict[str, Any]) -> str:
                     f"  {solver:<8} {name:<16} {one['milliseconds']:>12.3f} {one['milliseconds_loop']:>12.3f}"
                     f" {np.mean(one['iterations']):>11.2f} {np.mean(one['cost']):>10.3f}"
                 )
-    for solver in MANY:
+    for solver in SOLVERS:
         for pair in PAIRS:
             if pair in found[solver]:
                 ratio, loop = found[solver][pair], found[solver][f"{pair}, loop"]

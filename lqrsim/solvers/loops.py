@@ -42,23 +42,11 @@ from lqrsim.solvers.passes import (
 
 
 def relative_improvement(old, cost, nothing):
-    """The decrease of cost relative to what is left; 0 for no change, at a cost of zero too."""
-    return 0.0 if old == cost else (old - cost) / max(abs(cost), nothing)
+    """The decrease of cost relative to what is left; 0 for no change, at a cost of zero too.
 
-
-def nothing_left(x, S, s, k):
-    """What is as good as a cost of zero, given the cost-to-go at a start x.
-
-    Where the least cost is zero, what remains are squares of rounding errors, which never settle. They are measured by
-    the terms that cancel in the cost-to-go.
+    Costs below `nothing` are zero but for rounding: what there is of them never settles.
     """
-    scale = abs(k)
-    for i in range(N):
-        curved = 0.0
-        for j in range(N):
-            curved += S[i, j] * x[j]
-        scale += abs(0.5 * curved * x[i]) + abs(s[i] * x[i])
-    return max(1e-20 * scale, 1e-300) if scale < inf else 1e-300
+    return 0.0 if old == cost else (old - cost) / max(abs(cost), nothing)
 
 
 def smoother_iterations(
@@ -100,7 +88,7 @@ def smoother_iterations(
         )  # fmt: skip
         if failed >= 0:
             return done, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, False, failed
-        failed, good = backward_pass(
+        failed, good, nothing = backward_pass(
             steps, fixed, 1.0, 0.0, plan_x, plan_u,
             x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, weight, prior_about,
         )  # fmt: skip
@@ -111,7 +99,6 @@ def smoother_iterations(
         if cost < best[0]:
             best[0] = cost
             keep_plan(steps, states, controls, plan_x, plan_u)
-        nothing = nothing_left(x_hat, S[0], s[0], k[0])
         improvement = relative_improvement(log[done - 1, 0] if done > 0 else inf, cost, nothing)
         gap = largest_gap(steps, x_hats, states)
         settled = abs(improvement) < tolerance and (gap < gap_tolerance or not optimal)
@@ -152,7 +139,7 @@ def keep_plan(steps, states, controls, plan_x, plan_u):
 
 def relative_optimality(failed, decrease, cost, nothing):
     """A promised decrease relative to the cost; infinite where the pass failed that was to tell it."""
-    return decrease / max(abs(cost), nothing) if failed < 0 and decrease < inf else inf
+    return decrease / max(abs(cost), nothing, 1e-300) if failed < 0 and decrease < inf else inf
 
 
 def ending(settled, optimal, left, tolerance, cost, full):
@@ -213,13 +200,12 @@ def ilqr_iterations(
         )
         if fraction > 0:
             keep_plan(steps, new_states, new_controls, states, controls)
-        nothing = nothing_left(states[0], S[0], s[0], k[0])
-        improvement = relative_improvement(old, cost, nothing)
+        improvement = relative_improvement(old, cost, 0.0)
         settled = abs(improvement) < tolerance
         left = nan
         if settled or done + 1 == max_iterations:
             failed, _, left = differential_pass(steps, states, controls, p, dt, stage, final, 0.0, 1, L, l, S, s, k)
-            left = relative_optimality(failed, left, cost, nothing)
+            left = relative_optimality(failed, left, cost, 0.0)
         write_row(log, done, cost, improvement, 0.0, left, 0.0, ILQR)
         outcome = ending(settled, optimal, left, tolerance, cost, done + 1 == max_iterations)
         if outcome == RUNNING and fraction == 0:

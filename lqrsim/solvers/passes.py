@@ -96,14 +96,13 @@ def end_model(hessian, gradient, value, x, S, s):
 def begin_model(x, initial, fixed, damping, plan_x, C, b):
     """Write the cost-to-come at 0, with c_0 quadratised at x, and return its constant; or of a start that is given.
 
-    Returns also whether there is one.
+    Returns also whether there is one, and what the quadratic of c_0 is at the origin.
     """
     hessian, gradient, Q, q, none = stack(W, W), stack(W), stack(N, N), stack(N), stack(M)
     if fixed:
         clear(C, N, N)
-        for i in range(N):
-            b[i] = x[i]
-        return 0.0, True
+        copy(x, N, b)
+        return 0.0, True, 0.0
     value = initial_quadratic(x, none, 0, initial, hessian, gradient)
     if damping > 0:
         for i in range(N):
@@ -112,7 +111,8 @@ def begin_model(x, initial, fixed, damping, plan_x, C, b):
             gradient[i] += weight * error
             value += 0.5 * weight * error * error
     constant = end_model(hessian, gradient, value, x, Q, q)
-    return begin(Q, q, constant, x, C, b)
+    k, good = begin(Q, q, constant, x, C, b)
+    return k, good, constant
 
 
 def forward_pass(
@@ -129,7 +129,7 @@ def forward_pass(
     fx, fu, x_next, costate, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(M)
     clear(fx, N, N)
     clear(fu, N, M)
-    kbar[0], good = begin_model(x_hat, initial, fixed, damping, plan_x, C[0], b[0])
+    kbar[0], good, _ = begin_model(x_hat, initial, fixed, damping, plan_x, C[0], b[0])
     if not good:
         return 0, finite(C[0], N, N)
     for t in range(steps):
@@ -171,13 +171,17 @@ def backward_pass(
     `x_hat` (N,) is, on return, the minimiser at 0, where c_0 was quadratised anew. Writes all the minimisers to
     `x_hats` (T+1, N). What is linearised about lies a fraction `reach` of the way from the plan to where the minimisers
     lead: all of it in the paper's method. The rest is as in `forward_pass`.
+
+    Returns also a cost that is as good as none. Where the least cost is zero, squares of rounding errors remain of it.
+    They are measured by what the quadratic models are at the origin, from which they rise or fall to the plan.
     """
     hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
     fx, fu, x_next, x, u, costate = stack(N, N), stack(N, M), stack(N), stack(N), stack(M), stack(N)
     clear(fx, N, N)
     clear(fu, N, M)
     if not minimizer(S[steps], s[steps], C[steps], b[steps], costate, x_hat):
-        return steps, finite(S[steps], N, N) and finite(C[steps], N, N)
+        return steps, finite(S[steps], N, N) and finite(C[steps], N, N), 0.0
+    size = abs(k[steps])
     for t in range(steps - 1, -1, -1):
         copy(x_hat, N, x_hats[t + 1])
         depart(x_hat, costate, G[t], a[t], Lbar[t], lbar[t], p, dt, x, u)
@@ -189,18 +193,20 @@ def backward_pass(
         step_jacobian(x, u, p, dt, fx, fu, x_next, jacobian)
         offset(jacobian, x, u, x_next, c)
         constant = stage_model(x, u, t, stage, prior_weight, prior_about, damping, plan_u, hessian, gradient)
+        size += abs(constant)
         k[t], good = riccati_backward(
             jacobian, c, hessian, gradient, constant, S[t + 1], s[t + 1], k[t + 1], L[t], l[t], S[t], s[t]
         )
         if not good or not minimizer(S[t], s[t], C[t], b[t], costate, x_hat):
-            return t, finite(hessian, W, W) and finite(jacobian, N, W) and finite(C[t], N, N)
+            return t, finite(hessian, W, W) and finite(jacobian, N, W) and finite(C[t], N, N), 0.0
     good = True
     if not fixed:
-        kbar[0], good = begin_model(x_hat, initial, fixed, damping, plan_x, C[0], b[0])
+        kbar[0], good, constant = begin_model(x_hat, initial, fixed, damping, plan_x, C[0], b[0])
+        size += abs(constant)
     if not good or not minimizer(S[0], s[0], C[0], b[0], costate, x_hat):
-        return 0, finite(S[0], N, N) and finite(C[0], N, N)
+        return 0, finite(S[0], N, N) and finite(C[0], N, N), 0.0
     copy(x_hat, N, x_hats[0])
-    return -1, True
+    return -1, True, 1e-20 * size
 
 
 def opening_pass(

@@ -9,7 +9,7 @@ from math import inf, isnan, nan
 
 from lqrsim.solvers.interface import DAMPED, ILQR, MAX_ITERATIONS, REJECTED, RUNNING, STALLED, M, N, stack
 from lqrsim.solvers.kernels import affine
-from lqrsim.solvers.loops import ending, keep_plan, nothing_left, optimality, relative_improvement, write_row
+from lqrsim.solvers.loops import ending, keep_plan, optimality, relative_improvement, write_row
 from lqrsim.solvers.passes import backward_pass, copy, dynamics_residual, forward_pass, largest_gap, line_search
 
 
@@ -36,14 +36,14 @@ def damped_iterations(
     """
     shift = stack(N)
     for done in range(first, last):
-        reach, weight = best[1], best[2]
+        reach, weight, nothing = best[1], best[2], 0.0
         copy(start if fixed else plan_x[0], N, x_hat)
         failed, _ = forward_pass(
             steps, fixed, True, weight, plan_x, plan_u,
             x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final, no_weight, no_about,
         )  # fmt: skip
         if failed < 0:
-            failed, _ = backward_pass(
+            failed, _, nothing = backward_pass(
                 steps, fixed, reach, weight, plan_x, plan_u, x_hat, x_hats,
                 L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, no_weight, no_about,
             )  # fmt: skip
@@ -59,7 +59,7 @@ def damped_iterations(
             )
         full = done + 1 == max_iterations
         if fraction > 0:
-            improvement = relative_improvement(best[0], cost, nothing_left(x_hat, S[0], s[0], k[0]))
+            improvement = relative_improvement(best[0], cost, nothing)
             follow(steps, fraction, plan_x, x_hats)
             # At reach 0 as for iLQR: nothing but a rollout was linearised about.
             gap = largest_gap(steps, x_hats, states) if reach > 0 else 0.0
@@ -121,19 +121,19 @@ def relinearize(
     no_weight, no_about, plan_x, plan_u, best, log, done,
 ):  # fmt: skip
     """Both passes about the plan, without a weight. Writes optimality and residual to the log; returns the outcome."""
+    nothing = 0.0
     copy(start if fixed else plan_x[0], N, x_hat)
     failed, _ = forward_pass(
         steps, fixed, True, 0.0, plan_x, plan_u,
         x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final, no_weight, no_about,
     )  # fmt: skip
     if failed < 0:
-        failed, _ = backward_pass(
+        failed, _, nothing = backward_pass(
             steps, fixed, 0.0, 0.0, plan_x, plan_u, x_hat, x_hats,
             L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, no_weight, no_about,
         )  # fmt: skip
     if failed >= 0:
         return RUNNING
-    nothing = nothing_left(plan_x[0], S[0], s[0], k[0])
     left = optimality(steps, fixed, plan_x, plan_u, best[0], nothing, p, dt, initial, stage, final)
     log[done, 3], log[done, 4] = left, dynamics_residual(steps, x_hats, L, l, p, dt, plan_x)
     if isnan(log[done, 2]):  # of an iteration that was rejected

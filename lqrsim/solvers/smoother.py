@@ -50,6 +50,7 @@ def smooth(
       problem: with an initial cost, the paper's soft start, or a `FixedState`, which only the dual form takes.
       form: "dual" has the cost-to-come by its moments and needs no inverse dynamics; "primal" is the paper's.
       first_pass: "forward" or "backward"; each iteration ends with a backward pass, so the latter is one pass more.
+        From controls it runs the dynamics backwards in time, from the minimiser of the final cost.
       safeguard: where the method fails, go on from the best plan so far by steps that lower its cost; see
         `solvers/safeguard.py`. Where it converges, the safeguard changes nothing, to the last bit.
       stop: "optimal" (change of cost, gap and first-order optimality all within tolerance) or "cost", the paper's
@@ -138,7 +139,7 @@ class _Arrays:
         self.go = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
         if begin.cost_to_go is not None:
             value = begin.cost_to_go
-            self.go = value.hessian.copy(), value.gradient.copy(), value.constant.copy()
+            self.go = value.hessian.copy(), value.gradient.copy(), np.array(value.constant)
         self.come = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
         kept = steps if self.dual else 1  # the primal form finds its way back without
         self.back = zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))
@@ -185,6 +186,8 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
     control = begin.offset[0].copy()
     check_functions(problem, start, control)
+    if settings.first_pass == "backward" and begin.gain.any():
+        begin = begin.rolled_out(problem, start)
     arrays = _Arrays(problem, settings, begin, start)
     ending = _undamped(problem, settings, begin, arrays, each=each, callback=callback)
     checked = check_outcome(problem, ending, start, control, refuse=each)

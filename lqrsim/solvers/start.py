@@ -1,7 +1,7 @@
 """What a solver may begin with: nothing, controls, a policy, a trajectory or a solution."""
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,15 @@ class Start:
     cost_to_go: Quadratic | None
     trajectory: Trajectory | None
     summary: object
+
+    def rolled_out(self, problem: Problem, x: Array) -> "Start":
+        """With the trajectory of the policy from a state (n,): what a backward pass that comes first is about."""
+        states, controls = [x], []
+        with np.errstate(all="ignore"):
+            for gain, offset in zip(self.gain, self.offset, strict=True):
+                controls.append(gain @ states[-1] + offset)
+                states.append(problem.dynamics.step(states[-1], controls[-1], problem.dt))
+        return replace(self, trajectory=Trajectory(np.array(states), np.array(controls), problem.dt))
 
 
 def resolve(start: StartLike, problem: Problem) -> Start:
