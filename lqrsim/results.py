@@ -252,14 +252,15 @@ class Iteration:
       cost: true cost of rolling the policy out under the true dynamics.
       improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration.
       gap: largest difference between the minimal-total-cost states and that rollout, each state relative to its
-        range along the rollout (at least 1 unit).
+        range along the rollout (at least 1 unit). Where the safeguard went part of the way, they are taken there; 0 for
+        steps of iLQR, which has none.
       optimality: the decrease that a linear-quadratic model about the rollout still predicts, relative to the cost; NaN
         where it was not evaluated (it is once the other tests pass, and after the last iteration).
       dynamics_residual: how far one step of the true dynamics takes a minimal-total-cost state from the next one, at
         most; relative as the gap is, and evaluated where the optimality is. The plan itself is a rollout, and has none.
       seconds: time this iteration took.
-      method: "smooth", the paper's; of the safeguard's: "damped", "rejected" (damped, but it would have cost more, or a
-        pass failed; cost is that of the plan that was kept), or "ilqr".
+      method: "smooth", the paper's; of the safeguard's: "damped", "ilqr" where its step is that of iLQR, or "rejected"
+        (it would have cost more, or a pass failed; cost is that of the plan that was kept).
     """
 
     cost: float

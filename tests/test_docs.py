@@ -78,3 +78,10 @@ def test_a_policy_is_loaded_with_numpy_alone(
     for t in (0.0, 3.3, 24.99, 30.0):
         state = drive_solution.trajectory.states[min(int(6 * t), 149)] + [0.02, -0.01, 6 * np.pi + 0.1]
         np.testing.assert_allclose(control(state, t), drive_solution.policy(state, t), rtol=0, atol=1e-12)
+
+
+def test_forms_starts_and_endings() -> None:
+    names = run_page("solving.md")
+    np.testing.assert_allclose(names["least"], names["solution"].cost, rtol=1e-3)
+    assert "pass of iteration" in names["safe"].detail
+    assert names["control"].shape == (2,)

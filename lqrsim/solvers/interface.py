@@ -21,6 +21,9 @@ NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED = 5, 6, 7, 8
 # What an iteration was; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
 
+# How many iterations the safeguard goes on with before it tries what iLQR does for a while.
+PATIENCE = 50
+
 
 def stack(*shape: int) -> np.ndarray:
     """An uninitialised float64 array of constant shape, on the stack of the compiled function."""

@@ -7,7 +7,7 @@ where the method converges. What Levenberg-Marquardt is to Gauss-Newton, the dam
 
 from math import inf, isnan, nan
 
-from lqrsim.solvers.interface import DAMPED, ILQR, MAX_ITERATIONS, REJECTED, RUNNING, STALLED, M, N, stack
+from lqrsim.solvers.interface import DAMPED, ILQR, MAX_ITERATIONS, PATIENCE, REJECTED, RUNNING, STALLED, M, N, stack
 from lqrsim.solvers.kernels import affine
 from lqrsim.solvers.loops import ending, keep_plan, optimality, relative_improvement, write_row
 from lqrsim.solvers.passes import backward_pass, copy, dynamics_residual, forward_pass, largest_gap, line_search
@@ -31,8 +31,9 @@ def damped_iterations(
     about the plan and without a weight, to tell how far it is from optimal; that also gives the policy and the value
     functions of the answer.
 
-    `best` (6,) is the cost of the plan, reach, weight, how many small changes there were in a row, and of iterations at
-    reach 0 how many are left, and how many there will be the next time.
+    `best` (7,) is the cost of the plan, reach, weight, how many small changes there were in a row; of iterations at
+    reach 0 how many are left, and how many there will be the next time; and of others how many there were since. After
+    too many of those without an end, too, reach 0 has its turn, each time for twice as long.
     """
     shift = stack(N)
     for done in range(first, last):
@@ -71,6 +72,9 @@ def damped_iterations(
                 best[2] = 0.1 * weight if weight > 1e-6 else 0.0
             elif reach > 0:
                 best[1] = min(2 * reach, 1.0) if fraction == 1 else reach
+                best[6] += 1
+                if best[6] > PATIENCE:
+                    best[1], best[4], best[5], best[6] = 0.0, best[5], 2 * best[5], 0.0
             else:
                 best[4] -= 1
                 best[1] = 0.25 if best[4] <= 0 else 0.0

@@ -154,7 +154,7 @@ class _Arrays:
             self.plan = begin.trajectory.states.copy(), begin.trajectory.controls.copy()
         self.states, self.controls = zeros((steps + 1, n)), zeros((steps, m))
         self.kept = zeros((steps, m, n)), zeros((steps, m))
-        self.best = zeros(6)
+        self.best = zeros(7)
         self.model = model(problem)
 
     @property
@@ -242,7 +242,7 @@ def _rescue(
         settings.max_iterations, settings.tolerance, float(settings.gap_tolerance or 0), settings.stop == "optimal",
         arrays.fixed,
     )  # fmt: skip
-    arrays.best[1:] = 1.0, 0.0, 0.0, 0.0, 2.0  # all of the way, and no weight
+    arrays.best[1:] = 1.0, 0.0, 0.0, 0.0, 2.0, 0.0  # all of the way, and no weight
     more = *arrays.no_prior, *arrays.plan, arrays.states, arrays.controls, arrays.best, log
     loop = core.entry("damped_iterations", problem.steps, 0, 0, *stops, *arrays.passes, *more)
     damped = iterate(
