@@ -22,7 +22,7 @@ from lqrsim.costs import Term
 from lqrsim.dynamics import Dynamics
 from lqrsim.errors import Array
 from lqrsim.problem import Problem
-from lqrsim.solvers import dual, interface, kernels, loops, lq_passes, passes, primal, projection, safeguard
+from lqrsim.solvers import dual, interface, kernels, loops, lq_passes, passes, primal, projection, rollouts, safeguard
 from lqrsim.world import World
 
 # The terms of a cost as far as they are structure: the source of each, and what it may bend in (see `Term`).
@@ -55,7 +55,7 @@ def _core(form: str, n: int, m: int, dynamics: str, costs: tuple[tuple[str, Stru
     return Core("\n\n".join(parts), {"N": n, "M": m, "W": n + m, **_OUTCOMES}, what)
 
 
-_SHARED = passes, loops, safeguard
+_SHARED = passes, rollouts, loops, safeguard
 
 
 @cache

@@ -21,7 +21,11 @@ NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED = 5, 6, 7, 8
 # What an iteration was; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
 
-# How many iterations the safeguard goes on with before it tries what iLQR does for a while.
+# The safeguard's memory: the cost of the plan; how far the next iteration reaches, and the weight on changes of the
+# controls; how many small changes there were in a row; of iterations at reach 0, iLQR's, how many are left, how many
+# there will be the next time, and how many others there were since, of which PATIENCE are enough.
+PLAN_COST, REACH, WEIGHT, SMALL, ILQR_LEFT, ILQR_NEXT, SINCE_ILQR = 0, 1, 2, 3, 4, 5, 6
+MEMORY = 7
 PATIENCE = 50
 
 

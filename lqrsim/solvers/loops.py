@@ -17,6 +17,7 @@ from lqrsim.solvers.interface import (
     NO_START,
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
+    PLAN_COST,
     RUNNING,
     SMOOTH,
     STALLED,
@@ -24,16 +25,15 @@ from lqrsim.solvers.interface import (
     N,
     stack,
 )
-from lqrsim.solvers.passes import (
-    backward_pass,
-    copy,
+from lqrsim.solvers.passes import backward_pass, copy, forward_pass, opening_pass
+from lqrsim.solvers.rollouts import (
     differential_pass,
     dynamics_residual,
-    forward_pass,
     initial_step,
+    keep_law,
+    keep_plan,
     largest_gap,
     line_search,
-    opening_pass,
     rollout,
 )
 
@@ -52,23 +52,23 @@ def relative_improvement(old, cost, nothing):
 def smoother_iterations(
     steps, first, last, max_iterations, tolerance, gap_tolerance, optimal, fixed, guided, opening,
     start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-    prior_weight, prior_about, prior_iterations, plan_x, plan_u, states, controls, kept_L, kept_l, best, log,
+    prior_weight, prior_about, prior_iterations, plan_x, plan_u, states, controls, kept_L, kept_l, memory, log,
 ):  # fmt: skip
     """Iterated LQR smoothing: a forward pass, a backward pass and the rollout of the new policy, again and again.
 
     L, l, S, s are the policy and the cost-to-go to begin with. With `guided`, the first pass linearises about the plan;
     with `opening`, a backward pass comes first, on its own. `states`, `controls`, `kept_L`, `kept_l` are what the last
     iteration that was completed found; before any, where the first policy leads. From the first iteration on the plan
-    is the rollout of least cost so far, and best[0] that cost: no business of the method, but the safeguard's.
+    is the rollout of least cost so far, and memory[PLAN_COST] that cost: for the safeguard.
     """
     no_weight = stack(N)
     for i in range(N):
         no_weight[i] = 0.0
     if first == 0:
-        best[0] = rollout(steps, start, L, l, p, dt, initial, stage, final, states, controls)
+        memory[PLAN_COST] = rollout(steps, start, L, l, p, dt, initial, stage, final, states, controls)
         keep_law(steps, L, l, kept_L, kept_l)
-        if guided or opening or not best[0] < inf:
-            best[0] = inf  # a plan that is needed first, or cannot be rolled out
+        if guided or opening or not memory[PLAN_COST] < inf:
+            memory[PLAN_COST] = inf  # a plan that is needed first, or cannot be rolled out
         else:
             keep_plan(steps, states, controls, plan_x, plan_u)
         copy(start, N, x_hat)
@@ -96,8 +96,8 @@ def smoother_iterations(
             return done, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, True, failed
         cost = rollout(steps, x_hat, L, l, p, dt, initial, stage, final, states, controls)
         keep_law(steps, L, l, kept_L, kept_l)
-        if cost < best[0]:
-            best[0] = cost
+        if cost < memory[PLAN_COST]:
+            memory[PLAN_COST] = cost
             keep_plan(steps, states, controls, plan_x, plan_u)
         improvement = relative_improvement(log[done - 1, 0] if done > 0 else inf, cost, nothing)
         gap = largest_gap(steps, x_hats, states)
@@ -129,14 +129,6 @@ def write_row(log, row, cost, improvement, gap, left, residual, method):
     log[row, 4], log[row, 5] = residual, method
 
 
-def keep_plan(steps, states, controls, plan_x, plan_u):
-    """Copy a trajectory."""
-    for t in range(steps + 1):
-        copy(states[t], N, plan_x[t])
-    for t in range(steps):
-        copy(controls[t], M, plan_u[t])
-
-
 def relative_optimality(failed, decrease, cost, nothing):
     """A promised decrease relative to the cost; infinite where the pass failed that was to tell it."""
     return decrease / max(abs(cost), nothing, 1e-300) if failed < 0 and decrease < inf else inf
@@ -151,15 +143,6 @@ def ending(settled, optimal, left, tolerance, cost, full):
     if full:
         return MAX_ITERATIONS if abs(cost) < inf else DIVERGED
     return RUNNING
-
-
-def keep_law(steps, L, l, kept_L, kept_l):
-    """Copy a policy."""
-    for t in range(steps):
-        for i in range(M):
-            kept_l[t, i] = l[t, i]
-            for j in range(N):
-                kept_L[t, i, j] = L[t, i, j]
 
 
 def ilqr_iterations(

@@ -7,16 +7,33 @@ where the method converges. What Levenberg-Marquardt is to Gauss-Newton, the dam
 
 from math import inf, isnan, nan
 
-from lqrsim.solvers.interface import DAMPED, ILQR, MAX_ITERATIONS, PATIENCE, REJECTED, RUNNING, STALLED, M, N, stack
-from lqrsim.solvers.kernels import affine
-from lqrsim.solvers.loops import ending, keep_plan, optimality, relative_improvement, write_row
-from lqrsim.solvers.passes import backward_pass, copy, dynamics_residual, forward_pass, largest_gap, line_search
+from lqrsim.solvers.interface import (
+    DAMPED,
+    ILQR,
+    ILQR_LEFT,
+    ILQR_NEXT,
+    MAX_ITERATIONS,
+    PATIENCE,
+    PLAN_COST,
+    REACH,
+    REJECTED,
+    RUNNING,
+    SINCE_ILQR,
+    SMALL,
+    STALLED,
+    WEIGHT,
+    N,
+    stack,
+)
+from lqrsim.solvers.loops import ending, optimality, relative_improvement, write_row
+from lqrsim.solvers.passes import backward_pass, copy, forward_pass
+from lqrsim.solvers.rollouts import about_plan, dynamics_residual, follow, keep_plan, largest_gap, line_search
 
 
 def damped_iterations(
     steps, first, last, max_iterations, tolerance, gap_tolerance, optimal, fixed,
     start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-    no_weight, no_about, plan_x, plan_u, states, controls, best, log,
+    no_weight, no_about, plan_x, plan_u, states, controls, memory, log,
 ):  # fmt: skip
     """Iterations from the best plan so far, each of which lowers its cost or leaves it as it is.
 
@@ -31,13 +48,12 @@ def damped_iterations(
     about the plan and without a weight, to tell how far it is from optimal; that also gives the policy and the value
     functions of the answer.
 
-    `best` (7,) is the cost of the plan, reach, weight, how many small changes there were in a row; of iterations at
-    reach 0 how many are left, and how many there will be the next time; and of others how many there were since. After
-    too many of those without an end, too, reach 0 has its turn, each time for twice as long.
+    After many iterations without an end, too, reach 0 has its turn, each time for twice as long. `memory` (MEMORY,) is
+    what one iteration leaves to the next; see `interface.py`.
     """
     shift = stack(N)
     for done in range(first, last):
-        reach, weight, nothing = best[1], best[2], 0.0
+        reach, weight, nothing = memory[REACH], memory[WEIGHT], 0.0
         copy(start if fixed else plan_x[0], N, x_hat)
         failed, _ = forward_pass(
             steps, fixed, True, weight, plan_x, plan_u,
@@ -54,46 +70,33 @@ def damped_iterations(
                 shift[i] = x_hat[i] - plan_x[0, i]
             about_plan(steps, plan_x, plan_u, L, l)
             smallest = 0.1 if reach > 0 else 1e-8
-            bound = best[0] + 1e-12 * abs(best[0])  # what differs by rounding is not refused
+            bound = memory[PLAN_COST] + 1e-12 * abs(memory[PLAN_COST])  # what differs by rounding is not refused
             cost, fraction = line_search(
                 steps, plan_x, plan_u, shift, L, l, p, dt, initial, stage, final, bound, smallest, states, controls
             )
         full = done + 1 == max_iterations
         if fraction > 0:
-            improvement = relative_improvement(best[0], cost, nothing)
+            improvement = relative_improvement(memory[PLAN_COST], cost, nothing)
             follow(steps, fraction, plan_x, x_hats)
             # At reach 0 as for iLQR: nothing but a rollout was linearised about.
             gap = largest_gap(steps, x_hats, states) if reach > 0 else 0.0
             keep_plan(steps, states, controls, plan_x, plan_u)
-            best[0] = cost
-            best[3] = best[3] + 1 if abs(improvement) < tolerance and (gap < gap_tolerance or not optimal) else 0
-            settled, stalled = best[3] > 1, False
-            if weight > 0:
-                best[2] = 0.1 * weight if weight > 1e-6 else 0.0
-            elif reach > 0:
-                best[1] = min(2 * reach, 1.0) if fraction == 1 else reach
-                best[6] += 1
-                if best[6] > PATIENCE:
-                    best[1], best[4], best[5], best[6] = 0.0, best[5], 2 * best[5], 0.0
-            else:
-                best[4] -= 1
-                best[1] = 0.25 if best[4] <= 0 else 0.0
+            memory[PLAN_COST] = cost
+            small = abs(improvement) < tolerance and (gap < gap_tolerance or not optimal)
+            memory[SMALL] = memory[SMALL] + 1 if small else 0.0
+            settled, stalled = memory[SMALL] > 1, False
+            be_bolder(memory, fraction)
             write_row(log, done, cost, improvement, gap, nan, nan, DAMPED if reach > 0 else ILQR)
         else:
-            if reach > 0.25:
-                best[1] = 0.25
-            elif reach > 0:
-                best[1], best[4], best[5] = 0.0, best[5], 2 * best[5]
-            else:
-                best[2] = max(10 * weight, 1e-3)
-            stalled = best[2] > 1e12
+            be_more_careful(memory)
+            stalled = memory[WEIGHT] > 1e12
             settled = stalled
-            write_row(log, done, best[0], 0.0, nan, nan, nan, REJECTED)
+            write_row(log, done, memory[PLAN_COST], 0.0, nan, nan, nan, REJECTED)
         if settled or full:
             outcome = relinearize(
                 steps, fixed, tolerance, gap_tolerance, optimal, settled,
                 start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-                no_weight, no_about, plan_x, plan_u, best, log, done,
+                no_weight, no_about, plan_x, plan_u, memory, log, done,
             )  # fmt: skip
             if outcome == RUNNING and (stalled or full):
                 outcome = STALLED if stalled else MAX_ITERATIONS
@@ -102,27 +105,42 @@ def damped_iterations(
     return last, RUNNING, False, -1
 
 
-def follow(steps, fraction, plan_x, x_hats):
-    """Make of the states that a whole step was to lead to those that a part of it was."""
-    if fraction < 1:
-        for t in range(steps + 1):
-            for i in range(N):
-                x_hats[t, i] = plan_x[t, i] + fraction * (x_hats[t, i] - plan_x[t, i])
+def be_bolder(memory, fraction):
+    """What the next iteration ventures after one that lowered the cost, by that fraction of its step."""
+    if memory[WEIGHT] > 0:
+        memory[WEIGHT] = 0.1 * memory[WEIGHT] if memory[WEIGHT] > 1e-6 else 0.0
+    elif memory[REACH] > 0:
+        if fraction == 1:
+            memory[REACH] = min(2 * memory[REACH], 1.0)
+        memory[SINCE_ILQR] += 1
+        if memory[SINCE_ILQR] > PATIENCE:
+            turn_to_ilqr(memory)
+    else:
+        memory[ILQR_LEFT] -= 1
+        memory[REACH] = 0.25 if memory[ILQR_LEFT] <= 0 else 0.0
 
 
-def about_plan(steps, plan_x, plan_u, L, l):
-    """Make the policy relative to the plan: l becomes L x + l - u, the change of the controls that it asks for."""
-    u = stack(M)
-    for t in range(steps):
-        affine(L[t], l[t], plan_x[t], u)
-        for i in range(M):
-            l[t, i] = u[i] - plan_u[t, i]
+def be_more_careful(memory):
+    """What the next iteration ventures after one that did not lower the cost."""
+    if memory[REACH] > 0.25:
+        memory[REACH] = 0.25
+    elif memory[REACH] > 0:
+        turn_to_ilqr(memory)
+    else:
+        memory[WEIGHT] = max(10 * memory[WEIGHT], 1e-3)
+
+
+def turn_to_ilqr(memory):
+    """Reach 0 for a while: each time for twice as long, for what lies beyond has not helped so far."""
+    memory[REACH], memory[SINCE_ILQR] = 0.0, 0.0
+    memory[ILQR_LEFT] = memory[ILQR_NEXT]
+    memory[ILQR_NEXT] *= 2
 
 
 def relinearize(
     steps, fixed, tolerance, gap_tolerance, optimal, settled,
     start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-    no_weight, no_about, plan_x, plan_u, best, log, done,
+    no_weight, no_about, plan_x, plan_u, memory, log, done,
 ):  # fmt: skip
     """Both passes about the plan, without a weight. Writes optimality and residual to the log; returns the outcome."""
     nothing = 0.0
@@ -138,9 +156,9 @@ def relinearize(
         )  # fmt: skip
     if failed >= 0:
         return RUNNING
-    left = optimality(steps, fixed, plan_x, plan_u, best[0], nothing, p, dt, initial, stage, final)
+    left = optimality(steps, fixed, plan_x, plan_u, memory[PLAN_COST], nothing, p, dt, initial, stage, final)
     log[done, 3], log[done, 4] = left, dynamics_residual(steps, x_hats, L, l, p, dt, plan_x)
     if isnan(log[done, 2]):  # of an iteration that was rejected
         log[done, 2] = largest_gap(steps, x_hats, plan_x)
         settled = settled and (log[done, 2] < gap_tolerance or not optimal)
-    return ending(settled and left < tolerance, optimal, left, tolerance, best[0], False)
+    return ending(settled and left < tolerance, optimal, left, tolerance, memory[PLAN_COST], False)

@@ -154,7 +154,7 @@ class _Arrays:
             self.plan = begin.trajectory.states.copy(), begin.trajectory.controls.copy()
         self.states, self.controls = zeros((steps + 1, n)), zeros((steps, m))
         self.kept = zeros((steps, m, n)), zeros((steps, m))
-        self.best = zeros(7)
+        self.memory = zeros(interface.MEMORY)
         self.model = model(problem)
 
     @property
@@ -215,7 +215,7 @@ def _undamped(
         settings.max_iterations, settings.tolerance, float(settings.gap_tolerance or 0), settings.stop == "optimal",
         arrays.fixed, begin.trajectory is not None, settings.first_pass == "backward",
     )  # fmt: skip
-    more = *arrays.prior, *arrays.plan, arrays.states, arrays.controls, *arrays.kept, arrays.best, log
+    more = *arrays.prior, *arrays.plan, arrays.states, arrays.controls, *arrays.kept, arrays.memory, log
     loop = core.entry("smoother_iterations", problem.steps, 0, 0, *options, *arrays.passes, *more)
     return iterate(
         problem,
@@ -242,8 +242,8 @@ def _rescue(
         settings.max_iterations, settings.tolerance, float(settings.gap_tolerance or 0), settings.stop == "optimal",
         arrays.fixed,
     )  # fmt: skip
-    arrays.best[1:] = 1.0, 0.0, 0.0, 0.0, 2.0, 0.0  # all of the way, and no weight
-    more = *arrays.no_prior, *arrays.plan, arrays.states, arrays.controls, arrays.best, log
+    arrays.memory[interface.REACH], arrays.memory[interface.ILQR_NEXT] = 1.0, 2.0
+    more = *arrays.no_prior, *arrays.plan, arrays.states, arrays.controls, arrays.memory, log
     loop = core.entry("damped_iterations", problem.steps, 0, 0, *stops, *arrays.passes, *more)
     damped = iterate(
         problem,
@@ -252,7 +252,7 @@ def _rescue(
     )  # fmt: skip
     states, controls = arrays.plan
     detail = f"the undamped method failed ({why})"
-    if not np.isfinite(arrays.best[0]):
+    if not np.isfinite(arrays.memory[interface.PLAN_COST]):
         # Nothing that was tried leads anywhere. What is left is how it failed, and the controls that it began with.
         return assemble(
             problem, solver="smooth", options=options, status=ending.status, detail=detail,
