@@ -40,6 +40,14 @@ class InitialPrior:
         self.about = check_array("InitialPrior: about", about, (*time, len(self.weight)))
         self.iterations = check_count("InitialPrior: iterations", iterations)
 
+    def at(self, step: float) -> Array:
+        """Where it is zero, (n,), at a step or between two."""
+        if self.about.ndim == 1:
+            return self.about
+        before = min(int(step), len(self.about) - 2)
+        share = step - before
+        return (1 - share) * self.about[before] + share * self.about[before + 1]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:

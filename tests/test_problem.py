@@ -92,6 +92,10 @@ FIELDS = {
         ({"stage_cost": ls.SymbolicCost(lambda x, u, p: [x[0], x[1]])}, "got 2 entries, want one: the cost"),
         ({"stage_cost": ls.SymbolicCost(lambda x, u, p: p.gain * x[0])}, "parameter: got 'gain', want one of"),
         ({"prior": ls.InitialPrior(np.ones(2), about=np.zeros(2))}, r"prior: weight: got shape \(2,\), want \(3,\)"),
+        (
+            {"prior": ls.InitialPrior(np.ones(3), about=np.zeros((7, 3)))},
+            r"prior: about: got shape \(7, 3\), want \(11, 3\)",
+        ),
     ],
 )
 def test_bad_problems_get_one_line(fields: dict, message: str) -> None:
@@ -146,3 +150,15 @@ def test_an_obstacle_cost_needs_a_position() -> None:
             stage_cost=ls.ObstacleCost(PILLAR, radius=0.1),
             final_cost=ls.QuadraticCost([1.0], about=[0.0]),
         )
+
+
+def test_a_prior_may_be_about_a_trajectory(differential_drive: ls.Scenario) -> None:
+    """Constant in time it is the same prior, to the last bit; in continuous time it is a line between the steps."""
+    problem = differential_drive.problem
+    prior = problem.prior
+    assert prior is not None
+    along = ls.InitialPrior(prior.weight, about=np.tile(prior.about, (problem.steps + 1, 1)), iterations=2)
+    one, other = ls.smooth(problem), ls.smooth(dataclasses.replace(problem, prior=along))
+    np.testing.assert_array_equal(one.policy.gain, other.policy.gain)
+    np.testing.assert_allclose(ls.InitialPrior([1.0], about=[[0.0], [2.0], [6.0]]).at(1.25), [3.0], rtol=1e-15)
+    np.testing.assert_array_equal(ls.InitialPrior([1.0], about=[[0.0], [2.0], [6.0]]).at(2.0), [6.0])

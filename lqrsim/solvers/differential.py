@@ -264,7 +264,7 @@ class System:
             u = law[:, :-1] @ x + law[:, -1]
             value = self._look(t, x, u)
             if prior is not None:
-                weight, error = prior.weight / self.dt, x - prior.about
+                weight, error = prior.weight / self.dt, x - prior.at(t / self.dt)
                 self._hessian[range(self.n), range(self.n)] += weight
                 self._gradient[: self.n] += weight * error
                 value += 0.5 * float(error @ (weight * error))
