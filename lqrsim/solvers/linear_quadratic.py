@@ -43,14 +43,13 @@ def smooth_lq(
         raise InputError(f"stage: got {type(stage).__name__}, want a Stage")
     if np.ndim(stage.B) != 3:
         raise InputError("stage: got one stage, want one a step: B of shape (T, n, m)")
-    A, B, c, Q, P, R, q, r, constant = (
-        np.asarray(getattr(stage, name)) for name in ("A", "B", "c", *"QPRqr", "constant")
-    )
+    parts = _parts(stage)
+    A, B, c, Q, P, R, q, r, constant = parts
     steps, n, m = B.shape
     jacobian = np.ascontiguousarray(np.concatenate([A, B], axis=2))
+    inverse, c_inverse = (jacobian, c.copy()) if form == "dual" else _inverse(A, B, c)
     cost = np.ascontiguousarray(np.block([[Q, np.swapaxes(P, 1, 2)], [P, R]]))
     slope = np.ascontiguousarray(np.concatenate([q, r], axis=1))
-    inverse, c_inverse = (jacobian, c) if form == "dual" else _inverse(A, B, c)
     go = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
     come = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
     go[0][-1], go[1][-1], go[2][-1] = _end("final", final, n)
@@ -59,24 +58,18 @@ def smooth_lq(
     back = np.zeros((steps, n, n)), np.zeros((steps, n)), np.zeros((steps, m, n)), np.zeros((steps, m))
     x_hat = np.zeros((steps + 1, n))
     failed, which = compiled.linear_quadratic(n, m, form).lq_passes(
-        steps, jacobian, c.copy(), inverse, c_inverse.copy(), cost, slope, constant.copy(),
-        *law, *go, *come, *back, x_hat,
-    )  # fmt: skip
-    detail = ""
-    status = Status.CONVERGED
-    if failed >= 0:
-        part = ("backward pass", "forward pass", "minimum of the total cost")[which]
-        status, detail = Status.NOT_POSITIVE_DEFINITE, f"{part}, step {failed} of {steps}"
-    states, controls, spent = _rollout(stage, law, x_hat[0] if failed < 0 else np.zeros(n))
-    value = spent + float(final(states[-1]))
-    if isinstance(initial, Quadratic):
-        value += float(initial(states[0]))
+        steps, jacobian, c.copy(), inverse, c_inverse, cost, slope, constant.copy(), *law, *go, *come, *back, x_hat
+    )
+    solved = failed < 0
+    states, controls, value = _rollout(parts, law, x_hat[0])
+    value += float(final(states[-1])) + (float(initial(states[0])) if isinstance(initial, Quadratic) else 0.0)
     to_go, to_come = Quadratic(*go), (Moments(*come) if form == "dual" else Quadratic(*come))
     iterations = ()
-    if failed < 0:
+    if solved:
         scale = np.maximum(np.ptp(states, axis=0), 1.0)
+        u_hat = np.einsum("tij,tj->ti", law[0], x_hat[:-1]) + law[1]
+        ahead = np.einsum("tij,tj->ti", A, x_hat[:-1]) + np.einsum("tij,tj->ti", B, u_hat) + c
         least = float(TotalCost(to_go, to_come).minimum()[0])
-        ahead = np.einsum("tij,tj->ti", A, x_hat[:-1]) + np.einsum("tij,tj->ti", B, _controls(law, x_hat)) + c
         iterations = (
             Iteration(
                 cost=value, improvement=np.inf, gap=float((np.abs(x_hat - states) / scale).max()),
@@ -85,35 +78,48 @@ def smooth_lq(
                 seconds=time.perf_counter() - clock, method="smooth",
             ),
         )  # fmt: skip
-    digest = hashlib.sha256(b"".join(array.tobytes() for array in (jacobian, c, cost, slope, constant)))
-    for end in (initial, final):
-        for array in (end.state,) if isinstance(end, FixedState) else (end.hessian, end.gradient, end.constant):
-            digest.update(np.asarray(array, dtype=np.float64).tobytes())
-
-    def coordinates(letter: str, size: int) -> Coordinates:
-        return Coordinates(names=tuple(f"{letter}{i}" for i in range(size)), units=("",) * size)
 
     def policy(gain: Array, offset: Array, nominal: Array) -> AffinePolicy:
         return AffinePolicy(
             gain=gain, offset=offset, nominal=nominal, dt=dt,
-            state_coordinates=coordinates("x", n), control_coordinates=coordinates("u", m),
+            state_coordinates=_coordinates("x", n), control_coordinates=_coordinates("u", m),
         )  # fmt: skip
 
     return Solution(
-        status=status,
-        detail=detail,
+        status=Status.CONVERGED if solved else Status.NOT_POSITIVE_DEFINITE,
+        detail="" if solved else f"{_WHICH[which]}, step {failed} of {steps}",
         policy=policy(*law, states[:-1]),
-        inverse_policy=policy(*back[2:], states[1:]) if form == "primal" and failed < 0 else None,
-        cost_to_go=to_go if failed < 0 else None,
-        cost_to_come=to_come if failed < 0 else None,
+        inverse_policy=policy(*back[2:], states[1:]) if solved and form == "primal" else None,
+        cost_to_go=to_go if solved else None,
+        cost_to_come=to_come if solved else None,
         trajectory=Trajectory(states, controls, dt),
         iterations=iterations,
         clearance=None,
         solver="smooth_lq",
         options={"form": form},
-        problem_digest=digest.hexdigest()[:16],
+        problem_digest=_digest(parts, initial, final),
         versions=versions(),
     )
+
+
+# What `lq_passes` says of a pass that failed.
+_WHICH = ("backward pass", "forward pass", "minimum of the total cost")
+
+
+def _parts(stage: Stage) -> tuple[Array, ...]:
+    return tuple(np.asarray(getattr(stage, name)) for name in ("A", "B", "c", *"QPRqr", "constant"))
+
+
+def _coordinates(letter: str, size: int) -> Coordinates:
+    return Coordinates(names=tuple(f"{letter}{i}" for i in range(size)), units=("",) * size)
+
+
+def _digest(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Quadratic) -> str:
+    hasher = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
+    for end in (initial, final):
+        for part in (end.state,) if isinstance(end, FixedState) else (end.hessian, end.gradient, end.constant):
+            hasher.update(np.asarray(part, dtype=np.float64).tobytes())
+    return hasher.hexdigest()[:16]
 
 
 def _end(field: str, end: Quadratic, n: int) -> tuple[Array, Array, float]:
@@ -158,15 +164,9 @@ def _inverse(A: Array, B: Array, c: Array) -> tuple[Array, Array]:
     return np.ascontiguousarray(np.concatenate([inverse, -inverse @ B], axis=2)), -np.einsum("tij,tj->ti", inverse, c)
 
 
-def _controls(law: tuple[Array, Array], states: Array) -> Array:
-    return np.einsum("tij,tj->ti", law[0], states[:-1]) + law[1]
-
-
-def _rollout(stage: Stage, law: tuple[Array, Array], start: Array) -> tuple[Array, Array, float]:
+def _rollout(parts: tuple[Array, ...], law: tuple[Array, Array], start: Array) -> tuple[Array, Array, float]:
     """States and controls of the policy, and what the stages cost."""
-    A, B, c, Q, P, R, q, r, constant = (
-        np.asarray(getattr(stage, name)) for name in ("A", "B", "c", *"QPRqr", "constant")
-    )
+    A, B, c, Q, P, R, q, r, constant = parts
     steps, n, m = B.shape
     states, controls, spent = np.zeros((steps + 1, n)), np.zeros((steps, m)), 0.0
     states[0] = start
