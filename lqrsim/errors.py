@@ -111,9 +111,9 @@ def check_weight(field: str, value: npt.ArrayLike, size: int | None = None, *, d
 def check_name(field: str, name: str, valid: Iterable[str]) -> str:
     """`name` if it is one of `valid`; otherwise an InputError that lists them and guesses the meant one."""
     names = list(valid)
-    if name in names:
+    if isinstance(name, str) and name in names:
         return name
-    near = difflib.get_close_matches(name, names, n=1)
+    near = difflib.get_close_matches(str(name), names, n=1)
     hint = f" (did you mean {near[0]}?)" if near else ""
     raise InputError(f"{field}: got {name!r}, want one of: {', '.join(names) or '(there are none)'}{hint}")
 

@@ -1,11 +1,12 @@
 """The linear-quadratic problem of Sec. IV: what `smooth_lq` solves, and an iteration of `smooth` sets up."""
 
+import contextlib
 from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import InputError, check_array
+from lqrsim.errors import InputError, check_array, excerpt
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,8 +16,8 @@ class Stage:
         step (discrete) or rate (continuous) of x:   A x + B u + c
         cost of the step, or a second of it:         1/2 x'Q x + 1/2 u'R u + u'P x + q'x + r'u + constant
 
-    A leading axis of T, if there is one, is time: one stage a step. Everything but A, B and R may be left out and is
-    zero then. Paper: Eqs. (4), (7).
+    A leading axis of T, if there is one, is time: one stage a step; what has none is the same at each. Everything but
+    A, B and R may be left out and is zero then. Paper: Eqs. (4), (7).
 
     Attributes:
       A: (..., n, n). B: (..., n, m). c: (..., n).
@@ -38,20 +39,28 @@ class Stage:
     constant: npt.ArrayLike | None = None
 
     def __post_init__(self) -> None:
-        shape = np.shape(self.B)
+        shape = _shape(self.B)
         if len(shape) not in (2, 3):
-            raise InputError(f"Stage: B: got {len(shape)} dimensions, want (n, m) or, one a step, (T, n, m)")
-        time, (n, m) = shape[:-2], shape[-2:]
+            raise InputError(f"Stage: B: got {excerpt(self.B)}, want an array (n, m) or, one a step, (T, n, m)")
+        if 0 in shape:
+            raise InputError(f"Stage: B: got shape {shape}, want at least one of each")
+        n, m = shape[-2:]
         shapes = {
             "A": (n, n), "B": (n, m), "c": (n,), "Q": (n, n), "P": (m, n), "R": (m, m), "q": (n,), "r": (m,),
             "constant": (),
         }  # fmt: skip
+        # Time is the leading axis of any of them, and those without one are the same at each step.
+        given = {name: _shape(getattr(self, name)) for name in shapes if getattr(self, name) is not None}
+        time = max((shape[:1] for name, shape in given.items() if len(shape) == len(shapes[name]) + 1), default=())
         for field in fields(self):
             value, want = getattr(self, field.name), shapes[field.name]
             if value is None:
+                if field.name in ("A", "R"):
+                    raise InputError(f"Stage: {field.name}: got None, want an array of shape {shapes[field.name]}")
                 value = np.zeros(want)
-            if time and np.ndim(value) == len(want):  # the same at each step
-                value = np.broadcast_to(value, (*time, *np.shape(value)))
+            with contextlib.suppress(ValueError):  # what is ragged has no shape, and is refused below
+                if time and np.ndim(value) == len(want):  # the same at each step
+                    value = np.broadcast_to(value, (*time, *np.shape(value)))
             array = check_array(f"Stage: {field.name}", value, (*time, *want))
             if field.name in ("Q", "R") and not np.allclose(array, np.swapaxes(array, -1, -2), rtol=1e-9, atol=0):
                 raise InputError(f"Stage: {field.name}: got a matrix that is not symmetric, want a symmetric one")
@@ -66,3 +75,11 @@ class Stage:
     def controls(self) -> int:
         """m, the number of controls."""
         return np.shape(self.B)[-1]
+
+
+def _shape(value: npt.ArrayLike) -> tuple[int, ...]:
+    """() for what is ragged and has none."""
+    try:
+        return np.shape(value)
+    except ValueError:
+        return ()

@@ -225,7 +225,7 @@ _STATUS_TEXT = {
         'look at the gap, or solve with stop="optimal"',
     ),
     Status.MAX_ITERATIONS: (
-        "the iteration limit came first",
+        "the iteration limit came first, or no step lowered the cost any more",
         "raise max_iterations if the improvements still shrink; if they do not, try another start or a prior",
     ),
     Status.INFEASIBLE: ("no trajectory meets the constraints", "relax the constraint that is named, or give more time"),

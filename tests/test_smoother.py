@@ -248,7 +248,8 @@ class TestSafeguard:
     def test_many_and_one_give_the_same_bits(self, stiff: ls.Problem) -> None:
         assert same(ls.smooth(stiff), *ls.smooth_many([stiff], threads=2))
         seen: list[ls.Iteration] = []
-        assert tuple(seen) == () or ls.smooth(stiff, callback=seen.append).iterations == tuple(seen)
+        assert len(ls.smooth(stiff, callback=seen.append).iterations) == len(seen)
+        assert {row.method for row in seen} >= {"damped"}
 
     @pytest.mark.parametrize("form", FORMS)
     def test_a_motion_that_cannot_even_be_rolled_out_at_first(self, form: str) -> None:

@@ -341,7 +341,7 @@ def test_the_callback_sees_every_iteration_and_may_stop_the_solve(differential_d
         ({"max_iterations": 0}, "max_iterations: got 0, want a whole number >= 1"),
         ({"start": (0.1,) * 3}, r"start: got shape \(3,\), want controls \(2,\) or \(150, 2\), a Trajectory"),
         ({"start": (np.inf, 0)}, r"start: got inf at index \[0, 0\], want finite numbers"),
-        ({"start": "hover"}, r"start: got str, want controls \(2,\) or \(150, 2\), a Trajectory"),
+        ({"start": "hover"}, r"start: got 'hover', want controls \(2,\) or \(150, 2\), a Trajectory"),
         ({"form": "Dual"}, r"form: got 'Dual', want one of: dual, primal \(did you mean dual\?\)"),
         ({"first_pass": "back"}, "first_pass: got 'back', want one of: forward, backward"),
         ({"safeguard": "yes"}, "safeguard: got 'yes', want True or False"),

@@ -11,7 +11,7 @@ import numpy as np
 
 from lqrsim import compiled
 from lqrsim.checks import check_functions, check_start, functions_of
-from lqrsim.errors import Array, InputError, check_count, check_name, check_number
+from lqrsim.errors import Array, InputError, check_count, check_name, check_number, excerpt
 from lqrsim.problem import Problem
 from lqrsim.results import AffinePolicy, Iteration, Moments, Quadratic, Solution, Status, Trajectory
 from lqrsim.solvers import interface
@@ -43,36 +43,52 @@ LOG_COLUMNS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """When to stop, and from where to start; see `smooth` for what each means. None where a solver has none."""
+    """When to stop, and from where to start; see `ilqr` for what each means."""
 
     stop: str
     tolerance: float
     max_iterations: int
     start: StartLike
-    gap_tolerance: float | None = None
-    form: str | None = None
-    first_pass: str | None = None
-    safeguard: bool | None = None
 
     def __post_init__(self) -> None:
         check_name("stop", self.stop, ("optimal", "cost"))
-        check_number("tolerance", self.tolerance, above=0.0)
-        if self.gap_tolerance is not None:
-            check_number("gap_tolerance", self.gap_tolerance, above=0.0)
-        check_count("max_iterations", self.max_iterations)
+        # What is kept is plain Python's: NumPy's numbers would be other types for the compiler, and not for JSON.
+        object.__setattr__(self, "tolerance", check_number("tolerance", self.tolerance, above=0.0))
+        object.__setattr__(self, "max_iterations", check_count("max_iterations", self.max_iterations))
         if self.max_iterations > 1_000_000:  # the log of so many takes 48 MB
             raise InputError(f"max_iterations: got {self.max_iterations}, want at most 1000000")
-        if self.form is not None:
-            check_name("form", self.form, tuple(compiled.FORMS))
-        if self.first_pass is not None:
-            check_name("first_pass", self.first_pass, ("forward", "backward"))
-        if self.safeguard not in (None, True, False):
-            raise InputError(f"safeguard: got {self.safeguard!r}, want True or False")
+
+    @property
+    def core_form(self) -> str:
+        """The form of the core that is used."""
+        return "dual"
 
     def options(self, start: Start) -> dict[str, object]:
         """The settings as a solution keeps them."""
-        given = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value for name, value in given.items() if value is not None} | {"start": start.summary}
+        return {field.name: getattr(self, field.name) for field in fields(self)} | {"start": start.summary}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmootherSettings(Settings):
+    """What `smooth` has beyond that."""
+
+    gap_tolerance: float
+    form: str
+    first_pass: str
+    safeguard: bool
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "gap_tolerance", check_number("gap_tolerance", self.gap_tolerance, above=0.0))
+        check_name("form", self.form, tuple(compiled.FORMS))
+        check_name("first_pass", self.first_pass, ("forward", "backward"))
+        if not isinstance(self.safeguard, bool | np.bool_):
+            raise InputError(f"safeguard: got {excerpt(self.safeguard)}, want True or False")
+        object.__setattr__(self, "safeguard", bool(self.safeguard))
+
+    @property
+    def core_form(self) -> str:
+        return self.form
 
 
 @dataclass(frozen=True)
@@ -130,6 +146,8 @@ def iterate(
       each: come back after each iteration, to time it, to tell `callback` and to heed Ctrl-C; otherwise nothing but
         compiled code runs, and the seconds of an iteration are the average.
     """
+    if callback is not None and not callable(callback):
+        raise InputError(f"callback: got {excerpt(callback)}, want a function of an Iteration")
     functions = functions_of(problem)
     for function in functions:
         function.forget()
@@ -154,7 +172,7 @@ def iterate(
 def solve_all(
     problems: list[Problem],
     settings: Settings,
-    check: Callable[[Problem, Settings], None],
+    check: Callable[[Problem, Any], None],
     solve: Callable[..., Solution],
     *,
     threads: int | None,
@@ -169,7 +187,7 @@ def solve_all(
             check(problem, settings)
             start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start
             check_functions(problem, start, resolve(settings.start, problem).offset[0])
-            compiled.core(problem, settings.form or "dual")
+            compiled.core(problem, settings.core_form)
             compiled.arguments(problem)  # compiles numba functions
         except InputError as error:
             raise InputError(f"problems[{i}]: {error}") from None

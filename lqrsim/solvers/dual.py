@@ -8,37 +8,46 @@ slope of the cost-to-go at the minimiser, leads from each step to the one before
 control is eliminated by u = w - F x - h: the rest is At = A - B F, Qt = Q - P'F, qt = q - P'h, ct = c - B h.
 """
 
+from math import sqrt
+
 from lqrsim.integration import step_jacobian
 from lqrsim.solvers.interface import M, N, stack
 from lqrsim.solvers.kernels import cholesky, cholesky_solve, offset
 
 
-def begin(Q, q, constant, x, covariance, mean):
+def begin(Q, q, constant, x, S, covariance, mean):
     """Write the cost-to-come at 0, given c_0 about the origin, quadratised at x; return its constant.
 
-    Where c_0 has no curvature, there is no covariance, and it gets a little about x. An optimum stays one, and the next
-    iteration moves x on.
+    Where c_0 has no curvature, there is no covariance, and it gets a little about x, relative to that of the cost-to-go
+    S where there is one by now. An optimum stays one, and the next iteration moves x on. What is little is told in
+    units of each state's own curvature.
     """
     factor, column, slope = stack(N, N), stack(N), stack(N)
-    scale, curved = 0.0, True
+    largest = 0.0
     for i in range(N):
-        scale = max(scale, abs(Q[i, i]))
+        largest = max(largest, abs(Q[i, i]))
         slope[i] = q[i]
+        column[i] = sqrt(Q[i, i]) if Q[i, i] > 0 else 0.0
+    for i in range(N):
         for j in range(N):
-            factor[i, j] = Q[i, j]
+            scale = column[i] * column[j]
+            factor[i, j] = Q[i, j] / scale if scale > 0 else 0.0
     curved = cholesky(factor, N)
     for i in range(N):
-        curved = curved and factor[i, i] * factor[i, i] * scale < 1e10  # the reciprocals of the pivots
+        curved = curved and factor[i, i] < 1e6  # the reciprocal of the root of a pivot
+    for i in range(N):
+        for j in range(N):
+            factor[i, j] = Q[i, j]
     if not curved:
-        little = 1e-6 * scale if scale > 0 else 1e-6
         for i in range(N):
-            for j in range(N):
-                factor[i, j] = Q[i, j]
+            little = 1e-6 * max(abs(Q[i, i]), S[i, i])
+            if not little > 0:
+                little = 1e-6 * largest if largest > 0 else 1e-6
             factor[i, i] += little
             slope[i] -= little * x[i]
             constant += 0.5 * little * x[i] * x[i]
-        if not cholesky(factor, N):
-            return constant, False
+    if not cholesky(factor, N):
+        return constant, False
     for j in range(N):
         for i in range(N):
             column[i] = 1.0 if i == j else 0.0
@@ -184,11 +193,12 @@ def back_substitute(factor, rows):
 def update(V, Q, size):
     """Turn V into (V^-1 + Q)^-1, for V and Q semidefinite, in place; False if there is none. Q is used up.
 
-    With Q = sum of d f f', one term at a time: V - d / (1 + d f'V f) V f f'V. This keeps V symmetric and semidefinite
-    whatever its rank, and costs little where Q has few entries, as those of obstacles have. `size` (N,) is the diagonal
-    of Q before anything was taken from it: what is far less is rounding.
+    With Q = sum of d f f', one term at a time, each in the form of Joseph, (I - K f') V (I - K f')' + K K' / d with
+    K = d V f / (1 + d f'V f): a sum of squares, which keeps V semidefinite whatever its rank, and small parts beside
+    large ones. It costs little where Q has few entries, as those of obstacles have. `size` (N,) is the diagonal of Q
+    before anything was taken from it: what is far less is rounding.
     """
-    f, w = stack(N), stack(N)
+    f, w, gain = stack(N), stack(N), stack(N)
     scale = 0.0
     for i in range(N):
         scale = max(scale, size[i])
@@ -200,7 +210,7 @@ def update(V, Q, size):
                     return False
             continue
         for j in range(N):
-            f[j] = Q[i, j] / d
+            f[j] = Q[i, j] / d if j >= i else 0.0
             w[j] = V[i, j]  # f[i] is 1
         for k in range(i + 1, N):
             if f[k] != 0:
@@ -214,9 +224,17 @@ def update(V, Q, size):
         if not total > 0:
             return False
         for j in range(N):
-            factor = d / total * w[j]
+            gain[j] = d / total * w[j]
             for k in range(N):
-                V[j, k] -= factor * w[k]
+                V[j, k] -= gain[j] * w[k]
+        for j in range(N):
+            left = 0.0
+            for k in range(N):
+                left += V[j, k] * f[k]
+            w[j] = left
+        for j in range(N):
+            for k in range(N):
+                V[j, k] += (gain[j] / d - w[j]) * gain[k]
     return True
 
 

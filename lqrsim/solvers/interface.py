@@ -1,9 +1,8 @@
 """What a compiled core knows about its problem: the names that the kernels are written against.
 
-`integration.py`, `kernels.py`, `passes.py`, `loops.py`, one of `dual.py` and `primal.py`, and the sources that dynamics
-and costs write are joined into one text for each structure (see `compiled.py`), with these sizes as constants and these
-functions filled in. This module only declares them, so that each of those files can be read, linted and type-checked on
-its own.
+The modules of the numba subset, with one of `dual.py` and `primal.py`, and the sources that dynamics and costs write
+are joined into one text for each structure (see `compiled.py`), with these sizes as constants and these functions
+filled in. This module only declares them, so that each of those files can be read, linted and type-checked on its own.
 """
 
 import numpy as np
@@ -24,8 +23,9 @@ SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
 # The safeguard's memory: the cost of the plan; how far the next iteration reaches, and the weight on changes of the
 # controls; how many small changes there were in a row; of iterations at reach 0, iLQR's, how many are left, how many
 # there will be the next time, and how many others there were since, of which PATIENCE are enough.
-PLAN_COST, REACH, WEIGHT, SMALL, ILQR_LEFT, ILQR_NEXT, SINCE_ILQR = 0, 1, 2, 3, 4, 5, 6
-MEMORY = 7
+# At the end, how far the states of least total cost are from the plan.
+PLAN_COST, REACH, WEIGHT, SMALL, ILQR_LEFT, ILQR_NEXT, SINCE_ILQR, FINAL_GAP = 0, 1, 2, 3, 4, 5, 6, 7
+MEMORY = 8
 PATIENCE = 50
 
 
@@ -75,7 +75,7 @@ def final_quadratic(x, u, t, data, hessian, gradient) -> float:
 # What the form of the cost-to-come brings; see `dual.py` and `primal.py`.
 
 
-def begin(Q, q, constant, x, C, b) -> tuple[float, bool]:
+def begin(Q, q, constant, x, S, C, b) -> tuple[float, bool]:
     """Write the cost-to-come at 0."""
     return 0.0, True
 

@@ -10,7 +10,7 @@ from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array, check_name, check_number
 from lqrsim.linear_quadratic import Stage
 from lqrsim.problem import FixedState
-from lqrsim.results import AffinePolicy, Iteration, Moments, Quadratic, Solution, Status, TotalCost, Trajectory
+from lqrsim.results import AffinePolicy, Iteration, Moments, Quadratic, Solution, Status, Trajectory
 from lqrsim.versions import versions
 
 
@@ -30,8 +30,10 @@ def smooth_lq(
       dt: seconds a step, for the times of the trajectory and the policy.
 
     Returns:
-      A Solution with one iteration: status CONVERGED, or NOT_POSITIVE_DEFINITE where a step has no unique minimum, and
-      its detail says which. The trajectory is the rollout of the policy; its gap to x_hat is rounding.
+      A Solution with one iteration. The trajectory is the rollout of the policy. CONVERGED says that it costs what the
+      cost-to-go promised, to ACCURACY, relatively (that is its optimality); NOT_POSITIVE_DEFINITE that there is no
+      unique minimum, or none to working precision, and the detail says where. Where the states of least total cost are
+      further off the plan than that, rounding has spoilt the cost-to-come, and it is left out.
 
     Raises:
       InputError: arrays that do not fit together, or that the form does not take.
@@ -60,24 +62,44 @@ def smooth_lq(
     failed, which = compiled.linear_quadratic(n, m, form).lq_passes(
         steps, jacobian, c.copy(), inverse, c_inverse, cost, slope, constant.copy(), *law, *go, *come, *back, x_hat
     )
-    solved = failed < 0
-    states, controls, value = _rollout(parts, law, x_hat[0])
-    value += float(final(states[-1])) + (float(initial(states[0])) if isinstance(initial, Quadratic) else 0.0)
+    detail = f"{_WHICH[which]}, step {failed} of {steps}" if failed >= 0 else ""
+    if failed >= 0 and form == "dual" and which > 0:
+        detail += '; form="primal" may do'
     to_go, to_come = Quadratic(*go), (Moments(*come) if form == "dual" else Quadratic(*come))
-    iterations = ()
-    if solved:
-        scale = np.maximum(np.ptp(states, axis=0), 1.0)
-        u_hat = np.einsum("tij,tj->ti", law[0], x_hat[:-1]) + law[1]
-        ahead = np.einsum("tij,tj->ti", A, x_hat[:-1]) + np.einsum("tij,tj->ti", B, u_hat) + c
-        least = float(TotalCost(to_go, to_come).minimum()[0])
-        iterations = (
-            Iteration(
-                cost=value, improvement=np.inf, gap=float((np.abs(x_hat - states) / scale).max()),
-                optimality=abs(value - least) / max(abs(value), 1e-300),
-                dynamics_residual=float((np.abs(x_hat[1:] - ahead) / scale).max()),
-                seconds=time.perf_counter() - clock, method="smooth",
-            ),
-        )  # fmt: skip
+    start = x_hat[0]
+    if isinstance(initial, Quadratic) and failed < 0:
+        # With every step of the cost-to-go definite, this alone says that there is one minimum.
+        curve = initial.hessian + go[0][0]
+        if not np.linalg.eigvalsh(curve)[0] > 0:
+            detail = "minimum of the total cost, step 0"
+        else:
+            start = -np.linalg.solve(curve, initial.gradient + go[1][0])
+    states, controls, value = _rollout(parts, law, start)
+    value += float(final(states[-1])) + (float(initial(states[0])) if isinstance(initial, Quadratic) else 0.0)
+    iterations, gap, residual = (), np.inf, np.inf
+    if not detail:
+        promised = float(Quadratic(go[0][0], go[1][0], go[2][0])(start))
+        promised += float(initial(start)) if isinstance(initial, Quadratic) else 0.0
+        with np.errstate(all="ignore"):
+            optimality = abs(value - promised) / max(abs(value), 1e-28 * _size(parts, initial, final), 1e-300)
+            scale = np.maximum(np.ptp(states, axis=0), 1.0)
+            gap = float((np.abs(x_hat - states) / scale).max())
+            u_hat = np.einsum("tij,tj->ti", law[0], x_hat[:-1]) + law[1]
+            ahead = np.einsum("tij,tj->ti", A, x_hat[:-1]) + np.einsum("tij,tj->ti", B, u_hat) + c
+            residual = float((np.abs(x_hat[1:] - ahead) / scale).max())
+        if not optimality < ACCURACY:
+            detail = f"too ill-conditioned: the plan costs {value:.9g}, the cost-to-go promised {promised:.9g}"
+        else:
+            iterations = (
+                Iteration(
+                    cost=value, improvement=np.inf, gap=gap, optimality=optimality, dynamics_residual=residual,
+                    seconds=time.perf_counter() - clock, method="smooth",
+                ),
+            )  # fmt: skip
+    solved = not detail
+    whole = solved and max(gap, residual) < ACCURACY
+    if solved and not whole:
+        detail = f"the states of least total cost are {gap:.1g} off the plan, so the cost-to-come is left out"
 
     def policy(gain: Array, offset: Array, nominal: Array) -> AffinePolicy:
         return AffinePolicy(
@@ -87,11 +109,11 @@ def smooth_lq(
 
     return Solution(
         status=Status.CONVERGED if solved else Status.NOT_POSITIVE_DEFINITE,
-        detail="" if solved else f"{_WHICH[which]}, step {failed} of {steps}",
+        detail=detail,
         policy=policy(*law, states[:-1]),
-        inverse_policy=policy(*back[2:], states[1:]) if solved and form == "primal" else None,
+        inverse_policy=policy(*back[2:], states[1:]) if whole and form == "primal" else None,
         cost_to_go=to_go if solved else None,
-        cost_to_come=to_come if solved else None,
+        cost_to_come=to_come if whole else None,
         trajectory=Trajectory(states, controls, dt),
         iterations=iterations,
         clearance=None,
@@ -102,12 +124,21 @@ def smooth_lq(
     )
 
 
+# What is said to be solved is so to this share of the cost, and of the range of each state.
+ACCURACY = 1e-6
+
 # What `lq_passes` says of a pass that failed.
 _WHICH = ("backward pass", "forward pass", "minimum of the total cost")
 
 
 def _parts(stage: Stage) -> tuple[Array, ...]:
     return tuple(np.asarray(getattr(stage, name)) for name in ("A", "B", "c", *"QPRqr", "constant"))
+
+
+def _size(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Quadratic) -> float:
+    """What the parts of the cost are at the origin: of what cancels there, some rounding remains."""
+    size = float(np.abs(parts[-1]).sum()) + abs(float(final.constant))
+    return size + (abs(float(initial.constant)) if isinstance(initial, Quadratic) else 0.0)
 
 
 def _coordinates(letter: str, size: int) -> Coordinates:

@@ -37,59 +37,59 @@ from lqrsim.solvers.rollouts import (
     rollout,
 )
 
-# Far outside an arena costs reach 1e20, and rounding takes iLQR's backward pass its positive-definite matrices. Then,
-# and only then, changes of the controls get a weight; it falls again by the same steps.
-
 
 def relative_improvement(old, cost, nothing):
-    """The decrease of cost relative to what is left; 0 for no change, at a cost of zero too.
+    """The decrease of cost relative to what is left; 0 for no change, at a cost of zero too; infinite if the cost is.
 
     Costs below `nothing` are zero but for rounding: what there is of them never settles.
     """
+    if not abs(cost) < inf:
+        return -inf
     return 0.0 if old == cost else (old - cost) / max(abs(cost), nothing)
 
 
 def smoother_iterations(
     steps, first, last, max_iterations, tolerance, gap_tolerance, optimal, fixed, guided, opening,
     start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-    prior_weight, prior_about, prior_iterations, plan_x, plan_u, states, controls, kept_L, kept_l, memory, log,
+    prior_weight, prior_about, prior_iterations, guess_x, guess_u, plan_x, plan_u,
+    states, controls, kept_L, kept_l, memory, log,
 ):  # fmt: skip
     """Iterated LQR smoothing: a forward pass, a backward pass and the rollout of the new policy, again and again.
 
-    L, l, S, s are the policy and the cost-to-go to begin with. With `guided`, the first pass linearises about the plan;
-    with `opening`, a backward pass comes first, on its own. `states`, `controls`, `kept_L`, `kept_l` are what the last
-    iteration that was completed found; before any, where the first policy leads. From the first iteration on the plan
-    is the rollout of least cost so far, and memory[PLAN_COST] that cost: for the safeguard.
+    L, l, S, s are the policy and the cost-to-go to begin with. With `guided`, the first pass linearises about the
+    guess; with `opening`, a backward pass comes first, on its own. `states`, `controls`, `kept_L`, `kept_l` are what
+    the last iteration that was completed found; before any, where the first policy leads. The plan is the rollout of
+    least cost so far, that of the first policy included, and memory[PLAN_COST] that cost: for the safeguard.
     """
     no_weight = stack(N)
     for i in range(N):
         no_weight[i] = 0.0
     if first == 0:
-        memory[PLAN_COST] = rollout(steps, start, L, l, p, dt, initial, stage, final, states, controls)
+        memory[PLAN_COST] = inf
+        cost = rollout(steps, start, L, l, p, dt, initial, stage, final, states, controls)
         keep_law(steps, L, l, kept_L, kept_l)
-        if guided or opening or not memory[PLAN_COST] < inf:
-            memory[PLAN_COST] = inf  # a plan that is needed first, or cannot be rolled out
-        else:
+        if cost < inf:
+            memory[PLAN_COST] = cost
             keep_plan(steps, states, controls, plan_x, plan_u)
         copy(start, N, x_hat)
         if opening:
             failed, good = opening_pass(
-                steps, guided, plan_x, plan_u, L, l, S, s, k, p, dt, stage, final, prior_weight, prior_about
+                steps, guided, guess_x, guess_u, L, l, S, s, k, p, dt, stage, final, prior_weight, prior_about
             )
             if failed >= 0:
                 return 0, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, True, failed
         elif guided and not fixed:
-            copy(plan_x[0], N, x_hat)
+            copy(guess_x[0], N, x_hat)
     for done in range(first, last):
         weight = prior_weight if done < prior_iterations else no_weight
         failed, good = forward_pass(
-            steps, fixed, guided and not opening and done == 0, 0.0, plan_x, plan_u,
+            steps, fixed, guided and not opening and done == 0, 0.0, guess_x, guess_u,
             x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final, weight, prior_about,
         )  # fmt: skip
         if failed >= 0:
             return done, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, False, failed
         failed, good, nothing = backward_pass(
-            steps, fixed, 1.0, 0.0, plan_x, plan_u,
+            steps, fixed, 1.0, 0.0, guess_x, guess_u,
             x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, weight, prior_about,
         )  # fmt: skip
         if failed >= 0:
@@ -131,7 +131,9 @@ def write_row(log, row, cost, improvement, gap, left, residual, method):
 
 def relative_optimality(failed, decrease, cost, nothing):
     """A promised decrease relative to the cost; infinite where the pass failed that was to tell it."""
-    return decrease / max(abs(cost), nothing, 1e-300) if failed < 0 and decrease < inf else inf
+    if failed >= 0 or not decrease < inf or not abs(cost) < inf:
+        return inf
+    return decrease / max(abs(cost), nothing, 1e-300)
 
 
 def ending(settled, optimal, left, tolerance, cost, full):
@@ -151,6 +153,9 @@ def ilqr_iterations(
     states, controls, new_states, new_controls, damping, log,
 ):  # fmt: skip
     """Iterative LQR: a backward pass about a feasible trajectory and a line search, again and again.
+
+    Far outside an arena costs reach 1e20, and rounding takes the backward pass its positive-definite matrices. Then,
+    and only then, changes of the controls get a weight; it falls again by the same steps.
 
     L, l are the policy that makes the first trajectory, from x0; afterwards `states` and `controls` are the best one,
     and L, l (relative to it), S, s, k are about it. `damping` (1,) is the weight on changes of the controls; `log` has,

@@ -8,6 +8,8 @@ The prior is `1/2 (x - prior_about[t])' diag(prior_weight) (x - prior_about[t])`
 added to its quadratic model in the first iterations, where it keeps the linearisations sensible.
 """
 
+from math import inf
+
 from lqrsim.integration import step, step_jacobian
 from lqrsim.solvers.interface import (
     M,
@@ -72,7 +74,7 @@ def end_model(hessian, gradient, value, x, S, s):
     return constant
 
 
-def begin_model(x, initial, fixed, damping, plan_x, C, b):
+def begin_model(x, initial, fixed, damping, plan_x, S, C, b):
     """Write the cost-to-come at 0, with c_0 quadratised at x, and return its constant; or of a start that is given.
 
     Returns also whether there is one, and what the quadratic of c_0 is at the origin.
@@ -90,7 +92,7 @@ def begin_model(x, initial, fixed, damping, plan_x, C, b):
             gradient[i] += weight * error
             value += 0.5 * weight * error * error
     constant = end_model(hessian, gradient, value, x, Q, q)
-    k, good = begin(Q, q, constant, x, C, b)
+    k, good = begin(Q, q, constant, x, S, C, b)
     return k, good, constant
 
 
@@ -108,7 +110,7 @@ def forward_pass(
     fx, fu, x_next, costate, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(M)
     clear(fx, N, N)
     clear(fu, N, M)
-    kbar[0], good, _ = begin_model(x_hat, initial, fixed, damping, plan_x, C[0], b[0])
+    kbar[0], good, _ = begin_model(x_hat, initial, fixed, damping, plan_x, S[0], C[0], b[0])
     if not good:
         return 0, finite(C[0], N, N)
     for t in range(steps):
@@ -151,8 +153,8 @@ def backward_pass(
     `x_hats` (T+1, N). What is linearised about lies a fraction `reach` of the way from the plan to where the minimisers
     lead: all of it in the paper's method. The rest is as in `forward_pass`.
 
-    Returns also a cost that is as good as none. Where the least cost is zero, squares of rounding errors remain of it.
-    They are measured by what the quadratic models are at the origin, from which they rise or fall to the plan.
+    Returns also a cost that is as good as none. Where the least cost is zero, squares of rounding errors remain of it,
+    some 1e-14 of the numbers that cancel: those are in what the quadratic models are at the origin.
     """
     hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
     fx, fu, x_next, x, u, costate = stack(N, N), stack(N, M), stack(N), stack(N), stack(M), stack(N)
@@ -180,12 +182,12 @@ def backward_pass(
             return t, finite(hessian, W, W) and finite(jacobian, N, W) and finite(C[t], N, N), 0.0
     good = True
     if not fixed:
-        kbar[0], good, constant = begin_model(x_hat, initial, fixed, damping, plan_x, C[0], b[0])
+        kbar[0], good, constant = begin_model(x_hat, initial, fixed, damping, plan_x, S[0], C[0], b[0])
         size += abs(constant)
     if not good or not minimizer(S[0], s[0], C[0], b[0], costate, x_hat):
         return 0, finite(S[0], N, N) and finite(C[0], N, N), 0.0
     copy(x_hat, N, x_hats[0])
-    return -1, True, 1e-20 * size
+    return -1, True, 1e-28 * size if size < inf else 0.0
 
 
 def opening_pass(
@@ -223,6 +225,14 @@ def opening_pass(
         copy(x, N, x_hat)
         lowest(S[t], s[t], x_hat)
     return -1, True
+
+
+def minimizers(steps, S, s, C, b, x_hats):
+    """Write the states of least total cost; False if one has none."""
+    costate, good = stack(N), True
+    for t in range(steps + 1):
+        good = minimizer(S[t], s[t], C[t], b[t], costate, x_hats[t]) and good
+    return good
 
 
 def lowest(S, s, x):

@@ -17,7 +17,7 @@ from lqrsim.solvers.kernels import (
 )
 
 
-def begin(Q, q, constant, x, Sbar, sbar):
+def begin(Q, q, constant, x, S, Sbar, sbar):
     """Write the cost-to-come at 0, given c_0 about the origin, quadratised at x; return its constant. Eq. (18)."""
     for i in range(N):
         sbar[i] = q[i]

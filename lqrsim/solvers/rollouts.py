@@ -3,7 +3,7 @@
 Shapes and names are those of `passes.py`.
 """
 
-from math import nan
+from math import isnan, nan
 
 from lqrsim.integration import step, step_jacobian
 from lqrsim.solvers.interface import (
@@ -95,6 +95,8 @@ def initial_step(x0, initial, S, s, direction):
             slope[i] += S[i, j] * x0[j]
             total[i, j] = hessian[i, j] + S[i, j]
         direction[i] = -slope[i]
+        if slope[i] == 0 and total[i, i] == 0:  # a state that nothing weighs may stay
+            total[i, i] = 1.0
     if not cholesky(total, N):
         return nan
     cholesky_solve(total, N, direction)
@@ -111,11 +113,11 @@ def largest_gap(steps, x_hats, states):
         low, high, worst = states[0, i], states[0, i], 0.0
         for t in range(steps + 1):
             difference = abs(x_hats[t, i] - states[t, i])
-            if not difference <= worst:  # a NaN too
+            if difference > worst or isnan(difference):  # and then it stays
                 worst = difference
             low, high = min(low, states[t, i]), max(high, states[t, i])
         relative = worst / max(high - low, 1.0)
-        if not relative <= gap:
+        if relative > gap or isnan(relative):
             gap = relative
     return gap
 
@@ -130,13 +132,13 @@ def dynamics_residual(steps, x_hats, L, l, p, dt, states):
         step(x_hats[t], u, p, dt, ahead)
         for i in range(N):
             difference = abs(x_hats[t + 1, i] - ahead[i])
-            if not difference <= worst[i]:  # a NaN too
+            if difference > worst[i] or isnan(difference):
                 worst[i] = difference
             low[i], high[i] = min(low[i], states[t + 1, i]), max(high[i], states[t + 1, i])
     residual = 0.0
     for i in range(N):
         relative = worst[i] / max(high[i] - low[i], 1.0)
-        if not relative <= residual:
+        if relative > residual or isnan(relative):
             residual = relative
     return residual
 

@@ -9,6 +9,7 @@ from math import inf, isnan, nan
 
 from lqrsim.solvers.interface import (
     DAMPED,
+    FINAL_GAP,
     ILQR,
     ILQR_LEFT,
     ILQR_NEXT,
@@ -22,12 +23,22 @@ from lqrsim.solvers.interface import (
     SMALL,
     STALLED,
     WEIGHT,
+    M,
     N,
     stack,
 )
-from lqrsim.solvers.loops import ending, optimality, relative_improvement, write_row
-from lqrsim.solvers.passes import backward_pass, copy, forward_pass
-from lqrsim.solvers.rollouts import about_plan, dynamics_residual, follow, keep_plan, largest_gap, line_search
+from lqrsim.solvers.loops import ending, relative_improvement, relative_optimality, write_row
+from lqrsim.solvers.passes import backward_pass, copy, forward_pass, minimizers
+from lqrsim.solvers.rollouts import (
+    about_plan,
+    differential_pass,
+    dynamics_residual,
+    follow,
+    initial_step,
+    keep_plan,
+    largest_gap,
+    line_search,
+)
 
 
 def damped_iterations(
@@ -44,7 +55,7 @@ def damped_iterations(
     If so, changes of the controls (and of a soft start) get a weight in both passes, relative to the cost's own
     curvature, which grows tenfold until it helps.
 
-    A small change of cost can come from a short step, so two in a row are wanted. Then both passes are done once more,
+    A small change of cost can come from a short step, so two in a row are wanted. Then everything is done once more,
     about the plan and without a weight, to tell how far it is from optimal; that also gives the policy and the value
     functions of the answer.
 
@@ -94,7 +105,7 @@ def damped_iterations(
             write_row(log, done, memory[PLAN_COST], 0.0, nan, nan, nan, REJECTED)
         if settled or full:
             outcome = relinearize(
-                steps, fixed, tolerance, gap_tolerance, optimal, settled,
+                steps, fixed, tolerance, optimal, settled, nothing,
                 start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
                 no_weight, no_about, plan_x, plan_u, memory, log, done,
             )  # fmt: skip
@@ -138,27 +149,36 @@ def turn_to_ilqr(memory):
 
 
 def relinearize(
-    steps, fixed, tolerance, gap_tolerance, optimal, settled,
+    steps, fixed, tolerance, optimal, settled, nothing,
     start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
     no_weight, no_about, plan_x, plan_u, memory, log, done,
 ):  # fmt: skip
-    """Both passes about the plan, without a weight. Writes optimality and residual to the log; returns the outcome."""
-    nothing = 0.0
+    """Policy and value functions about the plan, without a weight. Returns the outcome.
+
+    Writes optimality and residual to the log, and to the memory how far the states of least total cost are from the
+    plan: where motions are unstable, rounding can spoil the cost-to-come while the rest is right.
+    """
+    shift = stack(N)
+    failed, _, left = differential_pass(steps, plan_x, plan_u, p, dt, stage, final, 0.0, 1, L, l, S, s, k)
+    if failed >= 0:
+        return RUNNING
+    if not fixed:
+        left += initial_step(plan_x[0], initial, S[0], s[0], shift)
+    left = relative_optimality(failed, left, memory[PLAN_COST], nothing)
     copy(start if fixed else plan_x[0], N, x_hat)
     failed, _ = forward_pass(
         steps, fixed, True, 0.0, plan_x, plan_u,
         x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final, no_weight, no_about,
     )  # fmt: skip
-    if failed < 0:
-        failed, _, nothing = backward_pass(
-            steps, fixed, 0.0, 0.0, plan_x, plan_u, x_hat, x_hats,
-            L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, no_weight, no_about,
-        )  # fmt: skip
-    if failed >= 0:
-        return RUNNING
-    left = optimality(steps, fixed, plan_x, plan_u, memory[PLAN_COST], nothing, p, dt, initial, stage, final)
+    memory[FINAL_GAP] = inf
+    if failed < 0 and minimizers(steps, S, s, C, b, x_hats):
+        memory[FINAL_GAP] = largest_gap(steps, x_hats, plan_x)
+    for t in range(steps):
+        for i in range(M):  # the policy that makes the plan
+            l[t, i] = plan_u[t, i]
+            for j in range(N):
+                l[t, i] -= L[t, i, j] * plan_x[t, j]
     log[done, 3], log[done, 4] = left, dynamics_residual(steps, x_hats, L, l, p, dt, plan_x)
     if isnan(log[done, 2]):  # of an iteration that was rejected
-        log[done, 2] = largest_gap(steps, x_hats, plan_x)
-        settled = settled and (log[done, 2] < gap_tolerance or not optimal)
+        log[done, 2] = 0.0
     return ending(settled and left < tolerance, optimal, left, tolerance, memory[PLAN_COST], False)

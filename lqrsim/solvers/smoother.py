@@ -16,7 +16,7 @@ from lqrsim.solvers.common import (
     LOG_COLUMNS,
     Callback,
     Ending,
-    Settings,
+    SmootherSettings,
     assemble,
     check_outcome,
     check_problem,
@@ -69,7 +69,7 @@ def smooth(
     Raises:
       InputError: an argument is not as described.
     """
-    settings = Settings(
+    settings = SmootherSettings(
         form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, start=start,
     )  # fmt: skip
@@ -109,14 +109,14 @@ def smooth_many(
       InputError: an argument is not as described; a problem that is refused is named by its place in the list. One that
         is only not finite at its start ends as NOT_FINITE, and its detail says where.
     """
-    settings = Settings(
+    settings = SmootherSettings(
         form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, start=start,
     )  # fmt: skip
     return solve_all(list_of(problems), settings, _check, _solve, threads=threads, progress=progress)
 
 
-def _check(problem: Problem, settings: Settings) -> None:
+def _check(problem: Problem, settings: SmootherSettings) -> None:
     check_problem(problem)
     if settings.form == "primal" and isinstance(problem.initial, FixedState):
         raise InputError(
@@ -128,7 +128,7 @@ def _check(problem: Problem, settings: Settings) -> None:
 class _Arrays:
     """What the loops read and write; see `solvers/loops.py` and `safeguard.py` for what each is."""
 
-    def __init__(self, problem: Problem, settings: Settings, begin: Start, start: Array) -> None:
+    def __init__(self, problem: Problem, settings: SmootherSettings, begin: Start, start: Array) -> None:
         n, steps, zeros = len(start), problem.steps, np.zeros
         m = begin.offset.shape[1]
         self.dual = settings.form == "dual"
@@ -149,9 +149,10 @@ class _Arrays:
             about = np.broadcast_to(problem.prior.about, (steps + 1, n)).copy()
             self.prior = problem.prior.weight.copy(), about, problem.prior.iterations
         # Without a trajectory to begin with: the start, and the controls with which the dynamics can run backwards.
-        self.plan = np.tile(self.start, (steps + 1, 1)), begin.offset.copy()
+        self.guess = np.tile(self.start, (steps + 1, 1)), begin.offset.copy()
         if begin.trajectory is not None:
-            self.plan = begin.trajectory.states.copy(), begin.trajectory.controls.copy()
+            self.guess = begin.trajectory.states.copy(), begin.trajectory.controls.copy()
+        self.plan = self.guess[0].copy(), self.guess[1].copy()
         self.states, self.controls = zeros((steps + 1, n)), zeros((steps, m))
         self.kept = zeros((steps, m, n)), zeros((steps, m))
         self.memory = zeros(interface.MEMORY)
@@ -180,7 +181,7 @@ class _Arrays:
         return {"cost_to_go": Quadratic(*self.go), "cost_to_come": Moments(*self.come), "inverse_law": inverse}
 
 
-def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callback | None = None) -> Solution:
+def _solve(problem: Problem, settings: SmootherSettings, *, each: bool, callback: Callback | None = None) -> Solution:
     """Solve; with `each`, a look after each iteration (see `iterate`)."""
     begin = resolve(settings.start, problem)
     start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
@@ -206,16 +207,24 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
 
 
 def _undamped(
-    problem: Problem, settings: Settings, begin: Start, arrays: _Arrays, *, each: bool, callback: Callback | None
+    problem: Problem,
+    settings: SmootherSettings,
+    begin: Start,
+    arrays: _Arrays,
+    *,
+    each: bool,
+    callback: Callback | None,
 ) -> Ending:
     """The method of the paper."""
-    core = compiled.core(problem, settings.form or "dual")
+    core = compiled.core(problem, settings.form)
     log = np.zeros((settings.max_iterations, LOG_COLUMNS))
     options = (
-        settings.max_iterations, settings.tolerance, float(settings.gap_tolerance or 0), settings.stop == "optimal",
+        settings.max_iterations, settings.tolerance, settings.gap_tolerance, settings.stop == "optimal",
         arrays.fixed, begin.trajectory is not None, settings.first_pass == "backward",
     )  # fmt: skip
-    more = *arrays.prior, *arrays.plan, arrays.states, arrays.controls, *arrays.kept, arrays.memory, log
+    more = (
+        *arrays.prior, *arrays.guess, *arrays.plan, arrays.states, arrays.controls, *arrays.kept, arrays.memory, log
+    )  # fmt: skip
     loop = core.entry("smoother_iterations", problem.steps, 0, 0, *options, *arrays.passes, *more)
     return iterate(
         problem,
@@ -226,7 +235,7 @@ def _undamped(
 
 def _rescue(
     problem: Problem,
-    settings: Settings,
+    settings: SmootherSettings,
     arrays: _Arrays,
     ending: Ending,
     options: dict[str, object],
@@ -236,38 +245,39 @@ def _rescue(
     callback: Callback | None,
 ) -> Solution:
     """The safeguard: iterations from the best plan so far."""
-    core = compiled.core(problem, settings.form or "dual")
+    core = compiled.core(problem, settings.form)
     log = np.zeros((settings.max_iterations, LOG_COLUMNS))
     stops = (
-        settings.max_iterations, settings.tolerance, float(settings.gap_tolerance or 0), settings.stop == "optimal",
-        arrays.fixed,
+        settings.max_iterations, settings.tolerance, settings.gap_tolerance, settings.stop == "optimal", arrays.fixed
     )  # fmt: skip
     arrays.memory[interface.REACH], arrays.memory[interface.ILQR_NEXT] = 1.0, 2.0
-    more = *arrays.no_prior, *arrays.plan, arrays.states, arrays.controls, arrays.memory, log
+    trial = np.zeros_like(arrays.states), np.zeros_like(arrays.controls)
+    more = *arrays.no_prior, *arrays.plan, *trial, arrays.memory, log
     loop = core.entry("damped_iterations", problem.steps, 0, 0, *stops, *arrays.passes, *more)
     damped = iterate(
         problem,
         lambda first, last: loop(problem.steps, first, last, *stops, *arrays.passes, *more),
         log, settings.max_iterations, before=ending.iterations, each=each, callback=callback,
     )  # fmt: skip
-    states, controls = arrays.plan
+    found: dict[str, Any] = {"solver": "smooth", "options": options, "iterations": damped.iterations}
     detail = f"the undamped method failed ({why})"
     if not np.isfinite(arrays.memory[interface.PLAN_COST]):
-        # Nothing that was tried leads anywhere. What is left is how it failed, and the controls that it began with.
+        # Nothing that was tried leads anywhere. What is left is how it failed.
         return assemble(
-            problem, solver="smooth", options=options, status=ending.status, detail=detail,
-            iterations=damped.iterations, states=states, controls=controls,
-            law=(np.zeros_like(arrays.law[0]), controls.copy()),
+            problem, status=ending.status, detail=detail, states=arrays.states, controls=arrays.controls,
+            law=arrays.kept, **found,
         )  # fmt: skip
     status = damped.status
     if damped.outcome == interface.STALLED:
         status, detail = ending.status, f"{detail}; from the best plan, no step lowers the cost any more"
-    # The last iteration ended with both passes about the plan, if they can be done there at all.
-    whole = np.isfinite(damped.iterations[-1].optimality)
-    gain = arrays.law[0] if whole else np.zeros_like(arrays.law[0])
-    return assemble(
-        problem, solver="smooth", options=options, status=status, detail=detail,
-        iterations=damped.iterations, states=states, controls=controls,
-        law=(gain, controls - np.einsum("tij,tj->ti", gain, states[:-1])),
-        **(arrays.value_functions() if whole else {}),
-    )  # fmt: skip
+    found["states"], found["controls"] = arrays.plan
+    if not np.isfinite(damped.iterations[-1].optimality):  # there is no model about the plan, nor a policy
+        law = np.zeros_like(arrays.law[0]), arrays.plan[1].copy()
+        return assemble(problem, status=status, detail=detail, law=law, **found)
+    values = arrays.value_functions()
+    gap = arrays.memory[interface.FINAL_GAP]
+    if not gap < settings.gap_tolerance:
+        # As from iLQR, whose steps need neither of these.
+        values["cost_to_come"] = values["inverse_law"] = None
+        detail += f"; the states of least total cost are {gap:.1g} off the plan, so the cost-to-come is left out"
+    return assemble(problem, status=status, detail=detail, law=arrays.law, **found, **values)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array
+from lqrsim.errors import Array, InputError, check_array, excerpt
 from lqrsim.problem import Problem
 from lqrsim.results import AffinePolicy, Quadratic, Solution, Trajectory
 
@@ -32,12 +32,20 @@ class Start:
     summary: object
 
     def rolled_out(self, problem: Problem, x: Array) -> "Start":
-        """With the trajectory of the policy from a state (n,): what a backward pass that comes first is about."""
+        """With the trajectory of the policy from a state (n,): what a backward pass that comes first is about.
+
+        Where it leaves all numbers, the last state and control stay: the trajectory need not be feasible.
+        """
         states, controls = [x], []
         with np.errstate(all="ignore"):
             for gain, offset in zip(self.gain, self.offset, strict=True):
-                controls.append(gain @ states[-1] + offset)
-                states.append(problem.dynamics.step(states[-1], controls[-1], problem.dt))
+                control = gain @ states[-1] + offset
+                state = (
+                    problem.dynamics.step(states[-1], control, problem.dt) if np.isfinite(control).all() else control
+                )
+                finite = np.isfinite(state).all()
+                controls.append(control if finite else controls[-1] if controls else offset)
+                states.append(state if finite else states[-1])
         return replace(self, trajectory=Trajectory(np.array(states), np.array(controls), problem.dt))
 
 
@@ -65,10 +73,12 @@ def resolve(start: StartLike, problem: Problem) -> Start:
         given = Trajectory(states, controls, problem.dt)
         return Start(np.zeros((steps, m, n)), controls, None, given, _summary(start, states, controls))
     wanted = problem.nominal_control if start is None else start
+    got = excerpt(wanted)
     try:
-        controls = np.broadcast_to(np.asarray(wanted, dtype=np.float64), (steps, m))
+        given = np.array(wanted, dtype=np.float64)
+        got = f"shape {given.shape}"
+        controls = np.broadcast_to(given, (steps, m))
     except (TypeError, ValueError):
-        got = f"shape {np.shape(wanted)}" if isinstance(wanted, list | tuple | np.ndarray) else type(wanted).__name__
         raise InputError(
             f"start: got {got}, want controls ({m},) or ({steps}, {m}), a Trajectory, an AffinePolicy or a Solution"
         ) from None
