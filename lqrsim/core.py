@@ -239,15 +239,19 @@ def _uncollected() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _as_one() -> Iterator[None]:
-    """Make machine code of the entry alone, into which all that it calls is linked, and none of each part by itself.
+    """Optimise and make machine code of the entry alone, into which all is linked that it calls, and not of each part.
 
-    numba makes both, which takes longer, and then it is up to the linker which of two copies of a part runs:
+    numba does both, which takes longer, and then it is up to the linker which of two copies of a part runs:
     they differ in the last bit, so the run that compiles and the one that loads would not give the same numbers.
     """
     from numba.core import codegen, registry
     from numba.core.compiler_lock import global_compiler_lock
 
     class Part(codegen.JITCodeLibrary):
+        def _optimize_final_module(self) -> None:
+            if self.name == "entry":
+                super()._optimize_final_module()
+
         def _finalize_final_module(self) -> None:
             if self.name == "entry":
                 super()._finalize_final_module()

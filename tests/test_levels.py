@@ -146,14 +146,14 @@ def test_derivatives_of_costs_of_every_level(name: str) -> None:
 
 def test_goals_masses_obstacles_and_horizons_are_data(quadrotor: ls.Scenario) -> None:
     given = quadrotor.problem
-    ls.smooth(given, max_iterations=2)
+    ls.smooth(given, max_iterations=2, safeguard=False)
     before = len(core.compilations)
     heavy, world = ls.Quadrotor(mass=0.7), quadrotor.scene.world
     fewer = ls.ObstacleCost(ls.World(world.obstacles[3:]), radius=0.25, sharpness=8.0, weight=2.0)
     control = ls.ControlCost([10.0] * 4, about=[heavy.hover_force] * 4)
     elsewhere = ls.QuadraticCost([400.0] * 12, about=[1.0, 0.5, -2.0, *[0.0] * 9])
     costs = {
-        ls.smooth(problem, max_iterations=2).cost
+        ls.smooth(problem, max_iterations=2, safeguard=False).cost
         for problem in (
             given,
             dataclasses.replace(given, dynamics=heavy.dynamics),
@@ -211,10 +211,10 @@ def test_numbers_and_plain_functions_are_data() -> None:
 @pytest.mark.parametrize("level", ["compiled here", "plain with Jacobian"])
 def test_a_problem_can_be_copied_and_sent_to_another_process(level: str) -> None:
     problem = swing(DYNAMICS[level], COSTS["plain with derivatives"])
-    want = ls.smooth(problem, max_iterations=2)
+    want = ls.smooth(problem, max_iterations=2, safeguard=False)
     for other in (pickle.loads(pickle.dumps(problem)), copy.deepcopy(problem)):
         assert other.digest == problem.digest
-        np.testing.assert_array_equal(ls.smooth(other, max_iterations=2).policy.gain, want.policy.gain)
+        np.testing.assert_array_equal(ls.smooth(other, max_iterations=2, safeguard=False).policy.gain, want.policy.gain)
 
 
 def test_what_a_plain_function_raises_ends_the_solve_with_its_words() -> None:
@@ -266,7 +266,7 @@ def test_ctrl_c_stops_plain_functions_in_other_threads() -> None:
     stopped = len(calls)
     time.sleep(0.05)
     assert len(calls) == stopped  # nothing runs on
-    assert ls.smooth(problems[1], max_iterations=1).iterations  # and nothing is left stopped
+    assert ls.smooth(problems[1], max_iterations=1, safeguard=False).iterations  # and nothing is left stopped
 
 
 def _index(x, u, p):
@@ -363,7 +363,9 @@ def test_kinks_and_jumps_have_derivatives_almost_everywhere() -> None:
         assert value == pytest.approx(max(a, 0) ** 2 + abs(b) ** 3 + abs(b), rel=1e-14)
         np.testing.assert_allclose(gradient[:2], [2 * max(a, 0), 3 * b * abs(b) + np.sign(b)], rtol=0, atol=1e-12)
         np.testing.assert_allclose(hessian[:2, :2], np.diag([2.0 * (a > 0), 6 * abs(b)]), rtol=0, atol=1e-12)
-    assert np.isfinite(ls.smooth(swing(DYNAMICS["symbolic"], cost), max_iterations=3).cost)  # and it compiles
+    assert np.isfinite(
+        ls.smooth(swing(DYNAMICS["symbolic"], cost), max_iterations=3, safeguard=False).cost
+    )  # and it compiles
 
 
 def test_a_cost_that_is_not_a_number_at_the_start_is_refused() -> None:

@@ -155,15 +155,20 @@ class TestStarts:
         assert len(found.iterations) == 1
 
 
+def _curved_end(x, u, p):
+    return p.weight * sympy.log(sympy.cosh(2 * (x[0] - p.about))) + p.other * (x[1] - p.speed) ** 2
+
+
+def _quadratic_end(x, u, p):
+    return p.weight * (x[0] - p.about) ** 2 + p.other * (x[1] - p.speed) ** 2
+
+
 def smooth_ends(*, curved: bool, singular: bool = False) -> ls.Problem:
     """A double integrator whose initial and final costs are not quadratic, or are; whose start may be partly free."""
 
     def end(about: float, weight: float, singular: bool) -> ls.SymbolicCost:
-        def cost(x, u, p):
-            along = sympy.log(sympy.cosh(2 * (x[0] - p.about))) if curved else (x[0] - p.about) ** 2
-            return p.weight * (along if singular else along + (x[1] - p.speed) ** 2)
-
-        return ls.SymbolicCost(cost, parameters={"about": about, "speed": 0.3, "weight": weight}, convex=True)
+        numbers = {"about": about, "speed": 0.3, "weight": weight, "other": 0.0 if singular else weight}
+        return ls.SymbolicCost(_curved_end if curved else _quadratic_end, parameters=numbers, convex=True)
 
     dynamics = ls.Dynamics(lambda x, u, p: [x[1], u[0]], states={"x": "m", "v": "m/s"}, controls={"a": "m/s^2"})
     return ls.Problem(

@@ -193,9 +193,9 @@ def back_substitute(factor, rows):
 def update(V, Q, size):
     """Turn V into (V^-1 + Q)^-1, for V and Q semidefinite, in place; False if there is none. Q is used up.
 
-    With Q = sum of d f f', one term at a time, each in the form of Joseph, (I - K f') V (I - K f')' + K K' / d with
-    K = d V f / (1 + d f'V f): a sum of squares, which keeps V semidefinite whatever its rank, and small parts beside
-    large ones. It costs little where Q has few entries, as those of obstacles have. `size` (N,) is the diagonal of Q
+    With Q = sum of d f f', one term at a time: V - K f'V with K = d V f / (1 + d f'V f). Where that cancels digits,
+    what is left is worked out in the form of Joseph, (I - K f') V (I - K f')' + K K' / d: a sum of squares, which keeps
+    V semidefinite. It takes little time where Q has few entries, as those of obstacles have. `size` (N,) is the diagonal of Q
     before anything was taken from it: what is far less is rounding.
     """
     f, w, gain = stack(N), stack(N), stack(N)
@@ -227,14 +227,15 @@ def update(V, Q, size):
             gain[j] = d / total * w[j]
             for k in range(N):
                 V[j, k] -= gain[j] * w[k]
-        for j in range(N):
-            left = 0.0
-            for k in range(N):
-                left += V[j, k] * f[k]
-            w[j] = left
-        for j in range(N):
-            for k in range(N):
-                V[j, k] += (gain[j] / d - w[j]) * gain[k]
+        if total > 1e3:
+            for j in range(N):
+                left = 0.0
+                for k in range(N):
+                    left += V[j, k] * f[k]
+                w[j] = left
+            for j in range(N):
+                for k in range(N):
+                    V[j, k] += (gain[j] / d - w[j]) * gain[k]
     return True
 
 

@@ -23,9 +23,9 @@ SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
 # The safeguard's memory: the cost of the plan; how far the next iteration reaches, and the weight on changes of the
 # controls; how many small changes there were in a row; of iterations at reach 0, iLQR's, how many are left, how many
 # there will be the next time, and how many others there were since, of which PATIENCE are enough.
-# At the end, how far the states of least total cost are from the plan.
-PLAN_COST, REACH, WEIGHT, SMALL, ILQR_LEFT, ILQR_NEXT, SINCE_ILQR, FINAL_GAP = 0, 1, 2, 3, 4, 5, 6, 7
-MEMORY = 8
+# At the end, how far the states of least total cost are from the plan; at the beginning, whether that was made.
+PLAN_COST, REACH, WEIGHT, SMALL, ILQR_LEFT, ILQR_NEXT, SINCE_ILQR, FINAL_GAP, STARTED = 0, 1, 2, 3, 4, 5, 6, 7, 8
+MEMORY = 9
 PATIENCE = 50
 
 

@@ -21,11 +21,12 @@ from lqrsim.solvers.interface import (
     RUNNING,
     SMOOTH,
     STALLED,
+    STARTED,
     M,
     N,
     stack,
 )
-from lqrsim.solvers.passes import backward_pass, copy, forward_pass, opening_pass
+from lqrsim.solvers.passes import backward_pass, copy, forward_pass
 from lqrsim.solvers.rollouts import (
     differential_pass,
     dynamics_residual,
@@ -49,7 +50,7 @@ def relative_improvement(old, cost, nothing):
 
 
 def smoother_iterations(
-    steps, first, last, max_iterations, tolerance, gap_tolerance, optimal, fixed, guided, opening,
+    steps, first, last, max_iterations, tolerance, gap_tolerance, optimal, fixed, guided,
     start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
     prior_weight, prior_about, prior_iterations, guess_x, guess_u, plan_x, plan_u,
     states, controls, kept_L, kept_l, memory, log,
@@ -57,33 +58,27 @@ def smoother_iterations(
     """Iterated LQR smoothing: a forward pass, a backward pass and the rollout of the new policy, again and again.
 
     L, l, S, s are the policy and the cost-to-go to begin with. With `guided`, the first pass linearises about the
-    guess; with `opening`, a backward pass comes first, on its own. `states`, `controls`, `kept_L`, `kept_l` are what
-    the last iteration that was completed found; before any, where the first policy leads. The plan is the rollout of
-    least cost so far, that of the first policy included, and memory[PLAN_COST] that cost: for the safeguard.
+    guess. `states`, `controls`, `kept_L`, `kept_l` are what the last iteration that was completed found; before any,
+    where the first policy leads. The plan is the rollout of least cost so far, that of the first policy included, and
+    memory[PLAN_COST] that cost: for the safeguard. With `last` of 0, only that is begun with.
     """
     no_weight = stack(N)
     for i in range(N):
         no_weight[i] = 0.0
-    if first == 0:
-        memory[PLAN_COST] = inf
+    if memory[STARTED] == 0:
+        memory[STARTED], memory[PLAN_COST] = 1.0, inf
         cost = rollout(steps, start, L, l, p, dt, initial, stage, final, states, controls)
         keep_law(steps, L, l, kept_L, kept_l)
         if cost < inf:
             memory[PLAN_COST] = cost
             keep_plan(steps, states, controls, plan_x, plan_u)
         copy(start, N, x_hat)
-        if opening:
-            failed, good = opening_pass(
-                steps, guided, guess_x, guess_u, L, l, S, s, k, p, dt, stage, final, prior_weight, prior_about
-            )
-            if failed >= 0:
-                return 0, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, True, failed
-        elif guided and not fixed:
+        if guided and not fixed:
             copy(guess_x[0], N, x_hat)
     for done in range(first, last):
         weight = prior_weight if done < prior_iterations else no_weight
         failed, good = forward_pass(
-            steps, fixed, guided and not opening and done == 0, 0.0, guess_x, guess_u,
+            steps, fixed, guided and done == 0, 0.0, guess_x, guess_u,
             x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final, weight, prior_about,
         )  # fmt: skip
         if failed >= 0:

@@ -220,12 +220,21 @@ def _undamped(
     log = np.zeros((settings.max_iterations, LOG_COLUMNS))
     options = (
         settings.max_iterations, settings.tolerance, settings.gap_tolerance, settings.stop == "optimal",
-        arrays.fixed, begin.trajectory is not None, settings.first_pass == "backward",
+        arrays.fixed, begin.trajectory is not None and settings.first_pass == "forward",
     )  # fmt: skip
     more = (
         *arrays.prior, *arrays.guess, *arrays.plan, arrays.states, arrays.controls, *arrays.kept, arrays.memory, log
     )  # fmt: skip
     loop = core.entry("smoother_iterations", problem.steps, 0, 0, *options, *arrays.passes, *more)
+    if settings.first_pass == "backward":
+        loop(problem.steps, 0, 0, *options, *arrays.passes, *more)  # where the start leads, before it is forgotten
+        p, dt, _, stage, final = arrays.model
+        failed, good = core.opening_pass(
+            problem.steps, begin.trajectory is not None, *arrays.guess, *arrays.law, *arrays.go, p, dt, stage, final,
+            *arrays.prior[:2],
+        )  # fmt: skip
+        if failed >= 0:
+            return Ending((), interface.NOT_POSITIVE_DEFINITE if good else interface.NOT_FINITE, True, failed, "")
     return iterate(
         problem,
         lambda first, last: loop(problem.steps, first, last, *options, *arrays.passes, *more),
