@@ -77,7 +77,7 @@ def check(problem: ls.Problem, solution: ls.Solution, rate: Rate | None = None) 
         cost=float(cost),
         scale=float(scale),
         residual=_residual(plan, arrived),
-        decrease=float(saved / (abs(cost) + 1e-28 * scale + 1e-300)),
+        decrease=float(saved / (abs(cost) + 1e-26 * scale + 1e-300)),
         stationarity=_stationarity(A, B, gain, gradient, hessian, start_slope, end_slope, end_curve, fixed=fixed),
         states=plan.states + dx,
         controls=plan.controls + du,

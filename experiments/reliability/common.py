@@ -113,7 +113,9 @@ def improvements(pairs: Iterable[tuple[ls.Problem, ls.Solution]], name: str) -> 
         except ls.InputError:
             return None
         further = ls.ilqr(held, start=plan.controls, tolerance=1e-9, max_iterations=2000)
-        return (solution.cost - paid - further.cost) / max(abs(solution.cost), 1e-300)
+        return (solution.cost - paid - further.cost) / max(
+            abs(solution.cost), 1e-20
+        )  # of less, it is a share of rounding
 
     return [improvement(problem, solution) for problem, solution in progress(list(pairs), name)]
 

@@ -195,8 +195,8 @@ def update(V, Q, size):
 
     With Q = sum of d f f', one term at a time: V - K f'V with K = d V f / (1 + d f'V f). Where that cancels digits,
     what is left is worked out in the form of Joseph, (I - K f') V (I - K f')' + K K' / d: a sum of squares, which keeps
-    V semidefinite. It takes little time where Q has few entries, as those of obstacles have. `size` (N,) is the diagonal of Q
-    before anything was taken from it: what is far less is rounding.
+    V semidefinite. It takes little time where Q has few entries, as those of obstacles have. `size` (N,) is the
+    diagonal of Q before anything was taken from it: what is far less is rounding.
     """
     f, w, gain = stack(N), stack(N), stack(N)
     scale = 0.0

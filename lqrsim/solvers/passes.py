@@ -154,7 +154,7 @@ def backward_pass(
     lead: all of it in the paper's method. The rest is as in `forward_pass`.
 
     Returns also a cost that is as good as none. Where the least cost is zero, squares of rounding errors remain of it,
-    some 1e-14 of the numbers that cancel: those are in what the quadratic models are at the origin.
+    some 1e-13 of the numbers that cancel: those are in what the quadratic models are at the origin.
     """
     hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
     fx, fu, x_next, x, u, costate = stack(N, N), stack(N, M), stack(N), stack(N), stack(M), stack(N)
@@ -187,7 +187,7 @@ def backward_pass(
     if not good or not minimizer(S[0], s[0], C[0], b[0], costate, x_hat):
         return 0, finite(S[0], N, N) and finite(C[0], N, N), 0.0
     copy(x_hat, N, x_hats[0])
-    return -1, True, 1e-28 * size if size < inf else 0.0
+    return -1, True, 1e-26 * size if size < inf else 0.0
 
 
 def opening_pass(
