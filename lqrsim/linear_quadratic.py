@@ -6,7 +6,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import InputError, check_array, excerpt
+from lqrsim.errors import Array, InputError, check_array, excerpt
+from lqrsim.results import Quadratic
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +76,21 @@ class Stage:
     def controls(self) -> int:
         """m, the number of controls."""
         return np.shape(self.B)[-1]
+
+
+def check_end(field: str, cost: Quadratic, n: int) -> tuple[Array, Array, float]:
+    """Hessian (n, n), gradient (n,) and constant of an initial or final cost.
+
+    Raises:
+      InputError: it is no Quadratic of n states, or its Hessian is not symmetric.
+    """
+    if not isinstance(cost, Quadratic):
+        raise InputError(f"{field}: got {type(cost).__name__}, want a Quadratic")
+    hessian = check_array(f"{field}: hessian", cost.hessian, (n, n))
+    if not np.allclose(hessian, hessian.T, rtol=1e-9, atol=0):
+        raise InputError(f"{field}: hessian: got a matrix that is not symmetric, want a symmetric one")
+    gradient = check_array(f"{field}: gradient", cost.gradient, (n,))
+    return hessian, gradient, float(check_array(f"{field}: constant", cost.constant, ()))
 
 
 def _shape(value: npt.ArrayLike) -> tuple[int, ...]:

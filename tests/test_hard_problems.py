@@ -65,7 +65,8 @@ def test_backward_first_from_a_policy_that_escapes_does_not_raise() -> None:
     policy = ls.smooth(problem).policy
     wild = dataclasses.replace(policy, gain=policy.gain + 2.0)
     for first_pass in ("forward", "backward"):
-        assert isinstance(ls.smooth(problem, start=wild, first_pass=first_pass).status, Status)
+        solution = ls.smooth(problem, start=wild, first_pass=first_pass)
+        assert np.isfinite(solution.cost) or not solution.success
 
 
 def unicycle(offset: float, weight: float, effort: float) -> ls.Problem:

@@ -15,7 +15,7 @@ from scipy.interpolate import PPoly
 from lqrsim.checks import check_functions, check_start, functions_of
 from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt
 from lqrsim.functions import External
-from lqrsim.linear_quadratic import Stage
+from lqrsim.linear_quadratic import Stage, check_end
 from lqrsim.problem import FixedState, Problem
 from lqrsim.results import Iteration, Quadratic, Status
 from lqrsim.solvers.differential import (
@@ -211,13 +211,7 @@ def _model(stage: Stage, n: int, m: int) -> Model:
 
 def _end(field: str, cost: Quadratic, n: int) -> Array:
     """An initial or final cost as V (n+1, n+1). Raises InputError if it is none of n states."""
-    if not isinstance(cost, Quadratic):
-        raise InputError(f"{field}: got {type(cost).__name__}, want a Quadratic")
-    hessian = check_array(f"{field}: hessian", cost.hessian, (n, n))
-    if not np.allclose(hessian, hessian.T, rtol=1e-9, atol=0):
-        raise InputError(f"{field}: hessian: got a matrix that is not symmetric, want a symmetric one")
-    gradient = check_array(f"{field}: gradient", cost.gradient, (n,))
-    return bordered(hessian, gradient, float(check_array(f"{field}: constant", cost.constant, ())))
+    return bordered(*check_end(field, cost, n))
 
 
 def _check_minimum(backward: Pass, forward: Pass) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from lqrsim import compiled
 from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array, check_name, check_number
-from lqrsim.linear_quadratic import Stage
+from lqrsim.linear_quadratic import Stage, check_end
 from lqrsim.problem import FixedState
 from lqrsim.results import AffinePolicy, Iteration, Moments, Quadratic, Solution, Status, Trajectory
 from lqrsim.versions import versions
@@ -54,7 +54,7 @@ def smooth_lq(
     slope = np.ascontiguousarray(np.concatenate([q, r], axis=1))
     go = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
     come = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
-    go[0][-1], go[1][-1], go[2][-1] = _end("final", final, n)
+    go[0][-1], go[1][-1], go[2][-1] = check_end("final", final, n)
     come[0][0], come[1][0], come[2][0] = _begin(initial, n, form)
     law = np.zeros((steps, m, n)), np.zeros((steps, m))
     back = np.zeros((steps, n, n)), np.zeros((steps, n)), np.zeros((steps, m, n)), np.zeros((steps, m))
@@ -153,16 +153,6 @@ def _digest(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Qu
     return hasher.hexdigest()[:16]
 
 
-def _end(field: str, end: Quadratic, n: int) -> tuple[Array, Array, float]:
-    if not isinstance(end, Quadratic):
-        raise InputError(f"{field}: got {type(end).__name__}, want a Quadratic")
-    hessian = check_array(f"{field}: hessian", end.hessian, (n, n))
-    if not np.allclose(hessian, hessian.T, rtol=1e-9, atol=0):
-        raise InputError(f"{field}: hessian: got a matrix that is not symmetric, want a symmetric one")
-    gradient = check_array(f"{field}: gradient", end.gradient, (n,))
-    return hessian, gradient, float(check_array(f"{field}: constant", end.constant, ()))
-
-
 def _begin(initial: Quadratic | FixedState, n: int, form: str) -> tuple[Array, Array, float]:
     """The cost-to-come at 0, as the form has it."""
     if isinstance(initial, FixedState):
@@ -171,7 +161,7 @@ def _begin(initial: Quadratic | FixedState, n: int, form: str) -> tuple[Array, A
                 'initial: got a FixedState, want a Quadratic: the primal form has no fixed start; "dual" has'
             )
         return np.zeros((n, n)), check_array("initial: state", initial.state, (n,)), 0.0
-    hessian, gradient, constant = _end("initial", initial, n)
+    hessian, gradient, constant = check_end("initial", initial, n)
     if form == "primal":
         return hessian, gradient, constant
     values = np.linalg.eigvalsh(hessian)
