@@ -14,7 +14,7 @@ speed     Against the C++ reference, one thread. The reference is no part of thi
           symbolic ones wrote ("by hand"), and as a user would give them, ls.Dynamics(f, jacobian=...), which compiled
           code calls at an address ("compiled level").
 peers     Against Crocoddyl's FDDP (pip install 'lqrsim[bench]', and g++): time a query, and the cost that is reached
-          from a start that is given exactly. peers.py says what is timed.
+          from a start that is given exactly. peers/ says what is timed.
 scaling   Time of an iteration as the states grow (a chain of masses, three states each), and time and memory as the
           horizon grows.
 threads   smooth_many on two threads against one.

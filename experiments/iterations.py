@@ -3,11 +3,12 @@
     python experiments/iterations.py            # 100 queries
     python experiments/iterations.py --quick    # 20
 
-Soft start, the paper's stop test (relative change of cost below 1e-4), both from hover.
+Soft start, no limits of the rotors, the paper's stop test (relative change of cost below 1e-4), both from hover.
 """
 
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,12 +32,14 @@ class Config:
 
 def main(config: Config) -> dict[str, Any]:
     count = 20 if config.quick else config.queries
-    solvers = {"smooth": ls.smooth, "ilqr": ls.ilqr}
+    solvers: dict[str, Callable[..., ls.Solution]] = {"smooth": ls.smooth, "ilqr": ls.ilqr}
     solutions: dict[str, list[ls.Solution]] = {name: [] for name in solvers}
     for query in tqdm(range(count), unit="query", leave=False, delay=2.0, disable=None):
-        problem = ls.scenarios.quadrotor(query=query, seed=config.seed).problem
+        scenario = ls.scenarios.quadrotor(query=query, seed=config.seed)
+        problem = replace(scenario.problem, control_limits=(-np.inf, np.inf))
         for name, solver in solvers.items():
-            solutions[name].append(solver(problem, stop="cost"))
+            start = scenario.paper_start if name == "smooth" else None
+            solutions[name].append(solver(problem, stop="cost", start=start))
     result: dict[str, Any] = {"config": asdict(config), "versions": dict(solutions["smooth"][0].versions)}
     for name, solved in solutions.items():
         result[name] = {

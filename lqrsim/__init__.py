@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from lqrsim import scenarios as scenarios
     from lqrsim.checks import DerivativeCheck as DerivativeCheck
     from lqrsim.checks import check_derivatives as check_derivatives
+    from lqrsim.constraints import Clearance as Clearance
+    from lqrsim.constraints import Constraint as Constraint
+    from lqrsim.constraints import Inequalities as Inequalities
     from lqrsim.coordinates import Coordinates as Coordinates
     from lqrsim.costs import ControlCost as ControlCost
     from lqrsim.costs import Cost as Cost
@@ -35,11 +38,12 @@ if TYPE_CHECKING:
     from lqrsim.files import save as save
     from lqrsim.linear_quadratic import Stage as Stage
     from lqrsim.problem import FixedState as FixedState
-    from lqrsim.problem import InitialPrior as InitialPrior
     from lqrsim.problem import Problem as Problem
     from lqrsim.results import AffinePolicy as AffinePolicy
+    from lqrsim.results import Candidate as Candidate
     from lqrsim.results import Iteration as Iteration
     from lqrsim.results import Moments as Moments
+    from lqrsim.results import Multipliers as Multipliers
     from lqrsim.results import Quadratic as Quadratic
     from lqrsim.results import Solution as Solution
     from lqrsim.results import Status as Status
@@ -69,6 +73,7 @@ if TYPE_CHECKING:
     from lqrsim.solvers.linear_quadratic import smooth_lq as smooth_lq
     from lqrsim.solvers.smoother import smooth as smooth
     from lqrsim.solvers.smoother import smooth_many as smooth_many
+    from lqrsim.solvers.start import InitialPrior as InitialPrior
     from lqrsim.view.plots import plot_run as plot_run
     from lqrsim.view.render import render as render
     from lqrsim.view.render import still as still
@@ -77,14 +82,26 @@ if TYPE_CHECKING:
 
 _HOME = {
     "checks": ["DerivativeCheck", "check_derivatives"],
+    "constraints": ["Clearance", "Constraint", "Inequalities"],
     "coordinates": ["Coordinates"],
     "costs": ["ControlCost", "Cost", "FunctionCost", "ObstacleCost", "QuadraticCost", "SymbolicCost", "Term"],
     "dynamics": ["Dynamics"],
     "errors": ["InputError"],
     "files": ["load_rollout", "load_solution", "save"],
     "linear_quadratic": ["Stage"],
-    "problem": ["FixedState", "InitialPrior", "Problem"],
-    "results": ["AffinePolicy", "Iteration", "Moments", "Quadratic", "Solution", "Status", "TotalCost", "Trajectory"],
+    "problem": ["FixedState", "Problem"],
+    "results": [
+        "AffinePolicy",
+        "Candidate",
+        "Iteration",
+        "Moments",
+        "Multipliers",
+        "Quadratic",
+        "Solution",
+        "Status",
+        "TotalCost",
+        "Trajectory",
+    ],
     "robots.base": ["Robot"],
     "robots.differential_drive": ["DifferentialDrive"],
     "robots.quadrotor": ["Quadrotor"],
@@ -98,6 +115,7 @@ _HOME = {
     "solvers.ilqr": ["ilqr", "ilqr_many"],
     "solvers.linear_quadratic": ["smooth_lq"],
     "solvers.smoother": ["smooth", "smooth_many"],
+    "solvers.start": ["InitialPrior"],
     "view.plots": ["plot_run"],
     "view.render": ["render", "still"],
     "world": ["Obstacle", "World"],

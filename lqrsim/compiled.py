@@ -9,6 +9,7 @@ import ast
 import hashlib
 import inspect
 import re
+from collections.abc import Sequence
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -17,16 +18,32 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import integration, rotations, world
+from lqrsim.constraints import Inequalities
 from lqrsim.core import Core, address_of, compiling
 from lqrsim.costs import Term
 from lqrsim.dynamics import Dynamics
 from lqrsim.errors import Array
-from lqrsim.problem import Problem
-from lqrsim.solvers import dual, interface, kernels, loops, lq_passes, passes, primal, projection, rollouts, safeguard
+from lqrsim.problem import FixedState, Problem
+from lqrsim.solvers import (
+    augmented,
+    dual,
+    interface,
+    kernels,
+    limits,
+    loops,
+    lq_passes,
+    passes,
+    primal,
+    projection,
+    rollouts,
+    safeguard,
+)
 from lqrsim.world import World
 
 # The terms of a cost as far as they are structure: the source of each, and what it may bend in (see `Term`).
 Structure = tuple[tuple[str, tuple[int, ...] | None], ...]
+# The constraints: the source of each, and whether it uses the control.
+Constraints = tuple[tuple[str, bool], ...]
 
 _FIELDS = {"initial": "initial", "stage": "stage_cost", "final": "final_cost"}
 
@@ -45,17 +62,28 @@ def _structure(problem: Problem) -> tuple[Any, ...]:
     dynamics = problem.dynamics
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     costs = [(name, tuple((t.source, t.bends) for t in problem.terms(field))) for name, field in _FIELDS.items()]
-    return n, m, dynamics.source, tuple(costs), f"{dynamics.name} ({n} states, {m} controls)"
+    constraints = tuple((inequalities.source, inequalities.uses_control) for inequalities in problem.inequalities)
+    return n, m, dynamics.source, tuple(costs), constraints, f"{dynamics.name} ({n} states, {m} controls)"
 
 
 @cache
-def _core(form: str, n: int, m: int, dynamics: str, costs: tuple[tuple[str, Structure], ...], what: str) -> Core:
+def _core(
+    form: str,
+    n: int,
+    m: int,
+    dynamics: str,
+    costs: tuple[tuple[str, Structure], ...],
+    constraints: Constraints,
+    what: str,
+) -> Core:
     parts = [_functions(module) for module in (rotations, world, kernels, integration, FORMS[form], *_SHARED)]
-    parts += [dynamics, *(_cost_source(name, structure) for name, structure in costs)]
-    return Core("\n\n".join(parts), {"N": n, "M": m, "W": n + m, **_OUTCOMES}, what)
+    parts += [dynamics, _constraint_source(constraints, len(dict(costs)["stage"]))]
+    parts += [_cost_source(name, terms, () if name == "initial" else constraints) for name, terms in costs]
+    sizes = {"N": n, "M": m, "W": n + m, "LIMITS": len(dict(costs)["stage"]) + 2 * len(constraints)}
+    return Core("\n\n".join(parts), {**_NAMES, **sizes}, what)
 
 
-_SHARED = passes, rollouts, loops, safeguard
+_SHARED = limits, passes, rollouts, loops, safeguard
 
 
 @cache
@@ -66,17 +94,36 @@ def linear_quadratic(n: int, m: int, form: str) -> Core:
         return Core("\n\n".join(parts), {"N": n, "M": m, "W": n + m}, f"linear-quadratic, {n} states, {m} controls")
 
 
-_OUTCOMES = {name: value for name, value in vars(interface).items() if name.isupper() and len(name) > 1}
+# The numbers that have names: outcomes, methods, and the places of what is remembered.
+_NAMES = {name: value for name, value in vars(interface).items() if name.isupper() and len(name) > 1}
 
 
-def arguments(problem: Problem) -> dict[str, Any]:
-    """The problem's numbers, as the passes take them: before its own, each part has the addresses of its functions."""
+def arguments(problem: Problem, *, share: float = 1.0, multipliers: Sequence[Array] = ()) -> dict[str, Any]:
+    """The problem's numbers, as the passes take them: before its own, each part has the addresses of its functions.
 
-    def numbers(part: Dynamics | Term) -> Array:
-        return np.array([*(address_of(function) for function in part.functions), *part.data], dtype=np.float64)
+    Args:
+      share: of the costs that may be eased; see `Term.factor`.
+      multipliers: of each constraint, as `augmented.py` has them; by default none act.
+    """
 
-    data = {name: tuple(numbers(term) for term in problem.terms(field)) for name, field in _FIELDS.items()}
-    return {"p": numbers(problem.dynamics), "dt": problem.dt, **data}
+    def numbers(part: Dynamics | Term, data: Array) -> Array:
+        return np.array([*(address_of(function) for function in part.functions), *data], dtype=np.float64)
+
+    parts = {name: problem.terms(field) for name, field in _FIELDS.items()}
+    data = {name: tuple(numbers(term, term.eased(share)) for term in terms) for name, terms in parts.items()}
+    multipliers = multipliers or [no_multipliers(problem, inequalities) for inequalities in problem.inequalities]
+    pairs = [(part.data.copy(), own) for part, own in zip(problem.inequalities, multipliers, strict=True)]
+    data["stage"] += tuple(array for pair in pairs for array in pair)
+    data["final"] += tuple(array for pair in pairs for array in pair)
+    data["stage"] += (np.array([*problem.control_coordinates.low, *problem.control_coordinates.high]),)
+    return {"p": numbers(problem.dynamics, problem.dynamics.data), "dt": problem.dt, **data}
+
+
+def no_multipliers(problem: Problem, inequalities: Inequalities) -> Array:
+    """Those of a constraint that does not act yet; see `solvers/augmented.py`."""
+    rows = inequalities.rows
+    first = 1 if isinstance(problem.initial, FixedState) else 0  # nothing can be done about a start that is given
+    return np.concatenate([[0.0, rows, first], np.zeros((problem.steps + 1) * rows)])
 
 
 def signed_distance(world_seen: World, points: npt.ArrayLike) -> Array:
@@ -106,14 +153,42 @@ def nearest(obstacles, count, data, points, out):
     return Core(f"{_functions(world)}\n\n{source}", {}, "distances to obstacles")
 
 
-def _cost_source(name: str, terms: Structure) -> str:
-    """Source of `<name>_value` and `<name>_quadratic`, which sum the terms."""
+def _constraint_source(constraints: Constraints, terms: int) -> str:
+    """Source of what the augmented Lagrangian needs of each constraint, and to look at them from outside."""
+    parts = []
+    look = "def look_at_constraints(steps, states, controls, data, values):\n    for t in range(steps + 1):\n"
+    look += "        u = controls[min(t, steps - 1)]\n"
+    slope = "def slope_of_constraint(which, row, x, u, t, data, gradient):\n"
+    for k, (source, _) in enumerate(constraints):
+        prefix = _prefix(source)
+        names = {"constraint_value": f"{prefix}_value", "constraint_slope": f"{prefix}_slope"}
+        names |= {name: f"{prefix}_{name}" for name in ("augment", "augmentation", "look")}
+        parts += [_own(source), _rename(_functions(augmented), names)]
+        at = terms + 2 * k
+        slope += f"    if which == {k}:\n        {prefix}_slope(x, u, t, row, data[{at}], gradient)\n"
+        look += f"        {prefix}_look(states[t], u, t, data[{at}], data[{at + 1}], values[{k}])\n"
+    return "\n\n".join([*parts, look, slope] if constraints else [])
+
+
+def _prefix(source: str) -> str:
+    # Terms of the same source are the same functions: those of an initial and a final cost, say.
+    return f"term_{hashlib.sha256(source.encode()).hexdigest()[:8]}"
+
+
+def _own(source: str) -> str:
+    """A source with its functions renamed, so that several can stand side by side."""
+    own = re.findall(r"^def (\w+)\(", source, flags=re.MULTILINE)
+    return _rename(source, {name: f"{_prefix(source)}_{name}" for name in own})
+
+
+def _cost_source(name: str, terms: Structure, constraints: Constraints) -> str:
+    """Source of `<name>_value`, the sum of the terms, of `<name>_added`, what the augmented Lagrangian adds, and of
+    `<name>_quadratic`, which models both.
+    """
     parts, values, convex, bent = [], [], [], []
     for i, (source, bends) in enumerate(terms):
-        # Terms of the same source are the same functions: those of an initial and a final cost, say.
-        prefix = f"term_{hashlib.sha256(source.encode()).hexdigest()[:8]}"
-        own = re.findall(r"^def (\w+)\(", source, flags=re.MULTILINE)
-        parts.append(_rename(source, {name: f"{prefix}_{name}" for name in own}))
+        prefix = _prefix(source)
+        parts.append(_own(source))
         values.append(f"    total += {prefix}_value(x, u, t, data[{i}])")
         call = f"    total += {prefix}_derivatives(x, u, t, data[{i}], hessian, gradient)"
         (convex if bends is None else bent).append(call)
@@ -122,6 +197,13 @@ def _cost_source(name: str, terms: Structure) -> str:
         # The sum of what may be indefinite is projected once; what is convex is added after.
         parts.append(_rename(_functions(projection), {"project": f"{name}_project", "K": str(len(support))}))
         bent.append(f"    {name}_project(hessian, {support})")
+    added = []
+    for k, (source, uses_control) in enumerate(constraints):
+        if not (uses_control and name == "final"):
+            pair = f"data[{len(terms) + 2 * k}], data[{len(terms) + 2 * k + 1}]"
+            convex.append(f"    total += {_prefix(source)}_augment(x, u, t, {pair}, hessian, gradient)")
+            added.append(f"    total += {_prefix(source)}_augmentation(x, u, t, {pair})")
+    parts.append("\n".join([f"def {name}_added(x, u, t, data):\n    total = 0.0", *added, "    return total"]))
     summed = f"def {name}_value(x, u, t, data):\n    total = 0.0\n" + "\n".join(values)
     parts.append(f"{summed}\n    return total")
     modelled = f"def {name}_quadratic(x, u, t, data, hessian, gradient):\n    clear(hessian, W, W)\n"

@@ -1,11 +1,11 @@
 """What the numbers of a state or control vector mean: names, units, limits, and which of them wrap."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array
+from lqrsim.errors import Array, InputError, check_array, excerpt
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +82,30 @@ class Coordinates:
     def difference(self, vector: npt.ArrayLike, near: npt.ArrayLike) -> Array:
         """`nearest(vector, near) - near`, (..., n): the error of `vector`, with whole turns taken out."""
         return self.nearest(vector, near) - np.asarray(near, dtype=np.float64)
+
+    def limited(self, low: npt.ArrayLike, high: npt.ArrayLike) -> "Coordinates":
+        """The same with other limits, each a number or one an entry.
+
+        Raises:
+          InputError: not numbers, or not in order.
+        """
+        try:
+            sides = [np.broadcast_to(np.asarray(side, dtype=np.float64), len(self)) for side in (low, high)]
+        except (TypeError, ValueError):
+            raise InputError(
+                f"control_limits: got {excerpt((low, high))}, want (lowest, highest), each a number or ({len(self)},)"
+            ) from None
+        for name, lowest, highest in zip(self.names, *sides, strict=True):
+            if not lowest < highest:
+                raise InputError(
+                    f"control_limits: got {lowest:g} to {highest:g} for {name}, want the first below the second"
+                )
+        return replace(self, low=tuple(sides[0].tolist()), high=tuple(sides[1].tolist()))
+
+    def within(self, other: "Coordinates") -> "Coordinates":
+        """The same with limits that are also the other's."""
+        low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)
+        return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def clip(self, vector: npt.ArrayLike) -> Array:
         """`vector` (..., n) held within the limits."""

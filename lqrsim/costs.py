@@ -30,6 +30,8 @@ class Term:
       bends: indices of the entries of (x, u) in which the Hessian may be indefinite: None for a convex term. The sum of
         all such terms is projected to the nearest positive-semidefinite matrix.
       uses_control: whether it depends on u (only stage costs may).
+      factor: index in `data` of a number that the whole term is proportional to, for what may be eased in the first
+        iterations; see `InitialPrior`. None where there is none.
       functions: what the source calls with `invoke`; their addresses come first in the data that it is given.
     """
 
@@ -37,7 +39,15 @@ class Term:
     data: Array
     bends: tuple[int, ...] | None = None
     uses_control: bool = False
+    factor: int | None = None
     functions: tuple[External, ...] = ()
+
+    def eased(self, share: float) -> Array:
+        """Its data, with that share of its factor."""
+        data = self.data.copy()
+        if self.factor is not None:
+            data[self.factor] *= share
+        return data
 
 
 class Cost(abc.ABC):
@@ -137,7 +147,7 @@ class ObstacleCost(Cost):
         place = [f"x[{i}]" for i in position] + (["0.0"] if len(position) == 2 else [])
         source = _OBSTACLES.format(place=", ".join(place), axes=repr(position), size=len(position), row=ROW)
         data = np.concatenate([[self.radius, self.sharpness, self.weight, len(world)], world.table.ravel()])
-        return Term(source, data, bends=position)
+        return Term(source, data, bends=position, factor=2)
 
 
 class SymbolicCost(Cost):

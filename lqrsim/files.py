@@ -19,10 +19,20 @@ import numpy.typing as npt
 
 from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array
-from lqrsim.results import AffinePolicy, Iteration, Moments, Quadratic, Solution, Status, Trajectory
+from lqrsim.results import (
+    AffinePolicy,
+    Candidate,
+    Iteration,
+    Moments,
+    Multipliers,
+    Quadratic,
+    Solution,
+    Status,
+    Trajectory,
+)
 from lqrsim.rollout import Rollout
 
-VERSIONS = {"solution": 2, "rollout": 1}
+VERSIONS = {"solution": 3, "rollout": 1}
 
 
 def save(result: Solution | Rollout, path: str | os.PathLike[str]) -> Path:
@@ -98,7 +108,15 @@ def load_solution(path: str | os.PathLike[str]) -> Solution:
                 return value(Moments, "cost_to_come")
             return value(Quadratic, "cost_to_come") if "cost_to_come.hessian" in arrays else None
 
-        log = _array(arrays, "iterations", (None, 6))
+        log = _array(arrays, "iterations", (None, 7))
+
+        def candidate(i: int, start: str, cost: float, count: int, status: str | None) -> Candidate:
+            plan = Trajectory(
+                _array(arrays, "candidates.states", (None, steps + 1, n))[i],
+                _array(arrays, "candidates.controls", (None, steps, m))[i], dt,
+            )  # fmt: skip
+            return Candidate(start, float(cost), int(count), None if status is None else Status(status), plan)
+
         rows = zip(log.tolist(), meta["methods"], strict=True)
         return Solution(
             status=Status(meta["status"]),
@@ -115,6 +133,11 @@ def load_solution(path: str | os.PathLike[str]) -> Solution:
             problem_digest=meta["problem_digest"],
             versions=meta["versions"],
             scenario=meta["scenario"],
+            candidates=tuple(candidate(i, *one) for i, one in enumerate(meta["candidates"])),
+            multipliers=tuple(
+                Multipliers(_array(arrays, f"multipliers.{i}", (steps + 1, None)), float(penalty))
+                for i, penalty in enumerate(meta["penalties"])
+            ),
         )
 
 
@@ -155,7 +178,7 @@ def _solution_parts(solution: Solution) -> tuple[str, dict[str, npt.NDArray[Any]
     arrays: dict[str, npt.NDArray[Any]] = {
         "trajectory.states": solution.trajectory.states,
         "trajectory.controls": solution.trajectory.controls,
-        "iterations": np.array([astuple(iteration)[:-1] for iteration in solution.iterations]).reshape(-1, 6),
+        "iterations": np.array([astuple(iteration)[:-1] for iteration in solution.iterations]).reshape(-1, 7),
     }
     for name, law in {"policy": solution.policy, "inverse_policy": solution.inverse_policy}.items():
         if law is not None:
@@ -165,12 +188,22 @@ def _solution_parts(solution: Solution) -> tuple[str, dict[str, npt.NDArray[Any]
             arrays |= {f"{name}.{field.name}": getattr(value, field.name) for field in fields(value)}
     if solution.clearance is not None:
         arrays["clearance"] = solution.clearance
+    if solution.candidates:
+        plans = [candidate.trajectory for candidate in solution.candidates]
+        arrays["candidates.states"] = np.array([plan.states for plan in plans])
+        arrays["candidates.controls"] = np.array([plan.controls for plan in plans])
+    arrays |= {f"multipliers.{i}": one.values for i, one in enumerate(solution.multipliers)}
     texts = {
         "status": solution.status.value, "detail": solution.detail, "dt": solution.trajectory.dt,
         "states": asdict(solution.policy.state_coordinates), "controls": asdict(solution.policy.control_coordinates),
         "solver": solution.solver, "options": dict(solution.options), "problem_digest": solution.problem_digest,
         "versions": dict(solution.versions), "scenario": solution.scenario,
         "methods": [iteration.method for iteration in solution.iterations],
+        "candidates": [
+            (one.start, one.cost, one.iterations, None if one.status is None else one.status.value)
+            for one in solution.candidates
+        ],
+        "penalties": [one.penalty for one in solution.multipliers],
     }  # fmt: skip
     return "solution", arrays, texts
 

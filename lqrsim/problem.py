@@ -1,14 +1,17 @@
 """The optimal control problem of Eqs. (1)-(2), in discrete time."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.constraints import Constraint, Inequalities
+from lqrsim.coordinates import Coordinates
 from lqrsim.costs import ControlCost, Cost, ObstacleCost, QuadraticCost, Term, terms_of
 from lqrsim.dynamics import Dynamics
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number
+from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt
 
 
 @dataclass(frozen=True)
@@ -21,34 +24,6 @@ class FixedState:
         object.__setattr__(self, "state", check_array("FixedState: state", self.state, (None,)))
 
 
-class InitialPrior:
-    """`1/2 (x - about)' diag(weight) (x - about)` at all steps but the first, in the first iterations only.
-
-    It is no part of the cost: it keeps the first linearisations of the smoother sensible, and so has a say in which
-    local optimum is found.
-
-    Args:
-      weight: (n,) not negative. iterations: how many it acts in.
-      about: where it is zero: (n,), or (T+1, n) for a trajectory to be drawn to.
-    """
-
-    def __init__(self, weight: npt.ArrayLike, *, about: npt.ArrayLike, iterations: int = 1) -> None:
-        self.weight = check_array("InitialPrior: weight", weight, (None,))
-        if (self.weight < 0).any():
-            raise InputError(f"InitialPrior: weight: got {self.weight.min():g}, want numbers >= 0")
-        time = () if np.ndim(about) == 1 else (None,)
-        self.about = check_array("InitialPrior: about", about, (*time, len(self.weight)))
-        self.iterations = check_count("InitialPrior: iterations", iterations)
-
-    def at(self, step: float) -> Array:
-        """Where it is zero, (n,), at a step or between two."""
-        if self.about.ndim == 1:
-            return self.about
-        before = min(int(step), len(self.about) - 2)
-        share = step - before
-        return (1 - share) * self.about[before] + share * self.about[before + 1]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Problem:
     """Minimise `c_0(x_0) + sum_t c(x_t, u_t, t) + c_T(x_T)` subject to `x_{t+1} = g(x_t, u_t)`.
@@ -59,7 +34,10 @@ class Problem:
       initial: c_0, the cost of starting elsewhere than wished (the paper's soft start); or `FixedState(x)`.
       stage_cost: c, per step: it is *not* multiplied by dt.
       final_cost: c_T.
-      prior: a hint to `smooth`, not a part of the problem; see `InitialPrior`.
+      control_limits: (lowest, highest) control to plan with, each a number or (m,); by default what the actuators can
+        do. Narrower ones leave some of that to the feedback; infinite ones plan as if there were none. The plan keeps
+        them exactly, and the policy does, as far as they are within the actuators' own.
+      constraints: what the plan must keep to at the steps; see `Clearance`.
 
     Raises:
       InputError: dt or steps not positive, a cost that does not fit the dynamics, an initial or final cost that depends
@@ -72,8 +50,10 @@ class Problem:
     initial: Cost | FixedState
     stage_cost: Cost
     final_cost: Cost
-    prior: InitialPrior | None = None
+    control_limits: tuple[npt.ArrayLike, npt.ArrayLike] | None = None
+    constraints: Sequence[Constraint] = ()
     _terms: dict[str, tuple[Term, ...]] = field(init=False, repr=False, compare=False)
+    _inequalities: tuple[Inequalities, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dt", check_number("dt", self.dt, above=0.0))
@@ -93,12 +73,24 @@ class Problem:
         for name in ("initial", "final_cost"):
             if any(term.uses_control for term in bound[name]):
                 raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
-        if self.prior is not None:
-            n = len(self.dynamics.state_coordinates)
-            check_array("prior: weight", self.prior.weight, (n,))
-            if self.prior.about.ndim == 2:
-                check_array("prior: about", self.prior.about, (self.steps + 1, n))
         object.__setattr__(self, "_terms", bound)
+        if not isinstance(self.constraints, Sequence) or not all(isinstance(c, Constraint) for c in self.constraints):
+            raise InputError(
+                f"constraints: got {excerpt(self.constraints)}, want a list of them, such as [Clearance(...)]"
+            )
+        object.__setattr__(self, "constraints", tuple(self.constraints))
+        bound_constraints = tuple(constraint.bind(self.dynamics) for constraint in self.constraints)
+        object.__setattr__(self, "_inequalities", bound_constraints)
+        if self.control_limits is not None:
+            try:
+                low, high = self.control_limits
+            except (TypeError, ValueError):
+                raise InputError(
+                    f"control_limits: got {excerpt(self.control_limits)}, want (lowest, highest)"
+                ) from None
+            limited = self.dynamics.control_coordinates.limited(low, high)
+            limited.within(self.dynamics.control_coordinates)  # or there is nothing that the actuators can do
+            object.__setattr__(self, "control_limits", (limited.low, limited.high))
         self._check_start_clear()
 
     @property
@@ -108,6 +100,18 @@ class Problem:
             return np.asarray(self.initial.state)
         abouts = [cost.about for cost in terms_of(self.initial) if isinstance(cost, QuadraticCost)]
         return abouts[0] if len(abouts) == 1 else None
+
+    @property
+    def goal(self) -> Array | None:
+        """The state (n,) that the final cost asks for; None where it names none."""
+        abouts = [cost.about for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
+        return abouts[0] if len(abouts) == 1 else None
+
+    @property
+    def control_coordinates(self) -> Coordinates:
+        """Names, units and limits of the controls, as they are planned with."""
+        coordinates = self.dynamics.control_coordinates
+        return coordinates if self.control_limits is None else coordinates.limited(*self.control_limits)
 
     @property
     def nominal_control(self) -> Array:
@@ -125,10 +129,16 @@ class Problem:
         return self._terms[which]
 
     @property
+    def inequalities(self) -> tuple[Inequalities, ...]:
+        """The bound constraints."""
+        return self._inequalities
+
+    @property
     def digest(self) -> str:
-        """Hash of everything that defines the problem: structure and numbers. The prior does not."""
+        """Hash of everything that defines the problem: structure and numbers."""
         hasher = hashlib.sha256(f"{self.dynamics.source} {self.dt!r} {self.steps}".encode())
         hasher.update(repr(self.dynamics.parameters).encode())
+        hasher.update(repr((self.control_coordinates.low, self.control_coordinates.high)).encode())
         functions = [*self.dynamics.functions]
         if isinstance(self.initial, FixedState):
             hasher.update(np.asarray(self.initial.state).tobytes())
@@ -136,6 +146,8 @@ class Problem:
             for term in self.terms(name):
                 hasher.update(term.source.encode() + term.data.tobytes())
                 functions += term.functions
+        for inequalities in self.inequalities:
+            hasher.update(inequalities.source.encode() + inequalities.data.tobytes())
         hasher.update("\n".join(function.identity for function in functions).encode())
         return hasher.hexdigest()[:16]
 

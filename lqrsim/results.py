@@ -5,13 +5,13 @@
 
 import enum
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.coordinates import Coordinates
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import Array, InputError, check_count
 
 
 @dataclass(frozen=True)
@@ -209,6 +209,11 @@ class Status(enum.StrEnum):
     NOT_POSITIVE_DEFINITE = "not positive definite"
 
     @property
+    def success(self) -> bool:
+        """True for CONVERGED, and for COST_CONVERGED, where only the cost was asked for."""
+        return self in (Status.CONVERGED, Status.COST_CONVERGED)
+
+    @property
     def meaning(self) -> str:
         return _STATUS_TEXT[self][0]
 
@@ -228,7 +233,10 @@ _STATUS_TEXT = {
         "the iteration limit came first, or no step lowered the cost any more",
         "raise max_iterations if the improvements still shrink; if they do not, try another start or a prior",
     ),
-    Status.INFEASIBLE: ("no trajectory meets the constraints", "relax the constraint that is named, or give more time"),
+    Status.INFEASIBLE: (
+        "the constraints can not be met, at least not near the plan that misses them least",
+        "relax the constraint that is named, give more time, or try another start",
+    ),
     Status.DIVERGED: (
         "the cost of the policy grew beyond all bounds",
         "add a prior, try a start nearer to a solution, shorten dt, or try the other solver",
@@ -258,6 +266,8 @@ class Iteration:
         where it was not evaluated (it is once the other tests pass, and after the last iteration).
       dynamics_residual: how far one step of the true dynamics takes a minimal-total-cost state from the next one, at
         most; relative as the gap is, and evaluated where the optimality is. The plan itself is a rollout, and has none.
+      violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all are kept, NaN where
+        it was not looked at.
       seconds: time this iteration took.
       method: "smooth", the paper's; of the safeguard's: "damped", "ilqr" where its step is that of iLQR, or "rejected"
         (it would have cost more, or a pass failed; cost is that of the plan that was kept).
@@ -268,20 +278,57 @@ class Iteration:
     gap: float
     optimality: float
     dynamics_residual: float
+    violation: float
     seconds: float
     method: str
 
-    HEADER = f"{'iteration':>9} {'cost':>14} {'improvement':>12} {'gap':>10} {'optimality':>11} {'ms':>8}  method"
+    HEADER = (
+        f"{'iteration':>9} {'cost':>14} {'improvement':>12} {'gap':>10} {'optimality':>11} {'violation':>10} {'ms':>8}"
+        "  method"
+    )
 
     def row(self, number: int) -> str:
         """This iteration as a line under `HEADER`."""
         optimality = "-" if np.isnan(self.optimality) else f"{self.optimality:.1e}"
         improvement = "-" if np.isinf(self.improvement) else f"{self.improvement:.2e}"
         gap = "-" if np.isnan(self.gap) else f"{self.gap:.1e}"
+        violation = "-" if np.isnan(self.violation) else f"{self.violation:.1e}"
         return (
-            f"{number:>9} {self.cost:>14.9g} {improvement:>12} {gap:>10} {optimality:>11}"
+            f"{number:>9} {self.cost:>14.9g} {improvement:>12} {gap:>10} {optimality:>11} {violation:>10}"
             f" {1e3 * self.seconds:>8.2f}  {self.method}"
         )
+
+
+@dataclass(frozen=True)
+class Multipliers:
+    """What a constraint presses with, at each step: zero where it is kept with room to spare.
+
+    Attributes:
+      values: (T+1, rows), not negative: what a unit more of the constraint would cost.
+      penalty: mu of the augmented Lagrangian, which holds the policy to the constraint.
+    """
+
+    values: Array
+    penalty: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One of several starts that a search tried.
+
+    Attributes:
+      start: what it was.
+      cost: true cost of the last plan that it led to; infinite if a pass failed.
+      iterations: how many it took until then.
+      status: how the chosen one ended; None where another start was the more promising.
+      trajectory: that plan.
+    """
+
+    start: str
+    cost: float
+    iterations: int
+    status: Status | None
+    trajectory: Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -304,6 +351,8 @@ class Solution:
       problem_digest: hash of everything that defined the problem.
       versions: of lqrsim and the libraries that the numbers depend on.
       scenario: what the command line was asked for; empty where a program called the solver.
+      candidates: the starts that were tried, where there were several.
+      multipliers: of each of the problem's constraints; none where the plan keeps them all without being made to.
     """
 
     status: Status
@@ -320,11 +369,13 @@ class Solution:
     problem_digest: str
     versions: Mapping[str, str]
     scenario: str = ""
+    candidates: tuple[Candidate, ...] = ()
+    multipliers: tuple[Multipliers, ...] = ()
 
     @property
     def success(self) -> bool:
         """True for CONVERGED, and for COST_CONVERGED, where only the cost was asked for."""
-        return self.status in (Status.CONVERGED, Status.COST_CONVERGED)
+        return self.status.success
 
     @property
     def cost(self) -> float:
@@ -347,6 +398,11 @@ class Solution:
         return self.iterations[-1].dynamics_residual if self.iterations else float("nan")
 
     @property
+    def violation(self) -> float:
+        """By how much the worst constraint is missed at the steps; see `Iteration.violation`."""
+        return self.iterations[-1].violation if self.iterations else float("nan")
+
+    @property
     def total_cost(self) -> TotalCost:
         """Cost-to-go plus cost-to-come, Eq. (20). Raises InputError where there is no cost-to-come, as from `ilqr`."""
         if self.cost_to_go is None or self.cost_to_come is None:
@@ -354,6 +410,41 @@ class Solution:
                 f"total_cost: got a solution of {self.solver} without both value functions, want one of smooth"
             )
         return TotalCost(self.cost_to_go, self.cost_to_come)
+
+    def shifted(self, steps: int) -> "Solution":
+        """What is left of it after so many steps, to start the next solve of a horizon that moves along.
+
+        The end is filled up: the last law, value function and multipliers stay in force, as a policy's last law does
+        after its horizon, and the last control is held. `smooth(problem, start=solution.shifted(k))`.
+
+        Raises:
+          InputError: `steps` is not a whole number from 0 to the last step.
+        """
+        if check_count("steps", steps, at_least=0) >= self.trajectory.steps:
+            raise InputError(f"steps: got {steps}, want less than {self.trajectory.steps}, the steps of the solution")
+
+        def moved(array: Array) -> Array:
+            kept = np.minimum(np.arange(steps, steps + len(array)), len(array) - 1)
+            return array[kept]
+
+        def law(policy: AffinePolicy) -> AffinePolicy:
+            return replace(policy, gain=moved(policy.gain), offset=moved(policy.offset), nominal=moved(policy.nominal))
+
+        plan, value = self.trajectory, self.cost_to_go
+        return replace(
+            self,
+            policy=law(self.policy),
+            inverse_policy=None,
+            cost_to_go=None
+            if value is None
+            else Quadratic(moved(value.hessian), moved(value.gradient), moved(np.asarray(value.constant))),
+            cost_to_come=None,
+            trajectory=Trajectory(moved(plan.states), moved(plan.controls), plan.dt),
+            clearance=None if self.clearance is None else moved(self.clearance),
+            candidates=(),
+            multipliers=tuple(replace(one, values=moved(one.values)) for one in self.multipliers),
+            detail=f"what is left of a solution after {steps} steps; {self.detail}".removesuffix("; "),
+        )
 
     def iteration_table(self) -> str:
         """The log as text, a line an iteration."""
@@ -373,6 +464,7 @@ class Solution:
             verdict = "collides" if self.clearance[knot] < 0 else "clear"
             lines.append(f"  clearance: {self.clearance[knot]:.3f} m at {knot * self.trajectory.dt:.2f} s ({verdict})")
         lines += [f"  limits:    {line}" for line in self._beyond_limits()]
+        lines += [f"  starts:    {line}" for line in self._search()]
         return "\n".join(lines)
 
     def _beyond_limits(self) -> list[str]:
@@ -383,6 +475,18 @@ class Solution:
             for label, used, low, high in zip(space.labels, controls.T, space.low, space.high, strict=True)
             if used.min() < low or used.max() > high
         ]
+
+    def _search(self) -> list[str]:
+        """Which of several starts was the best, if there were several."""
+        if not self.candidates:
+            return []
+        ended = [candidate for candidate in self.candidates if candidate.status is not None]
+        dropped = [candidate.cost for candidate in self.candidates if candidate.status is None]
+        best = next((candidate.start for candidate in ended if candidate.status == self.status), ended[0].start)
+        lines = [f"the plan is of {best}, one of {len(self.candidates)}"]
+        if dropped:
+            lines[0] += f"; {len(dropped)} were dropped at costs of {min(dropped):.6g} or more"
+        return lines + [f"{c.start} ended {c.status.name}" for c in ended if c.status and c.start != best]
 
     def __str__(self) -> str:
         return f"{self.iteration_table()}\n{self.summary()}"

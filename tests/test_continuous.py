@@ -24,8 +24,6 @@ def measured_orders(errors: list[Any]) -> Array:
 def drive_in_steps_of(problem: ls.Problem, parts: int) -> ls.Problem:
     """The problem of Fig. 2 with each step cut in parts, its weights with it."""
     control, obstacles = problem.stage_cost.terms  # pyright: ignore[reportAttributeAccessIssue]
-    prior = problem.prior
-    assert prior is not None
     return dataclasses.replace(
         problem,
         dt=problem.dt / parts,
@@ -34,7 +32,6 @@ def drive_in_steps_of(problem: ls.Problem, parts: int) -> ls.Problem:
         + ls.ObstacleCost(
             obstacles.world, radius=obstacles.radius, sharpness=obstacles.sharpness, weight=obstacles.weight / parts
         ),
-        prior=ls.InitialPrior(prior.weight / parts, about=prior.about, iterations=prior.iterations),
     )
 
 
@@ -47,13 +44,15 @@ def test_the_discrete_solution_of_the_differential_drive_comes_closer_at_first_o
     ends, small here, and until then the second order is larger. Both solvers are iterated until what convergence
     leaves, 1e-7, is far below the smallest difference, 4e-6.
     """
-    problem = differential_drive.problem
-    exact = smooth_continuous(problem, tolerance=1e-10, gap_tolerance=1e-7)
+    problem, prior = differential_drive.problem, differential_drive.paper_start
+    assert prior is not None
+    exact = smooth_continuous(problem, start=prior, tolerance=1e-10, gap_tolerance=1e-7)
     assert exact.status is Status.CONVERGED
     seconds, ends = np.arange(25.0), exact.x_hat([0.0, 25.0])
     errors = []
     for parts in (1, 2, 4, 8):
-        held = ls.smooth(drive_in_steps_of(problem, parts), tolerance=1e-10, gap_tolerance=1e-7)
+        start = ls.InitialPrior(prior.weight / parts, about=prior.about, iterations=prior.iterations)
+        held = ls.smooth(drive_in_steps_of(problem, parts), start=start, tolerance=1e-10, gap_tolerance=1e-7)
         assert held.status is Status.CONVERGED
         plan = held.trajectory
         assert held.cost_to_go is not None
@@ -66,7 +65,8 @@ def test_the_discrete_solution_of_the_differential_drive_comes_closer_at_first_o
         errors.append([np.abs(difference).max() for difference in differences.values()])
     np.testing.assert_allclose(measured_orders(errors), 1, atol=0.15)
     # The weights of a second are the same however the steps are cut.
-    again = smooth_continuous(drive_in_steps_of(problem, 4))
+    start = ls.InitialPrior(prior.weight / 4, about=prior.about, iterations=prior.iterations)
+    again = smooth_continuous(drive_in_steps_of(problem, 4), start=start)
     assert again.cost == pytest.approx(exact.cost, rel=1e-5)
 
 
@@ -158,11 +158,11 @@ def test_a_linear_quadratic_problem_takes_one_iteration_and_is_the_same() -> Non
 def test_the_prior_acts_in_both_passes_of_its_iterations_and_not_in_the_cost() -> None:
     """On a linear system one iteration with it is the exact solution of the problem that has it in its cost: 1e-6."""
     prior = ls.InitialPrior((0.1, 0.02), about=(0.5, 0.0))
-    problem = dataclasses.replace(swing(bend=0, quartic=0, steep=0), prior=prior)
-    with_it = smooth_continuous(problem, max_iterations=1)
+    problem = swing(bend=0, quartic=0, steep=0)
+    with_it = smooth_continuous(problem, start=prior, max_iterations=1)
     assert_same_values(with_it, linear_swing(prior=(2.0, 0.4)), np.linspace(0, 2, 9))  # a second has twenty steps
     assert with_it.iterations[0].optimality > 1e-3
-    found = smooth_continuous(problem)
+    found = smooth_continuous(problem, start=prior)
     assert found.success
     assert found.cost == pytest.approx(linear_swing().cost, abs=1e-6)
 

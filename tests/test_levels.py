@@ -159,7 +159,7 @@ def test_goals_masses_obstacles_and_horizons_are_data(quadrotor: ls.Scenario) ->
             dataclasses.replace(given, dynamics=heavy.dynamics),
             dataclasses.replace(given, stage_cost=control + fewer),
             dataclasses.replace(given, final_cost=elsewhere),
-            dataclasses.replace(given, steps=100, dt=0.04, prior=None),
+            dataclasses.replace(given, steps=100, dt=0.04),
         )
     }
     assert len(costs) == 5

@@ -43,8 +43,11 @@ def test_a_symbolic_cost_is_the_built_in_one(differential_drive: ls.Scenario) ->
     stage = ls.SymbolicCost(effort, parameters={"weight": 60.0, "cruise": 0.25}, convex=True)
     stage += ls.ObstacleCost(scene.world, radius=robot.radius)
     other = dataclasses.replace(problem, stage_cost=stage)
-    solution = ls.smooth(other, start=(0.25, 0.25))
-    assert solution.cost == pytest.approx(ls.smooth(problem).cost, rel=1e-9)
+    prior = differential_drive.paper_start
+    assert prior is not None
+    start = ls.InitialPrior(prior.weight, about=prior.about, controls=(0.25, 0.25))
+    other_start = ls.InitialPrior(prior.weight, about=prior.about)
+    assert ls.smooth(other, start=start).cost == pytest.approx(ls.smooth(problem, start=other_start).cost, rel=1e-9)
 
 
 STATES = {"x": "m", "y": "m", "speed": "m/s"}
@@ -91,11 +94,10 @@ FIELDS = {
         ),
         ({"stage_cost": ls.SymbolicCost(lambda x, u, p: [x[0], x[1]])}, "got 2 entries, want one: the cost"),
         ({"stage_cost": ls.SymbolicCost(lambda x, u, p: p.gain * x[0])}, "parameter: got 'gain', want one of"),
-        ({"prior": ls.InitialPrior(np.ones(2), about=np.zeros(2))}, r"prior: weight: got shape \(2,\), want \(3,\)"),
-        (
-            {"prior": ls.InitialPrior(np.ones(3), about=np.zeros((7, 3)))},
-            r"prior: about: got shape \(7, 3\), want \(11, 3\)",
-        ),
+        ({"control_limits": (0.5, -0.5)}, "control_limits: got 0.5 to -0.5 for .*, want the first below the second"),
+        ({"control_limits": ((0, 0), (1, 1))}, "control_limits: got .*, want \\(lowest, highest\\), each a number"),
+        ({"control_limits": 3.0}, "control_limits: got 3.0, want \\(lowest, highest\\)"),
+        ({"constraints": ["far away"]}, "constraints: got .*, want a list of them"),
     ],
 )
 def test_bad_problems_get_one_line(fields: dict, message: str) -> None:
@@ -154,11 +156,10 @@ def test_an_obstacle_cost_needs_a_position() -> None:
 
 def test_a_prior_may_be_about_a_trajectory(differential_drive: ls.Scenario) -> None:
     """Constant in time it is the same prior, to the last bit; in continuous time it is a line between the steps."""
-    problem = differential_drive.problem
-    prior = problem.prior
+    problem, prior = differential_drive.problem, differential_drive.paper_start
     assert prior is not None
     along = ls.InitialPrior(prior.weight, about=np.tile(prior.about, (problem.steps + 1, 1)), iterations=2)
-    one, other = ls.smooth(problem), ls.smooth(dataclasses.replace(problem, prior=along))
+    one, other = ls.smooth(problem, start=prior), ls.smooth(problem, start=along)
     np.testing.assert_array_equal(one.policy.gain, other.policy.gain)
     np.testing.assert_allclose(ls.InitialPrior([1.0], about=[[0.0], [2.0], [6.0]]).at(1.25), [3.0], rtol=1e-15)
     np.testing.assert_array_equal(ls.InitialPrior([1.0], about=[[0.0], [2.0], [6.0]]).at(2.0), [6.0])

@@ -7,7 +7,7 @@ import importlib
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 
@@ -167,7 +167,7 @@ class TestOracle:
     """What the claims are held against is right itself."""
 
     def test_it_notices_a_plan_that_is_not_optimal(self, differential_drive: ls.Scenario) -> None:
-        problem = differential_drive.problem
+        problem = replace(differential_drive.problem, control_limits=(-np.inf, np.inf))
         early = ls.ilqr(problem, max_iterations=2)
         report = kkt.check(problem, early)
         assert report.decrease > TOLERANCE

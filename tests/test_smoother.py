@@ -30,7 +30,10 @@ def same(one: ls.Solution, other: ls.Solution) -> bool:
 @pytest.fixture(scope="module")
 def solution(differential_drive: ls.Scenario) -> ls.Solution:
     """Not the best optimum of the differential drive."""
-    return ls.smooth(fixed(differential_drive.problem), start=(0.0, 0.0), tolerance=1e-8)
+    prior = differential_drive.paper_start
+    assert prior is not None
+    start = ls.InitialPrior(prior.weight, about=prior.about, iterations=prior.iterations, controls=(0.0, 0.0))
+    return ls.smooth(fixed(differential_drive.problem), start=start, tolerance=1e-8)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +94,7 @@ class TestStarts:
         self, differential_drive: ls.Scenario, solution: ls.Solution, kind: str, first_pass: str
     ) -> None:
         assert solution.cost > 50  # not the optimum that it finds from nothing, of 30
-        problem = dataclasses.replace(fixed(differential_drive.problem), prior=None)
+        problem = fixed(differential_drive.problem)
         plan = solution.trajectory
         bent = plan.states + 0.02 * np.random.default_rng(0).normal(size=plan.states.shape)  # no motion at all
         starts: dict[str, StartLike] = {
@@ -135,7 +138,10 @@ class TestStarts:
                     assert found.iterations[0].cost == pytest.approx(reference, rel=1e-10)
 
     def test_the_log_says_what_it_began_with(self, differential_drive: ls.Scenario, solution: ls.Solution) -> None:
-        assert ls.smooth(differential_drive.problem, max_iterations=1).options["start"] == [0.25, 0.25]
+        plain = ls.smooth(differential_drive.problem, start=(0.25, 0.25), max_iterations=1)
+        assert plain.options["start"] == [0.25, 0.25]
+        searched = ls.smooth(differential_drive.problem, max_iterations=1)
+        assert str(searched.options["start"]).startswith("InitialPrior ")
         started = ls.smooth(fixed(differential_drive.problem), start=solution, max_iterations=1)
         assert str(started.options["start"]).startswith("Solution ")
 

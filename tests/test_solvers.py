@@ -68,7 +68,12 @@ def test_the_differential_drive_reproduces_the_known_costs(
     differential_drive: ls.Scenario, form: str, controls: tuple[float, float] | None, cost: float, iterations: int
 ) -> None:
     """0.5 %: costs found by an independent implementation at the paper's stop test."""
-    solution = ls.smooth(differential_drive.problem, form=form, stop="cost", start=controls)
+    prior = differential_drive.paper_start
+    assert prior is not None
+    start = ls.InitialPrior(prior.weight, about=prior.about, iterations=prior.iterations, controls=controls)
+    # As in the paper, where controls have no limits.
+    problem = dataclasses.replace(differential_drive.problem, control_limits=(-np.inf, np.inf))
+    solution = ls.smooth(problem, form=form, stop="cost", start=start)
     assert solution.status is Status.COST_CONVERGED
     assert solution.cost == pytest.approx(cost, rel=5e-3)
     assert len(solution.iterations) == iterations
@@ -339,9 +344,9 @@ def test_the_callback_sees_every_iteration_and_may_stop_the_solve(differential_d
         ({"tolerance": 0.0}, "tolerance: got 0.0, want a finite number > 0"),
         ({"gap_tolerance": -1.0}, "gap_tolerance: got -1.0, want a finite number > 0"),
         ({"max_iterations": 0}, "max_iterations: got 0, want a whole number >= 1"),
-        ({"start": (0.1,) * 3}, r"start: got shape \(3,\), want controls \(2,\) or \(150, 2\), a Trajectory"),
+        ({"start": (0.1,) * 3}, r"start: got shape \(3,\), want controls \(2,\) or \(150, 2\), an InitialPrior"),
         ({"start": (np.inf, 0)}, r"start: got inf at index \[0, 0\], want finite numbers"),
-        ({"start": "hover"}, r"start: got 'hover', want controls \(2,\) or \(150, 2\), a Trajectory"),
+        ({"start": "hover"}, r"start: got 'hover', want controls \(2,\) or \(150, 2\), an InitialPrior"),
         ({"form": "Dual"}, r"form: got 'Dual', want one of: dual, primal \(did you mean dual\?\)"),
         ({"first_pass": "back"}, "first_pass: got 'back', want one of: forward, backward"),
         ({"safeguard": "yes"}, "safeguard: got 'yes', want True or False"),
@@ -361,5 +366,6 @@ def test_the_primal_form_wants_a_soft_start(differential_drive: ls.Scenario) -> 
 def test_the_summary_says_what_matters(drive_solution: ls.Solution) -> None:
     text = str(drive_solution)
     assert text.splitlines()[0] == ls.Iteration.HEADER
-    assert "CONVERGED after 4 iterations of smooth" in text
+    assert "CONVERGED after 6 iterations of smooth" in text
+    assert "the plan is of straight, one of 7; 6 were dropped" in text
     assert "clearance: 0.141 m" in text

@@ -1,10 +1,9 @@
 """What each part contributes: the form, the start, the prior, the safeguard; all that there is of them."""
 
-from dataclasses import replace
 from itertools import product
 from typing import Any
 
-from reliability.common import Config, cost_from_start, endings, mean, progress, queries, solve, summary
+from reliability.common import Config, cost_from_start, endings, mean, paper_start, progress, queries, solve, summary
 
 PARTS = (("dual", "primal"), ("soft", "fixed"), ("prior", "no prior"), ("safeguard", "bare"))
 
@@ -17,9 +16,9 @@ def measure(config: Config) -> dict[str, Any]:
             found[name] = {"skipped": "the primal form has no fixed start: its cost-to-come would be infinite"}
             continue
         problems = queries(config, soft=start == "soft")
-        if prior == "no prior":
-            problems = [replace(problem, prior=None) for problem in problems]
-        solutions = solve(config, problems, f"ablation, {name}", form=form, safeguard=safeguard == "safeguard")
+        options: dict[str, Any] = {"form": form, "safeguard": safeguard == "safeguard"}
+        options["start"] = paper_start() if prior == "prior" else problems[0].nominal_control
+        solutions = solve(config, problems, f"ablation, {name}", **options)
         pairs = progress(list(zip(problems, solutions, strict=True)), f"ablation, costs of {name}")
         found[name] = summary(solutions) | {"cost_from_start": [cost_from_start(*pair) for pair in pairs]}
     return found

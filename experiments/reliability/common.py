@@ -57,6 +57,13 @@ def fixed(problem: ls.Problem) -> ls.Problem:
     return replace(problem, initial=ls.FixedState(problem.start))
 
 
+def paper_start() -> ls.InitialPrior:
+    """How the paper begins with the quadrotor: from hover, upright."""
+    start = ls.scenarios.quadrotor().paper_start
+    assert start is not None
+    return start
+
+
 def solve(config: Config, problems: Sequence[ls.Problem], name: str, **options: Any) -> list[ls.Solution]:
     """`smooth_many`, with a bar."""
     with tqdm(total=len(problems), desc=name, leave=False, delay=2.0, disable=None) as bar:

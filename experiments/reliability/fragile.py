@@ -1,12 +1,12 @@
 """Bad advice: a prior that draws the first iteration along the straight line, through whatever is in the way."""
 
-from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 import lqrsim as ls
-from reliability.common import Config, converged, endings, mean, queries, solve, summary
+from reliability.common import Config, converged, endings, mean, paper_start, queries, solve, summary
 
 WEIGHTS = (1.0, 10.0, 100.0)
 
@@ -14,23 +14,21 @@ WEIGHTS = (1.0, 10.0, 100.0)
 def measure(config: Config) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for weight in WEIGHTS:
-        problems = [along_the_line(problem, weight) for problem in queries(config)]
+        start = partial(along_the_line, weight=weight)
         for safeguard in (False, True):
             name = f"{weight:g}, {'with' if safeguard else 'without'}"
-            found[name] = summary(solve(config, problems, f"fragile, {name}", safeguard=safeguard))
+            found[name] = summary(solve(config, queries(config), f"fragile, {name}", safeguard=safeguard, start=start))
     return found
 
 
-def along_the_line(problem: ls.Problem, weight: float) -> ls.Problem:
-    """The problem with that weight on the positions, at even speed from start to goal; on the rotation it stays."""
+def along_the_line(problem: ls.Problem, weight: float) -> ls.InitialPrior:
+    """That weight on the positions, at even speed from start to goal; on the rotation it is the paper's."""
     assert problem.start is not None
-    assert problem.prior is not None
-    assert isinstance(problem.final_cost, ls.QuadraticCost)
+    assert problem.goal is not None
     share = np.linspace(0, 1, problem.steps + 1)[:, None]
-    line = (1 - share) * problem.start + share * problem.final_cost.about
-    weights = problem.prior.weight.copy()
+    weights = paper_start().weight.copy()
     weights[:3] = weight
-    return replace(problem, prior=ls.InitialPrior(weights, about=line))
+    return ls.InitialPrior(weights, about=(1 - share) * problem.start + share * problem.goal)
 
 
 def table(found: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import lqrsim as ls
-from reliability.common import Config, progress, queries
+from reliability.common import Config, paper_start, progress, queries
 
 
 def measure(config: Config) -> dict[str, Any]:
@@ -15,7 +15,7 @@ def measure(config: Config) -> dict[str, Any]:
     for start in ("soft", "fixed"):
         problems = queries(config, soft=start == "soft")
         ratios, iterations, same, needed = [], [], [], []
-        ls.smooth_many(problems[:1], threads=1)  # compile
+        ls.smooth_many(problems[:1], threads=1, start=paper_start())  # compile
         for problem in progress(problems, f"overhead, {start}"):
             seconds: dict[bool, list[float]] = {False: [], True: []}
             solutions: dict[bool, ls.Solution] = {}
@@ -23,7 +23,8 @@ def measure(config: Config) -> dict[str, Any]:
             for _ in range(config.rounds):
                 for safeguard in order:
                     clock = time.perf_counter()
-                    (solutions[safeguard],) = ls.smooth_many([problem], threads=1, safeguard=safeguard)
+                    options: dict[str, Any] = {"threads": 1, "safeguard": safeguard, "start": paper_start()}
+                    (solutions[safeguard],) = ls.smooth_many([problem], **options)
                     seconds[safeguard].append(time.perf_counter() - clock)
                 order.reverse()
             bare, guarded = solutions[False], solutions[True]

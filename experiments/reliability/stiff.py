@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import lqrsim as ls
-from reliability.common import Config, converged, endings, improvements, queries, solve, summary, worst
+from reliability.common import Config, converged, endings, improvements, paper_start, queries, solve, summary, worst
 
 RATES = (0.01, 0.1, 0.33, 1.0)  # drag / mass * dt
 COUNT = 40
@@ -18,7 +18,7 @@ def measure(config: Config) -> dict[str, Any]:
         for problem in queries(config, COUNT):
             drag = rate * ls.Quadrotor().mass / problem.dt
             problems.append(replace(problem, dynamics=ls.Quadrotor(drag=drag).dynamics))
-        solutions = solve(config, problems, f"stiff, {rate:g}")
+        solutions = solve(config, problems, f"stiff, {rate:g}", start=paper_start())
         found[f"{rate:g}"] = summary(solutions) | {
             "improvement": improvements(zip(problems, solutions, strict=True), f"stiff, {rate:g}, improving")
         }

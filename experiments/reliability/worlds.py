@@ -1,7 +1,7 @@
 """The two robots in random worlds: pillars for the differential drive; bars, balls and boxes for the quadrotor.
 
 Nothing makes sure that there is a way through: a penalty is not a constraint, and there is an optimum all the same.
-Half have a fixed start, and half the prior of the scenarios, which the others do without.
+Half have a fixed start.
 """
 
 import numpy as np
@@ -68,7 +68,6 @@ def drive(rng: Generator) -> ls.Problem:
         stage_cost=ls.ControlCost((effort, effort), about=(0.25, 0.25))
         + ls.ObstacleCost(world, radius=robot.radius, sharpness=10.0),
         final_cost=ls.QuadraticCost(weight, about=last),
-        prior=ls.InitialPrior((0.0, 0.0, 0.4), about=(0.0, 0.0, ahead), iterations=2) if rng.random() < 0.5 else None,
     )
 
 
@@ -88,7 +87,6 @@ def quadrotor(rng: Generator) -> ls.Problem:
         stage_cost=ls.ControlCost(np.full(4, rng.uniform(10.0, 40.0)), about=np.full(4, robot.hover_force))
         + ls.ObstacleCost(world, radius=robot.radius, sharpness=10.0),
         final_cost=ls.QuadraticCost(weight, about=last),
-        prior=ls.InitialPrior(np.repeat((0.0, 0.0, 0.3, 0.0), 3), about=np.zeros(12)) if rng.random() < 0.5 else None,
     )
 
 

@@ -2,11 +2,12 @@
 
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
+import numpy as np
 from tqdm import tqdm
 
 import lqrsim as ls
@@ -14,8 +15,10 @@ import lqrsim as ls
 Job = TypeVar("Job")
 Taken = TypeVar("Taken")
 Section = Literal["speed", "peers", "scaling", "threads", "startup"]
-MANY: dict[str, Callable[..., list[ls.Solution]]] = {"smooth": ls.smooth_many, "ilqr": ls.ilqr_many}
-PRIMAL = {"primal": partial(ls.smooth_many, form="primal")}  # the form that the reference has
+# The smoother as in the paper, which is what the reference does.
+PAPER = partial(ls.smooth_many, start=ls.scenarios.quadrotor().paper_start)
+MANY: dict[str, Callable[..., list[ls.Solution]]] = {"smooth": PAPER, "ilqr": ls.ilqr_many}
+PRIMAL = {"primal": partial(PAPER, form="primal")}  # the form that the reference has
 
 # What is to be met: times the reference's, times one another's, or seconds.
 TARGETS = {
@@ -51,7 +54,9 @@ class Config:
 
 
 def make_problems(config: Config) -> list[ls.Problem]:
-    return [ls.scenarios.quadrotor(query=q, seed=config.seed).problem for q in range(config.queries)]
+    """As in the paper: without limits of the controls, which the reference and FDDP do not have."""
+    problems = [ls.scenarios.quadrotor(query=q, seed=config.seed).problem for q in range(config.queries)]
+    return [replace(problem, control_limits=(-np.inf, np.inf)) for problem in problems]
 
 
 def make_batches(config: Config) -> list[slice]:

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -13,7 +13,17 @@ from lqrsim import compiled
 from lqrsim.checks import check_functions, check_start, functions_of
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number, excerpt
 from lqrsim.problem import Problem
-from lqrsim.results import AffinePolicy, Iteration, Moments, Quadratic, Solution, Status, Trajectory
+from lqrsim.results import (
+    AffinePolicy,
+    Candidate,
+    Iteration,
+    Moments,
+    Multipliers,
+    Quadratic,
+    Solution,
+    Status,
+    Trajectory,
+)
 from lqrsim.solvers import interface
 from lqrsim.solvers.start import Start, StartLike, resolve
 from lqrsim.versions import versions
@@ -21,6 +31,7 @@ from lqrsim.versions import versions
 Callback = Callable[[Iteration], object]
 
 _STATUS = {
+    interface.RUNNING: Status.MAX_ITERATIONS,  # stopped from outside
     interface.CONVERGED: Status.CONVERGED,
     interface.COST_CONVERGED: Status.COST_CONVERGED,
     interface.MAX_ITERATIONS: Status.MAX_ITERATIONS,
@@ -29,6 +40,7 @@ _STATUS = {
     interface.NOT_FINITE: Status.NOT_FINITE,
     interface.NO_START: Status.NOT_FINITE,
     interface.STALLED: Status.MAX_ITERATIONS,
+    interface.CYCLING: Status.MAX_ITERATIONS,
 }
 
 
@@ -76,10 +88,18 @@ class SmootherSettings(Settings):
     form: str
     first_pass: str
     safeguard: bool
+    starts: int | None
+    constraint_tolerance: float
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.starts is not None:
+            object.__setattr__(self, "starts", check_count("starts", self.starts))
+            if self.starts > 1 and self.start is not None:
+                raise InputError(f"starts: got {self.starts} beside a start, want one of the two")
         object.__setattr__(self, "gap_tolerance", check_number("gap_tolerance", self.gap_tolerance, above=0.0))
+        number = check_number("constraint_tolerance", self.constraint_tolerance, above=0.0)
+        object.__setattr__(self, "constraint_tolerance", number)
         check_name("form", self.form, tuple(compiled.FORMS))
         check_name("first_pass", self.first_pass, ("forward", "backward"))
         if not isinstance(self.safeguard, bool | np.bool_):
@@ -109,6 +129,10 @@ class Ending:
         return _STATUS[self.outcome]
 
     @property
+    def success(self) -> bool:
+        return self.status.success
+
+    @property
     def pass_failed(self) -> bool:
         """Whether a pass of one more iteration was begun and not completed."""
         return self.outcome in (interface.NOT_POSITIVE_DEFINITE, interface.NOT_FINITE)
@@ -123,6 +147,8 @@ class Ending:
             return f"{place}: {self.raised}" if self.raised else place
         if self.outcome == interface.NO_START:
             return "rollout of the initial controls"
+        if self.outcome == interface.CYCLING:
+            return "the iterations repeat themselves"
         return "the line search found no lower cost" if self.outcome == interface.STALLED else ""
 
 
@@ -130,36 +156,41 @@ def iterate(
     problem: Problem,
     run: Callable[[int, int], tuple[int, int, bool, int]],
     log: Array,
-    max_iterations: int,
+    last: int,
     *,
+    done: tuple[Iteration, ...] = (),
     before: tuple[Iteration, ...] = (),
+    look: Callable[[], float] = lambda: 0.0,
     each: bool,
     callback: Callback | None = None,
 ) -> Ending:
-    """Run a loop of `solvers/loops.py` to its end.
+    """Run a loop of `solvers/loops.py` until it ends, or there are so many iterations.
 
     Args:
       problem: whose functions may raise meanwhile.
-      run: runs the iterations from its first argument up to its second.
+      run: runs the iterations from its first argument up to its second, or fewer.
       log: (any, LOG_COLUMNS), where `run` writes.
+      last: how many iterations there are to be.
+      done: those that there are already.
       before: the iterations of what ran before, which come first in the ending's.
+      look: how far the constraints are missed by what `run` found last.
       each: come back after each iteration, to time it, to tell `callback` and to heed Ctrl-C; otherwise nothing but
         compiled code runs, and the seconds of an iteration are the average.
     """
-    if callback is not None and not callable(callback):
-        raise InputError(f"callback: got {excerpt(callback)}, want a function of an Iteration")
     functions = functions_of(problem)
     for function in functions:
         function.forget()
-    iterations: list[Iteration] = []
+    iterations = list(done)
     outcome, backward, failed = interface.RUNNING, False, -1
-    while outcome == interface.RUNNING:
+    while outcome == interface.RUNNING and len(iterations) < last:
         first = len(iterations)
         clock = time.perf_counter()
-        done, outcome, backward, failed = run(first, first + 1 if each else max_iterations)
-        seconds = (time.perf_counter() - clock) / max(done - first, 1)
-        for cost, improvement, gap, optimality, residual, method in log[first:done].tolist():
-            iterations.append(Iteration(cost, improvement, gap, optimality, residual, seconds, _METHODS[int(method)]))
+        count, outcome, backward, failed = run(first, first + 1 if each else last)
+        seconds = (time.perf_counter() - clock) / max(count - first, 1)
+        for i, (cost, improvement, gap, optimality, residual, method) in enumerate(log[first:count].tolist(), first):
+            missed = look() if i == count - 1 else float("nan")
+            name = _METHODS[int(method)]
+            iterations.append(Iteration(cost, improvement, gap, optimality, residual, missed, seconds, name))
             if callback is not None:
                 callback(iterations[-1])
         for function in functions:
@@ -206,6 +237,12 @@ def solve_all(
             for function in functions:
                 function.stopped.clear()
             raise
+
+
+def check_callback(callback: Callback | None) -> None:
+    """Raises InputError for what can not be called."""
+    if callback is not None and not callable(callback):
+        raise InputError(f"callback: got {excerpt(callback)}, want a function of an Iteration")
 
 
 def list_of(problems: Iterable[Problem]) -> list[Problem]:
@@ -258,6 +295,8 @@ def assemble(
     inverse_law: tuple[Array, Array] | None = None,
     cost_to_go: Quadratic | None = None,
     cost_to_come: Quadratic | Moments | None = None,
+    multipliers: tuple[Multipliers, ...] = (),
+    candidates: tuple[Candidate, ...] = (),
 ) -> Solution:
     """The Solution of what a solver found."""
 
@@ -265,7 +304,7 @@ def assemble(
         return AffinePolicy(
             gain=gain, offset=offset, nominal=nominal, dt=problem.dt,
             state_coordinates=problem.dynamics.state_coordinates,
-            control_coordinates=problem.dynamics.control_coordinates,
+            control_coordinates=problem.control_coordinates.within(problem.dynamics.control_coordinates),
         )  # fmt: skip
 
     return Solution(
@@ -280,14 +319,16 @@ def assemble(
         clearance=_clearance(problem, states),
         solver=solver,
         options=options,
+        multipliers=multipliers,
+        candidates=candidates,
         problem_digest=problem.digest,
         versions=versions(),
     )
 
 
-def model(problem: Problem) -> tuple[Any, ...]:
+def model(problem: Problem, multipliers: Sequence[Array] = (), *, share: float = 1.0) -> tuple[Any, ...]:
     """The problem's numbers in the order in which the loops take them: p, dt, initial, stage, final."""
-    data = compiled.arguments(problem)
+    data = compiled.arguments(problem, multipliers=multipliers, share=share)
     return data["p"], data["dt"], data["initial"], data["stage"], data["final"]
 
 

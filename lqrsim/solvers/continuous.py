@@ -31,6 +31,7 @@ from lqrsim.solvers.differential import (
     riccati_pass,
     tolerances_of,
 )
+from lqrsim.solvers.start import InitialPrior
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -230,7 +231,7 @@ def smooth_continuous(
     tolerance: float = 1e-4,
     gap_tolerance: float = 1e-3,
     max_iterations: int = 50,
-    start: npt.ArrayLike | None = None,
+    start: npt.ArrayLike | InitialPrior | None = None,
     rtol: float = 1e-8,
     atol: float = 1e-8,
     callback: Callable[[Iteration], object] | None = None,
@@ -247,8 +248,8 @@ def smooth_continuous(
         that.
       gap_tolerance: of the gap (see `Iteration`), looked at every dt. The dynamics residual is not evaluated.
       max_iterations: when to give up.
-      start: (m,), the control that the first pass applies; the problem's nominal control by default. It has a say in
-        which local optimum is found.
+      start: (m,), the control that the first pass applies; the problem's nominal control by default. Or an
+        InitialPrior, which adds to that. It has a say in which local optimum is found.
       rtol, atol: how accurately everything is integrated, relative and absolute.
       callback: called with each `Iteration` as it ends.
 
@@ -271,7 +272,12 @@ def smooth_continuous(
     check_count("max_iterations", max_iterations)
     tolerances = tolerances_of(rtol, atol)
     m = len(problem.dynamics.control_coordinates)
-    control = check_array("start", problem.nominal_control if start is None else start, (m,))
+    prior = start.fitting(problem) if isinstance(start, InitialPrior) else None
+    if prior is not None and prior.obstacles:
+        raise InputError(f"start: got a prior with shares of the obstacles {prior.obstacles}, want one without, here")
+    control = problem.nominal_control
+    if start is not None and not isinstance(start, InitialPrior):
+        control = check_array("start", start, (m,))
     state = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
     check_functions(problem, state, control)
     check_start(problem, state, control)
@@ -279,7 +285,7 @@ def smooth_continuous(
     functions = functions_of(problem)
     for function in functions:
         function.forget()
-    solver = _Smoother(problem, state, control, tolerances)
+    solver = _Smoother(problem, state, control, prior, tolerances)
     iterations: list[Iteration] = []
     status, detail = Status.MAX_ITERATIONS, ""
     for number in range(1, max_iterations + 1):
@@ -296,6 +302,7 @@ def smooth_continuous(
         left = solver.optimality() if settled or number == max_iterations else math.nan
         row = Iteration(
             cost=cost, improvement=improvement, gap=solver.gap, optimality=left, dynamics_residual=math.nan,
+            violation=0.0,
             seconds=time.perf_counter() - clock, method="smooth",
         )  # fmt: skip
         iterations.append(row)
@@ -324,10 +331,12 @@ class _Smoother:
       cost, gap: of the last rollout; see `Iteration`.
     """
 
-    def __init__(self, problem: Problem, state: Array, control: Array, tolerances: Tolerances) -> None:
+    def __init__(
+        self, problem: Problem, state: Array, control: Array, prior: InitialPrior | None, tolerances: Tolerances
+    ) -> None:
         n, m = len(state), len(control)
         self.system, self._tolerances = System(problem), tolerances
-        self._prior, self._prior_left = problem.prior, problem.prior.iterations if problem.prior is not None else 0
+        self._prior, self._prior_left = prior, prior.iterations if prior is not None else 0
         self._x_hat = state  # at 0
         # Before the first pass: no cost-to-go, and a policy that plays the initial control.
         law = np.hstack([np.zeros((m, n)), control[:, None]])

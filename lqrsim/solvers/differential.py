@@ -23,8 +23,9 @@ from scipy.linalg.lapack import dposv  # pyright: ignore[reportAttributeAccessIs
 
 from lqrsim import compiled
 from lqrsim.errors import Array, check_number
-from lqrsim.problem import InitialPrior, Problem
+from lqrsim.problem import Problem
 from lqrsim.results import Status
+from lqrsim.solvers.start import InitialPrior
 
 NO_MINIMUM = "S + Sbar is not positive definite"
 

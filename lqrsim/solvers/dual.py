@@ -12,7 +12,7 @@ from math import sqrt
 
 from lqrsim.integration import step_jacobian
 from lqrsim.solvers.interface import M, N, stack
-from lqrsim.solvers.kernels import cholesky, cholesky_solve, offset
+from lqrsim.solvers.kernels import cholesky, cholesky_solve, offset, within
 
 
 def begin(Q, q, constant, x, S, covariance, mean):
@@ -297,7 +297,7 @@ def solve(a, b):
     return True
 
 
-def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, x, u):
+def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, low, high, x, u):
     """Write the state and control (x, u) on the way to the minimiser at t + 1, whose costate is given."""
     for i in range(N):
         total = updated[i]
@@ -309,3 +309,4 @@ def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, x, u):
         for j in range(N):
             total += gain[k, j] * costate[j]
         u[k] = total
+    within(u, low, high)

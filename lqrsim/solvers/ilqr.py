@@ -14,6 +14,7 @@ from lqrsim.solvers.common import (
     Callback,
     Settings,
     assemble,
+    check_callback,
     check_outcome,
     check_problem,
     iterate,
@@ -21,7 +22,7 @@ from lqrsim.solvers.common import (
     model,
     solve_all,
 )
-from lqrsim.solvers.start import StartLike, resolve
+from lqrsim.solvers.start import InitialPrior, StartLike, resolve
 
 
 def ilqr(
@@ -50,6 +51,7 @@ def ilqr(
       InputError: an argument is not as described, or the problem names no start.
     """
     settings = Settings(stop=stop, tolerance=tolerance, max_iterations=max_iterations, start=start)
+    check_callback(callback)
     _check(problem, settings)
     return _solve(problem, settings, each=True, callback=callback)
 
@@ -75,6 +77,10 @@ def ilqr_many(
 
 def _check(problem: Problem, settings: Settings) -> None:
     check_problem(problem)
+    if isinstance(settings.start, InitialPrior):
+        raise InputError(
+            "start: got an InitialPrior, want controls, a Trajectory, an AffinePolicy or a Solution: iLQR has no prior"
+        )
     if problem.start is None:
         raise InputError(
             "initial: got a cost that names no start, want FixedState(x) or QuadraticCost(weight, about=x)"

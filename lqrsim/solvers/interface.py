@@ -11,11 +11,13 @@ N = 0  # states
 M = 0  # controls
 W = N + M  # a state and a control, joined
 K = 0  # of these, how many entries a cost is not convex in
+LIMITS = 0  # which array of `stage` has the limits of the controls: lowest (M,), highest (M,)
 
 # How iterations end; see `Status`. Of those without a status of their own, NO_START is a first trajectory that is not
-# finite, and STALLED a line search that found no lower cost.
+# finite, STALLED a line search that found no lower cost, and CYCLING that the same costs come again and again.
 RUNNING, CONVERGED, COST_CONVERGED, MAX_ITERATIONS, DIVERGED = 0, 1, 2, 3, 4
-NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED = 5, 6, 7, 8
+NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED, CYCLING = 5, 6, 7, 8, 9
+LONGEST_CYCLE = 8
 
 # What an iteration was; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
@@ -24,8 +26,9 @@ SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
 # controls; how many small changes there were in a row; of iterations at reach 0, iLQR's, how many are left, how many
 # there will be the next time, and how many others there were since, of which PATIENCE are enough.
 # At the end, how far the states of least total cost are from the plan; at the beginning, whether that was made.
-PLAN_COST, REACH, WEIGHT, SMALL, ILQR_LEFT, ILQR_NEXT, SINCE_ILQR, FINAL_GAP, STARTED = 0, 1, 2, 3, 4, 5, 6, 7, 8
-MEMORY = 9
+# MERIT is the cost of the plan, and what the augmented Lagrangian adds to it: what is to be lowered.
+PLAN_COST, REACH, WEIGHT, SMALL, ILQR_LEFT, ILQR_NEXT, SINCE_ILQR, FINAL_GAP, STARTED, MERIT = range(10)
+MEMORY = 10
 PATIENCE = 50
 
 
@@ -50,6 +53,25 @@ def stage_value(x, u, t, data) -> float:
 def stage_quadratic(x, u, t, data, hessian, gradient) -> float:
     """Write the projected Hessian (W, W) and the gradient (W,) of the stage cost at (x, u); return its value."""
     return 0.0
+
+
+def stage_added(x, u, t, data) -> float:
+    """What the augmented Lagrangian adds to the stage cost for constraints."""
+    return 0.0
+
+
+def final_added(x, u, t, data) -> float:
+    """What it adds to the final cost."""
+    return 0.0
+
+
+def constraint_value(x, u, t, row, data) -> float:
+    """One of a constraint's numbers that are not to be negative."""
+    return 0.0
+
+
+def constraint_slope(x, u, t, row, data, gradient) -> None:
+    """Add its gradient (W,)."""
 
 
 def initial_value(x, u, t, data) -> float:
@@ -96,5 +118,5 @@ def minimizer(S, s, C, b, costate, x) -> bool:
     return True
 
 
-def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, x, u) -> None:
-    """Write the state and control on the way to the minimiser at t + 1."""
+def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, low, high, x, u) -> None:
+    """Write the state and control, within its limits, on the way to the minimiser at t + 1."""

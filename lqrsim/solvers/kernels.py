@@ -172,8 +172,17 @@ def quadratic_at(z, v, c):
 def riccati_backward(jacobian, c, cost, slope, constant, S1, s1, k1, gain, feedforward, S, s):
     """One step of the cost-to-go, Eqs. (9)-(11), (13): from (S1, s1, k1) at t + 1 to (S, s) at t.
 
-    `jacobian` = [A B] and c are the linearised step; `cost` (W, W) and `slope` (W,) the stage about the origin, used
-    up: on return `cost` is the Hessian of what was minimised. Returns the constant and whether the step succeeded.
+    The rest is as in `ahead`. Returns the constant and whether the step succeeded.
+    """
+    shifted = ahead(jacobian, c, cost, slope, constant, S1, s1, k1)
+    decrease = minimize_control(cost, slope, gain, feedforward, S, s)
+    return shifted - decrease, decrease >= 0
+
+
+def ahead(jacobian, c, cost, slope, constant, S1, s1, k1):
+    """Add to a stage about the origin, `cost` (W, W) and `slope` (W,), the cost-to-go where its step leads.
+
+    `jacobian` = [A B] and c are the linearised step. Returns the sum's constant.
     """
     v = stack(N)
     for i in range(N):
@@ -182,8 +191,7 @@ def riccati_backward(jacobian, c, cost, slope, constant, S1, s1, k1, gain, feedf
             v[i] += S1[i, j] * c[j]
     shifted = k1 + constant + quadratic_at(S1, s1, c)
     congruence(jacobian, S1, v, cost, slope)
-    decrease = minimize_control(cost, slope, gain, feedforward, S, s)
-    return shifted - decrease, decrease >= 0
+    return shifted
 
 
 def affine(gain, feedforward, x, u):
@@ -193,3 +201,12 @@ def affine(gain, feedforward, x, u):
         for j in range(N):
             total += gain[i, j] * x[j]
         u[i] = total
+
+
+def within(u, low, high):
+    """Cut a control off at its limits; a NaN stays."""
+    for i in range(M):
+        if u[i] < low[i]:
+            u[i] = low[i]
+        elif u[i] > high[i]:
+            u[i] = high[i]

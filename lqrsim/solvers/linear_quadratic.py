@@ -93,7 +93,7 @@ def smooth_lq(
             iterations = (
                 Iteration(
                     cost=value, improvement=np.inf, gap=gap, optimality=optimality, dynamics_residual=residual,
-                    seconds=time.perf_counter() - clock, method="smooth",
+                    violation=0.0, seconds=time.perf_counter() - clock, method="smooth",
                 ),
             )  # fmt: skip
     solved = not detail

@@ -11,8 +11,10 @@ from math import inf, isnan, nan
 from lqrsim.solvers.interface import (
     CONVERGED,
     COST_CONVERGED,
+    CYCLING,
     DIVERGED,
     ILQR,
+    LONGEST_CYCLE,
     MAX_ITERATIONS,
     NO_START,
     NOT_FINITE,
@@ -52,12 +54,13 @@ def relative_improvement(old, cost, nothing):
 def smoother_iterations(
     steps, first, last, max_iterations, tolerance, gap_tolerance, optimal, fixed, guided,
     start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-    prior_weight, prior_about, prior_iterations, guess_x, guess_u, plan_x, plan_u,
+    eased, prior_weight, prior_about, prior_iterations, guess_x, guess_u, plan_x, plan_u,
     states, controls, kept_L, kept_l, memory, log,
 ):  # fmt: skip
     """Iterated LQR smoothing: a forward pass, a backward pass and the rollout of the new policy, again and again.
 
-    L, l, S, s are the policy and the cost-to-go to begin with. With `guided`, the first pass linearises about the
+    L, l, S, s are the policy and the cost-to-go to begin with; `eased` is the stage cost as the passes see it, which is
+    not yet the true one in the first iterations of a continuation. With `guided`, the first pass linearises about the
     guess. `states`, `controls`, `kept_L`, `kept_l` are what the last iteration that was completed found; before any,
     where the first policy leads. The plan is the rollout of least cost so far, that of the first policy included, and
     memory[PLAN_COST] that cost: for the safeguard. With `last` of 0, only that is begun with.
@@ -79,13 +82,13 @@ def smoother_iterations(
         weight = prior_weight if done < prior_iterations else no_weight
         failed, good = forward_pass(
             steps, fixed, guided and done == 0, 0.0, guess_x, guess_u,
-            x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final, weight, prior_about,
+            x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, eased, final, weight, prior_about,
         )  # fmt: skip
         if failed >= 0:
             return done, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, False, failed
         failed, good, nothing = backward_pass(
             steps, fixed, 1.0, 0.0, guess_x, guess_u,
-            x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, weight, prior_about,
+            x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, eased, weight, prior_about,
         )  # fmt: skip
         if failed >= 0:
             return done, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, True, failed
@@ -101,12 +104,30 @@ def smoother_iterations(
         left, residual = nan, nan
         if settled or full:
             left = optimality(steps, fixed, states, controls, cost, nothing, p, dt, initial, stage, final)
-            residual = dynamics_residual(steps, x_hats, L, l, p, dt, states)
+            residual = dynamics_residual(steps, x_hats, L, l, p, dt, stage, states)
         write_row(log, done, cost, improvement, gap, left, residual, SMOOTH)
         outcome = ending(settled, optimal, left, tolerance, cost, full)
+        if outcome == RUNNING and cycling(log, done):
+            outcome = CYCLING
         if outcome != RUNNING:
             return done + 1, outcome, False, -1
     return last, RUNNING, False, -1
+
+
+def cycling(log, done):
+    """Whether the last costs are, to rounding, those before them in the same order: so they will be from now on.
+
+    Two rounds of a cycle that the iterations have come to are looked at; one that they only come nearer to is none yet.
+    """
+    for period in range(2, LONGEST_CYCLE + 1):
+        same = done + 1 >= 3 * period
+        for i in range(2 * period):
+            if same:
+                cost, before = log[done - i, 0], log[done - i - period, 0]
+                same = abs(cost - before) <= 1e-9 * abs(cost)
+        if same and abs(log[done, 0] - log[done - 1, 0]) > 1e-6 * abs(log[done, 0]):
+            return True
+    return False
 
 
 def optimality(steps, fixed, states, controls, cost, nothing, p, dt, initial, stage, final):
@@ -178,7 +199,7 @@ def ilqr_iterations(
         if not damping[0] > 1.0:
             damping[0] = 0.0
         old = cost
-        cost, fraction = line_search(
+        cost, _, fraction = line_search(
             steps, states, controls, no_shift, L, l, p, dt, initial, stage, final, old, 1e-8, new_states, new_controls
         )
         if fraction > 0:

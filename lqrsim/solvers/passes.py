@@ -33,8 +33,9 @@ from lqrsim.solvers.kernels import (
     clear,
     finite,
     offset,
-    riccati_backward,
+    within,
 )
+from lqrsim.solvers.limits import hold_those_at_limits, limits, riccati_backward_within
 
 
 def stage_model(x, u, t, stage, prior_weight, prior_about, damping, plan_u, hessian, gradient):
@@ -108,6 +109,8 @@ def forward_pass(
     """
     hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
     fx, fu, x_next, costate, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(M)
+    low, high = stack(M), stack(M)
+    limits(stage, low, high)
     clear(fx, N, N)
     clear(fu, N, M)
     kbar[0], good, _ = begin_model(x_hat, initial, fixed, damping, plan_x, S[0], C[0], b[0])
@@ -119,10 +122,12 @@ def forward_pass(
             copy(plan_u[t], M, u)
         else:
             affine(L[t], l[t], x_hat, u)
+            within(u, low, high)
         linearize(x_hat, u, p, dt, fx, fu, x_next, jacobian, c)
         constant = stage_model(
             x_hat, u, t, stage, prior_weight, prior_about, damping, plan_u, hessian, gradient
         )  # fmt: skip
+        constant += hold_those_at_limits(u, L[t], low, high, hessian, gradient, jacobian, c)
         kbar[t + 1], good = riccati_forward(
             jacobian, c, hessian, gradient, constant, C[t], b[t], kbar[t], G[t], a[t], Lbar[t], lbar[t],
             C[t + 1], b[t + 1],
@@ -158,6 +163,8 @@ def backward_pass(
     """
     hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
     fx, fu, x_next, x, u, costate = stack(N, N), stack(N, M), stack(N), stack(N), stack(M), stack(N)
+    low, high = stack(M), stack(M)
+    limits(stage, low, high)
     clear(fx, N, N)
     clear(fu, N, M)
     if not minimizer(S[steps], s[steps], C[steps], b[steps], costate, x_hat):
@@ -165,7 +172,7 @@ def backward_pass(
     size = abs(k[steps])
     for t in range(steps - 1, -1, -1):
         copy(x_hat, N, x_hats[t + 1])
-        depart(x_hat, costate, G[t], a[t], Lbar[t], lbar[t], p, dt, x, u)
+        depart(x_hat, costate, G[t], a[t], Lbar[t], lbar[t], p, dt, low, high, x, u)
         if reach < 1:
             for i in range(N):
                 x[i] = plan_x[t, i] + reach * (x[i] - plan_x[t, i]) if reach > 0 else plan_x[t, i]
@@ -175,8 +182,8 @@ def backward_pass(
         offset(jacobian, x, u, x_next, c)
         constant = stage_model(x, u, t, stage, prior_weight, prior_about, damping, plan_u, hessian, gradient)
         size += abs(constant)
-        k[t], good = riccati_backward(
-            jacobian, c, hessian, gradient, constant, S[t + 1], s[t + 1], k[t + 1], L[t], l[t], S[t], s[t]
+        k[t], good = riccati_backward_within(
+            jacobian, c, hessian, gradient, constant, S[t + 1], s[t + 1], k[t + 1], x, low, high, L[t], l[t], S[t], s[t]
         )
         if not good or not minimizer(S[t], s[t], C[t], b[t], costate, x_hat):
             return t, finite(hessian, W, W) and finite(jacobian, N, W) and finite(C[t], N, N), 0.0
@@ -200,6 +207,8 @@ def opening_pass(
     """
     hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
     fx, fu, x_next, x, x_hat, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(N), stack(M)
+    low, high = stack(M), stack(M)
+    limits(stage, low, high)
     clear(fx, N, N)
     clear(fu, N, M)
     copy(plan_x[steps], N, x_hat)
@@ -217,8 +226,8 @@ def opening_pass(
         step_jacobian(x, u, p, dt, fx, fu, x_next, jacobian)
         offset(jacobian, x, u, x_next, c)
         constant = stage_model(x, u, t, stage, prior_weight, prior_about, 0.0, plan_u, hessian, gradient)
-        k[t], good = riccati_backward(
-            jacobian, c, hessian, gradient, constant, S[t + 1], s[t + 1], k[t + 1], L[t], l[t], S[t], s[t]
+        k[t], good = riccati_backward_within(
+            jacobian, c, hessian, gradient, constant, S[t + 1], s[t + 1], k[t + 1], x, low, high, L[t], l[t], S[t], s[t]
         )
         if not good:
             return t, finite(hessian, W, W) and finite(jacobian, N, W)

@@ -14,6 +14,7 @@ from lqrsim.solvers.kernels import (
     minimize_control,
     offset,
     quadratic_at,
+    within,
 )
 
 
@@ -91,7 +92,8 @@ def minimizer(S, s, Sbar, sbar, costate, x):
     return True
 
 
-def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, x, u):
+def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, low, high, x, u):
     """Write the state and control (x, u) that lead to x_hat = x_{t+1}: the inverse policy, then the inverse step."""
     affine(gain, feedforward, x_hat, u)
+    within(u, low, high)
     step(x_hat, u, p, -dt, x)

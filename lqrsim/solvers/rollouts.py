@@ -10,27 +10,32 @@ from lqrsim.solvers.interface import (
     M,
     N,
     W,
+    final_added,
     final_quadratic,
     final_value,
     initial_quadratic,
     initial_value,
     stack,
+    stage_added,
     stage_quadratic,
     stage_value,
 )
-from lqrsim.solvers.kernels import affine, cholesky, cholesky_solve, clear, congruence, finite, minimize_control
+from lqrsim.solvers.kernels import affine, cholesky, cholesky_solve, clear, congruence, finite, within
+from lqrsim.solvers.limits import limits, minimize_within
 from lqrsim.solvers.passes import copy, end_model
 
 
 def rollout(steps, x0, gain, feedforward, p, dt, initial, stage, final, states, controls):
     """Run the policy from x0 under the true dynamics; write the trajectory and return its true cost."""
-    x, u = states[0], stack(M)
+    x, u, low, high = states[0], stack(M), stack(M), stack(M)
+    limits(stage, low, high)
     for i in range(N):
         x[i] = x0[i]
     cost = initial_value(x, u, 0, initial)
     for t in range(steps):
         x, u = states[t], controls[t]
         affine(gain[t], feedforward[t], x, u)
+        within(u, low, high)
         cost += stage_value(x, u, t, stage)
         step(x, u, p, dt, states[t + 1])
     return cost + final_value(states[steps], u, steps, final)
@@ -47,6 +52,10 @@ def differential_pass(steps, states, controls, p, dt, stage, final, damping, kee
     hessian, gradient, jacobian = stack(W, W), stack(W), stack(N, W)
     fx, fu, x_next, none = stack(N, N), stack(N, M), stack(N), stack(M)
     slope, curve = stack(N), stack(N, N)
+    no_change, low, high, lowest, highest = stack(N), stack(M), stack(M), stack(M), stack(M)
+    limits(stage, low, high)
+    for i in range(N):
+        no_change[i] = 0.0
     clear(fx, N, N)
     clear(fu, N, M)
     for i in range(M):
@@ -66,8 +75,9 @@ def differential_pass(steps, states, controls, p, dt, stage, final, damping, kee
         congruence(jacobian, curve, slope, hessian, gradient)
         for i in range(M):
             hessian[N + i, N + i] += damping
-        decrease = minimize_control(hessian, gradient, L[at], l[at], curve, slope)
-        if not decrease >= 0:
+            lowest[i], highest[i] = low[i] - controls[t, i], high[i] - controls[t, i]
+        decrease, good = minimize_within(hessian, gradient, no_change, lowest, highest, L[at], l[at], curve, slope)
+        if not good:
             return t, finite(hessian, W, W) and finite(jacobian, N, W), predicted
         predicted += decrease
         constant = ahead - predicted
@@ -122,22 +132,25 @@ def largest_gap(steps, x_hats, states):
     return gap
 
 
-def dynamics_residual(steps, x_hats, L, l, p, dt, states):
+def dynamics_residual(steps, x_hats, L, l, p, dt, stage, states):
     """The largest step x_{t+1} - g(x_t, u_t) of a sequence of states under a policy, relative as the gap is."""
-    u, ahead, low, high, worst = stack(M), stack(N), stack(N), stack(N), stack(N)
+    u, ahead, least, most, worst = stack(M), stack(N), stack(N), stack(N), stack(N)
+    low, high = stack(M), stack(M)
+    limits(stage, low, high)
     for i in range(N):
-        low[i], high[i], worst[i] = states[0, i], states[0, i], 0.0
+        least[i], most[i], worst[i] = states[0, i], states[0, i], 0.0
     for t in range(steps):
         affine(L[t], l[t], x_hats[t], u)
+        within(u, low, high)
         step(x_hats[t], u, p, dt, ahead)
         for i in range(N):
             difference = abs(x_hats[t + 1, i] - ahead[i])
             if difference > worst[i] or isnan(difference):
                 worst[i] = difference
-            low[i], high[i] = min(low[i], states[t + 1, i]), max(high[i], states[t + 1, i])
+            least[i], most[i] = min(least[i], states[t + 1, i]), max(most[i], states[t + 1, i])
     residual = 0.0
     for i in range(N):
-        relative = worst[i] / max(high[i] - low[i], 1.0)
+        relative = worst[i] / max(most[i] - least[i], 1.0)
         if relative > residual or isnan(relative):
             residual = relative
     return residual
@@ -146,15 +159,18 @@ def dynamics_residual(steps, x_hats, L, l, p, dt, states):
 def line_search(
     steps, states, controls, shift, L, l, p, dt, initial, stage, final, old, smallest, new_states, new_controls
 ):  # fmt: skip
-    """Try steps 1, 1/2, 1/4, ... along the changes of start and controls until the true cost falls below `old`.
+    """Try steps 1, 1/2, 1/4, ... along the changes of start and controls until the merit falls below `old`.
 
-    Writes the trajectory. Returns its cost and the step, which is 0 if none down to `smallest` lowers the cost.
+    The merit is the true cost and what the augmented Lagrangian adds to it. Writes the trajectory. Returns its merit,
+    its cost, and the step, which is 0 if none down to `smallest` lowers the merit.
     """
+    low, high = stack(M), stack(M)
+    limits(stage, low, high)
     fraction = 1.0
     while fraction >= smallest:
         for i in range(N):
             new_states[0, i] = states[0, i] + fraction * shift[i]
-        cost = initial_value(new_states[0], new_controls[0], 0, initial)
+        cost, added = initial_value(new_states[0], new_controls[0], 0, initial), 0.0
         for t in range(steps):
             x, u = new_states[t], new_controls[t]
             for i in range(M):
@@ -162,13 +178,16 @@ def line_search(
                 for j in range(N):
                     total += L[t, i, j] * (x[j] - states[t, j])
                 u[i] = total
+            within(u, low, high)
             cost += stage_value(x, u, t, stage)
+            added += stage_added(x, u, t, stage)
             step(x, u, p, dt, new_states[t + 1])
         cost += final_value(new_states[steps], new_controls[steps - 1], steps, final)
-        if cost < old:
-            return cost, fraction
+        added += final_added(new_states[steps], new_controls[steps - 1], steps, final)
+        if cost + added < old:
+            return cost + added, cost, fraction
         fraction *= 0.5
-    return old, 0.0
+    return old, old, 0.0
 
 
 def keep_plan(steps, states, controls, plan_x, plan_u):

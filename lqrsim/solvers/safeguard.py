@@ -14,6 +14,7 @@ from lqrsim.solvers.interface import (
     ILQR_LEFT,
     ILQR_NEXT,
     MAX_ITERATIONS,
+    MERIT,
     PATIENCE,
     PLAN_COST,
     REACH,
@@ -46,7 +47,8 @@ def damped_iterations(
     start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
     no_weight, no_about, plan_x, plan_u, states, controls, memory, log,
 ):  # fmt: skip
-    """Iterations from the best plan so far, each of which lowers its cost or leaves it as it is.
+    """Iterations from the best plan so far, each of which lowers its cost or leaves it as it is; with constraints, its
+    merit, to which the augmented Lagrangian belongs.
 
     The forward pass linearises about the plan, the backward pass part of the way (`reach`) to where the minimisers
     lead, and the new policy is followed as far as lowers the cost, by halves. Where a tenth of the way does not, the
@@ -75,24 +77,24 @@ def damped_iterations(
                 steps, fixed, reach, weight, plan_x, plan_u, x_hat, x_hats,
                 L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, no_weight, no_about,
             )  # fmt: skip
-        cost, fraction = inf, 0.0
+        merit, cost, fraction = inf, inf, 0.0
         if failed < 0:
             for i in range(N):
                 shift[i] = x_hat[i] - plan_x[0, i]
             about_plan(steps, plan_x, plan_u, L, l)
             smallest = 0.1 if reach > 0 else 1e-8
-            bound = memory[PLAN_COST] + 1e-12 * abs(memory[PLAN_COST])  # what differs by rounding is not refused
-            cost, fraction = line_search(
+            bound = memory[MERIT] + 1e-12 * abs(memory[MERIT])  # what differs by rounding is not refused
+            merit, cost, fraction = line_search(
                 steps, plan_x, plan_u, shift, L, l, p, dt, initial, stage, final, bound, smallest, states, controls
             )
         full = done + 1 == max_iterations
         if fraction > 0:
-            improvement = relative_improvement(memory[PLAN_COST], cost, nothing)
+            improvement = relative_improvement(memory[MERIT], merit, nothing)
             follow(steps, fraction, plan_x, x_hats)
             # At reach 0 as for iLQR: nothing but a rollout was linearised about.
             gap = largest_gap(steps, x_hats, states) if reach > 0 else 0.0
             keep_plan(steps, states, controls, plan_x, plan_u)
-            memory[PLAN_COST] = cost
+            memory[PLAN_COST], memory[MERIT] = cost, merit
             small = abs(improvement) < tolerance and (gap < gap_tolerance or not optimal)
             memory[SMALL] = memory[SMALL] + 1 if small else 0.0
             settled, stalled = memory[SMALL] > 1, False
@@ -164,7 +166,7 @@ def relinearize(
         return RUNNING
     if not fixed:
         left += initial_step(plan_x[0], initial, S[0], s[0], shift)
-    left = relative_optimality(failed, left, memory[PLAN_COST], nothing)
+    left = relative_optimality(failed, left, memory[MERIT], nothing)
     copy(start if fixed else plan_x[0], N, x_hat)
     failed, _ = forward_pass(
         steps, fixed, True, 0.0, plan_x, plan_u,
@@ -178,7 +180,7 @@ def relinearize(
             l[t, i] = plan_u[t, i]
             for j in range(N):
                 l[t, i] -= L[t, i, j] * plan_x[t, j]
-    log[done, 3], log[done, 4] = left, dynamics_residual(steps, x_hats, L, l, p, dt, plan_x)
+    log[done, 3], log[done, 4] = left, dynamics_residual(steps, x_hats, L, l, p, dt, stage, plan_x)
     if isnan(log[done, 2]):  # of an iteration that was rejected
         log[done, 2] = 0.0
     return ending(settled and left < tolerance, optimal, left, tolerance, memory[PLAN_COST], False)

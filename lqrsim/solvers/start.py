@@ -1,17 +1,71 @@
-"""What a solver may begin with: nothing, controls, a policy, a trajectory or a solution."""
+"""What a solver may begin with: nothing, controls, a prior, a policy, a trajectory or a solution."""
 
 import hashlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_count, excerpt
 from lqrsim.problem import Problem
-from lqrsim.results import AffinePolicy, Quadratic, Solution, Trajectory
+from lqrsim.results import AffinePolicy, Multipliers, Quadratic, Solution, Trajectory
 
-# Controls (m,) or (T, m), or what has more to say.
-StartLike = npt.ArrayLike | AffinePolicy | Trajectory | Solution | None
+
+class InitialPrior:
+    """`1/2 (x - about)' diag(weight) (x - about)` at all steps but the first, in the first iterations only.
+
+    It is no part of the cost: it keeps the first linearisations of the smoother sensible, and so has a say in which
+    local optimum is found.
+
+    Args:
+      weight: (n,) not negative. iterations: how many it acts in.
+      about: where it is zero: (n,), or (T+1, n) for a trajectory to be drawn to.
+      obstacles: the shares of the obstacle costs that the first iterations see, one an iteration; then it is all.
+      controls: what the first pass applies, (m,) or (T, m); by default the problem's nominal control.
+    """
+
+    def __init__(
+        self,
+        weight: npt.ArrayLike,
+        *,
+        about: npt.ArrayLike,
+        iterations: int = 1,
+        obstacles: Sequence[float] = (),
+        controls: npt.ArrayLike | None = None,
+    ) -> None:
+        self.weight = check_array("InitialPrior: weight", weight, (None,))
+        if (self.weight < 0).any():
+            raise InputError(f"InitialPrior: weight: got {self.weight.min():g}, want numbers >= 0")
+        time = () if np.ndim(about) == 1 else (None,)
+        self.about = check_array("InitialPrior: about", about, (*time, len(self.weight)))
+        self.iterations = check_count("InitialPrior: iterations", iterations)
+        shares = check_array("InitialPrior: obstacles", obstacles, (None,))
+        if ((shares < 0) | (shares > 1)).any():
+            raise InputError(f"InitialPrior: obstacles: got {excerpt(obstacles)}, want numbers from 0 to 1")
+        self.obstacles = tuple(shares.tolist())
+        self.controls = None if controls is None else np.array(controls, dtype=np.float64)
+
+    def at(self, step: float) -> Array:
+        """Where it is zero, (n,), at a step or between two."""
+        if self.about.ndim == 1:
+            return self.about
+        before = min(int(step), len(self.about) - 2)
+        share = step - before
+        return (1 - share) * self.about[before] + share * self.about[before + 1]
+
+    def fitting(self, problem: Problem) -> "InitialPrior":
+        """Itself. Raises InputError if it does not fit the problem."""
+        n = len(problem.dynamics.state_coordinates)
+        check_array("start: InitialPrior: weight", self.weight, (n,))
+        if self.about.ndim == 2:
+            check_array("start: InitialPrior: about", self.about, (problem.steps + 1, n))
+        return self
+
+
+# Controls (m,) or (T, m), or what has more to say; or a function that makes one of these for a problem.
+Beginning = npt.ArrayLike | InitialPrior | AffinePolicy | Trajectory | Solution | None
+StartLike = Beginning | Callable[[Problem], Beginning]
 
 
 @dataclass(frozen=True)
@@ -23,6 +77,8 @@ class Start:
       cost_to_go: what is known of it; None for nothing.
       trajectory: what the first pass linearises about, feasible or not; None to leave that to the policy.
       summary: what a solution's options say of it.
+      prior: what acts in the first iterations besides the cost.
+      multipliers: of the constraints, where they are known.
     """
 
     gain: Array
@@ -30,6 +86,8 @@ class Start:
     cost_to_go: Quadratic | None
     trajectory: Trajectory | None
     summary: object
+    prior: InitialPrior | None = None
+    multipliers: tuple[Multipliers, ...] = ()
 
     def rolled_out(self, problem: Problem, x: Array) -> "Start":
         """With the trajectory of the policy from a state (n,): what a backward pass that comes first is about.
@@ -56,13 +114,22 @@ def resolve(start: StartLike, problem: Problem) -> Start:
       InputError: it does not fit the problem.
     """
     n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
+    if callable(start) and not isinstance(start, AffinePolicy):
+        start = start(problem)
+    if isinstance(start, InitialPrior):
+        prior, controls = start.fitting(problem), resolve(start.controls, problem)
+        return replace(controls, prior=prior, summary=_summary(start, prior.weight, prior.about, controls.offset))
     if isinstance(start, Solution):
         policy, value = resolve(start.policy, problem), start.cost_to_go
         if value is not None:
             hessian = check_array("start: cost_to_go.hessian", value.hessian, (steps + 1, n, n))
             value = Quadratic(hessian, check_array("start: cost_to_go.gradient", value.gradient, (steps + 1, n)),
                               check_array("start: cost_to_go.constant", value.constant, (steps + 1,)))  # fmt: skip
-        return Start(policy.gain, policy.offset, value, None, _summary(start, policy.gain, policy.offset))
+        multipliers = start.multipliers
+        if [one.values.shape for one in multipliers] != [(steps + 1, one.rows) for one in problem.inequalities]:
+            multipliers = ()  # of other constraints
+        summary = _summary(start, policy.gain, policy.offset)
+        return Start(policy.gain, policy.offset, value, None, summary, multipliers=multipliers)
     if isinstance(start, AffinePolicy):
         gain = check_array("start: gain", start.gain, (steps, m, n))
         offset = check_array("start: offset", start.offset, (steps, m))
@@ -80,7 +147,8 @@ def resolve(start: StartLike, problem: Problem) -> Start:
         controls = np.broadcast_to(given, (steps, m))
     except (TypeError, ValueError):
         raise InputError(
-            f"start: got {got}, want controls ({m},) or ({steps}, {m}), a Trajectory, an AffinePolicy or a Solution"
+            f"start: got {got}, want controls ({m},) or ({steps}, {m}), an InitialPrior, a Trajectory, an AffinePolicy"
+            " or a Solution"
         ) from None
     controls = check_array("start", controls, (steps, m))
     summary = controls[0] if (controls == controls[0]).all() else controls

@@ -1,37 +1,33 @@
-// The quadrotor's dynamics and obstacle cost, the same functions as lqrsim's, with derivatives by hand; the Hessian of the
-// obstacle cost is projected to the nearest positive-semidefinite matrix, too. Everything but the number of states and
-// controls is data.
+// The dynamics of lqrsim's two robots, the same functions, with derivatives by hand. The numbers are data.
 #pragma once
 
-#include <Eigen/Eigenvalues>
+#include <Eigen/Core>
 #include <cmath>
-#include <vector>
 
 namespace {
 
-constexpr int N = 12, M = 4, W = N + M;
 using Vector3 = Eigen::Vector3d;
 using Matrix3 = Eigen::Matrix3d;
-using State = Eigen::Matrix<double, N, 1>;
-using Control = Eigen::Matrix<double, M, 1>;
-using Slope = Eigen::Matrix<double, N, W, Eigen::RowMajor>;
 
-// As peers.py fills them, in this order.
-struct Numbers {
+template <int n, int m>
+struct Sizes {
+  static constexpr int N = n, M = m, W = n + m;
+  using State = Eigen::Matrix<double, N, 1>;
+  using Control = Eigen::Matrix<double, M, 1>;
+  using Slope = Eigen::Matrix<double, N, W, Eigen::RowMajor>;
+};
+
+// The robots' constants, in the order of the parameters of lqrsim's dynamics. The first D states are the position.
+struct Quadrotor : Sizes<12, 4> {
+  static constexpr int D = 3;
   double mass, inertia, arm, torque_ratio, drag, gravity;
-  double dt, radius, sharpness, obstacle_weight;
-  double control_weight[M], control_about[M], final_weight[N], final_about[N];
+  struct Rate;
 };
-struct Cylinder {
-  double point[3], axis[3], radius;
-};
-struct Plane {
-  double point[3], normal[3];
-};
-struct World {
-  Numbers numbers;
-  std::vector<Cylinder> cylinders;
-  std::vector<Plane> planes;
+
+struct DifferentialDrive : Sizes<3, 2> {
+  static constexpr int D = 2;
+  double axle;
+  struct Rate;
 };
 
 // sin t / t, (1 - cos t) / t^2 and (1 - t/2 cot(t/2)) / t^2 for t^2 = s, and their derivatives in s.
@@ -65,11 +61,11 @@ Matrix3 cross(const Vector3& v) {
 }
 
 // xdot; with `slope`, also its derivatives: of the acceleration in r and the force, of the rate of r in r and w.
-struct Rate {
+struct Quadrotor::Rate {
   Vector3 up;               // the body's z axis in the world
   Matrix3 force_r, r_r, r_w;  // d(acceleration)/dr, d(rdot)/dr, d(rdot)/dw
 
-  void operator()(const Numbers& p, const State& x, const Control& u, State& out, bool slope) {
+  void operator()(const Quadrotor& p, const State& x, const Control& u, State& out, bool slope) {
     const Vector3 r = x.segment<3>(6), w = x.segment<3>(9);
     const double s = r.squaredNorm(), thrust = u.sum() / p.mass, along = r.dot(w);
     const Ratios ratio(s);
@@ -96,7 +92,7 @@ struct Rate {
   }
 
   // fx ([1 0] + a previous) + [0 fu], written out for the blocks that are not zero.
-  void chain(const Numbers& p, const Slope& previous, double a, Slope& out) const {
+  void chain(const Quadrotor& p, const Slope& previous, double a, Slope& out) const {
     Slope inner = a * previous;
     for (int i = 0; i < N; i++) inner(i, i) += 1;
     out.topRows<3>() = inner.middleRows<3>(3);
@@ -114,84 +110,74 @@ struct Rate {
   }
 };
 
-void step(const Numbers& p, const State& x, const Control& u, State& out) {
-  Rate rate;
-  State k, z;
+// As above; the derivatives are those of the velocity in the heading.
+struct DifferentialDrive::Rate {
+  double sine, cosine, speed;
+
+  void operator()(const DifferentialDrive& p, const State& x, const Control& u, State& out, bool) {
+    sine = std::sin(x[2]);
+    cosine = std::cos(x[2]);
+    speed = (u[0] + u[1]) / 2;
+    out << speed * cosine, speed * sine, (u[1] - u[0]) / p.axle;
+  }
+
+  void chain(const DifferentialDrive& p, const Slope& previous, double a, Slope& out) const {
+    Slope inner = a * previous;
+    for (int i = 0; i < N; i++) inner(i, i) += 1;
+    out.row(0) = -speed * sine * inner.row(2);
+    out.row(1) = speed * cosine * inner.row(2);
+    out.row(2).setZero();
+    for (int j = N; j < W; j++) {
+      out(0, j) += cosine / 2;
+      out(1, j) += sine / 2;
+    }
+    out(2, N) = -1 / p.axle;
+    out(2, N + 1) = 1 / p.axle;
+  }
+};
+
+// One Runge-Kutta step.
+template <class Robot>
+void step(const Robot& p, double dt, const typename Robot::State& x, const typename Robot::Control& u,
+          typename Robot::State& out) {
+  typename Robot::Rate rate;
+  typename Robot::State k, z;
   rate(p, x, u, k, false);
   out = k;
-  z = x + 0.5 * p.dt * k;
+  z = x + 0.5 * dt * k;
   rate(p, z, u, k, false);
   out += 2 * k;
-  z = x + 0.5 * p.dt * k;
+  z = x + 0.5 * dt * k;
   rate(p, z, u, k, false);
   out += 2 * k;
-  z = x + p.dt * k;
+  z = x + dt * k;
   rate(p, z, u, k, false);
-  out = x + p.dt / 6 * (out + k);
+  out = x + dt / 6 * (out + k);
 }
 
-void step_slope(const Numbers& p, const State& x, const Control& u, Slope& out) {
-  Rate rate;
-  State k, z;
-  Slope zero = Slope::Zero(), first, second;
+// Its derivatives, of the states before those of the controls.
+template <class Robot>
+void step_slope(const Robot& p, double dt, const typename Robot::State& x, const typename Robot::Control& u,
+                typename Robot::Slope& out) {
+  typename Robot::Rate rate;
+  typename Robot::State k, z;
+  typename Robot::Slope zero = Robot::Slope::Zero(), first, second;
   rate(p, x, u, k, true);
   rate.chain(p, zero, 0, first);
   out = first;
-  z = x + 0.5 * p.dt * k;
+  z = x + 0.5 * dt * k;
   rate(p, z, u, k, true);
-  rate.chain(p, first, 0.5 * p.dt, second);
+  rate.chain(p, first, 0.5 * dt, second);
   out += 2 * second;
-  z = x + 0.5 * p.dt * k;
+  z = x + 0.5 * dt * k;
   rate(p, z, u, k, true);
-  rate.chain(p, second, 0.5 * p.dt, first);
+  rate.chain(p, second, 0.5 * dt, first);
   out += 2 * first;
-  z = x + p.dt * k;
+  z = x + dt * k;
   rate(p, z, u, k, true);
-  rate.chain(p, first, p.dt, second);
-  out = p.dt / 6 * (out + second);
-  for (int i = 0; i < N; i++) out(i, i) += 1;
-}
-
-// The cost of the obstacles at a place; with `gradient`, its derivatives too.
-double obstacles(const World& world, const Vector3& place, Vector3* gradient, Matrix3* hessian) {
-  const Numbers& p = world.numbers;
-  double total = 0;
-  if (gradient) {
-    gradient->setZero();
-    hessian->setZero();
-  }
-  for (const Cylinder& cylinder : world.cylinders) {
-    const Vector3 axis(cylinder.axis);
-    Vector3 away = place - Vector3(cylinder.point);
-    away -= axis * axis.dot(away);
-    const double distance = away.norm();
-    const double cost = p.obstacle_weight * std::exp(-p.sharpness * (distance - cylinder.radius - p.radius));
-    total += cost;
-    if (gradient) {
-      const double slope = -p.sharpness * cost / distance;
-      *gradient += slope * away;
-      *hessian += (p.sharpness * p.sharpness * cost - slope) / (distance * distance) * away * away.transpose() +
-                  slope * (Matrix3::Identity() - axis * axis.transpose());
-    }
-  }
-  for (const Plane& plane : world.planes) {
-    const Vector3 normal(plane.normal);
-    const double distance = normal.dot(place - Vector3(plane.point));
-    const double cost = p.obstacle_weight * std::exp(-p.sharpness * (distance - p.radius));
-    total += cost;
-    if (gradient) {
-      *gradient -= p.sharpness * cost * normal;
-      *hessian += p.sharpness * p.sharpness * cost * normal * normal.transpose();
-    }
-  }
-  return total;
-}
-
-void project(Matrix3& h) {
-  const double minor = h(0, 0) * h(1, 1) - h(0, 1) * h(1, 0);
-  if (h(0, 0) > 0 && minor > 0 && h.determinant() > 0) return;
-  const Eigen::SelfAdjointEigenSolver<Matrix3> eigen(h);
-  h = eigen.eigenvectors() * eigen.eigenvalues().cwiseMax(0).asDiagonal() * eigen.eigenvectors().transpose();
+  rate.chain(p, first, dt, second);
+  out = dt / 6 * (out + second);
+  for (int i = 0; i < Robot::N; i++) out(i, i) += 1;
 }
 
 }  // namespace

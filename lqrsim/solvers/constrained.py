@@ -1,0 +1,219 @@
+"""Constraints: from the optimum without them to one that keeps them, by the method of multipliers.
+
+The smoother minimises the augmented Lagrangian (see `augmented.py`), roughly; then the multipliers are renewed, and
+where what is missed has not halved, the penalty grows; and again. Were they renewed after every iteration, plans that
+slide along an obstacle would swing to and fro, for the model leaves out how an obstacle curves. Where undamped
+iterations do not settle, the safeguard's minimise each augmented Lagrangian.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from lqrsim.errors import Array
+from lqrsim.results import Iteration, Moments, Multipliers, Status
+from lqrsim.solvers import interface
+from lqrsim.solvers.attempt import Attempt, Found
+from lqrsim.solvers.common import LOG_COLUMNS, Callback
+
+PENALTY = 8.0  # at first, relative to what it costs to change what is constrained
+GROWTH = 5.0  # of the penalty
+LARGEST = 1e6  # how far it grows before that is given up
+ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
+ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to renew the multipliers, and when anyway
+
+
+def satisfy(attempt: Attempt, found: Found | None, *, each: bool, callback: Callback | None = None) -> Found:
+    """Go on from what was found without the constraints, or, without it, from the multipliers of another solution."""
+    tolerance = attempt.settings.constraint_tolerance
+    lagrangian = _Lagrangian(attempt)
+    if found is not None:
+        lagrangian.look(found.states, found.controls)
+        if not found.success or lagrangian.violation <= tolerance:
+            return found
+        lagrangian.begin()
+        found = found.changed(states=found.states.copy(), controls=found.controls.copy())  # these will be overwritten
+    before = found.iterations if found is not None else ()
+    undamped = _undamped(attempt, lagrangian, before, each=each, callback=callback)
+    if undamped.success or not attempt.settings.safeguard:
+        return undamped
+    return _damped(attempt, lagrangian, found, undamped, each=each, callback=callback)
+
+
+def _undamped(
+    attempt: Attempt,
+    lagrangian: "_Lagrangian",
+    before: tuple[Iteration, ...],
+    *,
+    each: bool,
+    callback: Callback | None,
+) -> Found:
+    work, settings = attempt.work, attempt.settings
+    work.memory[interface.PLAN_COST] = -np.inf  # of lower cost is not better now
+    log = np.zeros((min(ITERATIONS, settings.max_iterations), LOG_COLUMNS))
+    done: tuple[Iteration, ...] = ()
+    since = 0
+    while True:
+        ending = attempt.run_on(log, len(done) + 1, done=done, each=each, callback=callback)
+        done, since = ending.iterations, since + 1
+        if ending.pass_failed or not np.isfinite(done[-1].cost):
+            break
+        lagrangian.look(work.states, work.controls)
+        settled = ending.outcome in (interface.CONVERGED, interface.COST_CONVERGED)
+        if len(done) == len(log) or (settled and lagrangian.missed <= settings.constraint_tolerance):
+            break
+        rough = abs(done[-1].improvement) < ROUGH and done[-1].gap < ROUGH_GAP
+        if settled or rough or since == PATIENCE:
+            since = 0
+            lagrangian.renew()
+    found = attempt.found(ending)
+    detail = found.detail or ("" if found.success else f"with constraints, {lagrangian.worst()}")
+    if found.success and lagrangian.missed > settings.constraint_tolerance:
+        found = found.changed(status=Status.MAX_ITERATIONS)
+        detail = f"{len(done)} iterations with constraints: {lagrangian.worst()}"
+    return found.changed(iterations=before + done, detail=detail, multipliers=lagrangian.multipliers())
+
+
+def _damped(
+    attempt: Attempt,
+    lagrangian: "_Lagrangian",
+    found: Found | None,
+    undamped: Found,
+    *,
+    each: bool,
+    callback: Callback | None,
+) -> Found:
+    """The safeguard: from the plan without constraints or the last one with them, whichever is the better beginning."""
+    work, tolerance = attempt.work, attempt.settings.constraint_tolerance
+    plans = [(work.states, work.controls, undamped.iterations[-1].cost)] if undamped.iterations else []
+    plans += [(found.states, found.controls, found.iterations[-1].cost)] if found is not None else []
+    plans = [plan for plan in plans if np.isfinite(plan[2])]
+    if not plans:
+        return undamped
+    lagrangian.look(*plans[-1][:2])
+    lagrangian.begin()
+    merits = []
+    for *plan, cost in plans:
+        lagrangian.look(*plan)
+        merits.append(cost + lagrangian.added())
+    states, controls, cost = plans[int(np.argmin(merits))]
+    work.plan[0][:], work.plan[1][:] = states, controls
+    lagrangian.look(*work.plan)
+    iterations = undamped.iterations
+    why = "the undamped method failed with the constraints"
+    rounds = 0
+    while True:
+        rounds += 1
+        work.memory[interface.PLAN_COST] = cost
+        work.memory[interface.MERIT] = cost + lagrangian.added()
+        ending = attempt.damp(before=iterations, each=each, callback=callback)
+        iterations, cost = ending.iterations, float(work.memory[interface.PLAN_COST])
+        lagrangian.look(*work.plan)
+        if ending.success and lagrangian.missed <= tolerance:
+            return attempt.found_damped(ending, ending.status, why).changed(multipliers=lagrangian.multipliers())
+        if rounds == ROUNDS or lagrangian.grown > LARGEST:
+            break
+        lagrangian.renew()
+    status = Status.INFEASIBLE if lagrangian.violation > tolerance else Status.MAX_ITERATIONS
+    detail = lagrangian.worst() if status is Status.INFEASIBLE else f"{why}, and {lagrangian.worst()}"
+    return attempt.found_damped(ending, status, detail).changed(multipliers=lagrangian.multipliers())
+
+
+def _missed(array: Array, values: Array) -> float:
+    """By how much a constraint is missed, or its multipliers are off, at most."""
+    press = array[3:] / array[0] if array[0] > 0 else 0.0
+    return float(np.abs(np.minimum(values, press)).max(initial=0.0))
+
+
+class _Lagrangian:
+    """The multipliers of all constraints, in the memory that the compiled loops read.
+
+    Attributes:
+      violation: by how much the worst constraint is missed by the plan that was looked at last.
+      missed: the same, and where one is kept, by how much its multiplier is still off: `|min(d, lambda / mu)|`.
+      grown: by how much the penalty has grown.
+    """
+
+    def __init__(self, attempt: Attempt) -> None:
+        self._problem, self._work = attempt.problem, attempt.work
+        self._tolerance = attempt.settings.constraint_tolerance
+        self.violation, self.missed, self.grown = 0.0, np.inf, 1.0
+        self._last = np.inf
+
+    def look(self, states: Array, controls: Array) -> None:
+        """Evaluate the constraints of a plan."""
+        self._plan = states, controls
+        self._values = [values.ravel() for values in self._work.constraint_values(states, controls)]
+        self.violation = max(0.0, *(-values.min(initial=np.inf) for values in self._values))
+        self.missed = max(self._each(_missed))
+
+    def begin(self) -> None:
+        """No multipliers, and a penalty for each constraint that fits what it costs to change it."""
+        self.grown, self._last = 1.0, self.violation
+        for which, (array, values) in enumerate(zip(self._work.multipliers, self._values, strict=True)):
+            array[0], array[3:] = PENALTY * self._curvature(which, int(values.argmin())), 0.0
+
+    def renew(self) -> None:
+        """Take what the constraints press with for the multipliers; let the penalty grow if that helps too little."""
+        for array, values in zip(self._work.multipliers, self._values, strict=True):
+            array[3:] = np.maximum(array[3:] - array[0] * values, 0.0)
+        if self.violation > max(0.5 * self._last, self._tolerance):
+            self.grown *= GROWTH
+            for array in self._work.multipliers:
+                array[0] *= GROWTH
+        self._last = self.violation
+
+    def added(self) -> float:
+        """What the augmented Lagrangian adds to the cost of the plan."""
+
+        def one(array: Array, values: Array) -> float:
+            force = np.maximum(array[3:] - array[0] * values, 0.0)
+            return float((force @ force - array[3:] @ array[3:]) / (2 * array[0]))
+
+        return sum(self._each(one))
+
+    def multipliers(self) -> tuple[Multipliers, ...]:
+        """As a solution has them: with the last look taken into account."""
+
+        def one(array: Array, values: Array) -> Multipliers:
+            forces = np.maximum(array[3:] - array[0] * values, 0.0)
+            return Multipliers(forces.reshape(self._problem.steps + 1, -1), float(array[0]))
+
+        return tuple(self._each(one))
+
+    def worst(self) -> str:
+        """Which constraint is missed most, by how much and when."""
+        least = [values.min(initial=np.inf) for values in self._values]
+        which = int(np.argmin(least))
+        inequalities = self._problem.inequalities[which]
+        step, row = divmod(int(self._values[which].argmin()), inequalities.rows)
+        missed, time = -least[which], step * self._problem.dt
+        return f"{inequalities.says(row)} is missed by {missed:.2g} at {time:.2f} s (step {step})"
+
+    def _each(self, function: Callable[[Array, Array], "float | Multipliers"]) -> list:
+        return [function(*pair) for pair in zip(self._work.multipliers, self._values, strict=True)]
+
+    def _curvature(self, which: int, index: int) -> float:
+        """What it costs to change one of a constraint's numbers: twice the total cost of a change by 1 unit.
+
+        `1 / n' (S + Sbar)^-1 n` of its slope n: the curvature of the total cost, the rest of the trajectory giving way.
+        """
+        states, controls = self._plan
+        n, steps = states.shape[1], len(controls)
+        step, row = divmod(index, self._problem.inequalities[which].rows)
+        slope = self._work.constraint_slope(which, row, states[step], controls[min(step, steps - 1)], step)
+        values = self._work.value_functions()
+        go, come = values["cost_to_go"], values["cost_to_come"]
+        try:
+            if isinstance(come, Moments):
+                given = np.linalg.solve(np.eye(n) + come.covariance[step] @ go.hessian[step], come.covariance[step])
+            else:
+                given = np.linalg.inv(go.hessian[step] + come.hessian[step])
+        except np.linalg.LinAlgError:
+            return 1.0
+        spread = np.zeros((len(slope), len(slope)))
+        gain = self._work.law[0][min(step, steps - 1)]
+        spread[:n, :n], spread[n:, n:] = given, gain @ given @ gain.T
+        spread[:n, n:], spread[n:, :n] = given @ gain.T, gain @ given
+        bend = float(slope @ spread @ slope)
+        return 1 / bend if bend > 0 else 1.0

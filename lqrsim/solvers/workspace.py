@@ -1,0 +1,102 @@
+"""The memory of one solve, and what can be read from it."""
+
+import contextlib
+from typing import Any
+
+import numpy as np
+
+from lqrsim import compiled
+from lqrsim.errors import Array
+from lqrsim.problem import FixedState, Problem
+from lqrsim.results import Moments, Quadratic
+from lqrsim.solvers import interface
+from lqrsim.solvers.common import SmootherSettings, model
+from lqrsim.solvers.start import Start
+
+
+class Workspace:
+    """What the loops read and write; see `solvers/loops.py` and `safeguard.py` for what each is.
+
+    Attributes:
+      multipliers: of each constraint, as `solvers/augmented.py` has them; changes act at once.
+      core: the compiled loops.
+    """
+
+    def __init__(self, problem: Problem, settings: SmootherSettings, begin: Start, start: Array) -> None:
+        n, steps, zeros = len(start), problem.steps, np.zeros
+        m = begin.offset.shape[1]
+        self.dual = settings.form == "dual"
+        self.fixed = isinstance(problem.initial, FixedState)
+        self.start = start
+        self.x_hat, self.x_hats = self.start.copy(), zeros((steps + 1, n))
+        self.law = begin.gain.copy(), begin.offset.copy()
+        self.go = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
+        if begin.cost_to_go is not None:
+            value = begin.cost_to_go
+            self.go = value.hessian.copy(), value.gradient.copy(), np.array(value.constant)
+        self.come = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
+        kept = steps if self.dual else 1  # the primal form finds its way back without
+        self.back = zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))
+        self.no_prior = zeros(n), zeros((steps + 1, n))
+        self.prior = (*self.no_prior, 0)
+        if begin.prior is not None:
+            about = np.broadcast_to(begin.prior.about, (steps + 1, n)).copy()
+            self.prior = begin.prior.weight.copy(), about, begin.prior.iterations
+        # Without a trajectory to begin with: the start, and the controls with which the dynamics can run backwards.
+        self.guess = np.tile(self.start, (steps + 1, 1)), begin.offset.copy()
+        if begin.trajectory is not None:
+            self.guess = begin.trajectory.states.copy(), begin.trajectory.controls.copy()
+        self.plan = self.guess[0].copy(), self.guess[1].copy()
+        self.states, self.controls = zeros((steps + 1, n)), zeros((steps, m))
+        self.kept = zeros((steps, m, n)), zeros((steps, m))
+        self.memory = zeros(interface.MEMORY)
+        self.multipliers = [compiled.no_multipliers(problem, inequalities) for inequalities in problem.inequalities]
+        for array, known in zip(self.multipliers, begin.multipliers, strict=False):
+            array[0], array[3:] = known.penalty, known.values.ravel()
+        self.core = compiled.core(problem, settings.form)
+        self.model = model(problem, self.multipliers)
+        self._problem = problem
+
+    @property
+    def passes(self) -> tuple[Any, ...]:
+        """The part that all loops have."""
+        return (
+            self.start, self.x_hat, self.x_hats, *self.law, *self.go, *self.come, *self.back, *self.model
+        )  # fmt: skip
+
+    def value_functions(self) -> dict[str, Any]:
+        """Cost-to-go, cost-to-come and inverse law of the last passes, as `assemble` takes them."""
+        if not self.dual:
+            inverse = self.back[2], self.back[3]
+            return {"cost_to_go": Quadratic(*self.go), "cost_to_come": Quadratic(*self.come), "inverse_law": inverse}
+        covariance, mean, _ = self.come
+        inverse = None
+        if not self.fixed:  # or the first covariances are singular
+            # u = gain costate + offset, where the costate at a state of arrival x is -covariance^-1 (x - mean).
+            with contextlib.suppress(np.linalg.LinAlgError):
+                gain = -np.linalg.solve(covariance[1:], np.swapaxes(self.back[2], 1, 2))
+                gain = np.ascontiguousarray(np.swapaxes(gain, 1, 2))
+                inverse = gain, self.back[3] - np.einsum("tij,tj->ti", gain, mean[1:])
+        return {"cost_to_go": Quadratic(*self.go), "cost_to_come": Moments(*self.come), "inverse_law": inverse}
+
+    def eased(self, share: float) -> Any:
+        """The stage cost with that share of what may be eased."""
+        return self.model[3] if share == 1 else model(self._problem, self.multipliers, share=share)[3]
+
+    def constraint_values(self, states: Array, controls: Array) -> list[Array]:
+        """Of each constraint (T+1, rows): not to be negative; infinite where it does not act."""
+        values = [np.empty(len(multipliers) - 3) for multipliers in self.multipliers]
+        if values:
+            self.core.look_at_constraints(self._problem.steps, states, controls, self.model[3], tuple(values))
+        return [one.reshape(self._problem.steps + 1, -1) for one in values]
+
+    def constraint_slope(self, which: int, row: int, x: Array, u: Array, step: int) -> Array:
+        """Gradient (n+m,) of one of a constraint's numbers."""
+        slope = np.zeros(len(x) + len(u))
+        self.core.slope_of_constraint(which, row, x, u, step, self.model[3], slope)
+        return slope
+
+    def violation(self, states: Array, controls: Array) -> float:
+        """By how much the worst constraint is missed; 0 where none is."""
+        least = [values.min(initial=np.inf) for values in self.constraint_values(states, controls)]
+        return float(max(0.0, -np.min(least, initial=np.inf)))
