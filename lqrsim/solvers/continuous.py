@@ -240,7 +240,8 @@ def smooth_continuous(
 
     The horizon is `steps * dt`, the cost of a second is `stage_cost / dt`, and the control is not held over a step: as
     dt shrinks and the weights with it, `smooth` comes to this, at first order. A stage cost that depends on the step is
-    given the one in which the time lies, and at least 1: what is off at the first instant costs nothing there.
+    given the one in which the time lies, and at least 1: what is off at the first instant costs nothing there. Controls
+    have no limits here.
 
     Args:
       problem: with an initial cost, the paper's soft start.
@@ -267,6 +268,8 @@ def smooth_continuous(
             "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start);"
             " the primal form has no other start"
         )
+    if problem.constraints:
+        raise InputError("constraints: got some, want none in continuous time; smooth keeps them")
     check_number("tolerance", tolerance, above=0.0)
     check_number("gap_tolerance", gap_tolerance, above=0.0)
     check_count("max_iterations", max_iterations)

@@ -37,7 +37,8 @@ def ilqr(
     """Compute a locally optimal feedback policy by iterative LQR with a line search that halves the step.
 
     Each iteration is a backward pass about a feasible trajectory and the accepted rollout of its policy. The start is
-    fixed: the state of a `FixedState`, or the one that the initial cost is about. The cost never rises.
+    fixed: the state of a `FixedState`, or the one that the initial cost is about. The cost never rises. The limits of
+    the controls are kept; constraints are not for this solver.
 
     Args:
       stop, tolerance, max_iterations, callback: as in `smooth`; the gap is zero here, for every iterate is feasible.
@@ -80,6 +81,10 @@ def _check(problem: Problem, settings: Settings) -> None:
     if isinstance(settings.start, InitialPrior):
         raise InputError(
             "start: got an InitialPrior, want controls, a Trajectory, an AffinePolicy or a Solution: iLQR has no prior"
+        )
+    if problem.constraints:
+        raise InputError(
+            "constraints: got some, want none for ilqr, which keeps the control limits only; smooth keeps them"
         )
     if problem.start is None:
         raise InputError(
