@@ -98,25 +98,23 @@ def linear_quadratic(n: int, m: int, form: str) -> Core:
 _NAMES = {name: value for name, value in vars(interface).items() if name.isupper() and len(name) > 1}
 
 
-def arguments(problem: Problem, *, share: float = 1.0, multipliers: Sequence[Array] = ()) -> dict[str, Any]:
+def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> dict[str, Any]:
     """The problem's numbers, as the passes take them: before its own, each part has the addresses of its functions.
 
     Args:
-      share: of the costs that may be eased; see `Term.factor`.
       multipliers: of each constraint, as `augmented.py` has them; by default none act.
     """
 
-    def numbers(part: Dynamics | Term, data: Array) -> Array:
-        return np.array([*(address_of(function) for function in part.functions), *data], dtype=np.float64)
+    def numbers(part: Dynamics | Term) -> Array:
+        return np.array([*(address_of(function) for function in part.functions), *part.data], dtype=np.float64)
 
-    parts = {name: problem.terms(field) for name, field in _FIELDS.items()}
-    data = {name: tuple(numbers(term, term.eased(share)) for term in terms) for name, terms in parts.items()}
+    data = {name: tuple(numbers(term) for term in problem.terms(field)) for name, field in _FIELDS.items()}
     multipliers = multipliers or [no_multipliers(problem, inequalities) for inequalities in problem.inequalities]
     pairs = [(part.data.copy(), own) for part, own in zip(problem.inequalities, multipliers, strict=True)]
     data["stage"] += tuple(array for pair in pairs for array in pair)
     data["final"] += tuple(array for pair in pairs for array in pair)
     data["stage"] += (np.array([*problem.control_coordinates.low, *problem.control_coordinates.high]),)
-    return {"p": numbers(problem.dynamics, problem.dynamics.data), "dt": problem.dt, **data}
+    return {"p": numbers(problem.dynamics), "dt": problem.dt, **data}
 
 
 def no_multipliers(problem: Problem, inequalities: Inequalities) -> Array:

@@ -42,13 +42,6 @@ class Term:
     factor: int | None = None
     functions: tuple[External, ...] = ()
 
-    def eased(self, share: float) -> Array:
-        """Its data, with that share of its factor."""
-        data = self.data.copy()
-        if self.factor is not None:
-            data[self.factor] *= share
-        return data
-
 
 class Cost(abc.ABC):
     """One term of a cost."""

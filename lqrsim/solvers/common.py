@@ -326,9 +326,9 @@ def assemble(
     )
 
 
-def model(problem: Problem, multipliers: Sequence[Array] = (), *, share: float = 1.0) -> tuple[Any, ...]:
+def model(problem: Problem, multipliers: Sequence[Array] = ()) -> tuple[Any, ...]:
     """The problem's numbers in the order in which the loops take them: p, dt, initial, stage, final."""
-    data = compiled.arguments(problem, multipliers=multipliers, share=share)
+    data = compiled.arguments(problem, multipliers=multipliers)
     return data["p"], data["dt"], data["initial"], data["stage"], data["final"]
 
 

@@ -7,6 +7,7 @@ paths, bent to the sides, lead to other optima. Which start is best shows after 
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 
@@ -94,19 +95,23 @@ def path(start: Array, goal: Array, bend: Array, steps: int) -> Array:
     return start + way * (goal - start) + np.sin(np.pi * way) * bend
 
 
-def choose(attempts: Sequence[Attempt], advance: Callable[[Attempt, int], None], threads: int) -> list[Attempt]:
+def choose(attempts: Sequence[Attempt], advance: Callable[..., None], threads: int) -> list[Attempt]:
     """Run the attempts a few iterations, the worse ones fewer, and return them with the most promising first.
 
     What they are judged by is the true cost of the plan that each has so far.
 
     Args:
-      advance: runs an attempt up to so many iterations. threads: how many at once.
+      advance: `advance(attempt, last=...)` runs one up to so many iterations. threads: how many at once.
     """
     left, dropped = list(attempts), []
     for last, keep in ((HALVE, max(len(left) // 2, 1)), (CHOOSE, 1)):
         if len(left) > 1:
-            with ThreadPoolExecutor(threads, thread_name_prefix="lqrsim") as pool:
-                list(pool.map(lambda attempt: advance(attempt, last), left))  # noqa: B023 - used within the loop
+            if threads > 1:
+                with ThreadPoolExecutor(threads, thread_name_prefix="lqrsim") as pool:
+                    list(pool.map(partial(advance, last=last), left))
+            else:
+                for attempt in left:
+                    advance(attempt, last=last)
             left.sort(key=lambda attempt: attempt.cost)  # a stable sort: of equals, the first
             left, dropped = left[:keep], left[keep:] + dropped
     return left + dropped

@@ -1,6 +1,7 @@
 """Iterated LQR smoothing: Sec. V of the paper, with a safeguard for where it would fail."""
 
 from collections.abc import Callable, Iterable
+from functools import partial
 
 import numpy as np
 
@@ -150,7 +151,7 @@ def _solve(
     check_functions(problem, start, control)
     attempts = [Attempt(problem, settings, begin, start) for begin in begins]
     tried: list[tuple[Attempt, Found]] = []
-    for attempt in choose(attempts, lambda attempt, last: attempt.run(last, each=each), threads):
+    for attempt in choose(attempts, partial(Attempt.run, each=each), threads):
         tried.append((attempt, _finish(attempt, start, control, each=each, callback=callback)))
         if tried[-1][1].status is not Status.INFEASIBLE:
             break  # or else another way round may be wide enough

@@ -139,13 +139,12 @@ def resolve(start: StartLike, problem: Problem) -> Start:
         controls = check_array("start: controls", start.controls, (steps, m))
         given = Trajectory(states, controls, problem.dt)
         return Start(np.zeros((steps, m, n)), controls, None, given, _summary(start, states, controls))
-    wanted = problem.nominal_control if start is None else start
-    got = excerpt(wanted)
+    wanted, given = problem.nominal_control if start is None else start, None
     try:
         given = np.array(wanted, dtype=np.float64)
-        got = f"shape {given.shape}"
         controls = np.broadcast_to(given, (steps, m))
     except (TypeError, ValueError):
+        got = excerpt(wanted) if given is None else f"shape {given.shape}"
         raise InputError(
             f"start: got {got}, want controls ({m},) or ({steps}, {m}), an InitialPrior, a Trajectory, an AffinePolicy"
             " or a Solution"

@@ -80,8 +80,13 @@ class Workspace:
         return {"cost_to_go": Quadratic(*self.go), "cost_to_come": Moments(*self.come), "inverse_law": inverse}
 
     def eased(self, share: float) -> Any:
-        """The stage cost with that share of what may be eased."""
-        return self.model[3] if share == 1 else model(self._problem, self.multipliers, share=share)[3]
+        """The stage cost with that share of what may be eased; see `Term.factor`."""
+        stage = list(self.model[3])
+        for i, term in enumerate(self._problem.terms("stage_cost")):
+            if share != 1 and term.factor is not None:
+                stage[i] = stage[i].copy()
+                stage[i][len(term.functions) + term.factor] *= share
+        return tuple(stage)
 
     def constraint_values(self, states: Array, controls: Array) -> list[Array]:
         """Of each constraint (T+1, rows): not to be negative; infinite where it does not act."""
