@@ -75,18 +75,42 @@ class Solve:
     """Relative change of the cost below which it has settled, and the measure of the other tests."""
     max_iterations: Annotated[int | None, _optional("INT")] = None
     """Give up after so many. By default the solver's own limit."""
+    starts: Annotated[int | None, _optional("INT")] = None
+    """How many ways to the goal smooth tries for a few iterations, to go on with the best. By default 7."""
+    paper_start: bool = False
+    """Begin as the paper does in place of that: from the nominal control, with the scenario's prior."""
+    clearance: Annotated[float | None, _optional("METRES")] = None
+    """Keep at least this much between the robot and all obstacles, at the steps. By default they only cost."""
+    control_limits: Annotated[tuple[float, float] | None, _optional("LOWEST HIGHEST")] = None
+    """Plan with these limits of every control, in its unit. By default those of the actuators."""
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
         from lqrsim import console, files
+        from lqrsim.constraints import Clearance
+        from lqrsim.errors import InputError
         from lqrsim.references import resolve, short_name
 
         folder = self.out or Path("runs") / short_name(self.scenario)
         console.check_output("--out", folder)
-        problem = resolve(self.scenario).problem
+        scenario = resolve(self.scenario)
+        problem = scenario.problem
+        if self.clearance is not None:
+            kept = Clearance(scenario.scene.world, radius=scenario.robot.radius, margin=self.clearance)
+            problem = replace(problem, constraints=[*problem.constraints, kept])
+        if self.control_limits is not None:
+            problem = replace(problem, control_limits=self.control_limits)
         options: dict[str, object] = {"stop": self.stop, "tolerance": self.tolerance}
         if self.max_iterations is not None:
             options["max_iterations"] = self.max_iterations
+        if self.starts is not None or self.paper_start:
+            if self.solver != "smooth":
+                raise InputError(f"--starts, --paper-start: got one for {self.solver}, want them with --solver smooth")
+            options["starts"] = self.starts
+        if self.paper_start:
+            if scenario.paper_start is None:
+                raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario that the paper has")
+            options["start"] = scenario.paper_start
         solution = replace(console.solve(problem, self.solver, **options), scenario=self.scenario)
         console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
         return 0 if solution.success else 1

@@ -117,11 +117,11 @@ def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> dict[st
     return {"p": numbers(problem.dynamics), "dt": problem.dt, **data}
 
 
-def no_multipliers(problem: Problem, inequalities: Inequalities) -> Array:
+def no_multipliers(problem: Problem, inequalities: Inequalities, tolerance: float = 0.0) -> Array:
     """Those of a constraint that does not act yet; see `solvers/augmented.py`."""
     rows = inequalities.rows
     first = 1 if isinstance(problem.initial, FixedState) else 0  # nothing can be done about a start that is given
-    return np.concatenate([[0.0, rows, first], np.zeros((problem.steps + 1) * rows)])
+    return np.concatenate([[0.0, rows, first, tolerance], np.zeros((problem.steps + 1) * rows)])
 
 
 def signed_distance(world_seen: World, points: npt.ArrayLike) -> Array:

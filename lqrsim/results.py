@@ -257,7 +257,7 @@ class Iteration:
     """One line of the log.
 
     Attributes:
-      cost: true cost of rolling the policy out under the true dynamics.
+      cost: true cost of rolling the policy out under the true dynamics; NaN where it was only to keep the constraints.
       improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration.
       gap: largest difference between the minimal-total-cost states and that rollout, each state relative to its
         range along the rollout (at least 1 unit). Where the safeguard went part of the way, they are taken there; 0 for
@@ -482,11 +482,14 @@ class Solution:
             return []
         ended = [candidate for candidate in self.candidates if candidate.status is not None]
         dropped = [candidate.cost for candidate in self.candidates if candidate.status is None]
-        best = next((candidate.start for candidate in ended if candidate.status == self.status), ended[0].start)
+        best = min(
+            ended, key=lambda candidate: (candidate.status != self.status, abs(candidate.cost - self.cost))
+        ).start
         lines = [f"the plan is of {best}, one of {len(self.candidates)}"]
         if dropped:
             lines[0] += f"; {len(dropped)} were dropped at costs of {min(dropped):.6g} or more"
-        return lines + [f"{c.start} ended {c.status.name}" for c in ended if c.status and c.start != best]
+        others = [one for one in ended if one.start != best]
+        return lines + [f"{one.start} ended {one.status and one.status.name} at {one.cost:.6g}" for one in others]
 
     def __str__(self) -> str:
         return f"{self.iteration_table()}\n{self.summary()}"

@@ -16,7 +16,7 @@ from lqrsim.solvers.workspace import Workspace
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """What there is to answer with; see `assemble`."""
+    """What there is to answer with; see `assemble`. With `final`, another start would not do better."""
 
     status: Status
     detail: str
@@ -26,6 +26,18 @@ class Found:
     law: tuple[Array, Array]
     values: dict[str, Any] = field(default_factory=dict)
     multipliers: tuple[Multipliers, ...] = ()
+    final: bool = False
+
+    @property
+    def cost(self) -> float:
+        """True cost of the plan; infinite without one."""
+        return self.iterations[-1].cost if self.iterations else np.inf
+
+    @property
+    def rank(self) -> tuple[bool, float, float]:
+        """The smaller, the better: success first, then constraints, then the cost."""
+        violation = self.iterations[-1].violation if self.iterations else np.inf
+        return not self.success, 0.0 if self.success else violation, self.cost
 
     def changed(self, **changes: Any) -> "Found":
         """The same with some of it changed."""
@@ -158,9 +170,7 @@ class Attempt:
             plan = Trajectory(self.work.states, self.work.controls, self.problem.dt)
             return Candidate(name, self.cost, len(self.ending.iterations), None, plan)
         plan = Trajectory(found.states, found.controls, self.problem.dt)
-        return Candidate(
-            name, found.iterations[-1].cost if found.iterations else np.inf, len(found.iterations), found.status, plan
-        )
+        return Candidate(name, found.cost, len(found.iterations), found.status, plan)
 
     def _begin(self) -> bool:
         """What comes before the first iteration; False if it fails."""

@@ -4,16 +4,17 @@ For inequalities d >= 0, with multipliers lambda >= 0 and a penalty mu, it is
 
     sum (max(0, lambda - mu d)^2 - lambda^2) / (2 mu)
 
-At the optimum the multipliers are `max(0, lambda - mu d)`. Of its curvature only `mu n n'` is taken, n the slope of d:
-the rest can be negative. `compiled.py` makes these functions for each constraint.
+At the optimum the multipliers are `max(0, lambda - mu d)`. Here d is what a constraint has to spare beyond the
+tolerance to which it is solved, so that what is within the tolerance keeps the constraint itself. Of the curvature only
+`mu n n'` is taken, n the slope of d: the rest can be negative. `compiled.py` makes these functions for each constraint.
 
 `multipliers` is one array a constraint: mu, how many inequalities there are at a step, the first step at which they
-act, and then lambda, step by step. With mu of zero there is nothing.
+act, the tolerance, and from HEADER on lambda, step by step. With mu of zero there is nothing.
 """
 
 from math import inf
 
-from lqrsim.solvers.interface import W, constraint_slope, constraint_value, stack
+from lqrsim.solvers.interface import HEADER, W, constraint_slope, constraint_value, stack
 
 
 def augment(x, u, t, data, multipliers, hessian, gradient):
@@ -23,8 +24,8 @@ def augment(x, u, t, data, multipliers, hessian, gradient):
     total = 0.0
     if penalty > 0 and t >= multipliers[2]:
         for row in range(rows):
-            multiplier = multipliers[3 + rows * t + row]
-            force = multiplier - penalty * constraint_value(x, u, t, row, data)
+            multiplier = multipliers[HEADER + rows * t + row]
+            force = multiplier - penalty * (constraint_value(x, u, t, row, data) - multipliers[3])
             total -= multiplier * multiplier
             if force > 0:
                 total += force * force
@@ -45,8 +46,8 @@ def augmentation(x, u, t, data, multipliers):
     total = 0.0
     if penalty > 0 and t >= multipliers[2]:
         for row in range(rows):
-            multiplier = multipliers[3 + rows * t + row]
-            force = multiplier - penalty * constraint_value(x, u, t, row, data)
+            multiplier = multipliers[HEADER + rows * t + row]
+            force = multiplier - penalty * (constraint_value(x, u, t, row, data) - multipliers[3])
             total -= multiplier * multiplier
             if force > 0:
                 total += force * force

@@ -11,6 +11,7 @@ import numpy as np
 
 from lqrsim import compiled
 from lqrsim.checks import check_functions, check_start, functions_of
+from lqrsim.constraints import Clearance
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number, excerpt
 from lqrsim.problem import Problem
 from lqrsim.results import (
@@ -334,8 +335,12 @@ def model(problem: Problem, multipliers: Sequence[Array] = ()) -> tuple[Any, ...
 
 def _clearance(problem: Problem, states: Array) -> Array | None:
     position = list(problem.dynamics.state_coordinates.position)
-    costs = [cost for cost in problem.obstacle_costs if len(cost.world)]
-    if not costs:
-        return None
+    constraints = [constraint for constraint in problem.constraints if isinstance(constraint, Clearance)]
+    worlds = {(id(one.world), one.radius): one.world for one in (*problem.obstacle_costs, *constraints)}
     place = states[:, position]
-    return np.min([compiled.signed_distance(c.world.seen_by(len(position)), place) - c.radius for c in costs], axis=0)
+    found = [
+        compiled.signed_distance(world.seen_by(len(position)), place) - radius
+        for (_, radius), world in worlds.items()
+        if len(world)
+    ]
+    return np.min(found, axis=0) if found else None

@@ -6,10 +6,12 @@ slide along an obstacle would swing to and fro, for the model leaves out how an 
 iterations do not settle, the safeguard's minimise each augmented Lagrangian.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
 
+from lqrsim.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.errors import Array
 from lqrsim.results import Iteration, Moments, Multipliers, Status
 from lqrsim.solvers import interface
@@ -18,18 +20,19 @@ from lqrsim.solvers.common import LOG_COLUMNS, Callback
 
 PENALTY = 8.0  # at first, relative to what it costs to change what is constrained
 GROWTH = 5.0  # of the penalty
-LARGEST = 1e6  # how far it grows before that is given up
+LARGEST, STUCK = 1e4, 3  # how far it grows before that is given up, and how often to no avail at all
 ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
 ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to renew the multipliers, and when anyway
 
 
 def satisfy(attempt: Attempt, found: Found | None, *, each: bool, callback: Callback | None = None) -> Found:
     """Go on from what was found without the constraints, or, without it, from the multipliers of another solution."""
-    tolerance = attempt.settings.constraint_tolerance
     lagrangian = _Lagrangian(attempt)
     if found is not None:
+        if not found.success:
+            return _first_feasible(attempt, found, each=each, callback=callback)
         lagrangian.look(found.states, found.controls)
-        if not found.success or lagrangian.violation <= tolerance:
+        if lagrangian.violation == 0:
             return found
         lagrangian.begin()
         found = found.changed(states=found.states.copy(), controls=found.controls.copy())  # these will be overwritten
@@ -38,6 +41,37 @@ def satisfy(attempt: Attempt, found: Found | None, *, each: bool, callback: Call
     if undamped.success or not attempt.settings.safeguard:
         return undamped
     return _damped(attempt, lagrangian, found, undamped, each=each, callback=callback)
+
+
+def _first_feasible(attempt: Attempt, found: Found, *, each: bool, callback: Callback | None) -> Found:
+    """Where not even the problem without the constraints is solved: deep within obstacles, they cost beyond numbers.
+
+    Without these costs there is a plan that keeps the constraints, from where they can come in, or there is none.
+    """
+    problem, settings = attempt.problem, attempt.settings
+    if not (settings.safeguard and any(cost.weight for cost in problem.obstacle_costs)):
+        return found
+    costs = [
+        ObstacleCost(cost.world, radius=cost.radius, sharpness=cost.sharpness, weight=0.0)
+        if isinstance(cost, ObstacleCost)
+        else cost
+        for cost in terms_of(problem.stage_cost)
+    ]
+    plain = dataclasses.replace(problem, stage_cost=CostSum(tuple(costs)))
+    without = Attempt(plain, settings, dataclasses.replace(attempt.begin, prior=None), attempt.work.start)
+    without.run(settings.max_iterations, each=each)
+    kept = without.found(without.ending)
+    if not kept.success:
+        kept = without.rescue(kept.detail or kept.status.meaning, each=each)
+    kept = satisfy(without, kept, each=each) if kept.success else kept
+    if not kept.success:
+        last = [dataclasses.replace(one, cost=np.nan, improvement=np.nan) for one in kept.iterations[-1:]]
+        return kept.changed(iterations=(*found.iterations, *last), final=True)
+    begin = dataclasses.replace(
+        attempt.begin, gain=kept.law[0].copy(), offset=kept.law[1].copy(), cost_to_go=kept.values["cost_to_go"],
+        trajectory=None, prior=None, multipliers=kept.multipliers,
+    )  # fmt: skip
+    return satisfy(Attempt(problem, settings, begin, attempt.work.start), None, each=each, callback=callback)
 
 
 def _undamped(
@@ -111,17 +145,18 @@ def _damped(
         lagrangian.look(*work.plan)
         if ending.success and lagrangian.missed <= tolerance:
             return attempt.found_damped(ending, ending.status, why).changed(multipliers=lagrangian.multipliers())
-        if rounds == ROUNDS or lagrangian.grown > LARGEST:
+        if rounds == ROUNDS or lagrangian.grown > LARGEST or lagrangian.stuck == STUCK:
             break
         lagrangian.renew()
-    status = Status.INFEASIBLE if lagrangian.violation > tolerance else Status.MAX_ITERATIONS
-    detail = lagrangian.worst() if status is Status.INFEASIBLE else f"{why}, and {lagrangian.worst()}"
+    status, detail = Status.INFEASIBLE, lagrangian.worst()
+    if lagrangian.violation == 0:
+        status, detail = Status.MAX_ITERATIONS, f"{why}; the plan keeps them, but there are better ones"
     return attempt.found_damped(ending, status, detail).changed(multipliers=lagrangian.multipliers())
 
 
 def _missed(array: Array, values: Array) -> float:
     """By how much a constraint is missed, or its multipliers are off, at most."""
-    press = array[3:] / array[0] if array[0] > 0 else 0.0
+    press = array[interface.HEADER :] / array[0] if array[0] > 0 else 0.0
     return float(np.abs(np.minimum(values, press)).max(initial=0.0))
 
 
@@ -130,45 +165,49 @@ class _Lagrangian:
 
     Attributes:
       violation: by how much the worst constraint is missed by the plan that was looked at last.
-      missed: the same, and where one is kept, by how much its multiplier is still off: `|min(d, lambda / mu)|`.
-      grown: by how much the penalty has grown.
+      missed: by how much what is aimed at is, which is to keep them with the tolerance to spare; and where that is
+        kept, by how much its multiplier is still off: `|min(d, lambda / mu)|`.
+      grown: by how much the penalty has grown. stuck: how often in a row that did not help.
     """
 
     def __init__(self, attempt: Attempt) -> None:
         self._problem, self._work = attempt.problem, attempt.work
         self._tolerance = attempt.settings.constraint_tolerance
-        self.violation, self.missed, self.grown = 0.0, np.inf, 1.0
+        self.violation, self.missed, self.grown, self.stuck = 0.0, np.inf, 1.0, 0
         self._last = np.inf
 
     def look(self, states: Array, controls: Array) -> None:
         """Evaluate the constraints of a plan."""
         self._plan = states, controls
-        self._values = [values.ravel() for values in self._work.constraint_values(states, controls)]
-        self.violation = max(0.0, *(-values.min(initial=np.inf) for values in self._values))
+        stated = self._work.constraint_values(states, controls)
+        self.violation = max(0.0, *(-values.min(initial=np.inf) for values in stated))
+        self._values = [values.ravel() - self._tolerance for values in stated]
         self.missed = max(self._each(_missed))
 
     def begin(self) -> None:
         """No multipliers, and a penalty for each constraint that fits what it costs to change it."""
-        self.grown, self._last = 1.0, self.violation
+        self.grown, self.stuck, self._last = 1.0, 0, np.inf
         for which, (array, values) in enumerate(zip(self._work.multipliers, self._values, strict=True)):
-            array[0], array[3:] = PENALTY * self._curvature(which, int(values.argmin())), 0.0
+            array[0], array[interface.HEADER :] = PENALTY * self._curvature(which, int(values.argmin())), 0.0
 
     def renew(self) -> None:
         """Take what the constraints press with for the multipliers; let the penalty grow if that helps too little."""
         for array, values in zip(self._work.multipliers, self._values, strict=True):
-            array[3:] = np.maximum(array[3:] - array[0] * values, 0.0)
-        if self.violation > max(0.5 * self._last, self._tolerance):
+            array[interface.HEADER :] = np.maximum(array[interface.HEADER :] - array[0] * values, 0.0)
+        missed = max(-values.min(initial=np.inf) for values in self._values)
+        self.stuck = self.stuck + 1 if missed > 0.9 * self._last else 0
+        if missed > max(0.5 * self._last, self._tolerance):
             self.grown *= GROWTH
             for array in self._work.multipliers:
                 array[0] *= GROWTH
-        self._last = self.violation
+        self._last = missed
 
     def added(self) -> float:
         """What the augmented Lagrangian adds to the cost of the plan."""
 
         def one(array: Array, values: Array) -> float:
-            force = np.maximum(array[3:] - array[0] * values, 0.0)
-            return float((force @ force - array[3:] @ array[3:]) / (2 * array[0]))
+            force = np.maximum(array[interface.HEADER :] - array[0] * values, 0.0)
+            return float((force @ force - array[interface.HEADER :] @ array[interface.HEADER :]) / (2 * array[0]))
 
         return sum(self._each(one))
 
@@ -176,14 +215,14 @@ class _Lagrangian:
         """As a solution has them: with the last look taken into account."""
 
         def one(array: Array, values: Array) -> Multipliers:
-            forces = np.maximum(array[3:] - array[0] * values, 0.0)
+            forces = np.maximum(array[interface.HEADER :] - array[0] * values, 0.0)
             return Multipliers(forces.reshape(self._problem.steps + 1, -1), float(array[0]))
 
         return tuple(self._each(one))
 
     def worst(self) -> str:
         """Which constraint is missed most, by how much and when."""
-        least = [values.min(initial=np.inf) for values in self._values]
+        least = [values.min(initial=np.inf) + self._tolerance for values in self._values]
         which = int(np.argmin(least))
         inequalities = self._problem.inequalities[which]
         step, row = divmod(int(self._values[which].argmin()), inequalities.rows)

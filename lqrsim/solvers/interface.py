@@ -18,6 +18,7 @@ LIMITS = 0  # which array of `stage` has the limits of the controls: lowest (M,)
 RUNNING, CONVERGED, COST_CONVERGED, MAX_ITERATIONS, DIVERGED = 0, 1, 2, 3, 4
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED, CYCLING = 5, 6, 7, 8, 9
 LONGEST_CYCLE = 8
+HEADER = 4  # numbers that come before the multipliers; see `augmented.py`
 
 # What an iteration was; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3

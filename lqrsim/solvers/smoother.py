@@ -8,7 +8,7 @@ import numpy as np
 from lqrsim.checks import check_functions
 from lqrsim.errors import Array, InputError, check_count
 from lqrsim.problem import FixedState, Problem
-from lqrsim.results import Solution, Status
+from lqrsim.results import Solution
 from lqrsim.solvers.attempt import Attempt, Found
 from lqrsim.solvers.common import (
     Callback,
@@ -68,10 +68,10 @@ def smooth(
         of a similar problem, whose policy and cost-to-go it takes up. Or a function of the problem that returns one.
       starts: how many starts to try, by default 7 among obstacles; 1 is the straight way to the goal. The candidates
         are in the solution.
-      constraint_tolerance: by how much the problem's constraints may be missed at the steps, in their unit, which for a
-        clearance is metres.
+      constraint_tolerance: how closely the problem's constraints are solved for, in their unit: for a clearance it is
+        metres. So much to spare is aimed at; a plan that has converged keeps the constraints themselves.
       threads: how many of them to run at once; by default as many as there are processors.
-      callback: called with each `Iteration` as it ends; of a search, those of the start that was chosen.
+      callback: called with each `Iteration` as it ends; of a search, those of the starts that are run to their end.
 
     Returns:
       A Solution. A hard problem does not raise: the status says how it ended and what to try.
@@ -150,15 +150,18 @@ def _solve(
     control = begins[0].offset[0].copy()
     check_functions(problem, start, control)
     attempts = [Attempt(problem, settings, begin, start) for begin in begins]
-    tried: list[tuple[Attempt, Found]] = []
-    for attempt in choose(attempts, partial(Attempt.run, each=each), threads):
-        tried.append((attempt, _finish(attempt, start, control, each=each, callback=callback)))
-        if tried[-1][1].status is not Status.INFEASIBLE:
-            break  # or else another way round may be wide enough
-    else:
-        tried.sort(key=lambda pair: pair[1].iterations[-1].violation)
-        tried.append(tried[0])
-    chosen, found = tried[-1]
+    chosen, *others = choose(attempts, partial(Attempt.run, each=each), threads)
+    tried = [(chosen, _finish(chosen, start, control, each=each, callback=callback))]
+    if problem.constraints:
+        # Constraints can make the best way round the worst, or close it. What the others cost without them is about the
+        # least that they can cost with them.
+        for attempt in sorted(others, key=lambda attempt: attempt.cost):
+            best = tried[0][1]
+            if best.final or (best.success and not attempt.cost < best.cost):
+                break
+            tried.append((attempt, _finish(attempt, start, control, each=each, callback=callback)))
+            tried.sort(key=lambda pair: pair[1].rank)
+    chosen, found = tried[0]
     results = {id(attempt): found for attempt, found in tried}
     candidates = [
         attempt.candidate(name, results.get(id(attempt))) for name, attempt in zip(names, attempts, strict=True)

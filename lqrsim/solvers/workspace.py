@@ -50,9 +50,10 @@ class Workspace:
         self.states, self.controls = zeros((steps + 1, n)), zeros((steps, m))
         self.kept = zeros((steps, m, n)), zeros((steps, m))
         self.memory = zeros(interface.MEMORY)
-        self.multipliers = [compiled.no_multipliers(problem, inequalities) for inequalities in problem.inequalities]
+        spare = settings.constraint_tolerance
+        self.multipliers = [compiled.no_multipliers(problem, one, spare) for one in problem.inequalities]
         for array, known in zip(self.multipliers, begin.multipliers, strict=False):
-            array[0], array[3:] = known.penalty, known.values.ravel()
+            array[0], array[interface.HEADER :] = known.penalty, known.values.ravel()
         self.core = compiled.core(problem, settings.form)
         self.model = model(problem, self.multipliers)
         self._problem = problem
@@ -90,7 +91,7 @@ class Workspace:
 
     def constraint_values(self, states: Array, controls: Array) -> list[Array]:
         """Of each constraint (T+1, rows): not to be negative; infinite where it does not act."""
-        values = [np.empty(len(multipliers) - 3) for multipliers in self.multipliers]
+        values = [np.empty(len(multipliers) - interface.HEADER) for multipliers in self.multipliers]
         if values:
             self.core.look_at_constraints(self._problem.steps, states, controls, self.model[3], tuple(values))
         return [one.reshape(self._problem.steps + 1, -1) for one in values]
