@@ -45,9 +45,13 @@ class Config:
 
 
 def queries(config: Config, count: int | None = None, *, soft: bool = False) -> list[ls.Problem]:
-    """The quadrotor's problems, by default all, with the start given exactly or, as in the paper, softly."""
+    """The quadrotor's problems, by default all, with the start given exactly or, as in the paper, softly.
+
+    Controls have no limits, as in the paper.
+    """
     count = config.queries if count is None else min(count, config.queries)
     problems = [ls.scenarios.quadrotor(query=query, seed=config.seed).problem for query in range(count)]
+    problems = [replace(problem, control_limits=(-np.inf, np.inf)) for problem in problems]
     return problems if soft else [fixed(problem) for problem in problems]
 
 
