@@ -42,12 +42,9 @@ if TYPE_CHECKING:
     from lqrsim.results import AffinePolicy as AffinePolicy
     from lqrsim.results import Candidate as Candidate
     from lqrsim.results import Iteration as Iteration
-    from lqrsim.results import Moments as Moments
     from lqrsim.results import Multipliers as Multipliers
-    from lqrsim.results import Quadratic as Quadratic
     from lqrsim.results import Solution as Solution
     from lqrsim.results import Status as Status
-    from lqrsim.results import TotalCost as TotalCost
     from lqrsim.results import Trajectory as Trajectory
     from lqrsim.robots.base import Robot as Robot
     from lqrsim.robots.differential_drive import DifferentialDrive as DifferentialDrive
@@ -74,6 +71,9 @@ if TYPE_CHECKING:
     from lqrsim.solvers.smoother import smooth as smooth
     from lqrsim.solvers.smoother import smooth_many as smooth_many
     from lqrsim.solvers.start import InitialPrior as InitialPrior
+    from lqrsim.value_functions import Moments as Moments
+    from lqrsim.value_functions import Quadratic as Quadratic
+    from lqrsim.value_functions import TotalCost as TotalCost
     from lqrsim.view.plots import plot_run as plot_run
     from lqrsim.view.render import render as render
     from lqrsim.view.render import still as still
@@ -90,18 +90,7 @@ _HOME = {
     "files": ["load_rollout", "load_solution", "save"],
     "linear_quadratic": ["Stage"],
     "problem": ["FixedState", "Problem"],
-    "results": [
-        "AffinePolicy",
-        "Candidate",
-        "Iteration",
-        "Moments",
-        "Multipliers",
-        "Quadratic",
-        "Solution",
-        "Status",
-        "TotalCost",
-        "Trajectory",
-    ],
+    "results": ["AffinePolicy", "Candidate", "Iteration", "Multipliers", "Solution", "Status", "Trajectory"],
     "robots.base": ["Robot"],
     "robots.differential_drive": ["DifferentialDrive"],
     "robots.quadrotor": ["Quadrotor"],
@@ -116,6 +105,7 @@ _HOME = {
     "solvers.linear_quadratic": ["smooth_lq"],
     "solvers.smoother": ["smooth", "smooth_many"],
     "solvers.start": ["InitialPrior"],
+    "value_functions": ["Moments", "Quadratic", "TotalCost"],
     "view.plots": ["plot_run"],
     "view.render": ["render", "still"],
     "world": ["Obstacle", "World"],

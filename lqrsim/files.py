@@ -19,18 +19,9 @@ import numpy.typing as npt
 
 from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array
-from lqrsim.results import (
-    AffinePolicy,
-    Candidate,
-    Iteration,
-    Moments,
-    Multipliers,
-    Quadratic,
-    Solution,
-    Status,
-    Trajectory,
-)
+from lqrsim.results import AffinePolicy, Candidate, Iteration, Multipliers, Solution, Status, Trajectory
 from lqrsim.rollout import Rollout
+from lqrsim.value_functions import Moments, Quadratic
 
 VERSIONS = {"solution": 3, "rollout": 1}
 

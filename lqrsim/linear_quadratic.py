@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_array, excerpt
-from lqrsim.results import Quadratic
+from lqrsim.value_functions import Quadratic
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,9 +10,10 @@ from scipy.optimize import minimize
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.linear_quadratic import Stage
-from lqrsim.results import Quadratic, Status
+from lqrsim.results import Status
 from lqrsim.solvers import differential
 from lqrsim.solvers.continuous import ContinuousSolution, smooth_continuous, smooth_lq_continuous
+from lqrsim.value_functions import Quadratic
 
 
 def measured_orders(errors: list[Any]) -> Array:

@@ -14,7 +14,7 @@ PACKAGE = Path(lqrsim.__file__).parent
 # A module may import those above it, and those of its own room; nothing else of the package.
 ROOMS = (
     ("errors", "versions", "solvers.interface"),
-    ("coordinates",),
+    ("coordinates", "value_functions"),
     ("results",),
     ("rollout",),
     ("files",),

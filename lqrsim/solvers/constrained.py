@@ -13,10 +13,11 @@ import numpy as np
 
 from lqrsim.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.errors import Array
-from lqrsim.results import Iteration, Moments, Multipliers, Status
+from lqrsim.results import Iteration, Multipliers, Status
 from lqrsim.solvers import interface
 from lqrsim.solvers.attempt import Attempt, Found
 from lqrsim.solvers.common import LOG_COLUMNS, Callback
+from lqrsim.value_functions import Moments
 
 PENALTY = 8.0  # at first, relative to what it costs to change what is constrained
 GROWTH = 5.0  # of the penalty

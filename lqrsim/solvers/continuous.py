@@ -17,7 +17,7 @@ from lqrsim.errors import Array, InputError, check_array, check_count, check_num
 from lqrsim.functions import External
 from lqrsim.linear_quadratic import Stage, check_end
 from lqrsim.problem import FixedState, Problem
-from lqrsim.results import Iteration, Quadratic, Status
+from lqrsim.results import Iteration, Status
 from lqrsim.solvers.differential import (
     NO_MINIMUM,
     Model,
@@ -32,6 +32,7 @@ from lqrsim.solvers.differential import (
     tolerances_of,
 )
 from lqrsim.solvers.start import InitialPrior
+from lqrsim.value_functions import Quadratic
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

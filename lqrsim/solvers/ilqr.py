@@ -8,7 +8,7 @@ from lqrsim import compiled
 from lqrsim.checks import check_functions
 from lqrsim.errors import InputError
 from lqrsim.problem import Problem
-from lqrsim.results import Quadratic, Solution
+from lqrsim.results import Solution
 from lqrsim.solvers.common import (
     LOG_COLUMNS,
     Callback,
@@ -23,6 +23,7 @@ from lqrsim.solvers.common import (
     solve_all,
 )
 from lqrsim.solvers.start import InitialPrior, StartLike, resolve
+from lqrsim.value_functions import Quadratic
 
 
 def ilqr(

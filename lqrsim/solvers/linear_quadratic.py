@@ -10,7 +10,8 @@ from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array, check_name, check_number
 from lqrsim.linear_quadratic import Stage, check_end
 from lqrsim.problem import FixedState
-from lqrsim.results import AffinePolicy, Iteration, Moments, Quadratic, Solution, Status, Trajectory
+from lqrsim.results import AffinePolicy, Iteration, Solution, Status, Trajectory
+from lqrsim.value_functions import Moments, Quadratic
 from lqrsim.versions import versions
 
 

@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_array, check_count, excerpt
 from lqrsim.problem import Problem
-from lqrsim.results import AffinePolicy, Multipliers, Quadratic, Solution, Trajectory
+from lqrsim.results import AffinePolicy, Multipliers, Solution, Trajectory
+from lqrsim.value_functions import Quadratic
 
 
 class InitialPrior:

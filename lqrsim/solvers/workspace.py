@@ -8,10 +8,10 @@ import numpy as np
 from lqrsim import compiled
 from lqrsim.errors import Array
 from lqrsim.problem import FixedState, Problem
-from lqrsim.results import Moments, Quadratic
 from lqrsim.solvers import interface
 from lqrsim.solvers.common import SmootherSettings, model
 from lqrsim.solvers.start import Start
+from lqrsim.value_functions import Moments, Quadratic
 
 
 class Workspace:
