@@ -147,3 +147,98 @@ def test_benchmark_of_reliability() -> None:
     exact = ablation["dual, fixed, prior, safeguard"]
     np.testing.assert_allclose(exact["cost_from_start"], exact["cost"], rtol=1e-9)
     assert "handed over" in script.report(result)
+
+
+@pytest.fixture(scope="module")
+def quality() -> ModuleType:
+    sys.path.insert(0, str(FOLDER))  # it imports its neighbours
+    try:
+        return load("benchmark_quality")
+    finally:
+        sys.path.remove(str(FOLDER))
+
+
+def test_benchmark_of_quality(quality: ModuleType, tmp_path: Path) -> None:
+    """On two queries and five worlds, without peers: what solutions claim, recomputed by formulas of nobody's."""
+    known = [50.0, 200.0]
+    (tmp_path / "best_known.json").write_text(json.dumps({"0": known}), encoding="utf-8")
+    search = quality.ingredients.search
+    before = dict(vars(search))
+    result = quality.main(quality.Config(quick=True, queries=2, peers=False, reference=tmp_path))
+    assert {name: value for name, value in vars(search).items() if value is not before[name]} == {}
+    (starts,) = result["starts"]["seeds"].values()
+    ingredients = result["ingredients"]["rows"]
+    clearance, limits, worlds, resolve = (result[name] for name in ("clearance", "limits", "worlds", "resolve"))
+    robots = [worlds["robots"][robot][how]["smooth"] for robot in ("drive", "quadrotor") for how in ("free", "kept")]
+    solved = [
+        *starts.values(), *clearance["free"].values(), *clearance["kept"].values(), *limits["robots"].values(), *robots,
+        *ingredients.values(),
+    ]  # fmt: skip
+    for found in solved:
+        assert set(found["status"]) == {"CONVERGED"}
+        np.testing.assert_allclose(found["claimed"], found["cost"], rtol=1e-9)
+    np.testing.assert_allclose(starts["smooth"]["excess"], np.array(starts["smooth"]["cost"]) / known - 1)
+    assert ingredients["7 starts, the default"]["cost"] == starts["smooth"]["cost"]
+    assert ingredients["+ continuation"]["cost"] == starts["smooth, one start"]["cost"]
+    assert ingredients["hover"]["cost"] == starts["smooth, hover"]["cost"]
+    assert sum(ingredients["dropped late"]["all_iterations"]) > sum(starts["smooth"]["all_iterations"])
+    for found in clearance["kept"].values():
+        # Between the steps, the finer rollout ends elsewhere by the error of the coarser one.
+        assert (np.array(found["between"]) < np.array(found["clearance"]) + 1e-6).all()
+        np.testing.assert_allclose(found["violation"], np.maximum(-np.array(found["clearance"]), 0), atol=1e-9)
+        assert max(found["violation"]) <= 1e-3
+    for found in limits["robots"].values():
+        assert all(found["within"])
+        assert max(found["at_limits"]) > 0
+        assert max(found["followed"]) < 1e-9
+    for found in robots[1::2]:
+        assert min(found["clearance"]) >= -1e-3
+    for pairs in resolve.values():
+        for pair in pairs:
+            for solution in pair.values():
+                assert solution["status"] == "CONVERGED"
+                np.testing.assert_allclose(solution["claimed"], solution["cost"], rtol=1e-9)
+    assert set(result["time"]["milliseconds"]) == {"smooth, one start", "smooth"}
+    text = quality.report(result)
+    assert "lower than the best known: smooth, seed 0, query 1" in text
+    assert "IPOPT: skipped: not asked for" in text
+
+
+def test_benchmark_of_quality_says_what_it_skips(quality: ModuleType, tmp_path: Path) -> None:
+    config = quality.Config(
+        quick=True, queries=1, sections=("starts",), peers=False, reference=tmp_path, seeds=(7,)
+    )  # fmt: skip
+    result = quality.main(config)
+    assert "name its folder with --reference" in quality.report(result)
+    assert all("excess" not in one for one in result["starts"]["seeds"]["7"].values())
+
+
+def test_worlds_of_the_benchmark_of_quality(quality: ModuleType) -> None:
+    """One in five has a barrier, with one gap in it, as wide as was drawn; each is what it is by its number alone."""
+    worlds, distances = quality.random_worlds.worlds, quality.peers.truth.distances
+    for kind in ("drive", "quadrotor"):
+        drawn = [worlds.draw(kind, index) for index in range(15)]
+        digests = [one.problem.digest for one in drawn]
+        assert len(set(digests)) == 15
+        assert worlds.draw(kind, 14).problem.digest == digests[14]
+        assert worlds.draw(kind, 14, seed=1).problem.digest != digests[14]
+        assert [i for i, one in enumerate(drawn) if one.gap is not None] == [4, 9, 14]
+        for one in drawn[4::5]:
+            (cost,) = one.problem.obstacle_costs
+            gap, size = one.gap, len(one.gap.middle)
+            world = cost.world.seen_by(size)
+            across = [axis % size for axis in range(gap.axis + 1, gap.axis + size)]
+            for axis, width in zip(across, gap.widths, strict=True):
+                assert 0.05 <= width - 2 * cost.radius <= 0.25
+                line = np.linspace(-0.5, 0.5, 20001)
+                points = gap.middle + line[:, None] * np.eye(size)[axis]
+                free = line[distances(world, points).min(axis=1) > 0]
+                assert np.ptp(free) == pytest.approx(width, abs=1.1e-4)
+            grid = np.meshgrid(*[np.linspace(-3, 3, 121)] * len(across))
+            points = np.tile(gap.middle, (grid[0].size, 1))
+            points[:, across] = np.stack([axis.ravel() for axis in grid], axis=1)
+            fits = points[distances(world, points).min(axis=1) > cost.radius]
+            assert (np.abs(fits - gap.middle)[:, across] < np.array(gap.widths) / 2 - cost.radius).all()
+            start, goal = (state[:size] for state in (one.problem.start, one.problem.goal))
+            assert (start - gap.middle)[gap.axis] * (goal - gap.middle)[gap.axis] < 0
+            assert distances(world, np.array([start, goal])).min() > cost.radius

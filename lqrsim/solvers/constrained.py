@@ -91,7 +91,7 @@ def _undamped(
     while True:
         ending = attempt.run_on(log, len(done) + 1, done=done, each=each, callback=callback)
         done, since = ending.iterations, since + 1
-        if ending.pass_failed or not np.isfinite(done[-1].cost):
+        if ending.pass_failed or ending.outcome == interface.CYCLING or not np.isfinite(done[-1].cost):
             break
         lagrangian.look(work.states, work.controls)
         settled = ending.outcome in (interface.CONVERGED, interface.COST_CONVERGED)

@@ -118,7 +118,14 @@ def cycling(log, done):
     """Whether the last costs are, to rounding, those before them in the same order: so they will be from now on.
 
     Two rounds of a cycle that the iterations have come to are looked at; one that they only come nearer to is none yet.
+    A cost that stays the same is one, too: where the iterations that it comes of have not converged, they never will.
     """
+    same = done >= 5
+    for i in range(5):
+        if same:
+            same = abs(log[done - i, 0] - log[done - i - 1, 0]) <= 1e-12 * abs(log[done, 0])
+    if same:
+        return True
     for period in range(2, LONGEST_CYCLE + 1):
         same = done + 1 >= 3 * period
         for i in range(2 * period):

@@ -32,21 +32,11 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
 
     Args:
       count: how many; by default `STARTS` where there are obstacles.
-
-    Raises:
-      InputError: more than one is asked for where there is nothing to go round.
     """
-    pull = max(
-        (PULL * cost.weight * cost.sharpness**2 for cost in problem.obstacle_costs if len(cost.world)), default=0
-    )
-    position = list(problem.dynamics.state_coordinates.position)
-    if not (pull > 0 and position and problem.start is not None and problem.goal is not None):
-        if count is not None and count > 1:
-            raise InputError(
-                f"starts: got {count}, want 1 for a problem without obstacles, a start and a goal: there is nothing to"
-                " go round; or give a start"
-            )
+    pull = _pull(problem)
+    if pull == 0 or problem.start is None or problem.goal is None:
         return [("nominal control", None)]
+    position = list(problem.dynamics.state_coordinates.position)
     ends = problem.start[position], problem.goal[position]
     weight = np.zeros(len(problem.start))
     weight[position] = pull
@@ -56,6 +46,23 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
         about[:, position] = path(*ends, bend, problem.steps)
         found.append((name, InitialPrior(weight, about=about, obstacles=SHARES)))
     return found
+
+
+def check_starts(problem: Problem, count: int | None) -> None:
+    """Raises InputError if more than one start is asked for where there is nothing to go round."""
+    if count is not None and count > 1 and _pull(problem) == 0:
+        raise InputError(
+            f"starts: got {count}, want 1 for a problem without obstacles, a start and a goal: there is nothing to go"
+            " round; or give a start"
+        )
+
+
+def _pull(problem: Problem) -> float:
+    """The weight of the paths; 0 where there is nothing to go round."""
+    if not problem.dynamics.state_coordinates.position or problem.start is None or problem.goal is None:
+        return 0.0
+    costs = [cost for cost in problem.obstacle_costs if len(cost.world)]
+    return max((PULL * cost.weight * cost.sharpness**2 for cost in costs), default=0.0)
 
 
 def bends(way: Array, count: int) -> list[tuple[str, Array]]:

@@ -22,7 +22,7 @@ from lqrsim.solvers.common import (
     solve_all,
 )
 from lqrsim.solvers.constrained import satisfy
-from lqrsim.solvers.search import choose, guides
+from lqrsim.solvers.search import check_starts, choose, guides
 from lqrsim.solvers.start import StartLike, resolve
 
 
@@ -198,4 +198,4 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
             ' the primal form has no other start; form="dual" has'
         )
     if settings.start is None:
-        guides(problem, settings.starts)
+        check_starts(problem, settings.starts)

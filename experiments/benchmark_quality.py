@@ -1,0 +1,66 @@
+"""How good the plans of smooth() are: which optimum, at what price, inside which limits, how far from obstacles.
+
+    python experiments/benchmark_quality.py                            # everything, some twenty minutes
+    python experiments/benchmark_quality.py --sections starts limits   # some of it
+    python experiments/benchmark_quality.py --quick                    # bounded, and too few to trust
+
+Everything starts exactly where it is to start. Costs and clearances are recomputed from the controls by the same NumPy
+code, peers/truth.py, whoever planned them. Crocoddyl's FDDP and IPOPT need pip install 'lqrsim[bench]', and g++; where
+they are missing they are left out, and that is said.
+
+starts       Three times a hundred quadrotor queries, without limits of the controls: what the plans cost, and how many
+             are within 1 % of the lowest cost known, whoever found it. Those are in best_known.json, in a folder given
+             by --reference or $LQRSIM_REFERENCE, or else in shared/reference beside the repository.
+time         The same in turns, on one thread, against FDDP and IPOPT.
+clearance    With a clearance to be kept: at the steps, between them, with a margin; and what that costs.
+limits       With narrow limits of the controls: kept to the last bit, and what IPOPT makes of the same limits, from the
+             straight line and from our plan.
+worlds       Random worlds of both robots, one in five nearly blocked; settings untouched.
+resolve      Started with a solution of a similar problem: of a horizon that moved along, of another goal.
+ingredients  What each choice of the search brings; see lqrsim/solvers/search.py.
+"""
+
+import json
+from dataclasses import asdict
+from types import ModuleType
+from typing import Any
+
+import peers
+import tyro
+from quality import clearances, ingredients, limits, random_worlds, resolve, starts, timing
+from quality.common import Config, Section
+
+from lqrsim.solvers.common import processors
+from lqrsim.versions import versions
+
+SECTIONS: dict[Section, ModuleType] = {
+    "starts": starts,
+    "time": timing,
+    "clearance": clearances,
+    "limits": limits,
+    "worlds": random_worlds,
+    "resolve": resolve,
+    "ingredients": ingredients,
+}
+
+
+def main(config: Config) -> dict[str, Any]:
+    config = config.bounded()
+    result: dict[str, Any] = {
+        "config": asdict(config) | {"reference": str(config.reference) if config.reference else None},
+        "versions": versions() | peers.versions(),
+        "processors": processors(),
+    }
+    for name in config.sections:
+        result[name] = SECTIONS[name].measure(config)
+    return result
+
+
+def report(result: dict[str, Any]) -> str:
+    return "\n\n".join(section.table(result[name]) for name, section in SECTIONS.items() if name in result)
+
+
+if __name__ == "__main__":
+    settings = tyro.cli(Config, description=__doc__)
+    outcome = main(settings)
+    print(json.dumps(outcome) if settings.json else report(outcome))

@@ -1,0 +1,1 @@
+"""The parts of benchmark_quality.py: each measures, and writes its table."""
