@@ -120,7 +120,8 @@ def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> dict[st
 def no_multipliers(problem: Problem, inequalities: Inequalities, tolerance: float = 0.0) -> Array:
     """Those of a constraint that does not act yet; see `solvers/augmented.py`."""
     rows = inequalities.rows
-    first = 1 if isinstance(problem.initial, FixedState) else 0  # nothing can be done about a start that is given
+    # Nothing can be done about a start that is given; but about its control.
+    first = 1 if isinstance(problem.initial, FixedState) and not inequalities.uses_control else 0
     return np.concatenate([[0.0, rows, first, tolerance], np.zeros((problem.steps + 1) * rows)])
 
 
@@ -157,14 +158,15 @@ def _constraint_source(constraints: Constraints, terms: int) -> str:
     look = "def look_at_constraints(steps, states, controls, data, values):\n    for t in range(steps + 1):\n"
     look += "        u = controls[min(t, steps - 1)]\n"
     slope = "def slope_of_constraint(which, row, x, u, t, data, gradient):\n"
-    for k, (source, _) in enumerate(constraints):
+    for k, (source, uses_control) in enumerate(constraints):
         prefix = _prefix(source)
         names = {"constraint_value": f"{prefix}_value", "constraint_slope": f"{prefix}_slope"}
         names |= {name: f"{prefix}_{name}" for name in ("augment", "augmentation", "look")}
         parts += [_own(source), _rename(_functions(augmented), names)]
         at = terms + 2 * k
         slope += f"    if which == {k}:\n        {prefix}_slope(x, u, t, row, data[{at}], gradient)\n"
-        look += f"        {prefix}_look(states[t], u, t, data[{at}], data[{at + 1}], values[{k}])\n"
+        acts = "t < steps" if uses_control else "True"  # there is no last control
+        look += f"        {prefix}_look(states[t], u, t, {acts}, data[{at}], data[{at + 1}], values[{k}])\n"
     return "\n\n".join([*parts, look, slope] if constraints else [])
 
 

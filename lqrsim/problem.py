@@ -80,6 +80,10 @@ class Problem:
             )
         object.__setattr__(self, "constraints", tuple(self.constraints))
         bound_constraints = tuple(constraint.bind(self.dynamics) for constraint in self.constraints)
+        for constraint, inequalities in zip(self.constraints, bound_constraints, strict=True):
+            if not isinstance(inequalities, Inequalities):
+                name = type(constraint).__name__
+                raise InputError(f"constraints: {name}.bind: got {excerpt(inequalities)}, want Inequalities(...)")
         object.__setattr__(self, "_inequalities", bound_constraints)
         if self.control_limits is not None:
             try:
@@ -89,7 +93,7 @@ class Problem:
                     f"control_limits: got {excerpt(self.control_limits)}, want (lowest, highest)"
                 ) from None
             limited = self.dynamics.control_coordinates.limited(low, high)
-            limited.within(self.dynamics.control_coordinates)  # or there is nothing that the actuators can do
+            _check_within_reach(limited, self.dynamics.control_coordinates)
             object.__setattr__(self, "control_limits", (limited.low, limited.high))
         self._check_start_clear()
 
@@ -168,3 +172,14 @@ class Problem:
                     f"initial: got a start at ({where}) m, {-distances.min():.3g} m inside obstacle {name!r},"
                     f" want it clear of obstacles by the robot's radius of {cost.radius:g} m"
                 )
+
+
+def _check_within_reach(limits: Coordinates, actuators: Coordinates) -> None:
+    """Raises InputError if the actuators can do nothing of what is within the limits."""
+    sides = zip(limits.names, limits.low, limits.high, actuators.low, actuators.high, strict=True)
+    for name, low, high, lowest, highest in sides:
+        if not max(low, lowest) < min(high, highest):
+            raise InputError(
+                f"control_limits: got {low:g} to {high:g} for {name}, want some of what the actuator can do,"
+                f" {lowest:g} to {highest:g}"
+            )

@@ -80,12 +80,12 @@ class Attempt:
         """Go on until there are `last` iterations, or it ends; with `each`, a look after each (see `iterate`)."""
         if self.ending.outcome != interface.RUNNING:
             return
-        if not self.ending.iterations and not self._begin():
+        if not self.ending.iterations and not self.opened():
             return
         self.ending = iterate(
             self.problem, lambda first, last: self._loop(*self._arguments(first, last, self._log)), self._log,
-            min(last, self.settings.max_iterations), done=self.ending.iterations, look=self._violation, each=each,
-            callback=callback,
+            min(last, self.settings.max_iterations), done=self.ending.iterations, look=self._violation,
+            each=self._looking(each), callback=callback,
         )  # fmt: skip
 
     def run_on(
@@ -140,7 +140,7 @@ class Attempt:
         loop = work.core.entry("damped_iterations", *arguments(0, 0))
         return iterate(
             self.problem, lambda first, last: loop(*arguments(first, last)), log, settings.max_iterations,
-            before=before, look=lambda: self._violation_of(work.plan), each=each, callback=callback,
+            before=before, look=lambda: self._violation_of(work.plan), each=self._looking(each), callback=callback,
         )  # fmt: skip
 
     def found_damped(self, damped: Ending, status: Status, detail: str) -> Found:
@@ -172,8 +172,8 @@ class Attempt:
         plan = Trajectory(found.states, found.controls, self.problem.dt)
         return Candidate(name, found.cost, len(found.iterations), found.status, plan)
 
-    def _begin(self) -> bool:
-        """What comes before the first iteration; False if it fails."""
+    def opened(self) -> bool:
+        """Do what comes before the first iteration; False if it fails."""
         if self.settings.first_pass == "forward":
             return True
         self._loop(*self._arguments(0, 0, self._log))  # where the start leads, before it is forgotten
@@ -207,6 +207,10 @@ class Attempt:
     def _share(self, iteration: int) -> float:
         """How much of the obstacle costs the passes of an iteration see."""
         return self._shares[iteration] if iteration < len(self._shares) else 1.0
+
+    def _looking(self, each: bool) -> bool:
+        """Whether to come back after each iteration: constraints are looked at from outside of the loops."""
+        return each or bool(self.problem.constraints)
 
     def _violation(self) -> float:
         return self._violation_of((self.work.states, self.work.controls))

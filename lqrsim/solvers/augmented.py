@@ -55,8 +55,8 @@ def augmentation(x, u, t, data, multipliers):
     return total
 
 
-def look(x, u, t, data, multipliers, values):
+def look(x, u, t, acts, data, multipliers, values):
     """Write the values at a step, step by step as the multipliers are; infinite where they do not act."""
     rows = int(multipliers[1])
     for row in range(rows):
-        values[rows * t + row] = constraint_value(x, u, t, row, data) if t >= multipliers[2] else inf
+        values[rows * t + row] = constraint_value(x, u, t, row, data) if acts and t >= multipliers[2] else inf

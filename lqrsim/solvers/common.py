@@ -1,8 +1,9 @@
 """What the solvers share: settings, the iterations with a look after each, and putting the answer together."""
 
+import contextlib
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -13,6 +14,7 @@ from lqrsim import compiled
 from lqrsim.checks import check_functions, check_start, functions_of
 from lqrsim.constraints import Clearance
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number, excerpt
+from lqrsim.functions import External
 from lqrsim.problem import Problem
 from lqrsim.results import AffinePolicy, Candidate, Iteration, Multipliers, Solution, Status, Trajectory
 from lqrsim.solvers import interface
@@ -215,14 +217,21 @@ def solve_all(
         except InputError as error:
             raise InputError(f"problems[{i}]: {error}") from None
     functions = [function for problem in problems for function in functions_of(problem)]
-    with ThreadPoolExecutor(threads, thread_name_prefix="lqrsim") as pool:
+    with workers(threads, functions) as pool:
         futures = [pool.submit(solve, problem, settings, each=False) for problem in problems]
+        for done, _ in enumerate(as_completed(futures), start=1):
+            if progress is not None:
+                progress(done, len(futures))
+        return [future.result() for future in futures]
+
+
+@contextlib.contextmanager
+def workers(threads: int, functions: Iterable[External]) -> Iterator[ThreadPoolExecutor]:
+    """Threads that solve. On an error, Ctrl-C too, what is compiled ends in a moment; plain functions are told to."""
+    with ThreadPoolExecutor(threads, thread_name_prefix="lqrsim") as pool:
         try:
-            for done, _ in enumerate(as_completed(futures), start=1):
-                if progress is not None:
-                    progress(done, len(futures))
-            return [future.result() for future in futures]
-        except BaseException:  # Ctrl-C, too: what is compiled ends in a moment, plain functions are told to
+            yield pool
+        except BaseException:
             for function in functions:
                 function.stopped.set()
             pool.shutdown(wait=True, cancel_futures=True)

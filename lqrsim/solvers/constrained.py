@@ -101,12 +101,12 @@ def _undamped(
         if settled or rough or since == PATIENCE:
             since = 0
             lagrangian.renew()
-    found = attempt.found(ending)
+    found = attempt.found(dataclasses.replace(ending, iterations=before + done))
     detail = found.detail or ("" if found.success else f"with constraints, {lagrangian.worst()}")
     if found.success and lagrangian.missed > settings.constraint_tolerance:
         found = found.changed(status=Status.MAX_ITERATIONS)
         detail = f"{len(done)} iterations with constraints: {lagrangian.worst()}"
-    return found.changed(iterations=before + done, detail=detail, multipliers=lagrangian.multipliers())
+    return found.changed(detail=detail, multipliers=lagrangian.multipliers())
 
 
 def _damped(
@@ -176,6 +176,7 @@ class _Lagrangian:
         self._tolerance = attempt.settings.constraint_tolerance
         self.violation, self.missed, self.grown, self.stuck = 0.0, np.inf, 1.0, 0
         self._last = np.inf
+        self._first = [array[0] for array in self._work.multipliers]  # zero, but for those of another solution
 
     def look(self, states: Array, controls: Array) -> None:
         """Evaluate the constraints of a plan."""
@@ -189,7 +190,11 @@ class _Lagrangian:
         """No multipliers, and a penalty for each constraint that fits what it costs to change it."""
         self.grown, self.stuck, self._last = 1.0, 0, np.inf
         for which, (array, values) in enumerate(zip(self._work.multipliers, self._values, strict=True)):
-            array[0], array[interface.HEADER :] = PENALTY * self._curvature(which, int(values.argmin())), 0.0
+            array[interface.HEADER :] = 0.0
+            if not self._first[which] > 0:
+                # Only now: once there is a penalty, it is what the passes say of curvature.
+                self._first[which] = PENALTY * self._curvature(which, int(values.argmin())) if len(values) else 1.0
+            array[0] = self._first[which]
 
     def renew(self) -> None:
         """Take what the constraints press with for the multipliers; let the penalty grow if that helps too little."""

@@ -77,12 +77,13 @@ def ilqr_many(
     return solve_all(list_of(problems), settings, _check, _solve, threads=threads, progress=progress)
 
 
+_NO_PRIOR = "start: got an InitialPrior, want controls, a Trajectory, an AffinePolicy or a Solution: iLQR has no prior"
+
+
 def _check(problem: Problem, settings: Settings) -> None:
     check_problem(problem)
     if isinstance(settings.start, InitialPrior):
-        raise InputError(
-            "start: got an InitialPrior, want controls, a Trajectory, an AffinePolicy or a Solution: iLQR has no prior"
-        )
+        raise InputError(_NO_PRIOR)
     if problem.constraints:
         raise InputError(
             "constraints: got some, want none for ilqr, which keeps the control limits only; smooth keeps them"
@@ -97,6 +98,8 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     """Solve; with `each`, a look after each iteration (see `iterate`)."""
     assert problem.start is not None
     begin = resolve(settings.start, problem)
+    if begin.prior is not None:  # of a function, too
+        raise InputError(_NO_PRIOR)
     start, control = problem.start.copy(), begin.offset[0].copy()
     check_functions(problem, start, control)
     n, steps, zeros = len(start), problem.steps, np.zeros

@@ -6,14 +6,15 @@ paths, bent to the sides, lead to other optima. Which start is best shows after 
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
 
+from lqrsim.checks import functions_of
 from lqrsim.errors import Array, InputError
 from lqrsim.problem import Problem
 from lqrsim.solvers.attempt import Attempt
+from lqrsim.solvers.common import workers
 from lqrsim.solvers.start import InitialPrior
 
 # `python experiments/benchmark_quality.py --sections ingredients` shows what each of these choices brings.
@@ -114,7 +115,7 @@ def choose(attempts: Sequence[Attempt], advance: Callable[..., None], threads: i
     for last, keep in ((HALVE, max(len(left) // 2, 1)), (CHOOSE, 1)):
         if len(left) > 1:
             if threads > 1:
-                with ThreadPoolExecutor(threads, thread_name_prefix="lqrsim") as pool:
+                with workers(threads, functions_of(left[0].problem)) as pool:
                     list(pool.map(partial(advance, last=last), left))
             else:
                 for attempt in left:

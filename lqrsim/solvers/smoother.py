@@ -61,7 +61,8 @@ def smooth(
         test, which looks at the change of cost alone and can pass early.
       tolerance: of the relative change of cost, and of the optimality (see `Iteration`).
       gap_tolerance: of the gap (see `Iteration`).
-      max_iterations: when to give up the method; the safeguard, if it steps in, has as many again.
+      max_iterations: when to give up the method; the safeguard, if it steps in, has as many again, and with constraints
+        in each round of multipliers.
       start: what to begin with, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
         problem's nominal control, which the paper begins with; an InitialPrior, which adds to that what draws the first
         iterations; an AffinePolicy; a Trajectory, feasible or not, about which the first pass linearises; or a Solution
@@ -176,7 +177,7 @@ def _solve(
 def _finish(attempt: Attempt, start: Array, control: Array, *, each: bool, callback: Callback | None) -> Found:
     """Run an attempt to its end: the method, its safeguard where that fails, and then the constraints."""
     problem, settings = attempt.problem, attempt.settings
-    if attempt.begin.multipliers:
+    if attempt.begin.multipliers and attempt.opened():
         return satisfy(attempt, None, each=each, callback=callback)
     if callback is not None:
         for iteration in attempt.ending.iterations:

@@ -38,14 +38,24 @@ class InitialPrior:
         self.weight = check_array("InitialPrior: weight", weight, (None,))
         if (self.weight < 0).any():
             raise InputError(f"InitialPrior: weight: got {self.weight.min():g}, want numbers >= 0")
-        time = () if np.ndim(about) == 1 else (None,)
+        try:
+            time = () if np.ndim(about) == 1 else (None,)
+        except ValueError:  # ragged: the check below says so
+            time = ()
         self.about = check_array("InitialPrior: about", about, (*time, len(self.weight)))
         self.iterations = check_count("InitialPrior: iterations", iterations)
         shares = check_array("InitialPrior: obstacles", obstacles, (None,))
         if ((shares < 0) | (shares > 1)).any():
             raise InputError(f"InitialPrior: obstacles: got {excerpt(obstacles)}, want numbers from 0 to 1")
         self.obstacles = tuple(shares.tolist())
-        self.controls = None if controls is None else np.array(controls, dtype=np.float64)
+        self.controls = controls
+        if controls is not None:
+            try:
+                self.controls = np.array(controls, dtype=np.float64)
+            except (TypeError, ValueError):
+                raise InputError(
+                    f"InitialPrior: controls: got {excerpt(controls)}, want controls (m,) or (T, m)"
+                ) from None
 
     def at(self, step: float) -> Array:
         """Where it is zero, (n,), at a step or between two."""

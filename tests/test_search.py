@@ -1,0 +1,237 @@
+"""Which start is gone on with, what the others cost, and what is refused."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import kkt
+import numpy as np
+import pytest
+from test_smoother import same
+
+import lqrsim as ls
+from lqrsim.errors import Array
+from lqrsim.results import Iteration, Status
+from lqrsim.solvers.search import bends, guides, path
+
+STARTS = ["straight", *(f"{far} m to the {side}" for far in (1, 2, 3) for side in ("left", "right"))]
+
+
+def without_floor(problem: ls.Problem) -> ls.Problem:
+    """The same: seen from above a floor bounds nothing, and kkt.py does not know that."""
+    (cost,) = problem.obstacle_costs
+    world = ls.World([one for one in cost.world.obstacles if one.name != "floor"])
+    assert len(world) == len(cost.world) - 1
+    effort = next(term for term in problem.stage_cost.terms if term is not cost)  # pyright: ignore[reportAttributeAccessIssue]
+    obstacles = ls.ObstacleCost(world, radius=cost.radius, sharpness=cost.sharpness, weight=cost.weight)
+    return replace(problem, stage_cost=effort + obstacles)
+
+
+class TestCandidates:
+    def test_all_starts_are_there_in_their_order_with_what_they_cost(self, differential_drive, drive_solution) -> None:
+        """To 1e-9, by a motion and a cost that know nothing of the solver; and each plan is a motion."""
+        assert [one.start for one in drive_solution.candidates] == STARTS
+        problem = without_floor(differential_drive.problem)
+        for one in drive_solution.candidates:
+            cost, residual = kkt.recompute(problem, one.trajectory)
+            assert one.cost == pytest.approx(cost, rel=1e-9)
+            assert residual < 1e-12
+
+    def test_the_half_that_costs_less_goes_on_and_then_the_best(self, drive_solution) -> None:
+        candidates = drive_solution.candidates
+        ended = [one for one in candidates if one.status is not None]
+        assert len(ended) == 1
+        chosen = ended[0]
+        assert chosen.status is drive_solution.status
+        assert (chosen.cost, chosen.iterations) == (drive_solution.cost, len(drive_solution.iterations))
+        np.testing.assert_array_equal(chosen.trajectory.states, drive_solution.trajectory.states)
+        four = [one for one in candidates if one.status is None and one.iterations == 4]
+        three = [one for one in candidates if one.status is None and one.iterations == 3]
+        assert (len(three), len(four)) == (4, 2)
+        assert drive_solution.iterations[3].cost < min(one.cost for one in four)
+        assert f"the plan is of {chosen.start}, one of 7" in drive_solution.summary()
+        # What goes on was better than what was dropped at that time; of the two that were dropped later, cost fell.
+        assert max(one.cost for one in four) < min(one.cost for one in three)
+
+    def test_the_same_bits_however_they_are_run(self, differential_drive, drive_solution) -> None:
+        problem = differential_drive.problem
+        others = [ls.smooth(problem, threads=1), ls.smooth(problem, threads=2, starts=7)]
+        others += [*ls.smooth_many([problem, problem], threads=2), *ls.smooth_many([problem], threads=1)]
+        for other in others:
+            assert same(other, drive_solution)
+            for one, of_it in zip(drive_solution.candidates, other.candidates, strict=True):
+                assert (one.start, one.cost, one.iterations) == (of_it.start, of_it.cost, of_it.iterations)
+                np.testing.assert_array_equal(one.trajectory.states, of_it.trajectory.states)
+
+    def test_one_start_is_the_straight_one_alone(self, differential_drive, drive_solution) -> None:
+        alone = ls.smooth(differential_drive.problem, starts=1)
+        assert alone.candidates == ()
+        assert same(alone, drive_solution)  # where it was the best
+        assert "starts:" not in alone.summary()
+
+    @pytest.mark.parametrize("limit", [1, 2, 3, 4, 5])
+    def test_the_iteration_limit_may_come_before_the_choice(self, differential_drive, limit: int) -> None:
+        calls: list[Iteration] = []
+        options: dict[str, Any] = {"max_iterations": limit, "safeguard": False, "callback": calls.append}
+        solution = ls.smooth(differential_drive.problem, **options)
+        assert solution.status is Status.MAX_ITERATIONS
+        assert list(map(repr, calls)) == list(map(repr, solution.iterations))
+        assert len(calls) == limit
+        assert solution.cost == min(one.cost for one in solution.candidates)
+
+    @pytest.mark.parametrize(("form", "first_pass"), [("dual", "backward"), ("primal", "forward")])
+    def test_in_the_other_form_and_order(self, differential_drive, form: str, first_pass: str) -> None:
+        calls: list[Iteration] = []
+        solution = ls.smooth(differential_drive.problem, form=form, first_pass=first_pass, callback=calls.append)
+        assert solution.status is Status.CONVERGED
+        assert [one.start for one in solution.candidates] == STARTS
+        assert list(map(repr, calls)) == list(map(repr, solution.iterations))
+        report = kkt.check(without_floor(differential_drive.problem), solution)
+        assert report.decrease < 1e-4
+        assert report.cost == pytest.approx(solution.cost, rel=1e-9)
+
+
+class TestPaths:
+    @pytest.mark.parametrize("size", [2, 3])
+    @pytest.mark.parametrize("count", [1, 2, 7, 12])
+    def test_they_bend_across_the_way_and_evenly(self, size: int, count: int) -> None:
+        rng = np.random.default_rng(size)
+        start, goal = rng.normal(size=(2, size))
+        way, found = goal - start, bends(goal - start, count)
+        assert len(found) == len({name for name, _ in found}) == count
+        name, straight = found[0]
+        assert name == "straight"
+        assert not straight.any()
+        others = np.array([bend for _, bend in found[1:]]).reshape(-1, size)
+        np.testing.assert_allclose(others @ way, 0, atol=1e-12)
+        if size == 3 and count > 2:  # a ring
+            np.testing.assert_allclose(others.sum(axis=0), 0, atol=1e-12)
+            apart = np.linalg.norm(others - np.roll(others, 1, axis=0), axis=1)
+            np.testing.assert_allclose(apart, apart[0], rtol=1e-9)
+        if size == 2:  # pairs; the left is a quarter turn on from the way
+            side = way[0] * others[:, 1] - way[1] * others[:, 0]
+            assert [name.endswith("left") for name, _ in found[1:]] == (side > 0).tolist()
+            np.testing.assert_allclose(others[1::2], -others[: count - 1][0::2][: len(others[1::2])], atol=1e-12)
+
+    def test_they_go_from_rest_to_rest(self) -> None:
+        start, goal, bend = np.array([1.0, 2.0]), np.array([5.0, -1.0]), np.array([0.6, 0.8])
+        steps = 1000
+        places = path(start, goal, bend, steps)
+        np.testing.assert_allclose(places[[0, steps // 2, -1]], [start, (start + goal) / 2 + bend, goal], atol=1e-12)
+        speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) * steps  # per unit of time
+        assert max(speeds[0], speeds[-1]) < 1e-4 * speeds.max()
+        np.testing.assert_allclose(path(start, goal, 0 * bend, steps) @ (3.0, 4.0), 11.0, atol=1e-12)  # a line
+
+    def test_one_of_them_alone_is_an_initial_prior(self, differential_drive, drive_solution) -> None:
+        """What the search is made of can be given by hand, or by a function of the problem."""
+        problem = differential_drive.problem
+        calls: list[ls.Problem] = []
+
+        def straight(problem: ls.Problem) -> Any:
+            calls.append(problem)
+            return guides(problem, 1)[0][1]
+
+        assert same(ls.smooth(problem, start=straight), drive_solution)
+        other = replace(problem, final_cost=ls.QuadraticCost((5000.0, 5000.0, 50.0), about=(0.3, 2.4, np.pi)))
+        many = ls.smooth_many([problem, other], start=straight)
+        assert same(many[0], drive_solution)
+        assert same(many[1], ls.smooth(other, start=guides(other, 1)[0][1]))
+        assert {id(one) for one in calls} == {id(problem), id(other)}
+
+
+def in_the_plane(f: Callable[..., Any], **changes: Any) -> ls.Problem:
+    """Past a ball, by a body whose speed is the control."""
+    ball = ls.Obstacle("ball", "sphere", np.array([0.0, 0.1, 0.0]), np.eye(3), np.array([0.4, 0, 0]))
+    level = "plain" if f is plain else "symbolic"
+    dynamics = ls.Dynamics(
+        f, states={"x": "m", "y": "m"}, controls={"vx": "m/s", "vy": "m/s"}, position=("x", "y"), level=level
+    )
+    fields: dict[str, Any] = {
+        "dynamics": dynamics, "dt": 0.1, "steps": 12, "initial": ls.FixedState([-1.0, 0.0]),
+        "stage_cost": ls.ControlCost([0.5, 0.5], about=[0.0, 0.0])
+        + ls.ObstacleCost(ls.World([ball]), radius=0.1, sharpness=5.0),
+        "final_cost": ls.QuadraticCost([100.0, 100.0], about=[1.0, 0.0]),
+    }  # fmt: skip
+    return ls.Problem(**fields | changes)
+
+
+def plain(x: Array, u: Array, p: Any) -> Array:
+    if x[1] < -50:
+        raise RuntimeError("off the map")
+    return u.copy()
+
+
+def symbolic(x, u, p):
+    return [u[0], u[1]]
+
+
+class TestWithoutAWay:
+    def test_plain_functions_are_searched_with_too(self) -> None:
+        """One thread, two, and formulas: all the same."""
+        problem = in_the_plane(plain)
+        one, two = (ls.smooth(problem, threads=threads, safeguard=False) for threads in (1, 2))
+        formula = ls.smooth(in_the_plane(symbolic), safeguard=False)
+        assert one.status is Status.CONVERGED
+        assert same(one, two)
+        for a, b in zip(one.candidates, formula.candidates, strict=True):
+            assert (a.start, a.iterations, a.status) == (b.start, b.iterations, b.status)
+            assert a.cost == pytest.approx(b.cost, rel=1e-6)
+
+    def test_a_goal_where_it_starts(self) -> None:
+        here = ls.QuadraticCost([100.0, 100.0], about=[-1.0, 0.0])
+        solution = ls.smooth(in_the_plane(symbolic, final_cost=here), starts=7, safeguard=False)
+        assert solution.status is Status.CONVERGED
+        assert solution.candidates == ()
+
+    def test_no_goal_no_obstacles_or_no_start(self, differential_drive) -> None:
+        nowhere = in_the_plane(symbolic, steps=12)
+        (_, obstacles) = nowhere.stage_cost.terms  # pyright: ignore[reportAttributeAccessIssue]
+        bare = ls.ControlCost([0.5, 0.5], about=[0.0, 0.0])
+        free = bare + ls.ObstacleCost(ls.World(), radius=0.1)
+        weightless = bare + ls.ObstacleCost(obstacles.world, radius=0.1, weight=0.0)
+        goal = ls.QuadraticCost([1.0, 1.0], about=[1.0, 0.0])
+        for changes in (
+            {"stage_cost": bare}, {"stage_cost": free}, {"stage_cost": weightless}, {"final_cost": goal + goal},
+            {"initial": goal + goal},
+        ):  # fmt: skip
+            problem = in_the_plane(symbolic, **changes)
+            assert guides(problem, None) == guides(problem, 1) == [("nominal control", None)]
+            with pytest.raises(ls.InputError, match="starts: got 2, want 1 for a problem without obstacles, a start"):
+                ls.smooth(problem, starts=2)
+            with pytest.raises(ls.InputError, match=r"problems\[1\]: starts: got 2"):
+                ls.smooth_many([nowhere, problem], starts=2)
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"starts": 0}, "starts: got 0, want a whole number >= 1"),
+            ({"starts": 2.5}, "starts: got 2.5, want a whole number >= 1"),
+            ({"starts": 3, "start": (0.0, 0.0)}, "starts: got 3 beside a start, want one of the two"),
+            ({"threads": 0}, "threads: got 0, want a whole number >= 1"),
+            ({"start": lambda problem: "there"}, "start: got 'there', want controls"),
+        ],
+    )
+    def test_what_is_refused(self, options: dict[str, Any], message: str) -> None:
+        with pytest.raises(ls.InputError, match=message):
+            ls.smooth(in_the_plane(symbolic), **options)
+
+    @pytest.mark.parametrize(
+        ("fields", "message"),
+        [
+            ({"obstacles": 0.5}, r"InitialPrior: obstacles: got shape \(\), want \(any,\)"),
+            ({"obstacles": (0.0, 1.5)}, "InitialPrior: obstacles: got .*, want numbers from 0 to 1"),
+            ({"about": [[0.0, 0.0], [1.0]]}, "InitialPrior: about: got .*"),
+            ({"controls": "none"}, "InitialPrior: controls: got 'none', want .*"),
+            ({"weight": (-1.0, 0.0)}, "InitialPrior: weight: got -1, want numbers >= 0"),
+        ],
+    )
+    def test_priors_that_are_none_get_one_line(self, fields: dict[str, Any], message: str) -> None:
+        given: dict[str, Any] = {"weight": (1.0, 1.0), "about": (0.0, 0.0)}
+        with pytest.raises(ls.InputError, match=message):
+            ls.InitialPrior(**given | fields)
+
+    def test_ilqr_has_no_prior_whoever_makes_it(self) -> None:
+        prior = ls.InitialPrior((1.0, 1.0), about=(0.0, 0.0))
+        for start in (prior, lambda problem: prior):
+            with pytest.raises(ls.InputError, match="start: got an InitialPrior, want controls"):
+                ls.ilqr(in_the_plane(symbolic), start=start)
