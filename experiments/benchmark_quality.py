@@ -10,7 +10,8 @@ they are missing they are left out, and that is said.
 
 starts       Three times a hundred quadrotor queries, without limits of the controls: what the plans cost, and how many
              are within 1 % of the lowest cost known, whoever found it. Those are in best_known.json, in a folder given
-             by --reference or $LQRSIM_REFERENCE, or else in shared/reference beside the repository.
+             by --reference or $LQRSIM_REFERENCE, or else in shared/reference beside the repository. Our plans that cost
+             less than that are in quality/best_plans.npz: that is what --save writes.
 time         The same in turns, on one thread, against FDDP and IPOPT.
 clearance    With a clearance to be kept: at the steps, between them, with a margin; and what that costs.
 limits       With narrow limits of the controls: kept to the last bit, and what IPOPT makes of the same limits, from the
@@ -46,8 +47,9 @@ SECTIONS: dict[Section, ModuleType] = {
 
 def main(config: Config) -> dict[str, Any]:
     config = config.bounded()
+    paths = {name: path and str(path) for name, path in (("reference", config.reference), ("save", config.save))}
     result: dict[str, Any] = {
-        "config": asdict(config) | {"reference": str(config.reference) if config.reference else None},
+        "config": asdict(config) | paths,
         "versions": versions() | peers.versions(),
         "processors": processors(),
     }

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+import lqrsim as ls
+
 FOLDER = Path(__file__).parent.parent / "experiments"
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if "__main__" in path.read_text(encoding="utf-8"))
 
@@ -202,6 +204,16 @@ def test_benchmark_of_quality(quality: ModuleType, tmp_path: Path) -> None:
     text = quality.report(result)
     assert "lower than the best known: smooth, seed 0, query 1" in text
     assert "IPOPT: skipped: not asked for" in text
+
+
+def test_the_best_plans_cost_what_is_said_of_them(quality: ModuleType) -> None:
+    """As many as are there; recomputed by formulas of nobody's, to rounding."""
+    with np.load(FOLDER / "quality" / "best_plans.npz", allow_pickle=False) as plans:
+        rows = list(zip(*(plans[name] for name in ("seed", "query", "cost", "controls")), strict=True))
+    assert rows
+    for seed, query, cost, controls in rows:
+        problem = ls.scenarios.quadrotor(int(query), int(seed)).problem
+        assert quality.peers.cost_of(problem, controls) == pytest.approx(cost, rel=1e-12)
 
 
 def test_benchmark_of_quality_says_what_it_skips(quality: ModuleType, tmp_path: Path) -> None:

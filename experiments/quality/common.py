@@ -55,6 +55,8 @@ class Config:
     """How many solve at once where nothing is timed; by default as many as there are processors."""
     reference: Path | None = None
     """Folder with best_known.json, the lowest costs known."""
+    save: Path | None = None
+    """Where to write the plans that cost less than the best known, an .npz with seed, query, cost and controls."""
     peers: bool = True
     """Whether other people's solvers are asked, too."""
     quick: bool = False

@@ -6,6 +6,9 @@ import numpy as np
 import peers
 from reliability.common import mean, paper_start, progress
 
+import lqrsim as ls
+from lqrsim.errors import Array
+from lqrsim.files import replacing
 from quality.common import (
     ALL,
     NONE,
@@ -25,7 +28,12 @@ from quality.common import (
 )
 
 ONE, SEVERAL = "smooth, one start", "smooth"
-OURS: dict[str, dict[str, Any]] = {ONE: {"starts": 1}, SEVERAL: {}, "smooth, hover": {"start": paper_start()}}
+OURS: dict[str, dict[str, Any]] = {
+    ONE: {"starts": 1},
+    SEVERAL: {},
+    "smooth, 13, 1e-9": {"starts": 13, "tolerance": 1e-9, "gap_tolerance": 1e-6},
+    "smooth, hover": {"start": paper_start()},
+}
 NEAR = 0.01  # what counts as the best known
 LOWER = 1e-6  # relative, what is lower than that
 MEANS = {0: 122.5, 1: 119.5, 2: 119.5}  # of one start, at most
@@ -35,6 +43,7 @@ ITERATIONS = 8.5
 
 def measure(config: Config) -> dict[str, Any]:
     found: dict[str, Any] = {"seeds": {}, "skipped": {}}
+    lowest: list[tuple[int, int, float, float, Array]] = []
     try:
         known = best_known(config)
     except peers.Unavailable as error:
@@ -43,9 +52,11 @@ def measure(config: Config) -> dict[str, Any]:
     for seed in config.seeds:
         problems = queries(config.queries, seed, NONE)
         one: dict[str, Found] = {}
+        plans: dict[str, list[ls.Solution]] = {}
         for name, options in OURS.items():
             said = f"starts, seed {seed}, {name}"
-            one[name] = of_solutions(problems, solve(config, problems, said, **options), said)
+            plans[name] = solve(config, problems, said, **options)
+            one[name] = of_solutions(problems, plans[name], said)
         solvers, skipped = others(config, problems[0], PEERS)
         for name, solver in solvers.items():
             said = f"starts, seed {seed}, {name}"
@@ -56,8 +67,20 @@ def measure(config: Config) -> dict[str, Any]:
                 best = np.array(known[seed][: config.queries])
                 excess = np.array(contestant["cost"][: len(best)]) / best - 1
                 contestant["excess"] = excess.tolist()
+            lowest += [(seed, i, *lowest_plan(one, plans, i)) for i in range(len(best))]
         found["seeds"][str(seed)] = one
+    if config.save is not None:
+        kept = [(seed, i, cost, controls) for seed, i, excess, cost, controls in lowest if excess < -LOWER]
+        seeds, indices, costs, controls = zip(*kept, strict=True) if kept else ((), (), (), ())
+        with replacing(config.save) as unfinished, unfinished.open("wb") as file:
+            np.savez_compressed(file, seed=seeds, query=indices, cost=costs, controls=controls)
     return found
+
+
+def lowest_plan(one: dict[str, Found], plans: dict[str, list[ls.Solution]], query: int) -> tuple[float, float, Array]:
+    """What of the best known the cheapest of our plans costs more, its cost, and its controls."""
+    name = min(plans, key=lambda name: one[name]["cost"][query])
+    return one[name]["excess"][query], one[name]["cost"][query], plans[name][query].trajectory.controls
 
 
 def table(found: dict[str, Any]) -> str:
