@@ -63,8 +63,8 @@ def measure(config: Config) -> dict[str, Any]:
             one[name] = of_answers(problems, [solver(problem) for problem in progress(problems, said)], said)
         found["skipped"] |= skipped
         if seed in known:
+            best = np.array(known[seed][: config.queries])
             for contestant in one.values():
-                best = np.array(known[seed][: config.queries])
                 excess = np.array(contestant["cost"][: len(best)]) / best - 1
                 contestant["excess"] = excess.tolist()
             lowest += [(seed, i, *lowest_plan(one, plans, i)) for i in range(len(best))]
