@@ -203,7 +203,8 @@ def _cost_source(name: str, terms: Structure, constraints: Constraints) -> str:
             pair = f"data[{len(terms) + 2 * k}], data[{len(terms) + 2 * k + 1}]"
             convex.append(f"    total += {_prefix(source)}_augment(x, u, t, {pair}, hessian, gradient)")
             added.append(f"    total += {_prefix(source)}_augmentation(x, u, t, {pair})")
-    parts.append("\n".join([f"def {name}_added(x, u, t, data):\n    total = 0.0", *added, "    return total"]))
+    if name != "initial":
+        parts.append("\n".join([f"def {name}_added(x, u, t, data):\n    total = 0.0", *added, "    return total"]))
     summed = f"def {name}_value(x, u, t, data):\n    total = 0.0\n" + "\n".join(values)
     parts.append(f"{summed}\n    return total")
     modelled = f"def {name}_quadratic(x, u, t, data, hessian, gradient):\n    clear(hessian, W, W)\n"

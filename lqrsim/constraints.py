@@ -36,6 +36,8 @@ class Inequalities:
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", check_array("Inequalities: data", self.data, (None,), infinite=True))
         object.__setattr__(self, "rows", check_count("Inequalities: rows", self.rows, at_least=0))
+        if not callable(self.says):
+            raise InputError(f"Inequalities: says: got {excerpt(self.says)}, want a function of a row")
         for name in ("value", "slope"):
             if f"def {name}(" not in self.source:
                 raise InputError(f"Inequalities: source: got {excerpt(self.source)}, want it to define {name}(...)")
@@ -52,10 +54,11 @@ class Constraint(abc.ABC):
 class Clearance(Constraint):
     """At least `margin` between the robot and each obstacle, at the steps; walls are obstacles too.
 
-    An ObstacleCost keeps away from obstacles as far as that pays, and can end inside one; this does not. Between two
-    steps a plan can come a little nearer, by `v^2 dt^2 / 8 r` at the speed v along an obstacle of radius r, and what is
-    thinner than a step is long it can step over. Which way round is better only a cost says: have an ObstacleCost, too,
-    if only of a small weight, and the search has something to go by.
+    An ObstacleCost keeps away from obstacles as far as that pays, and can end inside one; this does not. Only at a
+    start that is given exactly, about which nothing can be done, it does not act. Between two steps a plan can come a
+    little nearer, by `v^2 dt^2 / 8 r` at the speed v along an obstacle of radius r, and what is thinner than a step is
+    long it can step over. Which way round is better only a cost says: have an ObstacleCost, too, if only of a small
+    weight, and the search has something to go by.
 
     Args:
       world: the obstacles; a robot in the plane sees it from above, as for an ObstacleCost.

@@ -34,14 +34,14 @@ class Problem:
       initial: c_0, the cost of starting elsewhere than wished (the paper's soft start); or `FixedState(x)`.
       stage_cost: c, per step: it is *not* multiplied by dt.
       final_cost: c_T.
-      control_limits: (lowest, highest) control to plan with, each a number or (m,); by default what the actuators can
-        do. Narrower ones leave some of that to the feedback; infinite ones plan as if there were none. The plan keeps
-        them exactly, and the policy does, as far as they are within the actuators' own.
+      control_limits: (lowest, highest) control, each a number or (m,); by default what the actuators can do. Infinite
+        ones plan as if there were none. Plan and policy keep them exactly, and the policy keeps the actuators', too.
       constraints: what the plan must keep to at the steps; see `Clearance`.
 
     Raises:
-      InputError: dt or steps not positive, a cost that does not fit the dynamics, an initial or final cost that depends
-        on the control, or a start that collides.
+      InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
+        cost that depends on the control, control limits out of order or beyond what the actuators can do, or a start
+        that collides.
     """
 
     dynamics: Dynamics

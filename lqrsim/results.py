@@ -134,7 +134,7 @@ _STATUS_TEXT = {
     ),
     Status.MAX_ITERATIONS: (
         "the iteration limit came first, or no step lowered the cost any more",
-        "raise max_iterations if the improvements still shrink; if they do not, try another start or a prior",
+        "raise max_iterations if the improvements still shrink; if they do not, try another start",
     ),
     Status.INFEASIBLE: (
         "the constraints can not be met, at least not near the plan that misses them least",
@@ -142,7 +142,7 @@ _STATUS_TEXT = {
     ),
     Status.DIVERGED: (
         "the cost of the policy grew beyond all bounds",
-        "add a prior, try a start nearer to a solution, shorten dt, or try the other solver",
+        "try a start nearer to a solution or an InitialPrior, shorten dt, or try the other solver",
     ),
     Status.NOT_FINITE: (
         "a NaN or an infinity appeared",
@@ -150,7 +150,7 @@ _STATUS_TEXT = {
     ),
     Status.NOT_POSITIVE_DEFINITE: (
         "a matrix that must be inverted was not positive definite",
-        "raise the control weight, add a prior, shorten dt, or try the other solver",
+        "raise the control weight, start with an InitialPrior, shorten dt, or try the other solver",
     ),
 }
 
@@ -161,7 +161,8 @@ class Iteration:
 
     Attributes:
       cost: true cost of rolling the policy out under the true dynamics; NaN where it was only to keep the constraints.
-      improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration.
+      improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration. Of damped iterations with
+        constraints it is of the cost with the augmented Lagrangian, and so is the optimality.
       gap: largest difference between the minimal-total-cost states and that rollout, each state relative to its
         range along the rollout (at least 1 unit). Where the safeguard went part of the way, they are taken there; 0 for
         steps of iLQR, which has none.
@@ -221,9 +222,10 @@ class Candidate:
 
     Attributes:
       start: what it was.
-      cost: true cost of the last plan that it led to; infinite if a pass failed.
+      cost: true cost of the last plan that it led to; infinite if a pass failed, or the plan is only to keep the
+        constraints.
       iterations: how many it took until then.
-      status: how the chosen one ended; None where another start was the more promising.
+      status: how it ended; None where it was dropped after a few iterations.
       trajectory: that plan.
     """
 
@@ -282,7 +284,7 @@ class Solution:
 
     @property
     def cost(self) -> float:
-        """True cost of the plan; NaN if not one iteration was completed."""
+        """True cost of the plan; NaN if not one iteration was completed, or it was only to keep the constraints."""
         return self.iterations[-1].cost if self.iterations else float("nan")
 
     @property
@@ -310,7 +312,8 @@ class Solution:
         """Cost-to-go plus cost-to-come, Eq. (20). Raises InputError where there is no cost-to-come, as from `ilqr`."""
         if self.cost_to_go is None or self.cost_to_come is None:
             raise InputError(
-                f"total_cost: got a solution of {self.solver} without both value functions, want one of smooth"
+                f"total_cost: got a solution of {self.solver} without both value functions, want one of smooth, not"
+                " shifted, whose passes were completed"
             )
         return TotalCost(self.cost_to_go, self.cost_to_come)
 
@@ -318,7 +321,8 @@ class Solution:
         """What is left of it after so many steps, to start the next solve of a horizon that moves along.
 
         The end is filled up: the last law, value function and multipliers stay in force, as a policy's last law does
-        after its horizon, and the last control is held. `smooth(problem, start=solution.shifted(k))`.
+        after its horizon, and the last control is held. Status, log, cost and digest stay those of the whole.
+        `smooth(problem, start=solution.shifted(k))`.
 
         Raises:
           InputError: `steps` is not a whole number from 0 to the last step.

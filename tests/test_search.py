@@ -179,7 +179,7 @@ class TestWithoutAWay:
 
     def test_a_goal_where_it_starts(self) -> None:
         here = ls.QuadraticCost([100.0, 100.0], about=[-1.0, 0.0])
-        solution = ls.smooth(in_the_plane(symbolic, final_cost=here), starts=7, safeguard=False)
+        solution = ls.smooth(in_the_plane(symbolic, final_cost=here), safeguard=False)
         assert solution.status is Status.CONVERGED
         assert solution.candidates == ()
 
@@ -196,7 +196,7 @@ class TestWithoutAWay:
         ):  # fmt: skip
             problem = in_the_plane(symbolic, **changes)
             assert guides(problem, None) == guides(problem, 1) == [("nominal control", None)]
-            with pytest.raises(ls.InputError, match="starts: got 2, want 1 for a problem without obstacles, a start"):
+            with pytest.raises(ls.InputError, match="starts: got 2, want 1 without an ObstacleCost, a start"):
                 ls.smooth(problem, starts=2)
             with pytest.raises(ls.InputError, match=r"problems\[1\]: starts: got 2"):
                 ls.smooth_many([nowhere, problem], starts=2)

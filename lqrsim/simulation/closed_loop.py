@@ -87,7 +87,7 @@ def simulate(
         control = command.copy()
         for actuate in actuations:
             control = actuate(step, control)
-        control = policy.control_coordinates.clip(control)
+        control = plant.robot.dynamics.control_coordinates.clip(control)
         for push in pushes:
             forces[:, step] += push(step, state)
         commanded[:, step], applied[:, step] = command, control

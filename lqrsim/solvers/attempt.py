@@ -1,6 +1,6 @@
 """The method from one start, as far as it has got; and the safeguard, where it fails."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ from lqrsim.errors import Array
 from lqrsim.problem import Problem
 from lqrsim.results import Candidate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers import interface
-from lqrsim.solvers.common import LOG_COLUMNS, Callback, Ending, SmootherSettings, iterate
+from lqrsim.solvers.common import LOG_COLUMNS, Callback, Ending, SmootherSettings, check_outcome, iterate
 from lqrsim.solvers.start import Start
 from lqrsim.solvers.workspace import Workspace
 
@@ -30,18 +30,15 @@ class Found:
 
     @property
     def cost(self) -> float:
-        """True cost of the plan; infinite without one."""
-        return self.iterations[-1].cost if self.iterations else np.inf
+        """True cost of the plan; infinite where there is none, or it is not known."""
+        cost = self.iterations[-1].cost if self.iterations else np.inf
+        return cost if np.isfinite(cost) else np.inf
 
     @property
     def rank(self) -> tuple[bool, float, float]:
         """The smaller, the better: success first, then constraints, then the cost."""
         violation = self.iterations[-1].violation if self.iterations else np.inf
         return not self.success, 0.0 if self.success else violation, self.cost
-
-    def changed(self, **changes: Any) -> "Found":
-        """The same with some of it changed."""
-        return replace(self, **changes)
 
     @property
     def success(self) -> bool:
@@ -97,13 +94,28 @@ class Attempt:
             done=done, look=self._violation, each=each, callback=callback,
         )  # fmt: skip
 
+    def roll_out(self) -> None:
+        """See where the start leads, if nothing has been done yet; the states and controls are in `work`."""
+        self._loop(*self._arguments(0, 0, self._log))
+
+    def finish(self, *, each: bool, callback: Callback | None = None) -> Found:
+        """The method, and its safeguard where that fails."""
+        settings = self.settings
+        self.run(settings.max_iterations, each=each, callback=callback)
+        ending = check_outcome(self.problem, self.ending, self.work.start, self.begin.offset[0], refuse=each)
+        lost = ending is not self.ending  # a function that is not finite at the start: nothing can help
+        found = self.found(ending)
+        if settings.safeguard and not lost and not found.success:
+            return self.rescue(found.detail or found.status.meaning, each=each, callback=callback)
+        return found
+
     def found(self, ending: Ending) -> Found:
         """What the bare method found; `ending` is its own, or one that knows more of why it failed."""
         work = self.work
         return Found(
             status=ending.status, detail=ending.detail(self.problem.steps), iterations=ending.iterations,
             states=work.states, controls=work.controls, law=work.kept,
-            values={} if self.ending.pass_failed else work.value_functions(),
+            values={} if ending.pass_failed else work.value_functions(),
         )  # fmt: skip
 
     def rescue(self, why: str, *, each: bool, callback: Callback | None = None) -> Found:
@@ -176,7 +188,7 @@ class Attempt:
         """Do what comes before the first iteration; False if it fails."""
         if self.settings.first_pass == "forward":
             return True
-        self._loop(*self._arguments(0, 0, self._log))  # where the start leads, before it is forgotten
+        self.roll_out()  # before the start is forgotten
         work = self.work
         p, dt, _, _, final = work.model
         failed, good = work.core.opening_pass(
@@ -216,4 +228,4 @@ class Attempt:
         return self._violation_of((self.work.states, self.work.controls))
 
     def _violation_of(self, plan: tuple[Array, Array]) -> float:
-        return self.work.violation(*plan) if self.problem.constraints else 0.0
+        return self.work.violation(self.work.constraint_values(*plan)) if self.problem.constraints else 0.0

@@ -182,7 +182,7 @@ def iterate(
         count, outcome, backward, failed = run(first, first + 1 if each else last)
         seconds = (time.perf_counter() - clock) / max(count - first, 1)
         for i, (cost, improvement, gap, optimality, residual, method) in enumerate(log[first:count].tolist(), first):
-            missed = look() if i == count - 1 else float("nan")
+            missed = look() if i == count - 1 or not problem.constraints else float("nan")
             name = _METHODS[int(method)]
             iterations.append(Iteration(cost, improvement, gap, optimality, residual, missed, seconds, name))
             if callback is not None:

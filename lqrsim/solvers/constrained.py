@@ -26,17 +26,37 @@ ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped one
 ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to renew the multipliers, and when anyway
 
 
+def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> Found:
+    """Run an attempt to its end: the method, its safeguard where that fails, and then the constraints."""
+    tried: tuple[Iteration, ...] = ()
+    if attempt.begin.multipliers and attempt.opened():
+        found = satisfy(attempt, None, each=each, callback=callback)
+        if found.success:
+            return found
+        # What is known of another problem does not help here.
+        tried, begin = found.iterations, dataclasses.replace(attempt.begin, multipliers=())
+        attempt = Attempt(attempt.problem, attempt.settings, begin, attempt.work.start)
+    found = attempt.finish(each=each, callback=callback)
+    if attempt.problem.constraints:
+        found = satisfy(attempt, found, each=each, callback=callback)
+    return dataclasses.replace(found, iterations=(*tried, *found.iterations))
+
+
 def satisfy(attempt: Attempt, found: Found | None, *, each: bool, callback: Callback | None = None) -> Found:
     """Go on from what was found without the constraints, or, without it, from the multipliers of another solution."""
     lagrangian = _Lagrangian(attempt)
-    if found is not None:
-        if not found.success:
-            return _first_feasible(attempt, found, each=each, callback=callback)
+    if found is None:
+        attempt.roll_out()
+        lagrangian.look(attempt.work.states, attempt.work.controls)
+    elif not found.success:
+        return _first_feasible(attempt, found, each=each, callback=callback)
+    else:
         lagrangian.look(found.states, found.controls)
         if lagrangian.violation == 0:
             return found
         lagrangian.begin()
-        found = found.changed(states=found.states.copy(), controls=found.controls.copy())  # these will be overwritten
+        # These will be overwritten.
+        found = dataclasses.replace(found, states=found.states.copy(), controls=found.controls.copy())
     before = found.iterations if found is not None else ()
     undamped = _undamped(attempt, lagrangian, before, each=each, callback=callback)
     if undamped.success or not attempt.settings.safeguard:
@@ -49,9 +69,17 @@ def _first_feasible(attempt: Attempt, found: Found, *, each: bool, callback: Cal
 
     Without these costs there is a plan that keeps the constraints, from where they can come in, or there is none.
     """
-    problem, settings = attempt.problem, attempt.settings
+    problem, settings, start = attempt.problem, attempt.settings, attempt.work.start
     if not (settings.safeguard and any(cost.weight for cost in problem.obstacle_costs)):
         return found
+
+    def without_cost(iteration: Iteration) -> Iteration:
+        return dataclasses.replace(iteration, cost=np.nan, improvement=np.nan)
+
+    def told(iteration: Iteration) -> None:
+        if callback is not None:
+            callback(without_cost(iteration))
+
     costs = [
         ObstacleCost(cost.world, radius=cost.radius, sharpness=cost.sharpness, weight=0.0)
         if isinstance(cost, ObstacleCost)
@@ -59,20 +87,19 @@ def _first_feasible(attempt: Attempt, found: Found, *, each: bool, callback: Cal
         for cost in terms_of(problem.stage_cost)
     ]
     plain = dataclasses.replace(problem, stage_cost=CostSum(tuple(costs)))
-    without = Attempt(plain, settings, dataclasses.replace(attempt.begin, prior=None), attempt.work.start)
-    without.run(settings.max_iterations, each=each)
-    kept = without.found(without.ending)
+    without = Attempt(plain, settings, dataclasses.replace(attempt.begin, prior=None), start)
+    kept = without.finish(each=each, callback=told)
+    if kept.success:
+        kept = satisfy(without, kept, each=each, callback=told)
+    before = (*found.iterations, *(without_cost(iteration) for iteration in kept.iterations))
     if not kept.success:
-        kept = without.rescue(kept.detail or kept.status.meaning, each=each)
-    kept = satisfy(without, kept, each=each) if kept.success else kept
-    if not kept.success:
-        last = [dataclasses.replace(one, cost=np.nan, improvement=np.nan) for one in kept.iterations[-1:]]
-        return kept.changed(iterations=(*found.iterations, *last), final=True)
+        return dataclasses.replace(kept, iterations=before, final=True)
     begin = dataclasses.replace(
-        attempt.begin, gain=kept.law[0].copy(), offset=kept.law[1].copy(), cost_to_go=kept.values["cost_to_go"],
-        trajectory=None, prior=None, multipliers=kept.multipliers,
+        attempt.begin, gain=kept.law[0].copy(), offset=kept.law[1].copy(), trajectory=None, prior=None,
+        cost_to_go=kept.values.get("cost_to_go"), multipliers=kept.multipliers,
     )  # fmt: skip
-    return satisfy(Attempt(problem, settings, begin, attempt.work.start), None, each=each, callback=callback)
+    again = finish(Attempt(problem, settings, begin, start), each=each, callback=callback)
+    return dataclasses.replace(again, iterations=(*before, *again.iterations))
 
 
 def _undamped(
@@ -104,9 +131,9 @@ def _undamped(
     found = attempt.found(dataclasses.replace(ending, iterations=before + done))
     detail = found.detail or ("" if found.success else f"with constraints, {lagrangian.worst()}")
     if found.success and lagrangian.missed > settings.constraint_tolerance:
-        found = found.changed(status=Status.MAX_ITERATIONS)
+        found = dataclasses.replace(found, status=Status.MAX_ITERATIONS)
         detail = f"{len(done)} iterations with constraints: {lagrangian.worst()}"
-    return found.changed(detail=detail, multipliers=lagrangian.multipliers())
+    return dataclasses.replace(found, detail=detail, multipliers=lagrangian.multipliers())
 
 
 def _damped(
@@ -145,14 +172,24 @@ def _damped(
         iterations, cost = ending.iterations, float(work.memory[interface.PLAN_COST])
         lagrangian.look(*work.plan)
         if ending.success and lagrangian.missed <= tolerance:
-            return attempt.found_damped(ending, ending.status, why).changed(multipliers=lagrangian.multipliers())
+            found = attempt.found_damped(ending, ending.status, why)
+            return dataclasses.replace(found, multipliers=lagrangian.multipliers())
         if rounds == ROUNDS or lagrangian.grown > LARGEST or lagrangian.stuck == STUCK:
             break
         lagrangian.renew()
-    status, detail = Status.INFEASIBLE, lagrangian.worst()
+    status, detail = Status.MAX_ITERATIONS, f"{why}, and {lagrangian.worst()}"
     if lagrangian.violation == 0:
-        status, detail = Status.MAX_ITERATIONS, f"{why}; the plan keeps them, but there are better ones"
-    return attempt.found_damped(ending, status, detail).changed(multipliers=lagrangian.multipliers())
+        detail = f"{why}; the plan keeps them, but there are better ones"
+    elif lagrangian.stuck == STUCK or lagrangian.grown > LARGEST:
+        status, detail = Status.INFEASIBLE, lagrangian.worst()
+    found = attempt.found_damped(ending, status, detail)
+    return dataclasses.replace(found, multipliers=lagrangian.multipliers())
+
+
+def _press(array: Array, values: Array) -> Array:
+    """max(0, lambda - mu d): what the inequalities press with; 0 where they do not act."""
+    acting = np.where(np.isinf(values), 0.0, values)
+    return np.where(np.isinf(values), 0.0, np.maximum(array[interface.HEADER :] - array[0] * acting, 0.0))
 
 
 def _missed(array: Array, values: Array) -> float:
@@ -182,7 +219,7 @@ class _Lagrangian:
         """Evaluate the constraints of a plan."""
         self._plan = states, controls
         stated = self._work.constraint_values(states, controls)
-        self.violation = max(0.0, *(-values.min(initial=np.inf) for values in stated))
+        self.violation = self._work.violation(stated)
         self._values = [values.ravel() - self._tolerance for values in stated]
         self.missed = max(self._each(_missed))
 
@@ -199,7 +236,7 @@ class _Lagrangian:
     def renew(self) -> None:
         """Take what the constraints press with for the multipliers; let the penalty grow if that helps too little."""
         for array, values in zip(self._work.multipliers, self._values, strict=True):
-            array[interface.HEADER :] = np.maximum(array[interface.HEADER :] - array[0] * values, 0.0)
+            array[interface.HEADER :] = _press(array, values)
         missed = max(-values.min(initial=np.inf) for values in self._values)
         self.stuck = self.stuck + 1 if missed > 0.9 * self._last else 0
         if missed > max(0.5 * self._last, self._tolerance):
@@ -212,7 +249,7 @@ class _Lagrangian:
         """What the augmented Lagrangian adds to the cost of the plan."""
 
         def one(array: Array, values: Array) -> float:
-            force = np.maximum(array[interface.HEADER :] - array[0] * values, 0.0)
+            force = _press(array, values)
             return float((force @ force - array[interface.HEADER :] @ array[interface.HEADER :]) / (2 * array[0]))
 
         return sum(self._each(one))
@@ -221,8 +258,7 @@ class _Lagrangian:
         """As a solution has them: with the last look taken into account."""
 
         def one(array: Array, values: Array) -> Multipliers:
-            forces = np.maximum(array[interface.HEADER :] - array[0] * values, 0.0)
-            return Multipliers(forces.reshape(self._problem.steps + 1, -1), float(array[0]))
+            return Multipliers(_press(array, values).reshape(self._problem.steps + 1, -1), float(array[0]))
 
         return tuple(self._each(one))
 

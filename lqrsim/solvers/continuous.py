@@ -279,9 +279,8 @@ def smooth_continuous(
     prior = start.fitting(problem) if isinstance(start, InitialPrior) else None
     if prior is not None and prior.obstacles:
         raise InputError(f"start: got a prior with shares of the obstacles {prior.obstacles}, want one without, here")
-    control = problem.nominal_control
-    if start is not None and not isinstance(start, InitialPrior):
-        control = check_array("start", start, (m,))
+    wanted = start.controls if isinstance(start, InitialPrior) else start
+    control = problem.nominal_control if wanted is None else check_array("start", wanted, (m,))
     state = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
     check_functions(problem, state, control)
     check_start(problem, state, control)

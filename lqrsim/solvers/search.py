@@ -53,14 +53,17 @@ def check_starts(problem: Problem, count: int | None) -> None:
     """Raises InputError if more than one start is asked for where there is nothing to go round."""
     if count is not None and count > 1 and _pull(problem) == 0:
         raise InputError(
-            f"starts: got {count}, want 1 for a problem without obstacles, a start and a goal: there is nothing to go"
-            " round; or give a start"
+            f"starts: got {count}, want 1 without an ObstacleCost, a start and a goal some way apart: there is nothing"
+            " to go round; or give a start"
         )
 
 
 def _pull(problem: Problem) -> float:
     """The weight of the paths; 0 where there is nothing to go round."""
-    if not problem.dynamics.state_coordinates.position or problem.start is None or problem.goal is None:
+    position = list(problem.dynamics.state_coordinates.position)
+    if not position or problem.start is None or problem.goal is None:
+        return 0.0
+    if np.array_equal(problem.start[position], problem.goal[position]):
         return 0.0
     costs = [cost for cost in problem.obstacle_costs if len(cost.world)]
     return max((PULL * cost.weight * cost.sharpness**2 for cost in costs), default=0.0)
@@ -73,7 +76,7 @@ def bends(way: Array, count: int) -> list[tuple[str, Array]]:
     """
     distance = float(np.linalg.norm(way))
     straight: list[tuple[str, Array]] = [("straight", np.zeros(len(way)))]
-    if count == 1 or distance == 0:
+    if count == 1:
         return straight
     ahead, others = way / distance, count - 1
     if len(way) == 2:

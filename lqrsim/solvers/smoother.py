@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from lqrsim.checks import check_functions
-from lqrsim.errors import Array, InputError, check_count
+from lqrsim.errors import InputError, check_count
 from lqrsim.problem import FixedState, Problem
 from lqrsim.results import Solution
 from lqrsim.solvers.attempt import Attempt, Found
@@ -15,13 +15,12 @@ from lqrsim.solvers.common import (
     SmootherSettings,
     assemble,
     check_callback,
-    check_outcome,
     check_problem,
     list_of,
     processors,
     solve_all,
 )
-from lqrsim.solvers.constrained import satisfy
+from lqrsim.solvers.constrained import finish
 from lqrsim.solvers.search import check_starts, choose, guides
 from lqrsim.solvers.start import StartLike, resolve
 
@@ -47,8 +46,8 @@ def smooth(
     Each iteration is a forward pass (cost-to-come), a backward pass (cost-to-go) and a rollout of the new policy; both
     passes linearise about the states of least total cost. No trajectory is needed to start from. Paper: Sec. V.
 
-    Which local optimum it ends in depends on the start. Among obstacles, unless a start is given, several are tried for
-    a few iterations each, and the most promising goes on; see `solvers/search.py`.
+    Which local optimum it ends in depends on the start. With an ObstacleCost, unless a start is given, several are
+    tried for a few iterations each, and the most promising goes on; see `solvers/search.py`.
 
     Args:
       problem: with an initial cost, the paper's soft start, or a `FixedState`, which only the dual form takes.
@@ -62,16 +61,17 @@ def smooth(
       tolerance: of the relative change of cost, and of the optimality (see `Iteration`).
       gap_tolerance: of the gap (see `Iteration`).
       max_iterations: when to give up the method; the safeguard, if it steps in, has as many again, and with constraints
-        in each round of multipliers.
+        as many for each of up to 30 rounds of multipliers.
       start: what to begin with, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
         problem's nominal control, which the paper begins with; an InitialPrior, which adds to that what draws the first
         iterations; an AffinePolicy; a Trajectory, feasible or not, about which the first pass linearises; or a Solution
         of a similar problem, whose policy and cost-to-go it takes up. Or a function of the problem that returns one.
-      starts: how many starts to try, by default 7 among obstacles; 1 is the straight way to the goal. The candidates
-        are in the solution.
+        Controls are cut off at their limits wherever they are applied.
+      starts: how many starts to try, by default 7 where there is an ObstacleCost; 1 is the straight way to the goal.
+        The candidates are in the solution.
       constraint_tolerance: how closely the problem's constraints are solved for, in their unit: for a clearance it is
         metres. So much to spare is aimed at; a plan that has converged keeps the constraints themselves.
-      threads: how many of them to run at once; by default as many as there are processors.
+      threads: how many starts to run at once; by default as many as there are processors.
       callback: called with each `Iteration` as it ends; of a search, those of the starts that are run to their end.
 
     Returns:
@@ -110,7 +110,8 @@ def smooth_many(
     """Solve many problems as `smooth` does, on several threads, without Python between the iterations.
 
     The solutions are those of `smooth`, to the last bit, whatever the number of threads; only the seconds of an
-    iteration are an average. Dynamics and costs that are plain Python take turns, and gain nothing from threads.
+    iteration are an average. With constraints there is a look at them after each iteration. Dynamics and costs that are
+    plain Python take turns, and gain nothing from threads.
 
     Args:
       problems: of one structure or of many; each structure is compiled once.
@@ -148,11 +149,17 @@ def _solve(
         names, priors = zip(*guides(problem, settings.starts), strict=True)
         begins = [resolve(prior, problem) for prior in priors]
     start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
-    control = begins[0].offset[0].copy()
-    check_functions(problem, start, control)
+    check_functions(problem, start, begins[0].offset[0].copy())
     attempts = [Attempt(problem, settings, begin, start) for begin in begins]
     chosen, *others = choose(attempts, partial(Attempt.run, each=each), threads)
-    tried = [(chosen, _finish(chosen, start, control, each=each, callback=callback))]
+
+    def finished(attempt: Attempt) -> Found:
+        if callback is not None:
+            for iteration in attempt.ending.iterations:
+                callback(iteration)
+        return finish(attempt, each=each, callback=callback)
+
+    tried = [(chosen, finished(chosen))]
     if problem.constraints:
         # Constraints can make the best way round the worst, or close it. What the others cost without them is about the
         # least that they can cost with them.
@@ -160,7 +167,7 @@ def _solve(
             best = tried[0][1]
             if best.final or (best.success and not attempt.cost < best.cost):
                 break
-            tried.append((attempt, _finish(attempt, start, control, each=each, callback=callback)))
+            tried.append((attempt, finished(attempt)))
             tried.sort(key=lambda pair: pair[1].rank)
     chosen, found = tried[0]
     results = {id(attempt): found for attempt, found in tried}
@@ -172,23 +179,6 @@ def _solve(
         iterations=found.iterations, states=found.states, controls=found.controls, law=found.law,
         candidates=tuple(candidates) if len(attempts) > 1 else (), multipliers=found.multipliers, **found.values,
     )  # fmt: skip
-
-
-def _finish(attempt: Attempt, start: Array, control: Array, *, each: bool, callback: Callback | None) -> Found:
-    """Run an attempt to its end: the method, its safeguard where that fails, and then the constraints."""
-    problem, settings = attempt.problem, attempt.settings
-    if attempt.begin.multipliers and attempt.opened():
-        return satisfy(attempt, None, each=each, callback=callback)
-    if callback is not None:
-        for iteration in attempt.ending.iterations:
-            callback(iteration)
-    attempt.run(settings.max_iterations, each=each, callback=callback)
-    ending = check_outcome(problem, attempt.ending, start, control, refuse=each)
-    lost = ending is not attempt.ending  # a function that is not finite at the start: nothing can help
-    found = attempt.found(ending)
-    if settings.safeguard and not lost and not found.success:
-        found = attempt.rescue(found.detail or found.status.meaning, each=each, callback=callback)
-    return satisfy(attempt, found, each=each, callback=callback) if problem.constraints else found
 
 
 def _check(problem: Problem, settings: SmootherSettings) -> None:

@@ -129,7 +129,10 @@ def resolve(start: StartLike, problem: Problem) -> Start:
         start = start(problem)
     if isinstance(start, InitialPrior):
         prior, controls = start.fitting(problem), resolve(start.controls, problem)
-        return replace(controls, prior=prior, summary=_summary(start, prior.weight, prior.about, controls.offset))
+        acting = np.array([prior.iterations, *prior.obstacles])
+        return replace(
+            controls, prior=prior, summary=_summary(start, prior.weight, prior.about, controls.offset, acting)
+        )
     if isinstance(start, Solution):
         policy, value = resolve(start.policy, problem), start.cost_to_go
         if value is not None:

@@ -102,7 +102,8 @@ class Workspace:
         self.core.slope_of_constraint(which, row, x, u, step, self.model[3], slope)
         return slope
 
-    def violation(self, states: Array, controls: Array) -> float:
-        """By how much the worst constraint is missed; 0 where none is."""
-        least = [values.min(initial=np.inf) for values in self.constraint_values(states, controls)]
-        return float(max(0.0, -np.min(least, initial=np.inf)))
+    @staticmethod
+    def violation(values: list[Array]) -> float:
+        """By how much the worst constraint is missed, given their values; 0 where none is, infinite if one is NaN."""
+        least = np.min([one.min(initial=np.inf) for one in values], initial=np.inf)
+        return max(0.0, float(-least)) if not np.isnan(least) else np.inf
