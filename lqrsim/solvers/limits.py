@@ -59,26 +59,26 @@ def minimize_within(g, h, x, low, high, gain, feedforward, hessian, gradient) ->
 
     Returns the decrease that the feedforward brings, and whether the control block is positive definite.
     """
-    u = stack(M)
-    decrease = minimize_control(g, h, gain, feedforward, hessian, gradient)
-    if not decrease >= 0:
-        return decrease, False
-    beyond = False
-    for i in range(M):
-        u[i] = feedforward[i]
-        for j in range(N):
-            u[i] += gain[i, j] * x[j]
-        beyond = beyond or u[i] < low[i] or u[i] > high[i]
-    if not beyond:
-        return decrease, True
-    settle(g, h, x, low, high, u)
-    outward, constant = stack(M), 0.0
-    for i in range(M):  # all of them first: what is held no longer shows in the slopes of the others
-        outward[i] = slope_at(g, h, x, u, i)
-    for i in range(M):
-        if (u[i] == low[i] and outward[i] > 0) or (u[i] == high[i] and outward[i] < 0):
-            constant += hold_cost(i, u[i], g, h)
-    decrease = minimize_control(g, h, gain, feedforward, hessian, gradient)
+    u, outward = stack(M), stack(M)
+    decrease, constant = 0.0, 0.0
+    for last in range(2):  # one call in the text, for it takes long to compile
+        decrease = minimize_control(g, h, gain, feedforward, hessian, gradient)
+        if last == 1 or not decrease >= 0:
+            break
+        beyond = False
+        for i in range(M):
+            u[i] = feedforward[i]
+            for j in range(N):
+                u[i] += gain[i, j] * x[j]
+            beyond = beyond or u[i] < low[i] or u[i] > high[i]
+        if not beyond:
+            break
+        settle(g, h, x, low, high, u)
+        for i in range(M):  # all of them first: what is held no longer shows in the slopes of the others
+            outward[i] = slope_at(g, h, x, u, i)
+        for i in range(M):
+            if (u[i] == low[i] and outward[i] > 0) or (u[i] == high[i] and outward[i] < 0):
+                constant += hold_cost(i, u[i], g, h)
     return decrease - constant, decrease >= 0
 
 
