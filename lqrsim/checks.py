@@ -1,6 +1,6 @@
 """Looks at what a user's functions return: before the first iteration, and where derivatives are in doubt."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,6 +80,27 @@ def evaluate(term: Term, dynamics: Dynamics, x: Array, u: Array) -> tuple[float,
     return float(names["derivatives"](x, u, 1, data, hessian, gradient)), gradient, hessian
 
 
+def _constraints(
+    problem: Problem,
+) -> Iterator[tuple[str, Callable[[Array, Array], float], Callable[[Array, Array], Array]]]:
+    """The constraints' numbers in plain Python: what messages call each, its value and its slope (n+m,) at (x, u)."""
+    n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
+    for inequalities in problem.inequalities:
+        names = plain_names(n, m, (), {})
+        exec(compile(inequalities.source, "<constraint>", "exec"), names)
+        for row in range(inequalities.rows):
+
+            def value(x: Array, u: Array, row: int = row, names: Any = names, data: Array = inequalities.data) -> float:
+                return float(names["value"](x, u, 1, row, data))
+
+            def slope(x: Array, u: Array, row: int = row, names: Any = names, data: Array = inequalities.data) -> Array:
+                gradient = np.zeros(n + m)
+                names["slope"](x, u, 1, row, data, gradient)
+                return gradient
+
+            yield inequalities.says(row), value, slope
+
+
 @dataclass(frozen=True)
 class DerivativeCheck:
     """How far derivatives are from central differences, where they are furthest.
@@ -119,7 +140,7 @@ class DerivativeCheck:
 def check_derivatives(
     subject: Problem | Dynamics, *, samples: int = 20, spread: float = 0.3, tolerance: float = 1e-5, seed: int = 0
 ) -> list[DerivativeCheck]:
-    """Compare derivatives with central differences: of dynamics, or of a problem's dynamics and costs.
+    """Compare derivatives with central differences: of dynamics, or of a problem's dynamics, costs and constraints.
 
     Derivatives of symbolic functions are exact, but a formula can still be singular where the robot goes; those of
     compiled and plain functions are as right as who wrote them. Costs without derivatives are left out, for theirs are
@@ -180,6 +201,10 @@ def check_derivatives(
                 curve = _differences(lambda z, t=term: evaluate(t, dynamics, z[:n], z[n:])[1], z, 6e-6)
                 compare(f"gradient of {cost}", gradient[None], slope, ("cost",), names, x, u)
                 compare(f"Hessian of {cost}", hessian, curve, names, names, x, u)
+        for name, value, slope in _constraints(subject) if isinstance(subject, Problem) else ():
+            for x, u in points:
+                differences = _differences(lambda z, f=value: np.array([f(z[:n], z[n:])]), np.concatenate([x, u]), 6e-6)
+                compare(f"slope of {name}", slope(x, u)[None], differences, ("value",), (*states, *controls), x, u)
     return [
         max(checks, key=lambda check: np.inf if np.isnan(check.error) else check.error) for checks in found.values()
     ]

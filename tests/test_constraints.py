@@ -171,3 +171,22 @@ def test_it_can_be_interrupted_before_the_constraints_and_with_them(iteration: i
     with pytest.raises(KeyboardInterrupt):
         ls.smooth(problem(weight=0.2), callback=interrupt)
     assert count == iteration
+
+
+def test_check_derivatives_finds_a_wrong_slope(differential_drive: ls.Scenario) -> None:
+    """Of a speed limit whose slope has one sign wrong; those of a clearance are right."""
+
+    class Slow(ls.Constraint):
+        def bind(self, dynamics: ls.Dynamics) -> ls.Inequalities:
+            source = (
+                "def value(x, u, t, row, data):\n    return data[0] - u[0] * u[1]\n\n\n"
+                "def slope(x, u, t, row, data, gradient):\n    gradient[3] -= u[1]\n    gradient[4] += u[0]\n"
+            )
+            return ls.Inequalities(source, np.array([0.1]), 1, lambda row: "slowness", uses_control=True)
+
+    clear = ls.Clearance(differential_drive.scene.world, radius=differential_drive.robot.radius)
+    stated = replace(differential_drive.problem, constraints=[Slow(), clear])
+    checks = ls.check_derivatives(stated, samples=3)
+    bad = [check for check in checks if not check.good]
+    assert [(check.what, check.column) for check in bad] == [("slope of slowness", "right")]
+    assert sum("clearance" in check.what for check in checks) == 15
