@@ -8,8 +8,13 @@ from importlib.metadata import PackageNotFoundError, version
 @cache
 def versions() -> dict[str, str]:
     """Name -> version of lqrsim, of the libraries that its numbers depend on, and of Python."""
-    found = {"python": platform.python_version()}
-    for name in ("lqrsim", "numpy", "numba", "mujoco"):
+    return {"python": platform.python_version()} | versions_of("lqrsim", "numpy", "numba", "mujoco")
+
+
+def versions_of(*names: str) -> dict[str, str]:
+    """Name -> version of installed distributions, or "not installed"."""
+    found = {}
+    for name in names:
         try:
             found[name] = version(name)
         except PackageNotFoundError:

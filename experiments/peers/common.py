@@ -8,7 +8,6 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ import lqrsim as ls
 from lqrsim import cache as disk
 from lqrsim.costs import terms_of
 from lqrsim.errors import Array
+from lqrsim.versions import versions_of
 
 # Rounding as in lqrsim's compiled functions: sums may be reordered, NaN and infinity stay meaningful.
 FLAGS = (
@@ -93,9 +93,9 @@ def parts(problem: ls.Problem) -> Parts:
 
 def ends(problem: ls.Problem) -> tuple[Array, Array]:
     """Start and goal (n,), in no time."""
-    (goal,) = [cost.about for cost in terms_of(problem.final_cost) if isinstance(cost, ls.QuadraticCost)]
     assert problem.start is not None
-    return problem.start, goal
+    assert problem.goal is not None
+    return problem.start, problem.goal
 
 
 def line(problem: ls.Problem) -> tuple[Array, Array]:
@@ -106,13 +106,7 @@ def line(problem: ls.Problem) -> tuple[Array, Array]:
 
 def versions() -> dict[str, str]:
     """Name -> version of the peers and of what their speed depends on."""
-    found = {}
-    for name in ("crocoddyl", "libcrocoddyl", "cmeel-eigen", "casadi"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    return versions_of("crocoddyl", "libcrocoddyl", "cmeel-eigen", "casadi")
 
 
 def compiled(what: str, sources: Sequence[Path], flags: Sequence[str], link: Sequence[str] = ()) -> Path:

@@ -1,7 +1,6 @@
 """What the sections share: what they are told, the problems, who solves them, what is recomputed, what is to be met."""
 
 import json
-import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import peers
 from reliability.common import fixed, progress
+from solver_benchmark.speed import reference_folder
 from tqdm import tqdm
 
 import lqrsim as ls
@@ -186,8 +186,7 @@ PEERS = ("FDDP, hover", "FDDP, line", "IPOPT, hover", "IPOPT, line")
 
 def best_known(config: Config) -> dict[int, list[float]]:
     """The lowest costs known, query by query, of some seeds. Raises Unavailable where nobody says."""
-    beside = Path(__file__).resolve().parents[3] / "shared" / "reference"
-    path = (config.reference or Path(os.environ.get("LQRSIM_REFERENCE") or beside)) / "best_known.json"
+    path = reference_folder(config.reference) / "best_known.json"
     if not path.is_file():
         raise peers.Unavailable("no best_known.json there: name its folder with --reference or LQRSIM_REFERENCE")
     return {int(seed): known for seed, known in json.loads(path.read_text(encoding="utf-8")).items()}

@@ -124,11 +124,15 @@ def _reference_turn(reference: ModuleType, solver: str, config: Config) -> Calla
     return run
 
 
+def reference_folder(given: Path | None) -> Path:
+    """Where the reference is: as told, or else named by the environment, or beside the repository."""
+    beside = Path(__file__).resolve().parents[3] / "shared" / "reference"
+    return given or Path(os.environ.get("LQRSIM_REFERENCE") or beside)
+
+
 def load_reference(config: Config) -> ModuleType:
     """The module reference.py, compiled and ready."""
-    beside = Path(__file__).resolve().parents[3] / "shared" / "reference"
-    folder = config.reference or Path(os.environ.get("LQRSIM_REFERENCE") or beside)
-    path = folder / "reference.py"
+    path = reference_folder(config.reference) / "reference.py"
     if not path.is_file():
         raise Unavailable("no reference.py there: name its folder with --reference or LQRSIM_REFERENCE")
     if shutil.which("g++") is None:

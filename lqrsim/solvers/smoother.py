@@ -144,10 +144,8 @@ def _solve(
     callback: Callback | None = None,
 ) -> Solution:
     """Solve; with `each`, a look after each iteration (see `iterate`)."""
-    names, begins = [""], [resolve(settings.start, problem)]
-    if settings.start is None:
-        names, priors = zip(*guides(problem, settings.starts), strict=True)
-        begins = [resolve(prior, problem) for prior in priors]
+    given = [("", settings.start)] if settings.start is not None else guides(problem, settings.starts)
+    names, begins = [name for name, _ in given], [resolve(start, problem) for _, start in given]
     start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
     check_functions(problem, start, begins[0].offset[0].copy())
     attempts = [Attempt(problem, settings, begin, start) for begin in begins]
