@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim.view.plots import _surface, plot_run
+from lqrsim.view.plots import plot_run
+from lqrsim.view.scenery import surface
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +86,7 @@ def test_surfaces_lie_on_the_obstacles(kind: str, infinite: bool) -> None:
     turn *= np.sign(np.linalg.det(turn))
     half = np.inf if infinite and kind in ("capsule", "cylinder") else 0.7
     obstacle = ls.Obstacle("it", kind, np.array([0.3, -0.2, 0.1]), turn, np.array([0.4, half, 0.5]))
-    x, y, z = _surface(obstacle, np.array([-3.0, -3.0, -3.0]), np.array([3.0, 3.0, 3.0]))
+    x, y, z = surface(obstacle, np.array([-3.0, -3.0, -3.0]), np.array([3.0, 3.0, 3.0]))
     points = np.stack([x, y, z], axis=-1)
     assert ls.World([obstacle]).distance(points) == pytest.approx(0.0, abs=1e-12)
 

@@ -4,39 +4,17 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
-from lqrsim import compiled
 from lqrsim.errors import Array, InputError
-from lqrsim.files import replacing
 from lqrsim.results import Solution, Trajectory
 from lqrsim.rollout import Rollout
-from lqrsim.world import Obstacle, World
-
-PLAN = "#222222"
-RUNS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")  # told apart by the colour-blind, and in grey by their lightness
-SOLID, MARGIN, LIMIT = "#8c96a3", "#dfe3e8", "#7a7a7a"
-# No date and no version in the files: the same data gives the same bytes.
-METADATA = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-STYLE = {
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 10,
-    "axes.titleweight": "bold",
-    "font.size": 9,
-    "legend.frameon": False,
-    "lines.linewidth": 1.4,
-    "savefig.dpi": 150,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "lqrsim",
-}
+from lqrsim.view import scenery, style
+from lqrsim.view.style import LIMIT, PLAN, RUNS
+from lqrsim.world import World
 
 
 def plot_run(
@@ -52,17 +30,9 @@ def plot_run(
     Raises:
       InputError: the rollouts are of other systems, or the file can not be written.
     """
-    path = Path(path)
-    if path.suffix.lower() not in METADATA:
-        raise InputError(f"path: got {str(path)!r}, want a name that ends in one of: {', '.join(METADATA)}")
     _check(solution, rollouts, trial)
-    with (
-        replacing(path) as unfinished,
-        matplotlib.style.context(["default", STYLE]),
-    ):
+    with style.figure(path, size=(11, 7.5)) as figure:
         strips = len(solution.policy.control_coordinates)
-        figure = Figure(figsize=(11, 7.5))
-        FigureCanvasAgg(figure)
         left = figure.add_gridspec(1, 1, left=0.05, right=0.455, bottom=0.13, top=0.95)[0]
         right = figure.add_gridspec(
             3, 1, left=0.57, right=0.92, bottom=0.13, top=0.95, hspace=0.42, height_ratios=(1, 0.7 + 0.3 * strips, 1)
@@ -79,8 +49,7 @@ def plot_run(
         _controls([figure.add_subplot(row) for row in rows], solution.trajectory, rollouts, trial)
         _cost(figure.add_subplot(right[2]), solution)
         figure.legend(*path_axes.get_legend_handles_labels(), loc="lower center", ncols=len(RUNS) + 3)
-        figure.savefig(unfinished, format=path.suffix[1:].lower(), metadata=METADATA[path.suffix.lower()])
-    return path
+    return Path(path)
 
 
 def _check(solution: Solution, rollouts: Mapping[str, Rollout], trial: int) -> None:
@@ -102,74 +71,30 @@ def _paths(solution: Solution, rollouts: Mapping[str, Rollout], trial: int) -> l
     position = list(solution.policy.state_coordinates.position)
     driven = [(name, color, "-", run.states[trial]) for (name, run), color in zip(rollouts.items(), RUNS, strict=False)]
     planned = ("planned", PLAN, "--", solution.trajectory.states)
-    return [(name, color, style, states[:, position]) for name, color, style, states in (*driven, planned)]
+    return [(name, color, line, states[:, position]) for name, color, line, states in (*driven, planned)]
 
 
 def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
-    paths, flat = _paths(solution, rollouts, trial), world.seen_by(2)
-    radius = next(iter(rollouts.values())).radius
-    places = np.vstack([*(points for *_, points in paths), *(o.position[None, :2] for o in flat.obstacles)])
-    low, high = np.nanmin(places, axis=0) - 1.5 * radius, np.nanmax(places, axis=0) + 1.5 * radius
-    if flat.obstacles:
-        # What the planner sees, whatever the obstacles are made of: the distance itself, and where it is the radius.
-        # Grid lines through the obstacles' positions keep the corners of walls sharp.
-        spacing, places = float((high - low).max()) / 130, [obstacle.position for obstacle in flat.obstacles]
-        x, y = (
-            np.unique(np.append(np.arange(low[axis], high[axis] + spacing, spacing), np.array(places)[:, axis]))
-            for axis in (0, 1)
-        )
-        distance = compiled.signed_distance(flat, np.stack(np.meshgrid(x, y), axis=-1))
-        axes.contourf(x, y, distance, levels=[-np.inf, 0, radius], colors=[SOLID, MARGIN])
-        axes.contour(x, y, distance, levels=[0], colors=["#5b6470"], linewidths=0.8)
-    for name, color, style, points in paths:
-        axes.plot(*points.T, style, color=color, label=name)
+    paths, radius = _paths(solution, rollouts, trial), next(iter(rollouts.values())).radius
+    places = np.vstack([points for *_, points in paths])
+    scenery.draw_in_plane(axes, world, *scenery.bounds(places, world.seen_by(2), 1.5 * radius), radius)
+    for name, color, line, points in paths:
+        axes.plot(*points.T, line, color=color, label=name)
     plan = paths[-1][-1]
     axes.plot(*plan[0], "o", color=PLAN, markersize=6, label="start")
     axes.plot(*plan[-1], "*", color=PLAN, markersize=10, label="end of the plan")
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x (m)", ylabel="y (m)")
     axes.set_title("path (pale: closer than the robot's radius)")
 
 
 def _path_in_space(axes: Axes3D, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
     paths = _paths(solution, rollouts, trial)
-    places = np.vstack([*(points for *_, points in paths), *(o.position[None] for o in world.obstacles)])
-    low, high = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
-    for obstacle in world.obstacles:
-        if obstacle.kind != "plane":  # they are the sides of the box that is drawn
-            x, y, z = _surface(obstacle, low, high)
-            axes.plot_surface(x, y, z, color=SOLID, alpha=0.10, linewidth=0, rstride=1, cstride=1, shade=True)
-    for name, color, style, points in paths:
-        axes.plot(*points.T, style, color=color, label=name)
+    scenery.draw_in_space(axes, world, *scenery.bounds(np.vstack([points for *_, points in paths]), world))
+    for name, color, line, points in paths:
+        axes.plot(*points.T, line, color=color, label=name)
     plan = paths[-1][-1]
     axes.plot(*plan[:1].T, "o", color=PLAN, markersize=6, label="start")
     axes.plot(*plan[-1:].T, "*", color=PLAN, markersize=10, label="end of the plan")
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set(xlabel="x (m)", ylabel="y (m)")
-    axes.zaxis.set_rotate_label(False)  # it would stand on its head
-    axes.set_zlabel("z (m)", rotation=90)
-    axes.set_box_aspect(tuple(high - low), zoom=1.0)  # pyright: ignore[reportArgumentType] a float, as its documentation says
-    axes.view_init(elev=27, azim=-110)
     axes.set_title("path")
-
-
-def _surface(obstacle: Obstacle, low: Array, high: Array) -> Array:
-    """Points (3, i, j) on an obstacle's surface; infinite ones end at the sides of the box from `low` to `high`."""
-    around, (radius, half, _) = np.linspace(0, 2 * np.pi, 25)[:, None], obstacle.size
-    if obstacle.kind == "sphere":
-        up = np.linspace(0, np.pi, 13)
-        local = np.broadcast_arrays(np.cos(around) * np.sin(up), np.sin(around) * np.sin(up), np.cos(up))
-        local = radius * np.stack(local)
-    elif obstacle.kind == "box":
-        ring = obstacle.size[:2, None] * np.array([[-1, -1, 1, 1, -1], [-1, 1, 1, -1, -1]])
-        ends = obstacle.size[2] * np.array([-1, 1])
-        local = np.stack(np.broadcast_arrays(ring[0][:, None], ring[1][:, None], ends))
-    else:
-        axis = obstacle.rotation[:, 2]
-        along = np.abs(axis) > 1e-9
-        spans = np.sort([(side - obstacle.position)[along] / axis[along] for side in (low, high)], axis=0)
-        ends = np.clip([spans[0].max(), spans[1].min()], -half, half)
-        local = np.stack(np.broadcast_arrays(radius * np.cos(around), radius * np.sin(around), ends))
-    return np.tensordot(obstacle.rotation, local, axes=1) + obstacle.position[:, None, None]
 
 
 def _tracking_error(axes: Axes, rollouts: Mapping[str, Rollout], trial: int) -> None:

@@ -1,0 +1,69 @@
+"""Obstacles in figures: in the plane as the planner sees them, in space as surfaces."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from mpl_toolkits.mplot3d import Axes3D
+
+from lqrsim import compiled
+from lqrsim.errors import Array
+from lqrsim.view.style import MARGIN, SOLID
+from lqrsim.world import Obstacle, World
+
+
+def bounds(places: Array, world: World, margin: float = 0.0) -> tuple[Array, Array]:
+    """The lowest and highest corner of what to show: places (k, 2 or 3) and the obstacles, with a margin in metres."""
+    size = places.shape[1]
+    places = np.vstack([places, *(obstacle.position[None, :size] for obstacle in world.obstacles)])
+    return np.nanmin(places, axis=0) - margin, np.nanmax(places, axis=0) + margin
+
+
+def draw_in_plane(axes: Axes, world: World, low: Array, high: Array, radius: float) -> None:
+    """Obstacles between two corners (2,), and, paler, where they are closer than the robot's radius in metres."""
+    flat = world.seen_by(2)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    if not flat.obstacles:
+        return
+    # What the planner sees, whatever the obstacles are made of: the distance itself, and where it is the radius.
+    # Grid lines through the obstacles' positions keep the corners of walls sharp.
+    spacing, places = float((high - low).max()) / 130, [obstacle.position for obstacle in flat.obstacles]
+    x, y = (
+        np.unique(np.append(np.arange(low[axis], high[axis] + spacing, spacing), np.array(places)[:, axis]))
+        for axis in (0, 1)
+    )
+    distance = compiled.signed_distance(flat, np.stack(np.meshgrid(x, y), axis=-1))
+    axes.contourf(x, y, distance, levels=[-np.inf, 0, radius], colors=[SOLID, MARGIN])
+    axes.contour(x, y, distance, levels=[0], colors=["#5b6470"], linewidths=0.8)
+
+
+def draw_in_space(axes: Axes3D, world: World, low: Array, high: Array) -> None:
+    """The surfaces of obstacles between two corners (3,), seen through."""
+    for obstacle in world.obstacles:
+        if obstacle.kind != "plane":  # they are the sides of the box that is drawn
+            x, y, z = surface(obstacle, low, high)
+            axes.plot_surface(x, y, z, color=SOLID, alpha=0.10, linewidth=0, rstride=1, cstride=1, shade=True)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set(xlabel="x (m)", ylabel="y (m)")
+    axes.zaxis.set_rotate_label(False)  # it would stand on its head
+    axes.set_zlabel("z (m)", rotation=90)
+    axes.set_box_aspect(tuple(high - low), zoom=1.0)  # pyright: ignore[reportArgumentType] a float, as its documentation says
+    axes.view_init(elev=27, azim=-110)
+
+
+def surface(obstacle: Obstacle, low: Array, high: Array) -> Array:
+    """Points (3, i, j) on an obstacle's surface; infinite ones end at the sides of the box from `low` to `high`."""
+    around, (radius, half, _) = np.linspace(0, 2 * np.pi, 25)[:, None], obstacle.size
+    if obstacle.kind == "sphere":
+        up = np.linspace(0, np.pi, 13)
+        local = np.broadcast_arrays(np.cos(around) * np.sin(up), np.sin(around) * np.sin(up), np.cos(up))
+        local = radius * np.stack(local)
+    elif obstacle.kind == "box":
+        ring = obstacle.size[:2, None] * np.array([[-1, -1, 1, 1, -1], [-1, 1, 1, -1, -1]])
+        ends = obstacle.size[2] * np.array([-1, 1])
+        local = np.stack(np.broadcast_arrays(ring[0][:, None], ring[1][:, None], ends))
+    else:
+        axis = obstacle.rotation[:, 2]
+        along = np.abs(axis) > 1e-9
+        spans = np.sort([(side - obstacle.position)[along] / axis[along] for side in (low, high)], axis=0)
+        ends = np.clip([spans[0].max(), spans[1].min()], -half, half)
+        local = np.stack(np.broadcast_arrays(radius * np.cos(around), radius * np.sin(around), ends))
+    return np.tensordot(obstacle.rotation, local, axes=1) + obstacle.position[:, None, None]

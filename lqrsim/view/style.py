@@ -1,0 +1,56 @@
+"""How figures look and how they are written: one style for all, and the same data gives the same bytes."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import matplotlib.style
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from lqrsim.errors import InputError
+from lqrsim.files import replacing
+
+PLAN = "#222222"
+RUNS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")  # told apart by the colour-blind, and in grey by their lightness
+SOLID, MARGIN, LIMIT = "#8c96a3", "#dfe3e8", "#7a7a7a"
+# No date and no version in the files: the same data gives the same bytes.
+METADATA = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+STYLE = {
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "font.size": 9,
+    "legend.frameon": False,
+    "lines.linewidth": 1.4,
+    "pdf.fonttype": 42,  # text in the file is text, which journals ask for
+    "savefig.dpi": 150,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "lqrsim",
+}
+
+
+@contextlib.contextmanager
+def figure(*paths: str | os.PathLike[str], size: tuple[float, float]) -> Iterator[Figure]:
+    """A figure, `size` inches wide and high, that is written to each path as the block ends: png, pdf or svg.
+
+    A block that fails writes nothing.
+
+    Raises:
+      InputError: a name ends otherwise, or a file can not be written.
+    """
+    places = [Path(path) for path in paths]
+    for place in places:
+        if place.suffix.lower() not in METADATA:
+            raise InputError(f"path: got {str(place)!r}, want a name that ends in one of: {', '.join(METADATA)}")
+    with contextlib.ExitStack() as stack:
+        unfinished = [(place.suffix.lower(), stack.enter_context(replacing(place))) for place in places]
+        stack.enter_context(matplotlib.style.context(["default", STYLE]))
+        drawn = Figure(figsize=size)
+        FigureCanvasAgg(drawn)
+        yield drawn
+        for suffix, file in unfinished:
+            drawn.savefig(file, format=suffix[1:], metadata=METADATA[suffix])
