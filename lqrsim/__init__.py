@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from lqrsim.files import load_solution as load_solution
     from lqrsim.files import save as save
     from lqrsim.linear_quadratic import Stage as Stage
+    from lqrsim.policy import AffinePolicy as AffinePolicy
     from lqrsim.problem import FixedState as FixedState
     from lqrsim.problem import Problem as Problem
-    from lqrsim.results import AffinePolicy as AffinePolicy
     from lqrsim.results import Candidate as Candidate
     from lqrsim.results import Iteration as Iteration
     from lqrsim.results import Multipliers as Multipliers
@@ -89,8 +89,9 @@ _HOME = {
     "errors": ["InputError"],
     "files": ["load_rollout", "load_solution", "save"],
     "linear_quadratic": ["Stage"],
+    "policy": ["AffinePolicy"],
     "problem": ["FixedState", "Problem"],
-    "results": ["AffinePolicy", "Candidate", "Iteration", "Multipliers", "Solution", "Status", "Trajectory"],
+    "results": ["Candidate", "Iteration", "Multipliers", "Solution", "Status", "Trajectory"],
     "robots.base": ["Robot"],
     "robots.differential_drive": ["DifferentialDrive"],
     "robots.quadrotor": ["Quadrotor"],

@@ -50,12 +50,14 @@ def check_number(
     above: float | None = None,
     at_least: float | None = None,
     at_most: float | None = None,
+    below: float | None = None,
 ) -> float:
     """`value` as a finite float within the stated bounds. Raises InputError otherwise."""
     wants = ["a finite number"]
     wants += [f"> {above:g}"] if above is not None else []
     wants += [f">= {at_least:g}"] if at_least is not None else []
     wants += [f"<= {at_most:g}"] if at_most is not None else []
+    wants += [f"< {below:g}"] if below is not None else []
     try:
         number = float(value)  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError):
@@ -65,6 +67,7 @@ def check_number(
         and (above is None or number > above)
         and (at_least is None or number >= at_least)
         and (at_most is None or number <= at_most)
+        and (below is None or number < below)
     )
     if not good:
         raise InputError(f"{field}: got {excerpt(value)}, want {' '.join(wants)}")

@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array
-from lqrsim.results import AffinePolicy, Candidate, Iteration, Multipliers, Solution, Status, Trajectory
+from lqrsim.policy import AffinePolicy
+from lqrsim.results import Candidate, Iteration, Multipliers, Solution, Status, Trajectory
 from lqrsim.rollout import Rollout
 from lqrsim.value_functions import Moments, Quadratic
 

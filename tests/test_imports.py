@@ -15,6 +15,7 @@ PACKAGE = Path(lqrsim.__file__).parent
 ROOMS = (
     ("errors", "versions", "solvers.interface"),
     ("coordinates", "value_functions"),
+    ("policy",),
     ("results",),
     ("rollout",),
     ("files",),
@@ -46,11 +47,12 @@ ROOMS = (
     ("simulation.plant",),
     ("simulation.disturbances",),
     ("simulation",),
+    ("stress",),
     ("scenarios",),
     ("view",),
     ("references",),
     ("console",),
-    ("demo",),
+    ("demo", "reproduce"),
     ("cli",),
 )
 

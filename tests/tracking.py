@@ -3,7 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.results import AffinePolicy, Solution, Status, Trajectory
+from lqrsim.policy import AffinePolicy
+from lqrsim.results import Solution, Status, Trajectory
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor

@@ -10,7 +10,8 @@ import numpy as np
 from mujoco import batch
 
 from lqrsim.errors import Array, InputError, check_count, check_number
-from lqrsim.results import AffinePolicy, Solution
+from lqrsim.policy import AffinePolicy
+from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant

@@ -15,8 +15,9 @@ from lqrsim.checks import check_functions, check_start, functions_of
 from lqrsim.constraints import Clearance
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number, excerpt
 from lqrsim.functions import External
+from lqrsim.policy import AffinePolicy
 from lqrsim.problem import Problem
-from lqrsim.results import AffinePolicy, Candidate, Iteration, Multipliers, Solution, Status, Trajectory
+from lqrsim.results import Candidate, Iteration, Multipliers, Solution, Status, Trajectory
 from lqrsim.solvers import interface
 from lqrsim.solvers.start import Start, StartLike, resolve
 from lqrsim.value_functions import Moments, Quadratic

@@ -9,8 +9,9 @@ from lqrsim import compiled
 from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array, check_name, check_number
 from lqrsim.linear_quadratic import Stage, check_end
+from lqrsim.policy import AffinePolicy
 from lqrsim.problem import FixedState
-from lqrsim.results import AffinePolicy, Iteration, Solution, Status, Trajectory
+from lqrsim.results import Iteration, Solution, Status, Trajectory
 from lqrsim.value_functions import Moments, Quadratic
 from lqrsim.versions import versions
 

@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_array, check_count, excerpt
+from lqrsim.policy import AffinePolicy
 from lqrsim.problem import Problem
-from lqrsim.results import AffinePolicy, Multipliers, Solution, Trajectory
+from lqrsim.results import Multipliers, Solution, Trajectory
 from lqrsim.value_functions import Quadratic
 
 

@@ -1,0 +1,101 @@
+"""How sure a number is: exact intervals of rates, paired comparisons, bootstrap intervals. SciPy does the work."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from lqrsim.errors import Array, InputError, check_count, check_number
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and the interval that it lies in with the given confidence."""
+
+    value: float
+    low: float
+    high: float
+    confidence: float = CONFIDENCE
+
+    def __format__(self, spec: str) -> str:
+        return f"{self.value:{spec}} [{self.low:{spec}}, {self.high:{spec}}]"
+
+
+def rate(successes: int, trials: int, *, confidence: float = CONFIDENCE) -> Estimate:
+    """A success rate with its exact (Clopper-Pearson) interval, which covers at least as often as it says.
+
+    Raises:
+      InputError: no trials, or more successes than trials.
+    """
+    check_count("trials", trials)
+    if check_count("successes", successes, at_least=0) > trials:
+        raise InputError(f"successes: got {successes}, want at most the {trials} trials")
+    check_number("confidence", confidence, above=0, below=1)
+    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method="exact")
+    return Estimate(successes / trials, float(interval.low), float(interval.high), confidence)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Two policies on the same trials: in how many only one of them succeeded, and the exact McNemar test.
+
+    Attributes:
+      p_value: how likely so uneven a split, or a less even one, were if neither was the better.
+    """
+
+    only_first: int
+    only_second: int
+    p_value: float
+
+
+def compare(first: npt.ArrayLike, second: npt.ArrayLike) -> Pairs:
+    """Whether each of two policies succeeded, trial by trial, (K,) each.
+
+    Raises:
+      InputError: of different lengths, or none.
+    """
+    one, other = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
+    if one.shape != other.shape or one.ndim != 1 or not len(one):
+        raise InputError(f"second: got shape {other.shape}, want that of first, {one.shape}, and at least one trial")
+    only_first, only_second = int(np.sum(one & ~other)), int(np.sum(other & ~one))
+    split = only_first + only_second
+    return Pairs(only_first, only_second, float(stats.binomtest(only_first, split).pvalue) if split else 1.0)
+
+
+def bootstrap(
+    statistic: Callable[..., Array | float],
+    *samples: npt.ArrayLike,
+    confidence: float = CONFIDENCE,
+    resamples: int = 10_000,
+    seed: int = 0,
+) -> Estimate:
+    """A statistic of samples (K,) that belong together, row by row, with its bootstrap interval (of percentiles).
+
+    Args:
+      statistic: of the samples and `axis`, as `scipy.stats.bootstrap` wants it; for example
+        `lambda a, b, axis: a.mean(axis) / b.mean(axis)`.
+      seed: of the resampling.
+
+    Raises:
+      InputError: fewer than two rows, or samples of different lengths.
+    """
+    arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
+    if not arrays or any(array.shape != arrays[0].shape or array.ndim != 1 for array in arrays) or len(arrays[0]) < 2:
+        raise InputError(f"samples: got shapes {[array.shape for array in arrays]}, want one length of at least 2")
+    check_number("confidence", confidence, above=0, below=1)
+    found = stats.bootstrap(
+        arrays,
+        statistic,
+        paired=True,
+        vectorized=True,
+        n_resamples=resamples,
+        batch=1000,  # bounds the memory
+        confidence_level=confidence,
+        method="percentile",  # BCa is undefined for medians of counts, which we have
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return Estimate(float(statistic(*arrays, axis=0)), float(found.low), float(found.high), confidence)

@@ -1,0 +1,107 @@
+"""Intervals and tests against closed forms, brute force, and how often they cover what is known."""
+
+from collections.abc import Callable
+from itertools import product
+from math import comb
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import lqrsim as ls
+from lqrsim.stress.statistics import bootstrap, compare, rate
+
+
+def at_least(successes: int, trials: int, p: float) -> float:
+    """Probability of so many successes or more, summed term by term."""
+    return sum(comb(trials, k) * p**k * (1 - p) ** (trials - k) for k in range(successes, trials + 1))
+
+
+@given(st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))), st.sampled_from([0.9, 0.95]))
+def test_exact_interval_is_where_the_tails_are_half_of_what_is_left(case: tuple[int, int], confidence: float) -> None:
+    """The definition of Clopper and Pearson; 1e-9, for the bounds are roots of it."""
+    successes, trials = case
+    found = rate(successes, trials, confidence=confidence)
+    tail = (1 - confidence) / 2
+    assert found.value == successes / trials
+    assert found.low <= found.value <= found.high
+    if successes:
+        assert at_least(successes, trials, found.low) == pytest.approx(tail, abs=1e-9)
+    else:
+        assert found.low == 0
+    if successes < trials:
+        assert 1 - at_least(successes + 1, trials, found.high) == pytest.approx(tail, abs=1e-9)
+    else:
+        assert found.high == 1
+
+
+def test_published_values() -> None:
+    """0 of 300 by the closed form 1 - 0.025^(1/300); 950 of 1,000 to the three digits of published tables."""
+    assert rate(0, 300).high == pytest.approx(1 - 0.025 ** (1 / 300), rel=1e-9)
+    assert (round(rate(950, 1000).low, 3), round(rate(950, 1000).high, 3)) == (0.935, 0.963)
+
+
+@pytest.mark.parametrize("p", [0.02, 0.3, 0.9])
+def test_exact_interval_covers(p: float) -> None:
+    """Summed over all outcomes: at least what it says, whatever the rate."""
+    trials = 40
+    covered = 0.0
+    for k in range(trials + 1):
+        found = rate(k, trials)
+        covered += (found.low <= p <= found.high) * comb(trials, k) * p**k * (1 - p) ** (trials - k)
+    assert covered >= 0.95
+
+
+def test_paired_test_is_the_sign_test_of_those_that_differ() -> None:
+    """Brute force: of all ways the pairs that differ could have gone, those that are no more likely than this one."""
+    first, second = [True] * 9 + [False] * 3 + [True] * 5, [False] * 8 + [True] * 4 + [True] * 5
+    found = compare(first, second)
+    assert (found.only_first, found.only_second) == (8, 3)
+    ways = [sum(way) for way in product((0, 1), repeat=11)]
+    assert found.p_value == pytest.approx(np.mean([comb(11, k) <= comb(11, 8) for k in ways]), rel=1e-12)
+    assert compare(first, first).p_value == 1
+
+
+def test_bootstrap_of_a_mean_is_near_the_normal_interval() -> None:
+    """At 2,000 normal draws the two agree to the noise of 10,000 resamples: 3 % of the width."""
+    sample = np.random.default_rng(1).normal(size=2000)
+    found = bootstrap(lambda x, axis: x.mean(axis), sample)
+    half = 1.96 * sample.std() / np.sqrt(len(sample))
+    assert found.low == pytest.approx(sample.mean() - half, abs=0.06 * half)
+    assert found.high == pytest.approx(sample.mean() + half, abs=0.06 * half)
+    assert found == bootstrap(lambda x, axis: x.mean(axis), sample)
+
+
+def test_bootstrap_keeps_pairs_together() -> None:
+    """The ratio of a sample to twice itself is 1/2 in each resample."""
+    sample = np.random.default_rng(1).exponential(size=50)
+    found = bootstrap(lambda x, y, axis: x.mean(axis) / y.mean(axis), sample, 2 * sample)
+    np.testing.assert_allclose((found.value, found.low, found.high), 0.5, rtol=1e-12)
+    assert f"{found:.2f}" == "0.50 [0.50, 0.50]"
+
+
+def test_bootstrap_covers() -> None:
+    """The median of 40 counts, where other intervals are not defined: of 200 studies 95 %, less three deviations."""
+    rng = np.random.default_rng(3)
+    draws = rng.exponential(size=(200, 40))
+    found = [bootstrap(lambda x, axis: np.median(x, axis), draw, resamples=500) for draw in draws]
+    covered = sum(one.low <= np.log(2) <= one.high for one in found)
+    assert covered >= 200 * 0.95 - 3 * np.sqrt(200 * 0.95 * 0.05)
+
+
+@pytest.mark.parametrize(
+    ("call", "field"),
+    [
+        (lambda: rate(3, 2), "successes: got 3"),
+        (lambda: rate(0, 0), "trials: got 0"),
+        (lambda: rate(1, 2, confidence=1.0), "confidence: got 1.0"),
+        (lambda: compare([True], [True, False]), "second: got shape"),
+        (lambda: compare([], []), "second: got shape"),
+        (lambda: bootstrap(np.mean, [1.0]), "samples: got shapes"),
+        (lambda: bootstrap(np.mean, [1.0, 2.0], [1.0]), "samples: got shapes"),
+    ],
+)
+def test_bad_input_is_named(call: Callable[[], object], field: str) -> None:
+    with pytest.raises(ls.InputError, match=field):
+        call()
