@@ -6,8 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import matplotlib.style
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
 from lqrsim.errors import InputError
 from lqrsim.files import replacing
@@ -54,3 +56,11 @@ def figure(*paths: str | os.PathLike[str], size: tuple[float, float]) -> Iterato
         yield drawn
         for suffix, file in unfinished:
             drawn.savefig(file, format=suffix[1:], metadata=METADATA[suffix])
+
+
+def plain_decades(*axes: Axis) -> None:
+    """Ticks of logarithmic axes over a few decades at 1, 2, 5, 10, 20, ..., in plain numbers."""
+    for axis in axes:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_minor_locator(NullLocator())
+        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
