@@ -218,7 +218,7 @@ def report(result: Result) -> str:
     return "\n\n".join(
         [
             "## Table I: the quadrotor's random queries",
-            picture("table_1", "Distribution of iterations and time, and both methods query by query"),
+            picture(result, "table_1", "Distribution of iterations and time, and both methods query by query"),
             table(head, rows),
             "Smoothing as a multiple of iLQR, with 95 % bootstrap intervals over the queries:",
             table(("", SOFT, FIXED, "the paper"), [*overall, *of_seeds, *optima]),

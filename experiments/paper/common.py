@@ -21,7 +21,7 @@ import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.stress.statistics import Estimate
 from lqrsim.versions import versions
-from lqrsim.view import style
+from lqrsim.view import gl, style
 
 Result = dict[str, Any]
 Item = TypeVar("Item")
@@ -98,8 +98,22 @@ def figure(config: Settings, result: Result, name: str, size: tuple[float, float
     result["figures"] += files
 
 
-def picture(name: str, caption: str) -> str:
-    """A figure in Markdown."""
+def still(config: Settings, result: Result, name: str, rollout: ls.Rollout, **options: Any) -> None:
+    """A picture of MuJoCo's as `lqrsim.still` draws it, noted in the result; without OpenGL, why there is none."""
+    try:
+        gl.bind()
+    except ls.InputError as error:
+        result.setdefault("not drawn", {})[name] = str(error)
+        return
+    size = (320, 180) if config.quick else (1280, 720)
+    ls.still(rollout, config.out / FIGURES / f"{name}.png", size=size, **options)
+    result["figures"].append(f"{name}.png")
+
+
+def picture(result: Result, name: str, caption: str) -> str:
+    """A figure in Markdown, or why there is none."""
+    if name in result.get("not drawn", {}):
+        return f"({caption}: not drawn: {result['not drawn'][name]})"
     return f"![{caption}]({FIGURES}/{name}.png)"
 
 
