@@ -31,7 +31,7 @@ import tyro
 from quality import clearances, ingredients, limits, random_worlds, resolve, starts, timing
 from quality.common import Config, Section
 
-from lqrsim.solvers.common import processors
+from lqrsim.machine import processors
 from lqrsim.versions import versions
 
 SECTIONS: dict[Section, ModuleType] = {

@@ -25,7 +25,7 @@ import tyro
 from reliability import ablation, fragile, overhead, stiff, thousand
 from reliability.common import Config, Section
 
-from lqrsim.solvers.common import processors
+from lqrsim.machine import processors
 from lqrsim.versions import versions
 
 SECTIONS: dict[Section, ModuleType] = {

@@ -33,7 +33,7 @@ from peers import Unavailable
 from solver_benchmark import peer_comparison, scaling, speed, startup, threads
 from solver_benchmark.common import Config, Section
 
-from lqrsim.solvers.common import processors
+from lqrsim.machine import processors
 from lqrsim.versions import versions
 
 SECTIONS: dict[Section, ModuleType] = {

@@ -22,6 +22,7 @@ The whole chain, for both robots, is `lqrsim demo`. Step by step, each command r
   lqrsim solve quadrotor --out runs/quadrotor
   lqrsim simulate runs/quadrotor/solution.npz --force-noise 0.1 --seed 1
   lqrsim render runs/quadrotor/rollout.npz
+The paper's results, beside what came out here: `lqrsim reproduce`.
 
 Exit codes: 0 done, 1 not converged or out of bounds, 2 bad input. The version is printed by `lqrsim --version`."""
 
@@ -255,6 +256,30 @@ class Demo:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Reproduce:
+    """Run the experiments of the paper again and say which of its statements hold, each with its figure.
+
+    Writes results.md, which sums them up, results.json, which has every number, and the figures as png and pdf. Takes
+    some minutes. Other people's solvers are compared with where the bench extra is installed.
+
+    Exits with 1 if an experiment failed; whether the paper's statements hold does not count.
+    """
+
+    results: Annotated[Positional[tuple[str, ...]], arg(metavar="RESULT ...")] = ()
+    """Which: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback. By default all."""
+    out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/paper")
+    """Where to write."""
+    quick: bool = False
+    """A small part of each, for a first look."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim.reproduce import reproduce
+
+        return reproduce(self.results, out=self.out, quick=self.quick)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Cache:
     """Show what is kept of compiled solvers and derived formulas, or remove it.
 
@@ -284,6 +309,9 @@ class Cache:
         return 0
 
 
+Command = List | Solve | Simulate | Render | Demo | Reproduce | Cache
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
@@ -299,9 +327,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         print(f"lqrsim {version('lqrsim')}")
         return 0
-    command = tyro.cli(
-        List | Solve | Simulate | Render | Demo | Cache, prog="lqrsim", description=DESCRIPTION, args=arguments
-    )
+    command = tyro.cli(Command, prog="lqrsim", description=DESCRIPTION, args=arguments)
 
     from lqrsim.errors import InputError
 

@@ -16,8 +16,13 @@ if TYPE_CHECKING:
 
 
 def say(text: str = "") -> None:
-    """Print at once, also where the output goes to a file or a pipe."""
-    print(text, flush=True)
+    """Print at once, also where the output goes to a file or a pipe, and above any progress bar."""
+    bars = sys.modules.get("tqdm")
+    if bars is None:
+        print(text, flush=True)
+    else:
+        bars.tqdm.write(text)
+        sys.stdout.flush()
 
 
 def check_output(field: str, folder: Path) -> None:

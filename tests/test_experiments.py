@@ -1,10 +1,10 @@
 """Every script in experiments/ runs, and says what it is there to say."""
 
-import importlib.util
 import json
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -18,30 +18,10 @@ FOLDER = Path(__file__).parent.parent / "experiments"
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if "__main__" in path.read_text(encoding="utf-8"))
 
 
-def load(name: str) -> ModuleType:
-    specification = importlib.util.spec_from_file_location(f"experiments.{name}", FOLDER / f"{name}.py")
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules[specification.name] = module
-    specification.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_scripts_explain_themselves(name: str) -> None:
     done = subprocess.run([sys.executable, FOLDER / f"{name}.py", "--help"], capture_output=True, text=True, check=True)
     assert "--quick" in done.stdout
-
-
-def test_smoothing_takes_under_half_of_the_iterations_of_ilqr() -> None:
-    """The paper's claim, on the first 20 queries, at the paper's stop test, with the paper's soft start."""
-    script = load("iterations")
-    result = script.main(script.Config(quick=True))
-    for name in ("smooth", "ilqr"):
-        assert result[name]["status"] == ["COST_CONVERGED"] * 20
-    assert np.mean(result["smooth"]["iterations"]) < 0.5 * np.mean(result["ilqr"]["iterations"])
-    assert "smooth" in script.report(result)
 
 
 def benchmark(*arguments: str) -> dict[str, Any]:
@@ -112,11 +92,7 @@ def test_benchmark_of_scaling_threads_and_startup(results: dict[str, Any]) -> No
 
 
 def test_benchmark_says_what_it_skips(tmp_path: Path) -> None:
-    sys.path.insert(0, str(FOLDER))  # it imports its neighbours
-    try:
-        script = load("benchmark_solver")
-    finally:
-        sys.path.remove(str(FOLDER))
+    script = import_module("benchmark_solver")
     with pytest.raises(script.Unavailable, match="name its folder with --reference"):
         script.speed.load_reference(script.Config(reference=tmp_path))
     assert script.report({"peers": {"skipped": "no such thing"}}) == "peers: skipped: no such thing"
@@ -124,13 +100,9 @@ def test_benchmark_says_what_it_skips(tmp_path: Path) -> None:
 
 def test_benchmark_of_reliability() -> None:
     """On few problems: bad advice breaks the bare method and not the guarded one, which changes nothing elsewhere."""
-    sys.path.insert(0, str(FOLDER))  # it imports its neighbours
-    try:
-        script = load("benchmark_reliability")
-        # What else there is of random problems has tests of its own.
-        result = script.main(script.Config(quick=True, kinds=("linear_2_1", "drive")))
-    finally:
-        sys.path.remove(str(FOLDER))
+    script = import_module("benchmark_reliability")
+    # What else there is of random problems has tests of its own.
+    result = script.main(script.Config(quick=True, kinds=("linear_2_1", "drive")))
     assert result["versions"]["lqrsim"]
     for found in result["stiff"].values():
         assert found["status"] == ["CONVERGED"] * 8
@@ -153,11 +125,7 @@ def test_benchmark_of_reliability() -> None:
 
 @pytest.fixture(scope="module")
 def quality() -> ModuleType:
-    sys.path.insert(0, str(FOLDER))  # it imports its neighbours
-    try:
-        return load("benchmark_quality")
-    finally:
-        sys.path.remove(str(FOLDER))
+    return import_module("benchmark_quality")
 
 
 def test_benchmark_of_quality(quality: ModuleType, tmp_path: Path) -> None:

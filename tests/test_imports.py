@@ -13,7 +13,7 @@ PACKAGE = Path(lqrsim.__file__).parent
 
 # A module may import those above it, and those of its own room; nothing else of the package.
 ROOMS = (
-    ("errors", "versions", "solvers.interface"),
+    ("errors", "machine", "versions", "solvers.interface"),
     ("coordinates", "value_functions"),
     ("policy",),
     ("results",),
@@ -65,7 +65,7 @@ ALLOWED = {
     "llvmlite": ("pointers",),
     "sympy": ("tracing", "dynamics", "rotations", "robots", "costs"),
     "tyro": ("cli",),
-    "tqdm": ("console",),
+    "tqdm": ("console", "reproduce"),
 }
 
 MODULES = {

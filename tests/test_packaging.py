@@ -39,13 +39,15 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_wheel_holds_the_package_and_the_models(built: Path) -> None:
+def test_wheel_holds_the_package_the_models_and_the_experiments(built: Path) -> None:
     (wheel,) = built.glob("*.whl")
     inside = set(zipfile.ZipFile(wheel).namelist())
     sources = {path.relative_to(ROOT).as_posix() for path in (ROOT / "lqrsim").rglob("*.py")}
     models = {f"lqrsim/models/{path.name}" for path in (ROOT / "models").glob("*.xml")}
+    scripts = {f"lqrsim/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "experiments").rglob("*.py")}
     assert models
-    assert sources | models | {"lqrsim/py.typed"} <= inside
+    assert scripts
+    assert sources | models | scripts | {"lqrsim/py.typed"} <= inside
     assert {name.split("/")[0] for name in inside} == {"lqrsim", f"{'-'.join(wheel.name.split('-')[:2])}.dist-info"}
 
 
@@ -64,4 +66,6 @@ def test_wheel_solves_from_an_empty_environment(built: Path, tmp_path: Path) -> 
     pip = [sys.executable, "-m", "pip", "--python", binaries / "python", "install", "--quiet", "--no-compile"]
     run(*pip, wheel, cwd=tmp_path)
     run(binaries / "python", "-I", "-c", SOLVE, cwd=tmp_path)
+    run(binaries / "lqrsim", "reproduce", "--quick", "figure_3", cwd=tmp_path)
+    assert (tmp_path / "runs" / "paper" / "figures" / "figure_3.pdf").stat().st_size > 0
     assert run(binaries / "lqrsim", "--version", cwd=tmp_path).split() == ["lqrsim", wheel.name.split("-")[1]]

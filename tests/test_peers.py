@@ -1,9 +1,7 @@
 """Other people's solvers are told the problem that lqrsim solves. Needs the `bench` extra, and Crocoddyl g++ too."""
 
 import importlib
-import sys
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -15,17 +13,12 @@ from lqrsim.costs import terms_of
 from lqrsim.errors import Array
 from lqrsim.world import ROW, signed_distance_derivatives
 
-EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 ROBOTS = ("differential_drive", "quadrotor")
 
 
 @pytest.fixture(scope="module")
 def peers() -> ModuleType:
-    sys.path.insert(0, str(EXPERIMENTS))
-    try:
-        return importlib.import_module("peers")
-    finally:
-        sys.path.remove(str(EXPERIMENTS))
+    return importlib.import_module("peers")
 
 
 def crocoddyl(peers: ModuleType, problem: ls.Problem) -> Any:

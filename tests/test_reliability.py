@@ -4,11 +4,8 @@ Claims are held against kkt.py, which shares nothing with the solvers.
 """
 
 import importlib
-import sys
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import ModuleType
 
 import kkt
@@ -20,8 +17,6 @@ import lqrsim as ls
 from lqrsim.costs import terms_of
 from lqrsim.errors import Array
 from lqrsim.results import Status
-
-EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 
 # Eleven kinds of problems are compiled where nothing is cached, some 10 seconds each, before the first test ends.
 pytestmark = pytest.mark.timeout(900)
@@ -55,12 +50,8 @@ def rate_of(kind: str) -> kkt.Rate | None:
 
 
 @pytest.fixture(scope="module")
-def problems() -> Iterator[ModuleType]:
-    sys.path.insert(0, str(EXPERIMENTS))
-    try:
-        yield importlib.import_module("reliability.problems")
-    finally:
-        sys.path.remove(str(EXPERIMENTS))
+def problems() -> ModuleType:
+    return importlib.import_module("reliability.problems")
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from typing import Any
 from peers import Unavailable
 
 import lqrsim as ls
-from lqrsim.solvers.common import processors
+from lqrsim.machine import processors
 from solver_benchmark.common import MANY, Config, judge, make_problems, median, take_turns
 
 

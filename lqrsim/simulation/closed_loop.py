@@ -2,7 +2,6 @@
 
 import contextlib
 import hashlib
-import os
 from collections.abc import Callable, Iterator, Sequence
 
 import mujoco
@@ -10,6 +9,7 @@ import numpy as np
 from mujoco import batch
 
 from lqrsim.errors import Array, InputError, check_count, check_number
+from lqrsim.machine import processors
 from lqrsim.policy import AffinePolicy
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
@@ -140,7 +140,7 @@ class _Simulation:
 
     def __init__(self, plant: Plant, trials: int, substeps: int) -> None:
         self.plant = plant
-        self.batch = batch.Batch(plant.model, trials, min(trials, _cores()))
+        self.batch = batch.Batch(plant.model, trials, min(trials, processors()))
         self._sensors = self.batch.bind("sensordata")
         # The longest equal parts of the period that are short enough to draw.
         parts = [part for part in range(1, substeps + 1) if substeps % part == 0]
@@ -228,9 +228,3 @@ def _digest(policy: AffinePolicy) -> str:
     for array in (policy.gain, policy.offset, policy.nominal, np.float64(policy.dt)):
         hasher.update(np.ascontiguousarray(array).tobytes())
     return hasher.hexdigest()[:16]
-
-
-def _cores() -> int:
-    """Cores that this process may use, where the system says so."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1

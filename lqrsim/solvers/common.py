@@ -1,7 +1,6 @@
 """What the solvers share: settings, the iterations with a look after each, and putting the answer together."""
 
 import contextlib
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -15,6 +14,7 @@ from lqrsim.checks import check_functions, check_start, functions_of
 from lqrsim.constraints import Clearance
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number, excerpt
 from lqrsim.functions import External
+from lqrsim.machine import processors
 from lqrsim.policy import AffinePolicy
 from lqrsim.problem import Problem
 from lqrsim.results import Candidate, Iteration, Multipliers, Solution, Status, Trajectory
@@ -258,12 +258,6 @@ def check_problem(problem: Problem) -> None:
     """Raises InputError unless it is a problem."""
     if not isinstance(problem, Problem):
         raise InputError(f"problem: got {type(problem).__name__}, want a Problem")
-
-
-def processors() -> int:
-    """How many processors this process may run on."""
-    affinity = getattr(os, "sched_getaffinity", None)  # not on macOS and Windows
-    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
 def check_outcome(problem: Problem, ending: Ending, x: Array, u: Array, *, refuse: bool) -> Ending:

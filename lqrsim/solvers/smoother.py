@@ -7,6 +7,7 @@ import numpy as np
 
 from lqrsim.checks import check_functions
 from lqrsim.errors import InputError, check_count
+from lqrsim.machine import processors
 from lqrsim.problem import FixedState, Problem
 from lqrsim.results import Solution
 from lqrsim.solvers.attempt import Attempt, Found
@@ -17,7 +18,6 @@ from lqrsim.solvers.common import (
     check_callback,
     check_problem,
     list_of,
-    processors,
     solve_all,
 )
 from lqrsim.solvers.constrained import finish
