@@ -73,11 +73,10 @@ def take_turns(
     """What each contestant returned, by job and round; each job is done by all in turn, and each has its turn first."""
     taken: dict[str, list[list[Taken]]] = {who: [[] for _ in jobs] for who in contestants}
     order = list(contestants)
-    for _ in progress(range(rounds), name):
-        for place, job in enumerate(jobs):
-            for who in order:
-                taken[who][place].append(contestants[who](job))
-            order = order[1:] + order[:1]
+    for place, job in progress(rounds * list(enumerate(jobs)), name):
+        for who in order:
+            taken[who][place].append(contestants[who](job))
+        order = order[1:] + order[:1]
     return taken
 
 
