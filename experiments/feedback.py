@@ -197,8 +197,11 @@ def draw_runs(axes: Axes, rollout: ls.Rollout, count: int, name: str) -> None:
 def report(result: Result) -> str:
     parts = [
         "## Feedback against open loop",
-        picture("feedback", "Distance from the plan over time, and success against the strength of the disturbances"),
         picture(
+            result, "feedback", "Distance from the plan over time, and success against the strength of the disturbances"
+        ),
+        picture(
+            result,
             "feedback_paths",
             "The first trials with feedback and without, disturbances as in the demo, each up to its first collision",
         ),

@@ -205,7 +205,9 @@ def report(result: Result) -> str:
     return "\n\n".join(
         [
             "## Against the state of the art",
-            picture("state_of_the_art", "Cost above the cheapest plan by solver, and mean cost against median time"),
+            picture(
+                result, "state_of_the_art", "Cost above the cheapest plan by solver, and mean cost against median time"
+            ),
             table(head, rows),
             f"{result['queries']} queries; costs, and clearances at the steps, are recomputed from the controls, from"
             " exactly the start. The cheapest plan of a query is the cheapest of all contestants'. Iterations of a"
