@@ -139,6 +139,18 @@ def progress(what: Iterable[Item], name: str) -> Iterable[Item]:
     return tqdm(what, desc=name, leave=False, delay=2.0, disable=None)
 
 
+@contextmanager
+def counting(name: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar for what says itself how many are done of how many, if it takes long."""
+    with tqdm(desc=name, leave=False, delay=2.0, disable=None) as bar:
+
+        def told(done: int, of: int) -> None:
+            bar.total = of
+            bar.update(done - bar.n)
+
+        yield told
+
+
 def as_in_the_paper(problem: ls.Problem) -> ls.Problem:
     """Without limits of the controls, which the paper does not have."""
     return replace(problem, control_limits=FREE)
@@ -153,3 +165,8 @@ def fixed(problem: ls.Problem) -> ls.Problem:
 def numbers(values: Iterable[float] | Array, digits: int = 6) -> list[float | None]:
     """Numbers as JSON has them, to so many digits; None for what is not finite."""
     return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in map(float, values)]
+
+
+def shown(value: float | None, spec: str) -> str:
+    """Such a number in words."""
+    return "-" if value is None else f"{value:{spec}}"
