@@ -17,22 +17,35 @@ Rate = Callable[[Sequence[float], Sequence[float], dict[str, float]], list[float
 
 def rollout(problem: ls.Problem, controls: Array) -> Array:
     """States (T+1, n) that the controls (T, m) lead to: one Runge-Kutta step each."""
+    step = _step(problem)
+    states = [np.array(parts(problem).start, dtype=float)]
+    for control in np.asarray(controls).tolist():
+        states.append(step(states[-1], control))
+    return np.array(states)
+
+
+def ahead(problem: ls.Problem, states: Array, controls: Array) -> Array:
+    """Where one step takes each of the states (T, n) under its control (T, m)."""
+    step = _step(problem)
+    return np.array([step(x, control) for x, control in zip(states, np.asarray(controls).tolist(), strict=True)])
+
+
+def _step(problem: ls.Problem) -> Callable[[Array, Sequence[float]], Array]:
+    """A Runge-Kutta step of the problem's dynamics, from a state and a control."""
     told, h = parts(problem), problem.dt
     rate: Rate = _quadrotor if told.robot == ls.Quadrotor.name else _drive
-    x = np.array(told.start, dtype=float)
-    states = [x]
-    for control in np.asarray(controls).tolist():
 
-        def slope(z: Array, u: Sequence[float] = control) -> Array:
-            return np.array(rate(z.tolist(), u, told.parameters))
+    def step(x: Array, control: Sequence[float]) -> Array:
+        def slope(z: Array) -> Array:
+            return np.array(rate(z.tolist(), control, told.parameters))
 
         first = slope(x)
         second = slope(x + h / 2 * first)
         third = slope(x + h / 2 * second)
         fourth = slope(x + h * third)
-        x = x + h / 6 * (first + 2 * second + 2 * third + fourth)
-        states.append(x)
-    return np.array(states)
+        return x + h / 6 * (first + 2 * second + 2 * third + fourth)
+
+    return step
 
 
 def cost_of(problem: ls.Problem, controls: Array) -> float:

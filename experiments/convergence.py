@@ -1,0 +1,373 @@
+"""How fast smoothing and iLQR converge, and what holds where they have: Secs. V-C and VI-B.
+
+    python experiments/convergence.py            # 100 of the quadrotor's queries, and the differential drive
+    python experiments/convergence.py --quick    # 8 queries
+
+Begun as in the paper (soft start, its priors, no limits of the controls; iLQR from hover), the iterations go on until
+rounding stops them. Smoothing is without its safeguard, which would take over where costs no longer change. Everything
+is done again with an obstacle weight of zero.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from paper.common import (
+    Result,
+    Settings,
+    Statement,
+    as_in_the_paper,
+    between,
+    figure,
+    interval,
+    numbers,
+    opening,
+    picture,
+    progress,
+    run,
+    table,
+)
+from paper.convergence_figures import ABOVE, EVERY, draw_ellipsoids, draw_iterations, draw_order
+from paper.curvature import discarded
+from paper.rates import CLOSE, FEWEST, ROUNDING, rate
+from peers import truth
+
+import lqrsim as ls
+from lqrsim.costs import CostSum, terms_of
+from lqrsim.stress.statistics import bootstrap
+
+SMOOTHING, ILQR = "smoothing", "iLQR"
+WITH, WITHOUT = "with obstacles", "without"
+PAPER_STOP, TIGHT = 1e-4, 1e-15  # of the relative change of cost; the latter is less than rounding leaves of it
+STOPPED, RUN_ON = "at the paper's stop", "run on"
+STOPS = {STOPPED: PAPER_STOP, RUN_ON: TIGHT}
+MOST = 2000  # iterations
+SHOWN = (1, 2, 4, 8, 16, 32)  # iterations whose gap is told
+
+CONSTANT, SECOND = (0.8, 1.3), 1.5  # orders that count as a constant factor; as second order, from there on
+FEW = 0.05  # share of queries that does not count
+FALLS = 10  # times, that the factor falls without obstacles if they explain it
+EXACT = 1e-6  # in SI units: what counts as satisfying the dynamics
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(Settings):
+    queries: int = 100
+    """How many random starts and goals."""
+    seed: int = 0
+    """Of the queries."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One query: logs by case and solver, the factor of what is thrown away by solver, consistency by form and stop."""
+
+    logs: dict[str, dict[str, list[ls.Iteration]]]
+    discarded: dict[str, float]
+    consistency: dict[str, dict[str, dict[str, float]]]
+
+
+def main(config: Config) -> Result:
+    count = min(config.queries, 8) if config.quick else config.queries
+    robots = {
+        "quadrotor": [ls.scenarios.quadrotor(query=query, seed=config.seed) for query in range(count)],
+        "drive": [ls.scenarios.differential_drive()],
+    }
+    measured = {robot: [measure(one) for one in progress(them, robot)] for robot, them in robots.items()}
+    result = opening(config)
+    result["rates"] = {
+        robot: {case: {solver: rates(found, case, solver) for solver in (SMOOTHING, ILQR)} for case in (WITH, WITHOUT)}
+        for robot, found in measured.items()
+    }
+    result["discarded"] = {
+        solver: explained(
+            [one.discarded[solver] for one in measured["quadrotor"]],
+            result["rates"]["quadrotor"][WITH][solver]["factor"],
+        )
+        for solver in (SMOOTHING, ILQR)
+    }
+    result["gap"] = gaps([one.logs[WITH][SMOOTHING] for one in measured["quadrotor"]])
+    result["consistency"] = {
+        robot: {
+            form: {
+                stop: {
+                    what: numbers((one.consistency[form][stop][what] for one in found), 4)
+                    for what in ("residual", "controls")
+                }
+                for stop in STOPS
+            }
+            for form in ("dual", "primal")
+        }
+        for robot, found in measured.items()
+    }
+    logs = {robot: [one.logs for one in found] for robot, found in measured.items()}
+    with figure(config, result, "convergence", (11, 3.8)) as drawn:
+        draw_iterations(drawn, logs, WITH, (SMOOTHING, ILQR), PAPER_STOP)
+    with figure(config, result, "convergence_order", (11, 3.9)) as drawn:
+        draw_order(
+            drawn,
+            [one.logs for one in measured["quadrotor"]],
+            (WITH, WITHOUT),
+            result["rates"]["quadrotor"][WITH],
+            result["discarded"],
+        )
+    with figure(config, result, "ellipsoids", (8.6, 5.6)) as drawn:
+        draw_ellipsoids(drawn, robots["drive"][0], early_and_late(robots["drive"][0]))
+    return result
+
+
+def measure(scenario: ls.Scenario) -> Measured:
+    problem = as_in_the_paper(scenario.problem)
+    solved = {
+        case: {
+            SMOOTHING: smooth(scenario, told),
+            ILQR: ls.ilqr(told, stop="cost", tolerance=TIGHT, max_iterations=MOST),
+        }
+        for case, told in ((WITH, problem), (WITHOUT, without_obstacles(problem)))
+    }
+    return Measured(
+        logs={case: {solver: list(one.iterations) for solver, one in both.items()} for case, both in solved.items()},
+        discarded={
+            solver: discarded(problem, one.trajectory, fixed=solver == ILQR) for solver, one in solved[WITH].items()
+        },
+        consistency={
+            form: {
+                stop: consistency(problem, smooth(scenario, problem, form=form, tolerance=tolerance))
+                for stop, tolerance in STOPS.items()
+            }
+            for form in ("dual", "primal")
+        },
+    )
+
+
+def smooth(
+    scenario: ls.Scenario, problem: ls.Problem, *, tolerance: float = TIGHT, form: str = "dual", most: int = MOST
+) -> ls.Solution:
+    return ls.smooth(
+        problem, form=form, start=scenario.paper_start, stop="cost", tolerance=tolerance, max_iterations=most,
+        safeguard=False,
+    )  # fmt: skip
+
+
+def early_and_late(scenario: ls.Scenario) -> dict[str, ls.Solution]:
+    """After as few iterations as have something to show, and at the end."""
+    problem = as_in_the_paper(scenario.problem)
+    return {f"after {few} iteration{'s' * (few > 1)}": smooth(scenario, problem, most=few) for few in (1,)} | {
+        "run on": smooth(scenario, problem)
+    }
+
+
+def without_obstacles(problem: ls.Problem) -> ls.Problem:
+    """The same with an obstacle weight of zero, which compiles nothing."""
+    terms = [
+        ls.ObstacleCost(term.world, radius=term.radius, sharpness=term.sharpness, weight=0.0)
+        if isinstance(term, ls.ObstacleCost)
+        else term
+        for term in terms_of(problem.stage_cost)
+    ]
+    return replace(problem, stage_cost=CostSum(tuple(terms)))
+
+
+def consistency(problem: ls.Problem, solution: ls.Solution) -> dict[str, float]:
+    """By how much, at most, minimal-total-cost states miss the true dynamics, and the two policies each other."""
+    x_hat, inverse = solution.total_cost.minimizer(), solution.inverse_policy
+    assert inverse is not None
+    controls = np.array([solution.policy.control(x, t) for t, x in enumerate(x_hat[:-1])])
+    backwards = np.array([inverse.control(x, t) for t, x in enumerate(x_hat[1:])])
+    missed = truth.ahead(problem, x_hat[:-1], controls) - x_hat[1:]
+    return {"residual": float(np.abs(missed).max()), "controls": float(np.abs(controls - backwards).max())}
+
+
+def rates(found: Sequence[Measured], case: str, solver: str) -> dict[str, Any]:
+    """The rate of each query, and the medians."""
+    logs = [one.logs[case][solver] for one in found]
+    each = [rate(np.array([iteration.cost for iteration in log])) for log in logs]
+    orders = np.array([one.order for one in each])
+    return {
+        "iterations": [len(log) for log in logs],
+        "order": numbers(orders),
+        "factor": numbers(one.factor for one in each),
+        "determined": int(np.isfinite(orders).sum()),
+        "second": int((orders > SECOND).sum()),
+        "medians": {what: middle([getattr(one, what) for one in each]) for what in ("order", "factor", "spread")},
+    }
+
+
+def middle(values: Iterable[float]) -> list[float]:
+    """The median of those that are known, with its interval where there are several; empty if none is."""
+    known = [value for value in values if np.isfinite(value)]
+    return interval(bootstrap(np.median, known)) if len(known) > 1 else known
+
+
+def explained(factors: Sequence[float], measured: Sequence[float | None]) -> dict[str, Any]:
+    """What is thrown away, by itself, against what was measured, and how many steps of Gauss-Newton an iteration is."""
+    known = np.array([np.nan if factor is None else factor for factor in measured])
+    with np.errstate(divide="ignore"):
+        worth = np.log(known) / np.log(factors)
+    return {"factor": numbers(factors), "median": middle(factors), "worth": middle(worth)}
+
+
+def gaps(logs: Sequence[Sequence[ls.Iteration]]) -> dict[str, Any]:
+    """Of smoothing: the gap at some iterations (the last one of those that ended before), and how it goes with cost."""
+    at = [[log[min(number, len(log)) - 1].gap for log in logs] for number in SHOWN]
+    slopes, stopped = [], []
+    for log in logs:
+        gap, improvement = (np.array([getattr(one, what) for one in log]) for what in ("gap", "improvement"))
+        stopped.append(gap[np.flatnonzero(np.abs(improvement) < PAPER_STOP)[0]])
+        small = (improvement < 1e-3) & (improvement > 1e-11)
+        slopes.append(np.polyfit(np.log(improvement[small]), np.log(gap[small]), 1)[0] if small.sum() > 2 else np.nan)
+    return {
+        "iterations": {
+            str(number): numbers(np.percentile(them, (5, 50, 95)), 3) for number, them in zip(SHOWN, at, strict=True)
+        },
+        STOPPED: numbers(np.percentile(stopped, (5, 50, 95)), 3),
+        "slope": middle(slopes),
+    }
+
+
+def said(estimate: Sequence[float], spec: str = ".3f") -> str:
+    if not estimate:
+        return "-"
+    return between(estimate, spec) if len(estimate) == 3 else f"{estimate[0]:{spec}}"
+
+
+def worst(result: Result, stop: str, what: str, forms: Iterable[str] = ("dual", "primal")) -> float:
+    """Of all queries of both robots; infinite if one is not known."""
+    values = [value for robot in result["consistency"].values() for form in forms for value in robot[form][stop][what]]
+    return float("inf") if None in values else max(values)
+
+
+def report(result: Result) -> str:
+    rows = []
+    for robot, cases in result["rates"].items():
+        for case, solvers in cases.items():
+            for solver, found in solvers.items():
+                medians, iterations = found["medians"], f"{np.median(found['iterations']):.0f}"
+                determined = f"{found['determined']}/{len(found['order'])}"
+                rates_said = said(medians["order"]), said(medians["factor"]), said(medians["spread"], ".2f")
+                rows.append([f"{robot}, {case}, {solver}", iterations, determined, *rates_said, found["second"]])
+    head = ("", "iterations", "determined", "order", "factor", "spread of the factor", f"order over {SECOND}")
+    origin = [
+        [
+            solver,
+            said(result["rates"]["quadrotor"][WITH][solver]["medians"]["factor"]),
+            said(one["median"]),
+            said(one["worth"], ".2f"),
+        ]
+        for solver, one in result["discarded"].items()
+    ]
+    gap = result["gap"]
+    opened = [
+        [f"iteration {number}", *(f"{value:.1e}" for value in them)] for number, them in gap["iterations"].items()
+    ]
+    opened.append([STOPPED, *(f"{value:.1e}" for value in gap[STOPPED])])
+    kept = [
+        [f"{robot}, {form} form, {stop}", *(f"{np.max(found[stop][what]):.1e}" for what in ("residual", "controls"))]
+        for robot, forms in result["consistency"].items()
+        for form, found in forms.items()
+        for stop in STOPS
+    ]
+    return "\n\n".join(
+        [
+            "## Convergence",
+            picture("convergence", "Size of the relative improvement by iteration, a line a query, and the gap"),
+            "Iterations until rounding stops them. The order is the slope of log error against the log error before,"
+            f" by least squares over the tail (relative errors in cost from {CLOSE:g} down to {ROUNDING:g}, or to a"
+            " hundred times the last change, if that is more). The factor is what an iteration multiplies the error by"
+            " at the end of the tail; its spread is the 90th over the 10th percentile of the factors in a tail. Medians"
+            f" over queries, 95 % bootstrap intervals, of those that are determined: by {FEWEST} errors or more.",
+            table(head, rows),
+            picture("convergence_order", "Each error against the one before, and what explains the factors"),
+            "The curvature that the projection of the obstacle term throws away tells, at the optimum, what a step of"
+            " Gauss-Newton would multiply the error by if everything else were exact. How many such steps an iteration"
+            " is worth is the ratio of the logarithms:",
+            table(("quadrotor", "factor, measured", "of what is thrown away", "steps an iteration is worth"), origin),
+            "The gap of smoothing is the largest relative difference between minimal-total-cost states and rollout; in"
+            f" the tail it goes as the improvement to the power of {said(gap['slope'])}:",
+            table(("gap, quadrotor", "5 %", "median", "95 %"), opened),
+            "By how much, at most over all queries and steps and in SI units, minimal-total-cost states miss one step"
+            " of the true dynamics, integrated independently of the package, and the two policies differ there:",
+            table(("", "dynamics", "policies"), kept),
+            picture(
+                "ellipsoids",
+                f"Differential drive, every {EVERY:g} s: where cost-to-go, cost-to-come and total cost are {ABOVE:g}"
+                " above their least, whatever the heading, and, marked, where each is least",
+            ),
+        ]
+    )
+
+
+def statements(result: Result) -> list[Statement]:
+    found = result["rates"]["quadrotor"]
+    medians = {case: {solver: one["medians"] for solver, one in found[case].items()} for case in found}
+    constant, orders = (
+        medians[WITH][SMOOTHING],
+        {case: {who: one["order"] for who, one in both.items()} for case, both in medians.items()},
+    )
+    second = {solver: (one["second"], one["determined"]) for solver, one in found[WITH].items()}
+    falls = {
+        who: medians[WITH][who]["factor"][0] / medians[WITHOUT][who]["factor"][0]
+        if medians[WITHOUT][who]["factor"]
+        else None
+        for who in (SMOOTHING, ILQR)
+    }
+    by_order = {who: bool(orders[WITHOUT][who]) and orders[WITHOUT][who][0] >= SECOND for who in falls}
+    by_factor = {who: fall is not None and fall >= FALLS for who, fall in falls.items()}
+    missed, apart = ({stop: worst(result, stop, what) for stop in STOPS} for what in ("residual", "controls"))
+    return [
+        Statement(
+            where="Sec. VI-B",
+            paper="the relative improvement typically declined by about a constant factor with each iteration",
+            test=f"the median order of smoothing is from {CONSTANT[0]} to {CONSTANT[1]}",
+            ours=f"order {said(constant['order'])}, factor {said(constant['factor'])}",
+            holds=CONSTANT[0] <= constant["order"][0] <= CONSTANT[1],
+            figure="convergence",
+        ),
+        Statement(
+            where="Sec. VI-B",
+            paper="a second-order convergence rate was not observed, for neither iLQR nor smoothing",
+            test=f"an order over {SECOND} in at most {100 * FEW:g} % of the queries of either",
+            ours=", ".join(f"{who} {some} of {of}" for who, (some, of) in second.items()),
+            holds=all(some <= FEW * of for some, of in second.values()),
+            figure="convergence_order",
+        ),
+        Statement(
+            where="Sec. VI-B",
+            paper="that is likely due to how the obstacle term is quadratized: negative curvature is thrown away",
+            test=f"without obstacles, the median order of both is at least {SECOND} or the factor falls {FALLS} times",
+            ours="; ".join(
+                f"{who}: order {said(orders[WITHOUT][who])}, the factor falls "
+                + ("by an unknown amount" if fall is None else f"{fall:.0f} times")
+                for who, fall in falls.items()
+            ),
+            holds=all(by_order[who] or by_factor[who] for who in falls),
+            figure="convergence_order",
+        ),
+        Statement(
+            where="Sec. V-C",
+            paper="the iterations are Gauss-Newton updates and should exhibit a rate approaching second order",
+            test=f"the median order of smoothing is at least {SECOND}, with obstacles or without",
+            ours=", ".join(f"{case} {said(orders[case][SMOOTHING])}" for case in orders),
+            holds=any(bool(one[SMOOTHING]) and one[SMOOTHING][0] >= SECOND for one in orders.values()),
+            figure="convergence_order",
+        ),
+        *(
+            Statement(
+                where="Sec. V-C, Eq. (22)",
+                paper=f"upon convergence {claim}",
+                test=f"to {EXACT:g} in SI units, in every query of both robots and forms, run on until rounding",
+                ours=f"{them[RUN_ON]:.1e} at most; {them[STOPPED]:.1e} at the paper's stop",
+                holds=them[RUN_ON] <= EXACT,
+                figure="convergence",
+            )
+            for claim, them in (
+                ("the minimal-total-cost states satisfy the true dynamics", missed),
+                ("policy and inverse policy give the same controls there", apart),
+            )
+        ),
+    ]
+
+
+if __name__ == "__main__":
+    run(Config, main, report, statements, __doc__)
