@@ -102,7 +102,7 @@ def draw_order(
         axes.text(
             2e-11, 1.2e-10, "slope 1", rotation=45, rotation_mode="anchor", transform_rotates_text=True, color=PLAN
         )
-        axes.text(8e-7, 2.5e-9, "slope 2", rotation=63, rotation_mode="anchor", transform_rotates_text=True, color=PLAN)
+        axes.text(4e-8, 3e-13, "slope 2", rotation=63, rotation_mode="anchor", transform_rotates_text=True, color=PLAN)
         axes.set(xscale="log", yscale="log", xlim=(3e-14, 3e-3), ylim=(3e-14, 3e-3))
         axes.set(xlabel="relative error in cost", ylabel="that of the next iteration", title=solver)
     handles = [
@@ -119,7 +119,7 @@ def draw_order(
     axes.plot(factor, factor**3, "--", color=LIMIT, linewidth=1, zorder=0)
     axes.text(0.32, 0.36, "one step", rotation=45, rotation_mode="anchor", transform_rotates_text=True, color=PLAN)
     axes.text(0.5, 0.06, "three steps", color=PLAN)
-    axes.set(xlim=(0, 1), ylim=(0, 1), title="factor, with obstacles")
+    axes.set(xlim=(0, 1), ylim=(0, 1), title="factor of an iteration, with obstacles")
     axes.set(
         xlabel="factor of a Gauss-Newton step, by what is\nthrown away alone", ylabel="factor of an iteration, measured"
     )
@@ -151,7 +151,7 @@ def _level_sets(axes: Axes, scenario: ls.Scenario, solution: ls.Solution) -> Non
     least_to_go = -np.einsum("tij,tj->ti", of_go, go.gradient)
     (cost,) = scenario.problem.obstacle_costs
     world, plan = cost.world, solution.trajectory.states[:, :2]
-    low, high = scenery.bounds(plan, world.seen_by(2))
+    low, high = scenery.bounds(plan, world.seen_by(2), 0.2)
     scenery.draw_in_plane(axes, world, low, high, cost.radius)
     axes.plot(*plan.T, color=LIMIT, linewidth=1, label="rollout")
     for name, colour, marker, centres, shapes in (

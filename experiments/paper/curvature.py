@@ -9,7 +9,6 @@ factor of the error, and its square that of the cost.
 import numpy as np
 from peers import truth
 from peers.common import Parts, parts
-from scipy.linalg import cho_factor, cho_solve
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -22,11 +21,8 @@ def discarded(problem: ls.Problem, plan: ls.Trajectory, *, fixed: bool) -> float
       fixed: the start is given, whatever the problem's initial cost says.
     """
     told, place = parts(problem), list(problem.dynamics.state_coordinates.position)
-    (n, m), steps, first = (
-        (plan.states.shape[1], plan.controls.shape[1]),
-        plan.steps,
-        0 if fixed else plan.states.shape[1],
-    )
+    (n, m), steps = (plan.states.shape[1], plan.controls.shape[1]), plan.steps
+    first = 0 if fixed else n
     values, axes = np.linalg.eigh(_obstacle_curvature(told, plan.states[1:-1, place]))  # at 0 it does not act
     slopes = np.zeros((steps + 1, n, first + steps * m))  # of each state, by the start and all controls
     slopes[0, :, :first] = np.eye(n)[:, :first]
@@ -46,7 +42,7 @@ def discarded(problem: ls.Problem, plan: ls.Trajectory, *, fixed: bool) -> float
     model += kept.T @ kept
     if not len(lost):
         return 0.0
-    return float(np.linalg.eigvalsh(lost @ cho_solve(cho_factor(model), lost.T))[-1] ** 2)
+    return float(np.linalg.eigvalsh(lost @ np.linalg.solve(model, lost.T))[-1] ** 2)
 
 
 def _obstacle_curvature(told: Parts, places: Array) -> Array:
