@@ -9,7 +9,7 @@ is done again with an obstacle weight of zero.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,21 +29,24 @@ from paper.common import (
     table,
 )
 from paper.convergence_figures import ABOVE, EVERY, draw_ellipsoids, draw_iterations, draw_order
-from paper.curvature import discarded
+from paper.convergence_runs import (
+    ILQR,
+    PAPER_STOP,
+    RUN_ON,
+    SMOOTHING,
+    STOPPED,
+    STOPS,
+    WITH,
+    WITHOUT,
+    Measured,
+    measure,
+    smooth,
+)
 from paper.rates import CLOSE, FEWEST, ROUNDING, rate
-from peers import truth
 
 import lqrsim as ls
-from lqrsim.costs import CostSum, terms_of
 from lqrsim.stress.statistics import bootstrap
 
-SMOOTHING, ILQR = "smoothing", "iLQR"
-WITH, WITHOUT = "with obstacles", "without"
-PAPER_STOP, TIGHT = 1e-4, 1e-15  # of the relative change of cost; the latter is less than rounding leaves of it
-STOPPED, RUN_ON = "at the paper's stop", "run on"
-STOPS = {STOPPED: PAPER_STOP, RUN_ON: TIGHT}
-MOST = 2000  # iterations
-EARLY = (2,)  # iterations, too few, after which the value functions are drawn besides the end
 SHOWN = (1, 2, 4, 8, 16, 32)  # iterations whose gap is told
 
 CONSTANT, SECOND = (0.8, 1.3), 1.5  # orders that count as a constant factor; as second order, from there on
@@ -58,15 +61,6 @@ class Config(Settings):
     """How many random starts and goals."""
     seed: int = 0
     """Of the queries."""
-
-
-@dataclass(frozen=True)
-class Measured:
-    """One query: logs by case and solver, the factor of what is thrown away by solver, consistency by form and stop."""
-
-    logs: dict[str, dict[str, tuple[ls.Iteration, ...]]]
-    discarded: dict[str, float]
-    consistency: dict[str, dict[str, dict[str, float]]]
 
 
 def main(config: Config) -> Result:
@@ -103,7 +97,7 @@ def main(config: Config) -> Result:
         for robot, found in measured.items()
     }
     logs = {robot: [one.logs for one in found] for robot, found in measured.items()}
-    with figure(config, result, "convergence", (11, 3.8)) as drawn:
+    with figure(config, result, "convergence", (9, 3.2)) as drawn:
         draw_iterations(drawn, logs, WITH, (SMOOTHING, ILQR), PAPER_STOP)
     with figure(config, result, "convergence_order", (11, 3.9)) as drawn:
         draw_order(
@@ -116,65 +110,9 @@ def main(config: Config) -> Result:
     with figure(config, result, "ellipsoids", (8.6, 5.6)) as drawn:
         (drive,) = robots["drive"]
         problem = as_in_the_paper(drive.problem)
-        ends = {f"after {most} iterations": smooth(drive, problem, most=most) for most in EARLY}
-        draw_ellipsoids(drawn, drive, ends | {RUN_ON: smooth(drive, problem)})
+        ends = {"after one iteration": smooth(drive, problem, most=1), "at the end": smooth(drive, problem)}
+        draw_ellipsoids(drawn, drive, ends)
     return result
-
-
-def measure(scenario: ls.Scenario) -> Measured:
-    problem = as_in_the_paper(scenario.problem)
-    free = without_obstacles(problem)
-    ends = {
-        form: {stop: smooth(scenario, problem, form=form, tolerance=tolerance) for stop, tolerance in STOPS.items()}
-        for form in ("dual", "primal")
-    }
-    solved = {
-        WITH: {SMOOTHING: ends["dual"][RUN_ON], ILQR: ilqr(problem)},
-        WITHOUT: {SMOOTHING: smooth(scenario, free), ILQR: ilqr(free)},
-    }
-    return Measured(
-        logs={case: {solver: one.iterations for solver, one in both.items()} for case, both in solved.items()},
-        discarded={
-            solver: discarded(problem, one.trajectory, fixed=solver == ILQR) for solver, one in solved[WITH].items()
-        },
-        consistency={
-            form: {stop: consistency(problem, one) for stop, one in stops.items()} for form, stops in ends.items()
-        },
-    )
-
-
-def ilqr(problem: ls.Problem) -> ls.Solution:
-    return ls.ilqr(problem, stop="cost", tolerance=TIGHT, max_iterations=MOST)
-
-
-def smooth(
-    scenario: ls.Scenario, problem: ls.Problem, *, tolerance: float = TIGHT, form: str = "dual", most: int = MOST
-) -> ls.Solution:
-    return ls.smooth(
-        problem, form=form, start=scenario.paper_start, stop="cost", tolerance=tolerance, max_iterations=most,
-        safeguard=False,
-    )  # fmt: skip
-
-
-def without_obstacles(problem: ls.Problem) -> ls.Problem:
-    """The same with an obstacle weight of zero, which compiles nothing."""
-    terms = [
-        ls.ObstacleCost(term.world, radius=term.radius, sharpness=term.sharpness, weight=0.0)
-        if isinstance(term, ls.ObstacleCost)
-        else term
-        for term in terms_of(problem.stage_cost)
-    ]
-    return replace(problem, stage_cost=CostSum(tuple(terms)))
-
-
-def consistency(problem: ls.Problem, solution: ls.Solution) -> dict[str, float]:
-    """By how much, at most, minimal-total-cost states miss the true dynamics, and the two policies each other."""
-    x_hat, inverse = solution.total_cost.minimizer(), solution.inverse_policy
-    assert inverse is not None
-    controls = np.array([solution.policy.control(x, t) for t, x in enumerate(x_hat[:-1])])
-    backwards = np.array([inverse.control(x, t) for t, x in enumerate(x_hat[1:])])
-    missed = truth.ahead(problem, x_hat[:-1], controls) - x_hat[1:]
-    return {"residual": float(np.abs(missed).max()), "controls": float(np.abs(controls - backwards).max())}
 
 
 def rates(found: Sequence[Measured], case: str, solver: str) -> dict[str, Any]:
@@ -289,8 +227,8 @@ def report(result: Result) -> str:
             table(("", "dynamics", "policies"), kept),
             picture(
                 "ellipsoids",
-                f"Differential drive, every {EVERY:g} s: where cost-to-go, cost-to-come and total cost are {ABOVE:g}"
-                " above their least, whatever the heading, and, marked, where each is least",
+                f"Differential drive, every {EVERY:g} s of its plan: where cost-to-go, cost-to-come and total cost are"
+                f" {ABOVE:g} above their least, whatever the heading, and, marked, where each is least",
             ),
         ]
     )

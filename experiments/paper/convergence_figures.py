@@ -39,7 +39,7 @@ def draw_iterations(
     smoothing = [one[case][solvers[0]] for one in logs["quadrotor"]]
     _lines(panels[2], smoothing, "gap", colours[solvers[0]])
     _drive(panels[2], logs["drive"][0][case][solvers[0]], "gap")
-    panels[2].set(title="gap of smoothing", ylabel="gap (relative to the range of a state)", ylim=(1e-8, 30))
+    panels[2].set(title="gap of smoothing", ylabel="gap", ylim=(1e-8, 30))
     panels[2].legend(
         handles=[
             Line2D([], [], color=colours[solvers[0]], alpha=0.4, linewidth=0.6, label="a query"),
@@ -60,7 +60,7 @@ def _lines(axes: Axes, logs: Sequence[Log], what: str, colour: str) -> None:
         found = np.abs([getattr(one, what) for one in log])
         row[: len(log)] = found
         found = np.where(np.isfinite(found) & (found > 0), found, np.nan)
-        axes.semilogy(np.arange(1, len(log) + 1), found, color=colour, linewidth=0.5, alpha=0.35)
+        axes.semilogy(np.arange(1, len(log) + 1), found, color=colour, linewidth=0.4, alpha=0.35)
     median = np.percentile(values, 50, axis=0, method="higher")
     axes.semilogy(
         np.arange(1, len(median) + 1),
