@@ -28,7 +28,7 @@ from paper.common import (
     run,
     table,
 )
-from paper.convergence_figures import ABOVE, EVERY, draw_ellipsoids, draw_iterations, draw_order
+from paper.convergence_figures import ABOVE, EVERY, LINES, draw_ellipsoids, draw_iterations, draw_order
 from paper.convergence_runs import (
     ILQR,
     PAPER_STOP,
@@ -207,7 +207,10 @@ def report(result: Result) -> str:
     return "\n\n".join(
         [
             "## Convergence",
-            picture("convergence", "Size of the relative improvement by iteration, a line a query, and the gap"),
+            picture(
+                "convergence",
+                f"Size of the relative improvement, and gap, by iteration: up to {LINES} queries, the median of all",
+            ),
             "Iterations until rounding stops them. The order is the slope of log error against the log error before,"
             f" by least squares over the tail (relative errors in cost from {CLOSE:g} down to {ROUNDING:g}, or to a"
             " hundred times the last change, if that is more). The factor is what an iteration multiplies the error by"

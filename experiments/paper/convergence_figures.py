@@ -20,6 +20,7 @@ from paper.rates import tail
 Log = Sequence[ls.Iteration]
 Logs = Sequence[Mapping[str, Mapping[str, Log]]]  # of queries, by case and solver
 
+LINES = 50  # queries with a line of their own
 ABOVE = 1.0  # cost above the least, of the level sets
 EVERY = 5.0  # seconds between them
 
@@ -42,7 +43,7 @@ def draw_iterations(
     panels[2].set(title="gap of smoothing", ylabel="gap", ylim=(1e-8, 30))
     panels[2].legend(
         handles=[
-            Line2D([], [], color=colours[solvers[0]], alpha=0.4, linewidth=0.6, label="a query"),
+            Line2D([], [], color=colours[solvers[0]], alpha=0.5, label="a query"),
             Line2D([], [], color="black", linewidth=2, label="median"),
             Line2D([], [], color=RUNS[1], linestyle="--", label="differential drive"),
         ],
@@ -52,15 +53,16 @@ def draw_iterations(
 
 
 def _lines(axes: Axes, logs: Sequence[Log], what: str, colour: str) -> None:
-    """One line a query, and the median, in which those that have ended count as zero."""
+    """One line for each of the first queries, and the median of all, in which those that have ended count as zero."""
     lengths = [len(log) for log in logs]
     shown = int(np.percentile(lengths, 90))
     values = np.zeros((len(logs), max(lengths)))
     for row, log in zip(values, logs, strict=True):
+        row[: len(log)] = np.abs([getattr(one, what) for one in log])
+    for log in logs[:LINES]:
         found = np.abs([getattr(one, what) for one in log])
-        row[: len(log)] = found
         found = np.where(np.isfinite(found) & (found > 0), found, np.nan)
-        axes.semilogy(np.arange(1, len(log) + 1), found, color=colour, linewidth=0.4, alpha=0.35)
+        axes.semilogy(np.arange(1, len(log) + 1), found, color=colour, linewidth=0.5, alpha=0.5)
     median = np.percentile(values, 50, axis=0, method="higher")
     axes.semilogy(
         np.arange(1, len(median) + 1),
@@ -99,10 +101,8 @@ def draw_order(
         ends = np.array([1e-13, 1e-3])
         axes.plot(ends, ends, "-", color=LIMIT, linewidth=1, zorder=0)
         axes.plot(ends, ends**2 / 1e-3, "--", color=LIMIT, linewidth=1, zorder=0)
-        axes.text(
-            2e-11, 1.2e-10, "slope 1", rotation=45, rotation_mode="anchor", transform_rotates_text=True, color=PLAN
-        )
-        axes.text(4e-8, 3e-13, "slope 2", rotation=63, rotation_mode="anchor", transform_rotates_text=True, color=PLAN)
+        axes.text(2e-11, 1.2e-10, "slope 1", rotation=45, rotation_mode="anchor", color=PLAN)
+        axes.text(1e-7, 3e-13, "slope 2", rotation=63, rotation_mode="anchor", color=PLAN)
         axes.set(xscale="log", yscale="log", xlim=(3e-14, 3e-3), ylim=(3e-14, 3e-3))
         axes.set(xlabel="relative error in cost", ylabel="that of the next iteration", title=solver)
     handles = [
@@ -117,7 +117,7 @@ def draw_order(
     factor = np.linspace(0, 1, 101)
     axes.plot(factor, factor, "-", color=LIMIT, linewidth=1, zorder=0)
     axes.plot(factor, factor**3, "--", color=LIMIT, linewidth=1, zorder=0)
-    axes.text(0.32, 0.36, "one step", rotation=45, rotation_mode="anchor", transform_rotates_text=True, color=PLAN)
+    axes.text(0.32, 0.36, "one step", rotation=45, rotation_mode="anchor", color=PLAN)
     axes.text(0.5, 0.06, "three steps", color=PLAN)
     axes.set(xlim=(0, 1), ylim=(0, 1), title="factor of an iteration, with obstacles")
     axes.set(
