@@ -208,6 +208,7 @@ def report(result: Result) -> str:
         [
             "## Convergence",
             picture(
+                result,
                 "convergence",
                 f"Size of the relative improvement, and gap, by iteration: up to {LINES} queries, the median of all",
             ),
@@ -217,7 +218,7 @@ def report(result: Result) -> str:
             " at the end of the tail; its spread is the 90th over the 10th percentile of the factors in a tail. Medians"
             f" over queries, 95 % bootstrap intervals, of those that are determined: by {FEWEST} errors or more.",
             table(head, rows),
-            picture("convergence_order", "Each error against the one before, and what explains the factors"),
+            picture(result, "convergence_order", "Each error against the one before, and what explains the factors"),
             "The curvature that the projection of the obstacle term throws away tells, at the optimum, what a step of"
             " Gauss-Newton would multiply the error by if everything else were exact. How many such steps an iteration"
             " is worth is the ratio of the logarithms:",
@@ -229,6 +230,7 @@ def report(result: Result) -> str:
             " of the true dynamics, integrated independently of the package, and the two policies differ there:",
             table(("", "dynamics", "policies"), kept),
             picture(
+                result,
                 "ellipsoids",
                 f"Differential drive, every {EVERY:g} s of its plan: where cost-to-go, cost-to-come and total cost are"
                 f" {ABOVE:g} above their least, whatever the heading, and, marked, where each is least",

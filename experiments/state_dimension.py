@@ -181,7 +181,7 @@ def report(result: Result) -> str:
     return "\n\n".join(
         [
             "## Time of an iteration and the dimension of the state",
-            picture("state_dimension", "Time of an iteration against the number of states"),
+            picture(result, "state_dimension", "Time of an iteration against the number of states"),
             "Milliseconds an iteration, medians; the ratio with its 95 % bootstrap interval over rounds:",
             table(("", "drive, 3 states", "quadrotor, 12 states", "ratio"), rows),
             "Chains of masses, which differ in nothing but their length; time grows as a power of their states:",
