@@ -1,7 +1,7 @@
 """How the time of an iteration grows with the dimension of the state: Sec. VI-B.
 
     python experiments/state_dimension.py            # drive and quadrotor, chains of 1 to 8 masses
-    python experiments/state_dimension.py --quick    # chains of 1 and 2, fewer rounds
+    python experiments/state_dimension.py --quick    # chains of 1 and 2, dual form only, fewer rounds
 
 The differential drive has 3 states and 2 controls, the quadrotor 12 and 4. Both have 150 steps, the same iterations are
 timed of both, and they take turns. Their obstacles differ in number and kind, so all is timed without any, too. A chain
@@ -65,6 +65,7 @@ class Config(Settings):
 
 def main(config: Config) -> Result:
     masses, rounds = (config.masses[:2], 10) if config.quick else (config.masses, config.rounds)
+    solvers = (DUAL,) if config.quick else (DUAL, ILQR)
     drive, quadrotor = ls.scenarios.differential_drive(), ls.scenarios.quadrotor()
     result = opening(config) | {"robots": {}, "chains": {}}
     cases: dict[str, Callable[[ls.Problem], ls.Problem]] = {AS_THEY_ARE: as_in_the_paper, EQUAL: without_obstacles}
@@ -82,11 +83,9 @@ def main(config: Config) -> Result:
             }
             for solver in SOLVERS
         }
-    chains = {
-        (3 * count, solver): iterating(solver, chain_of_masses(count)) for count in masses for solver in (DUAL, ILQR)
-    }
+    chains = {(3 * count, solver): iterating(solver, chain_of_masses(count)) for count in masses for solver in solvers}
     times = timed(chains, rounds, "chains")
-    for solver in (DUAL, ILQR):
+    for solver in solvers:
         sizes = [3 * count for count in masses]
         smallest, largest = sizes[0], max(size for size in sizes if size <= 12)
         ratio = bootstrap(of_medians, times[largest, solver], times[smallest, solver])
@@ -145,7 +144,7 @@ def draw(config: Config, result: Result) -> None:
                 values = [median(result["robots"][case][solver]["milliseconds"][robot]) for robot in ROBOTS]
                 at = aside * np.array([3, 12])
                 axes.plot(at, values, marker, color=colours[solver], markerfacecolor=face, markersize=6, zorder=3)
-        sizes, first = np.array([3.0, 12.0]), result["chains"][ILQR]["milliseconds"][0]
+        sizes, first = np.array([3.0, 12.0]), list(result["chains"].values())[-1]["milliseconds"][0]
         axes.plot(sizes, first * (sizes / 3) ** 3, ":", color=LIMIT, zorder=0)
         axes.set(xscale="log", yscale="log", xlim=(2.5, 1.15 * max(12, *result["chains"][DUAL]["states"])))
         axes.set(xlabel="states (the drive has 3, the quadrotor 12)", ylabel="time of an iteration (ms)")

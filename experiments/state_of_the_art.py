@@ -6,6 +6,7 @@
 All begin at exactly the given start, on one thread, in turns; rotors without limits. "hover" is the paper's beginning,
 the nominal control; "line" is the straight line of states to the goal. All stop when the cost changes by less than
 1e-4, but for the search with smooth()'s own test, which asks for more, and IPOPT, which has a test of its own (1e-8).
+With --quick IPOPT evaluates its functions in CasADi, which is slower, and compiles nothing.
 """
 
 import time
@@ -85,7 +86,7 @@ def main(config: Config) -> Result:
         SEARCH: ours(ls.smooth_many),
         ILQR: ours(ls.ilqr_many, stop="cost"),
     }
-    solvers, skipped = others(Asked(peers=config.peers), problems[0], PEERS)
+    solvers, skipped = others(Asked(peers=config.peers), problems[0], PEERS, compile=not config.quick)
     contestants |= {name: theirs(solver) for name, solver in solvers.items()}
     for contestant in contestants.values():
         contestant(problems[0])  # compile
