@@ -238,13 +238,13 @@ def cells(robot: dict[str, Any]) -> str:
                     f"{np.nanmean(final):.3g}" if np.isfinite(final).any() else "-",
                     f"{outcomes.count('reached')}/{len(outcomes)}",
                     f"{100 * value:.1f} ({100 * low:.1f} to {100 * high:.1f}) %" if several else "",
-                    *(outcomes.count(outcome) for outcome in ("collided", "missed", "diverged")),
+                    *(outcomes.count(outcome) for outcome in ("collided", "timed out", "diverged")),
                     f"{cell['p_value']:.1g}" if several and policy == FEEDBACK else "",
                 ]
             )  # fmt: skip
     head = (
-        "strength, policy", "rms, mean", "largest of all", "final, mean", "reached", "", "collided", "missed", "lost",
-        "p",
+        "strength, policy", "rms, mean", "largest of all", "final, mean", "reached", "", "collided", "timed out",
+        "lost", "p",
     )  # fmt: skip
     return table(head, rows)
 

@@ -76,7 +76,7 @@ def main(config: Config) -> Result:
         "bound": scenario.tracking_bound,
         "disturbances": list(runs.disturbances),
         "trials": trials,
-        "outcomes": {name: runs.outcome.count(name) for name in ("reached", "missed", "collided", "diverged")},
+        "outcomes": {name: runs.outcome.count(name) for name in ("reached", "timed out", "collided", "diverged")},
         "reached": interval(rate(int(runs.reached.sum()), trials)),
         "rms": float(np.sqrt(np.mean(error**2))),
         "worst": float(error.max()),

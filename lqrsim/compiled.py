@@ -9,7 +9,7 @@ import ast
 import hashlib
 import inspect
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim import integration, rotations, world
+from lqrsim import integration, laws, rotations, world
 from lqrsim.constraints import Inequalities
+from lqrsim.coordinates import Coordinates
 from lqrsim.core import Core, address_of, compiling
 from lqrsim.costs import Term
 from lqrsim.dynamics import Dynamics
@@ -138,6 +139,45 @@ def signed_distance(world_seen: World, points: npt.ArrayLike) -> Array:
     return out.reshape(points.shape[:-1])
 
 
+def signed_distance_displaced(world_seen: World, points: Array, displaced: Array) -> Array:
+    """The same with obstacles that are elsewhere: (K, k) from points (K, k, 2 or 3), displaced (K, obstacles, 3)."""
+    trials, count, size = points.shape
+    flat = np.zeros((trials * count, 3))
+    flat[:, :size] = points.reshape(-1, size)
+    out, table = np.empty(len(flat)), np.array(world_seen.table)
+    away = np.ascontiguousarray(displaced, dtype=np.float64).reshape(trials, -1)
+    with compiling:
+        distances = _distance_core()
+    distances.nearest_displaced(len(table), len(flat), count, table.ravel(), flat, away, out)
+    return out.reshape(trials, count)
+
+
+def policy(states: Coordinates, controls: Coordinates) -> Callable[..., Array]:
+    """What evaluates laws: (shown (K, n), gain (m, n), offset (m,), nominal (n,)) -> controls (K, m).
+
+    As `AffinePolicy.__call__`, but that each trial gets what it gets alone, to the last bit.
+    """
+    low, high = np.array(controls.low), np.array(controls.high)
+    with compiling:
+        core_of_laws = _policy_core(len(states), len(controls), states.angles, states.rotation_vectors)
+
+    def evaluate(shown: Array, gain: Array, offset: Array, nominal: Array) -> Array:
+        near, out = np.array(shown, dtype=np.float64), np.empty((len(shown), len(controls)))
+        law = (np.ascontiguousarray(part) for part in (gain, offset, nominal))
+        core_of_laws.apply_law(len(shown), near, *law, low, high, out)
+        return out
+
+    return evaluate
+
+
+@cache
+def _policy_core(n: int, m: int, angles: tuple[int, ...], rotation_vectors: tuple[int, ...]) -> Core:
+    turns = [f"    nearest_angle(x, nominal, {i})" for i in angles]
+    turns += [f"    nearest_rotation(x, nominal, {i})" for i in rotation_vectors]
+    source = "\n".join([_functions(laws), "def turn(x, nominal):", *(turns or ["    pass"])])
+    return Core(source, {"N": n, "M": m}, f"policies of {n} states and {m} controls")
+
+
 @cache
 def _distance_core() -> Core:
     source = f"""\
@@ -147,6 +187,20 @@ def nearest(obstacles, count, data, points, out):
         for row in range(0, {world.ROW} * obstacles, {world.ROW}):
             distance = signed_distance(data, row, points[i, 0], points[i, 1], points[i, 2])
             if not distance >= out[i]:  # NaN, too: nowhere is not far away
+                out[i] = distance
+"""
+    source += f"""
+
+def nearest_displaced(obstacles, count, each, data, points, displaced, out):
+    for i in range(count):
+        out[i] = inf
+        trial = i // each
+        for k in range(obstacles):
+            x = points[i, 0] - displaced[trial, 3 * k]
+            y = points[i, 1] - displaced[trial, 3 * k + 1]
+            z = points[i, 2] - displaced[trial, 3 * k + 2]
+            distance = signed_distance(data, {world.ROW} * k, x, y, z)
+            if not distance >= out[i]:
                 out[i] = distance
 """
     return Core(f"{_functions(world)}\n\n{source}", {}, "distances to obstacles")

@@ -24,7 +24,7 @@ from lqrsim.results import Candidate, Iteration, Multipliers, Solution, Status, 
 from lqrsim.rollout import Rollout
 from lqrsim.value_functions import Moments, Quadratic
 
-VERSIONS = {"solution": 3, "rollout": 1}
+VERSIONS = {"solution": 3, "rollout": 2}
 
 
 def save(result: Solution | Rollout, path: str | os.PathLike[str]) -> Path:
@@ -142,7 +142,8 @@ def load_rollout(path: str | os.PathLike[str]) -> Rollout:
         trials, knots, _ = arrays["states"].shape
         shapes = {
             "states": (trials, knots, n), "measured": (trials, knots, n), "commanded": (trials, knots - 1, m),
-            "applied": (trials, knots - 1, m), "forces": (trials, knots - 1, 3), "clearance": (trials, knots),
+            "applied": (trials, knots - 1, m), "forces": (trials, knots - 1, 3), "torques": (trials, knots - 1, 3),
+            "displaced": (trials, None, 3), "clearance": (trials, knots),
             "frame_times": (None,), "frames": (trials, len(arrays["frame_times"]), None),
         }  # fmt: skip
         return Rollout(
@@ -158,7 +159,7 @@ def load_rollout(path: str | os.PathLike[str]) -> Rollout:
 
 
 _ROLLOUT_ARRAYS = (
-    "states", "measured", "commanded", "applied", "forces", "clearance", "contacts", "diverged",
+    "states", "measured", "commanded", "applied", "forces", "torques", "displaced", "clearance", "contacts", "diverged",
     "frame_times", "frames",
 )  # fmt: skip
 _ROLLOUT_TEXTS = (

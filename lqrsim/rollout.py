@@ -25,7 +25,8 @@ class Rollout:
       states: (K, T+1, n) true states; angles in the representative nearest the plan.
       measured: (K, T+1, n) the states that the policy was shown.
       commanded: (K, T, m) what the policy asked for, within the limits. applied: (K, T, m) what the actuators got.
-      forces: (K, T, 3) disturbing force at the robot's centre of mass in N, world axes.
+      forces: (K, T, 3) disturbing force at the robot's centre of mass in N, world axes. torques: the same in N m.
+      displaced: (K, obstacles, 3) by how much each obstacle is away from where the plan believes it, in metres.
       clearance: (K, T+1) signed distance to the nearest obstacle minus the radius in metres; infinite without any.
       contacts: (K,) control periods in which MuJoCo reported a contact of the robot with an obstacle.
       diverged: (K,) whether the simulation became unstable; the states are NaN from there on.
@@ -48,6 +49,8 @@ class Rollout:
     commanded: Array
     applied: Array
     forces: Array
+    torques: Array
+    displaced: Array
     clearance: Array
     contacts: npt.NDArray[np.int64]
     diverged: npt.NDArray[np.bool_]
@@ -93,10 +96,10 @@ class Rollout:
 
     @property
     def outcome(self) -> tuple[str, ...]:
-        """`diverged`, `collided`, `reached` or `missed` for each trial."""
+        """`diverged`, `collided`, `reached` or `timed out` for each trial."""
         flags = zip(self.diverged, self.collided, self.reached, strict=True)
         return tuple(
-            "diverged" if diverged else "collided" if collided else "reached" if reached else "missed"
+            "diverged" if diverged else "collided" if collided else "reached" if reached else "timed out"
             for diverged, collided, reached in flags
         )
 

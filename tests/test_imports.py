@@ -20,7 +20,7 @@ ROOMS = (
     ("rollout",),
     ("files",),
     ("cache", "pointers"),
-    ("differences", "integration", "rotations", "world", "solvers.kernels"),
+    ("differences", "integration", "laws", "rotations", "world", "solvers.kernels"),
     ("fingerprint",),
     ("tracing",),
     ("functions",),

@@ -2,10 +2,12 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
+from mujoco import batch
 
 from lqrsim import compiled
 from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt
@@ -68,15 +70,36 @@ class Plant:
             )
         return round(steps)
 
-    def clearance(self, states: npt.ArrayLike) -> Array:
-        """Signed distance to the nearest obstacle minus the robot's radius in metres, (...), at states (..., n)."""
+    @cached_property
+    def without_contacts(self) -> mujoco.MjModel:
+        """The same model, but that the robot goes through the obstacles, and nothing says whether it touches them."""
+        return self._compile(contacts=False)
+
+    def clearance(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
+        """Signed distance to the nearest obstacle minus the robot's radius in metres, (...), at states (..., n).
+
+        Args:
+          displaced: (K, obstacles, 3), by how much obstacles are elsewhere in each trial; states are then (K, k, n).
+        """
         states = np.asarray(states, dtype=np.float64)
         if not len(self.world):
             return np.full(states.shape[:-1], np.inf)
         position = states[..., list(self.robot.dynamics.state_coordinates.position)]
-        return compiled.signed_distance(self.world, position) - self.robot.radius
+        if displaced is None or not displaced.any():
+            return compiled.signed_distance(self.world, position) - self.robot.radius
+        return compiled.signed_distance_displaced(self.world, position, displaced) - self.robot.radius
 
-    def _compile(self) -> mujoco.MjModel:
+    def displace(self, simulations: batch.Batch, displaced: Array) -> None:
+        """Move the obstacles of each simulation by (K, obstacles, 3) metres, world axes; `set_const` must follow."""
+        places = simulations.expand("geom_pos")
+        for number, name in enumerate(self.world.names):
+            geom = self.model.geom(name)
+            fixed_to = mujoco.MjData(self.model)
+            mujoco.mj_kinematics(self.model, fixed_to)
+            to_body = fixed_to.xmat[geom.bodyid[0]].reshape(3, 3).T
+            places[:, geom.id] += displaced[:, number] @ to_body.T
+
+    def _compile(self, *, contacts: bool = True) -> mujoco.MjModel:
         spec = mujoco.MjSpec.from_string(self.scene.xml)
         # The sensors need names; geoms without one get the obstacle's. A geom's id is its place in the compiled model.
         spec.compile()
@@ -84,6 +107,10 @@ class Plant:
         for geom, obstacle in zip(obstacle_geoms(self.scene.model), self.scene.world.obstacles, strict=True):
             geoms[geom].name = obstacle.name
         for name in self.world.names:
+            if not contacts:
+                geom = next(geom for geom in spec.geoms if geom.name == name)
+                geom.contype = geom.conaffinity = 0
+                continue
             spec.add_sensor(
                 name=f"contact with {name}",
                 type=mujoco.mjtSensor.mjSENS_CONTACT,

@@ -1,0 +1,106 @@
+"""What a disturbance is: what it does in a run, and what all of them share.
+
+To add one, subclass `Disturbance` and give it a `start`. It is called once a run, and returns what the closed loop then
+calls in every control period, on all trials at once: functions, so that they may look at the state (wind that depends
+on where the robot is) or remember the past (a delay).
+"""
+
+import abc
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from mujoco import batch
+
+from lqrsim.coordinates import Coordinates
+from lqrsim.errors import Array, InputError, check_array, check_number
+from lqrsim.results import Trajectory
+from lqrsim.simulation.plant import Plant
+
+Hook = Callable[[int, Array], Array]
+Numbers = float | Sequence[float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect:
+    """What a disturbance does in one run of K trials; None does nothing. Steps are numbers of control periods.
+
+    What is called with all trials gives each the numbers that it gets alone, to the last bit: no sums over trials.
+
+    Attributes:
+      begin: (states (K, n) at which the plan begins) -> the states at which the trials do, (K, n).
+      alter: called once, before the first step, with the simulations; gives each trial its own values of fields of
+        the model with `simulations.expand(field)`, whose first axis is the trial.
+      measure: (step, states (K, n)) -> the states that the policy is shown, (K, n); step runs to T inclusive.
+      actuate: (step, controls (K, m)) -> the controls on their way to the actuators, (K, m), which then saturate.
+      force: (step, true states (K, n)) -> force at the robot's centre of mass in N, world axes, (K, 3).
+      torque: (step, true states (K, n)) -> torque on the robot in N m, world axes, (K, 3).
+      displaced: (K, obstacles, 3), by how much each of the plant's obstacles is away from where the scene has it, in m.
+    """
+
+    begin: Callable[[Array], Array] | None = None
+    alter: Callable[[batch.Batch], None] | None = None
+    measure: Hook | None = None
+    actuate: Hook | None = None
+    force: Hook | None = None
+    torque: Hook | None = None
+    displaced: Array | None = None
+
+
+class Disturbance(abc.ABC):
+    """Base class of all disturbances."""
+
+    def describe(self, plant: Plant) -> str:
+        """In words and units, for the record; unless it is overridden, how the object is made."""
+        return repr(self)
+
+    @abc.abstractmethod
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        """Begin a run of one trial a generator. A trial's numbers may come from its own generator only.
+
+        Raises:
+          InputError: the disturbance does not fit the plant or the plan.
+        """
+
+
+def normal(generators: Sequence[np.random.Generator], steps: int, size: int) -> Array:
+    """Standard normal numbers (K, steps, size), each trial's from its own generator."""
+    return np.stack([generator.standard_normal((steps, size)) for generator in generators])
+
+
+def check_std(disturbance: Disturbance, std: Numbers) -> Numbers:
+    """`std` as it is kept: a number, or a tuple of them. Raises InputError for what is negative or not finite."""
+    field = f"{type(disturbance).__name__}: std"
+    if np.ndim(std) == 0:
+        return check_number(field, std, at_least=0.0)
+    values = check_array(field, std, (None,))
+    if (values < 0).any():
+        raise InputError(f"{field}: got {values.min():g}, want numbers >= 0")
+    return tuple(values.tolist())
+
+
+def fit(disturbance: Disturbance, std: npt.ArrayLike, names: Sequence[str]) -> Array:
+    """`std` as one number for each of `names`. Raises InputError if it has another number of them."""
+    values = np.asarray(std, dtype=np.float64)
+    if values.ndim and len(values) != len(names):
+        raise InputError(
+            f"{type(disturbance).__name__}: std: got {len(values)} numbers, want 1 or {len(names)}: {', '.join(names)}"
+        )
+    return np.broadcast_to(values, len(names))
+
+
+def with_units(disturbance: Disturbance, std: Numbers, coordinates: Coordinates) -> str:
+    """The numbers with their units, each unit once where its numbers are the same: `0.01 m, 0.02 rad`."""
+    values = fit(disturbance, std, coordinates.names)
+    of_unit = {
+        unit: [v for v, u in zip(values, coordinates.units, strict=True) if u == unit] for unit in coordinates.units
+    }
+    return ", ".join(f"{words(v if len(set(v)) > 1 else v[0])} {unit}".rstrip() for unit, v in of_unit.items())
+
+
+def words(numbers: Numbers) -> str:
+    """Numbers as they are written: 0.1, or (0.1, 0.2)."""
+    values = np.atleast_1d(numbers)
+    text = ", ".join(f"{value:g}" for value in values)
+    return text if np.ndim(numbers) == 0 else f"({text})"

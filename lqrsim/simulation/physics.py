@@ -1,0 +1,96 @@
+"""MuJoCo's side of the loop: all trials' states, and how to advance them by a control period."""
+
+import contextlib
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+from mujoco import batch
+
+from lqrsim.errors import Array
+from lqrsim.machine import processors
+from lqrsim.simulation.plant import Plant
+
+FRAME_PERIOD = 1 / 30  # s; positions for drawing are recorded at least this often, if the physics step is not longer
+
+_WARNINGS = mujoco.mjtWarning
+_UNSTABLE = [int(warning) for warning in (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)]
+
+
+class Physics:
+    """K simulations of a plant.
+
+    Args:
+      substeps: physics steps of a control period.
+      frames: whether to record positions for drawing, within the control periods too.
+      contacts: whether the robot collides with obstacles; through them, a quarter of the time is saved.
+      threads: by default as many as there are processors.
+
+    Attributes:
+      simulations: MuJoCo's. parts: frames of a control period.
+      unstable: (K,) who blew up.
+    """
+
+    def __init__(
+        self, plant: Plant, trials: int, substeps: int, *, frames: bool, contacts: bool, threads: int | None
+    ) -> None:
+        self.plant = plant
+        model = plant.model if contacts else plant.without_contacts
+        self.simulations = batch.Batch(model, trials, min(trials, threads or processors()))
+        self._sensors = self.simulations.bind("sensordata") if contacts else None
+        # The longest equal parts of the period that are short enough to draw.
+        parts = [part for part in range(1, substeps + 1) if substeps % part == 0]
+        drawn = max([part for part in parts if part * plant.timestep <= FRAME_PERIOD + 1e-9], default=1)
+        self._part = drawn if frames else substeps
+        self.parts = substeps // self._part if frames else 0
+        self._steps = substeps // self._part
+        self.unstable = np.zeros(trials, dtype=bool)
+
+    def place(self, states: Array) -> None:
+        """Put the robots where analytic states (K, n) say."""
+        qpos, qvel = self.plant.robot.configuration(states)
+        self.simulations.qpos[:, self.plant.qpos], self.simulations.qvel[:, self.plant.qvel] = qpos, qvel
+
+    def frame(self) -> Array:
+        """MuJoCo's qpos now, (K, nq)."""
+        return self.simulations.qpos.copy()
+
+    def state(self, near: Array) -> Array:
+        """The analytic states (K, n), in the representative nearest to `near` (n,)."""
+        qpos, qvel = self.simulations.qpos[:, self.plant.qpos], self.simulations.qvel[:, self.plant.qvel]
+        return self.plant.robot.state(qpos, qvel, near=near)
+
+    def advance(self, controls: Array, wrench: Array) -> tuple[np.ndarray, list[Array]]:
+        """One control period under controls (K, m), forces and torques (K, 6).
+
+        Returns:
+          who touched an obstacle, (K,), and the frames.
+        """
+        touched, frames = np.zeros(len(controls), dtype=bool), []
+        self.simulations.ctrl[:, self.plant.ctrl] = self.plant.robot.actuation(controls)
+        self.simulations.xfrc_applied[:, self.plant.body] = wrench
+        with _unlogged():
+            for _ in range(self._steps):
+                try:
+                    self.simulations.step(nstep=self._part)
+                except batch.SimulationError as error:
+                    self.unstable[error.ids] = True
+                if self._sensors is not None:
+                    touched |= (self._sensors[:, self.plant.contact] > 0).any(axis=1)
+                if self.parts:
+                    frames.append(self.frame())
+        # MuJoCo resets an unstable simulation and goes on; only its warnings tell.
+        self.unstable |= (self.simulations.warning[:, _UNSTABLE, 1] > 0).any(axis=1)
+        return touched, frames
+
+
+@contextlib.contextmanager
+def _unlogged() -> Iterator[None]:
+    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder when a trial becomes unstable; we record it."""
+    before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    quiet.logto_file = quiet.logto_console = False
+    quiet.set()
+    try:
+        yield
+    finally:
+        before.set()
