@@ -4,12 +4,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_count, check_number
+from lqrsim.errors import Array, InputError, check_count, check_number
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.controllers import Controller, Feedback
 from lqrsim.simulation.disturbances import Disturbance, Effect
-from lqrsim.simulation.physics import Physics
+from lqrsim.simulation.physics import Physics, unlogged
 from lqrsim.simulation.plant import Plant
 from lqrsim.versions import versions
 
@@ -83,49 +83,51 @@ def simulate(
     control = controller.start(trials)
 
     steps, (n, m) = plan.steps, (plan.states.shape[1], plan.controls.shape[1])
-    states, measured = np.empty((trials, steps + 1, n)), np.empty((trials, steps + 1, n))
-    commanded, applied = np.empty((trials, steps, m)), np.empty((trials, steps, m))
-    wrench = np.zeros((trials, steps, 6))
+    states, measured = _records(trials, steps + 1, n), _records(trials, steps + 1, n)
+    commanded, applied, wrench = _records(trials, steps, m), _records(trials, steps, m), _records(trials, steps, 6)
     contact_periods = np.zeros(trials, dtype=np.int64)
     lost = np.zeros(trials, dtype=bool)
     lost_since = np.full(trials, steps + 1)  # the knot from which on a trial's records mean nothing
     seen = [physics.frame()]
-    for step in range(steps + 1):
-        nominal = plan.states[step]
-        state = physics.state(nominal)
-        shown = state.copy()
-        for measure in measures:
-            shown = measure(step, shown)
-        states[:, step], measured[:, step] = state, shown
-        lost |= physics.unstable | ~np.isfinite(shown).all(axis=1)
-        lost_since[lost] = np.minimum(lost_since[lost], step)
-        if step == steps:
-            break
-        # A lost trial goes on with the plan's state, so that the others do.
-        command = control(step, np.where(lost[:, None], nominal, shown))
-        lost |= ~np.isfinite(command).all(axis=1)
-        applying = command.copy()
-        for actuate in actuations:
-            applying = actuate(step, applying)
-        applying = plant.robot.dynamics.control_coordinates.clip(applying)
-        for which, push in wrenches:
-            wrench[:, step, which] += push(step, state)
-        commanded[:, step], applied[:, step] = command, applying
-        touched, pictures = physics.advance(applying, wrench[:, step])
-        contact_periods += touched & ~lost
-        seen += pictures
-        if progress is not None:
-            progress(step + 1, steps)
+    with unlogged():
+        for step in range(steps + 1):
+            state = physics.state()
+            shown = state.copy()
+            for measure in measures:
+                shown = measure(step, shown)
+            states[:, step], measured[:, step] = state, shown
+            lost |= physics.unstable | ~np.isfinite(shown).all(axis=1)
+            lost_since[lost] = np.minimum(lost_since[lost], step)
+            if step == steps:
+                break
+            # A lost trial goes on with the plan's state, so that the others do.
+            command = control(step, np.where(lost[:, None], plan.states[step], shown))
+            lost |= ~np.isfinite(command).all(axis=1)
+            applying = command.copy()
+            for actuate in actuations:
+                applying = actuate(step, applying)
+            applying = plant.robot.dynamics.control_coordinates.clip(applying)
+            for which, push in wrenches:
+                wrench[:, step, which] += push(step, state)
+            commanded[:, step], applied[:, step] = command, applying
+            touched, pictures = physics.advance(applying, wrench[:, step])
+            contact_periods += touched & ~lost
+            seen += pictures
+            if progress is not None:
+                progress(step + 1, steps)
 
-    # A frame belongs to the knot that ends its period: the trial was lost somewhere before that.
     drawn = np.stack(seen, axis=1)
-    knot_of_frame = -(np.arange(len(seen)) // -max(physics.parts, 1))
-    for array, knots in (
-        *((array, np.arange(steps + 1)) for array in (states, measured)),
-        *((array, np.arange(steps)) for array in (commanded, applied, wrench)),
-        (drawn, knot_of_frame),
-    ):
-        array[knots >= lost_since[:, None]] = np.nan
+    space = controller.spaces[0]
+    states, measured = space.nearest(states, plan.states), space.nearest(measured, plan.states)
+    if lost.any():
+        # A frame belongs to the knot that ends its period: the trial was lost somewhere before that.
+        knot_of_frame = -(np.arange(len(seen)) // -max(physics.parts, 1))
+        for array, knots in (
+            *((array, np.arange(steps + 1)) for array in (states, measured)),
+            *((array, np.arange(steps)) for array in (commanded, applied, wrench)),
+            (drawn, knot_of_frame),
+        ):
+            array[knots >= lost_since[:, None]] = np.nan
     return Rollout(
         robot=plant.robot.name,
         scene=plant.scene.name,
@@ -153,6 +155,11 @@ def simulate(
         first_trial=first_trial,
         versions=versions(),
     )
+
+
+def _records(trials: int, steps: int, size: int) -> Array:
+    """Zeros (K, steps, size) that lie in memory as they are written: all trials of a step together."""
+    return np.zeros((steps, trials, size)).transpose(1, 0, 2)
 
 
 def _start(

@@ -44,21 +44,22 @@ class Physics:
         self._part = drawn if frames else substeps
         self.parts = substeps // self._part if frames else 0
         self._steps = substeps // self._part
+        self._qpos, self._qvel = self.simulations.bind("qpos"), self.simulations.bind("qvel")
+        self._ctrl, self._wrench = self.simulations.bind("ctrl"), self.simulations.bind("xfrc_applied")
         self.unstable = np.zeros(trials, dtype=bool)
 
     def place(self, states: Array) -> None:
         """Put the robots where analytic states (K, n) say."""
         qpos, qvel = self.plant.robot.configuration(states)
-        self.simulations.qpos[:, self.plant.qpos], self.simulations.qvel[:, self.plant.qvel] = qpos, qvel
+        self._qpos[:, self.plant.qpos], self._qvel[:, self.plant.qvel] = qpos, qvel
 
     def frame(self) -> Array:
         """MuJoCo's qpos now, (K, nq)."""
-        return self.simulations.qpos.copy()
+        return self._qpos.copy()
 
-    def state(self, near: Array) -> Array:
-        """The analytic states (K, n), in the representative nearest to `near` (n,)."""
-        qpos, qvel = self.simulations.qpos[:, self.plant.qpos], self.simulations.qvel[:, self.plant.qvel]
-        return self.plant.robot.state(qpos, qvel, near=near)
+    def state(self) -> Array:
+        """The analytic states (K, n), angles in any representative."""
+        return self.plant.robot.state(self._qpos[:, self.plant.qpos], self._qvel[:, self.plant.qvel])
 
     def advance(self, controls: Array, wrench: Array) -> tuple[np.ndarray, list[Array]]:
         """One control period under controls (K, m), forces and torques (K, 6).
@@ -67,25 +68,24 @@ class Physics:
           who touched an obstacle, (K,), and the frames.
         """
         touched, frames = np.zeros(len(controls), dtype=bool), []
-        self.simulations.ctrl[:, self.plant.ctrl] = self.plant.robot.actuation(controls)
-        self.simulations.xfrc_applied[:, self.plant.body] = wrench
-        with _unlogged():
-            for _ in range(self._steps):
-                try:
-                    self.simulations.step(nstep=self._part)
-                except batch.SimulationError as error:
-                    self.unstable[error.ids] = True
-                if self._sensors is not None:
-                    touched |= (self._sensors[:, self.plant.contact] > 0).any(axis=1)
-                if self.parts:
-                    frames.append(self.frame())
+        self._ctrl[:, self.plant.ctrl] = self.plant.robot.actuation(controls)
+        self._wrench[:, self.plant.body] = wrench
+        for _ in range(self._steps):
+            try:
+                self.simulations.step(nstep=self._part)
+            except batch.SimulationError as error:
+                self.unstable[error.ids] = True
+            if self._sensors is not None:
+                touched |= (self._sensors[:, self.plant.contact] > 0).any(axis=1)
+            if self.parts:
+                frames.append(self.frame())
         # MuJoCo resets an unstable simulation and goes on; only its warnings tell.
         self.unstable |= (self.simulations.warning[:, _UNSTABLE, 1] > 0).any(axis=1)
         return touched, frames
 
 
 @contextlib.contextmanager
-def _unlogged() -> Iterator[None]:
+def unlogged() -> Iterator[None]:
     """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder when a trial becomes unstable; we record it."""
     before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
     quiet.logto_file = quiet.logto_console = False

@@ -66,7 +66,10 @@ class Disturbance(abc.ABC):
 
 def normal(generators: Sequence[np.random.Generator], steps: int, size: int) -> Array:
     """Standard normal numbers (K, steps, size), each trial's from its own generator."""
-    return np.stack([generator.standard_normal((steps, size)) for generator in generators])
+    numbers = np.empty((steps, len(generators), size))  # in memory as they are read: all trials of a step together
+    for trial, generator in enumerate(generators):
+        numbers[:, trial] = generator.standard_normal((steps, size))
+    return numbers.transpose(1, 0, 2)
 
 
 def check_std(disturbance: Disturbance, std: Numbers) -> Numbers:
