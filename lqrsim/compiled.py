@@ -118,6 +118,15 @@ def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> dict[st
     return {"p": numbers(problem.dynamics), "dt": problem.dt, **data}
 
 
+def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
+    """Stage and final cost (K,) of each of K trajectories, states (K, T+1, n) and controls (K, T, m)."""
+    costs = np.empty(len(states))
+    told = arguments(problem)
+    flat = (np.ascontiguousarray(array).reshape(-1, array.shape[2]) for array in (states, controls))
+    core(problem).costs_of(len(states), problem.steps, *flat, told["stage"], told["final"], costs)
+    return costs
+
+
 def no_multipliers(problem: Problem, inequalities: Inequalities, tolerance: float = 0.0) -> Array:
     """Those of a constraint that does not act yet; see `solvers/augmented.py`."""
     rows = inequalities.rows

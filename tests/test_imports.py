@@ -65,6 +65,9 @@ ALLOWED = {
     "llvmlite": ("pointers",),
     "sympy": ("tracing", "dynamics", "rotations", "robots", "costs"),
     "tyro": ("cli",),
+    "pyarrow": ("stress",),
+    "distributed": ("stress",),
+    "jinja2": ("view",),
     "tqdm": ("console", "reproduce"),
 }
 

@@ -1,15 +1,19 @@
-"""What decides on the controls in the loop: a policy in compiled code. Subclass `Controller` for another way."""
+"""What decides on the controls in the loop: a policy, or solving again. Subclass `Controller` for another way."""
 
 import abc
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from lqrsim import compiled
 from lqrsim.coordinates import Coordinates
-from lqrsim.errors import Array
+from lqrsim.errors import Array, InputError, check_number
 from lqrsim.policy import AffinePolicy
+from lqrsim.problem import FixedState, Problem
+from lqrsim.results import Solution
+from lqrsim.solvers.smoother import smooth
 
 Control = Callable[[int, Array], Array]
 
@@ -61,3 +65,65 @@ class Feedback(Controller):
     @property
     def spaces(self) -> tuple[Coordinates, Coordinates]:
         return self.policy.state_coordinates, self.policy.control_coordinates
+
+
+class Replanning(Controller):
+    """Solves again and again from where the robot is measured to be, for what is left of the horizon.
+
+    Each solve begins with what is left of the law before it; where one does not succeed, that law goes on. It takes no
+    time in the simulation. Costs that depend on the step's number are not supported.
+
+    Args:
+      problem: that was solved. solution: its solution.
+      every: seconds between two solves, rounded to control periods.
+
+    Raises:
+      InputError: `every` is shorter than a control period.
+    """
+
+    def __init__(self, problem: Problem, solution: Solution, *, every: float) -> None:
+        check_number("Replanning: every", every, at_least=0.999 * problem.dt)
+        self.problem, self.solution, self.every = problem, solution, every
+        self._periods = round(every / problem.dt)
+
+    def start(self, trials: int) -> Control:
+        policy = self.solution.policy
+        evaluate = compiled.policy(*self.spaces)
+        laws = [(policy, 0)] * trials  # each trial's law, and the step that it begins at
+
+        def control(step: int, shown: Array) -> Array:
+            if step > 0 and step % self._periods == 0:
+                for trial, state in enumerate(shown):
+                    laws[trial] = self._again(*laws[trial], step, state)
+            commands = np.empty((trials, len(policy.control_coordinates)))
+            for trial, (law, first) in enumerate(laws):
+                t = min(step - first, law.steps - 1)
+                one = shown[trial : trial + 1]
+                commands[trial] = evaluate(one, law.gain[t], law.offset[t], law.nominal[t])[0]
+            return commands
+
+        return control
+
+    def _again(self, law: AffinePolicy, first: int, step: int, state: Array) -> tuple[AffinePolicy, int]:
+        """The law from now on, and the step that it begins at."""
+        left = self.problem.steps - step
+        if left < 1:
+            return law, first
+        done = step - first
+        rest = replace(law, gain=law.gain[done:], offset=law.offset[done:], nominal=law.nominal[done:])
+        here = law.state_coordinates.nearest(state, rest.nominal[0])
+        try:
+            problem = replace(self.problem, initial=FixedState(here), steps=left)
+            solution = smooth(problem, start=rest, threads=1)
+        except InputError:  # it begins within an obstacle
+            return law, first
+        return (solution.policy, step) if solution.success else (law, first)
+
+    @property
+    def digest(self) -> str:
+        text = f"{Feedback(self.solution.policy).digest} {self.problem.digest} {self._periods}"
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @property
+    def spaces(self) -> tuple[Coordinates, Coordinates]:
+        return Feedback(self.solution.policy).spaces

@@ -41,6 +41,16 @@ def rollout(steps, x0, gain, feedforward, p, dt, initial, stage, final, states, 
     return cost + final_value(states[steps], u, steps, final)
 
 
+def costs_of(count, steps, states, controls, stage, final, costs):
+    """Stage and final cost of trajectories (count (steps + 1), N) and (count steps, M), one after the other."""
+    for k in range(count):
+        costs[k] = 0.0
+        for t in range(steps):
+            costs[k] += stage_value(states[k * (steps + 1) + t], controls[k * steps + t], t, stage)
+        last = controls[(k + 1) * steps - 1]
+        costs[k] += final_value(states[(k + 1) * (steps + 1) - 1], last, steps, final)
+
+
 def differential_pass(steps, states, controls, p, dt, stage, final, damping, keep, L, l, S, s, k):
     """The backward pass of iLQR about a feasible trajectory; l is relative to it, S, s, k are about the origin.
 
