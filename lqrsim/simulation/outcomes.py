@@ -56,8 +56,8 @@ def outcomes(rollout: Rollout, plant: Plant, problem: Problem | None = None) -> 
       plant: that it was run on. problem: whose cost to work out; NaN without one.
     """
     plan, dt, steps = rollout.plan, rollout.plan.dt, rollout.plan.steps
-    hit: npt.NDArray[np.bool_] = rollout.clearance < 0
-    lost: npt.NDArray[np.bool_] = ~np.isfinite(rollout.states).all(axis=2)
+    hit = np.less(rollout.clearance, 0)
+    lost = np.any(~np.isfinite(rollout.states), axis=2)
     over = hit | lost
     last = np.where(over.any(axis=1), over.argmax(axis=1), steps)  # the knot with which a trial ends
     alive = np.arange(steps + 1) <= last[:, None]
