@@ -179,6 +179,15 @@ def policy(states: Coordinates, controls: Coordinates) -> Callable[..., Array]:
     return evaluate
 
 
+def nearest(space: Coordinates, states: Array, nominal: Array) -> Array:
+    """As `space.nearest`, compiled: states (K, T+1, n), nominal (T+1, n)."""
+    out = np.array(states, dtype=np.float64, order="C")
+    with compiling:
+        core_of_laws = _policy_core(len(space), 1, space.angles, space.rotation_vectors)
+    core_of_laws.turn_all(len(out), len(nominal), out.reshape(-1, len(space)), np.ascontiguousarray(nominal))
+    return out
+
+
 @cache
 def _policy_core(n: int, m: int, angles: tuple[int, ...], rotation_vectors: tuple[int, ...]) -> Core:
     turns = [f"    nearest_angle(x, nominal, {i})" for i in angles]

@@ -33,6 +33,13 @@ def apply_law(count, near, gain, offset, nominal, low, high, out) -> None:
             out[k, j] = total
 
 
+def turn_all(count, steps, states, nominal) -> None:
+    """Takes each of the states (count steps, N) to its representative nearest to its step's nominal (steps, N)."""
+    for k in range(count):
+        for t in range(steps):
+            turn(states[k * steps + t], nominal[t])
+
+
 def nearest_angle(x, nominal, i: int) -> None:
     """Takes whole turns out of what an angle differs by."""
     x[i] -= 2.0 * pi * floor((x[i] - nominal[i]) / (2.0 * pi) + 0.5)

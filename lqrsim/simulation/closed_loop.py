@@ -1,9 +1,11 @@
 """Running a policy on a plant: one code path for one trial and for many."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
+from lqrsim import compiled
 from lqrsim.errors import Array, InputError, check_count, check_number
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
@@ -117,8 +119,7 @@ def simulate(
                 progress(step + 1, steps)
 
     drawn = np.stack(seen, axis=1)
-    space = controller.spaces[0]
-    states, measured = space.nearest(states, plan.states), space.nearest(measured, plan.states)
+    states, measured = (compiled.nearest(controller.spaces[0], array, plan.states) for array in (states, measured))
     if lost.any():
         # A frame belongs to the knot that ends its period: the trial was lost somewhere before that.
         knot_of_frame = -(np.arange(len(seen)) // -max(physics.parts, 1))
@@ -169,10 +170,24 @@ def _start(
     for stream, disturbance in enumerate(disturbances):
         if not isinstance(disturbance, Disturbance):
             raise InputError(f"disturbances: got {disturbance!r}, want Disturbance objects, such as ControlNoise(0.05)")
-        keys = [np.random.SeedSequence(seed, spawn_key=(trial, stream)) for trial in trials]
-        generators = [np.random.Generator(np.random.Philox(key)) for key in keys]
-        effects.append(disturbance.start(plant, solution.trajectory, generators))
+        effects.append(disturbance.start(plant, solution.trajectory, _Streams(seed, trials, stream)))
     return effects
+
+
+class _Streams(Sequence[np.random.Generator]):
+    """The generator of each trial, made when it is asked for: some disturbances draw nothing."""
+
+    def __init__(self, seed: int, trials: range, stream: int) -> None:
+        self._seed, self._trials, self._stream = seed, trials, stream
+
+    def __len__(self) -> int:
+        return len(self._trials)
+
+    def __getitem__(self, place: Any) -> Any:
+        if isinstance(place, slice):
+            return _Streams(self._seed, self._trials[place], self._stream)
+        key = np.random.SeedSequence(self._seed, spawn_key=(self._trials[place], self._stream))
+        return np.random.Generator(np.random.Philox(key))
 
 
 def _check_solution(solution: Solution, controller: Controller, plant: Plant) -> None:
