@@ -167,5 +167,5 @@ def test_minimal_total_cost_states_obey_the_true_dynamics(quick: tuple[Path, dic
     }
     assert said["convergence", "upon convergence the minimal-total-cost states satisfy the true dynamics"]
     assert said["convergence", "upon convergence policy and inverse policy give the same controls there"]
-    assert said["figure_2", "7 iterations until convergence"]
+    assert said["figure_2", "7 iterations until convergence; from u*, prior"]
     assert said["figure_3", "a trajectory through the cage, without an initial one"]
