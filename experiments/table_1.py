@@ -178,7 +178,6 @@ def pairs(axes: Axes, result: Result, what: str, colours: Mapping[str, str]) -> 
         ours = pooled(result, name, what)
         axes.scatter(theirs, ours, 12, colours[name], marker=marker, linewidths=0.8, alpha=0.6, label=name)
     ends = [min(axes.get_xlim()[0], axes.get_ylim()[0]), max(axes.get_xlim()[1], axes.get_ylim()[1])]
-    ends[0] = max(ends[0], float(theirs.min()) / 3)
     axes.plot(ends, ends, ":", color=LIMIT, zorder=0)
     axes.set(xscale="log", yscale="log", xlabel=f"{what} of iLQR", ylabel=f"{what} of smoothing")
     axes.set_title(f"{what}, query by query (below the line: {'cheaper' if what == 'cost' else 'fewer'})")

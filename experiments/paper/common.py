@@ -48,7 +48,7 @@ class Statement:
     """What the paper says, and what came of it.
 
     Attributes:
-      where: in the paper. paper: what it says. test: when that counts as holding, decided before it was measured.
+      where: in the paper. paper: what it says. test: when that counts as holding here, a choice of ours.
       ours: what came out. holds: whether it does; None where it could not be found out, and `ours` says why.
       figure: which shows it, its name without the suffix.
     """
