@@ -203,7 +203,8 @@ def report(result: Result) -> str:
         picture(
             result,
             "feedback_paths",
-            "The first trials with feedback and without, disturbances as in the demo, each up to its first collision",
+            f"The first {min(result['config']['paths'], result['trials'])} trials with feedback and without, each up to"
+            " its first collision; disturbances as in the demo",
         ),
     ]
     for name, robot in result["robots"].items():
@@ -216,7 +217,8 @@ def report(result: Result) -> str:
     return "\n\n".join(
         [
             *parts,
-            "Errors are distances from the plan in metres: root mean square over time, the largest, and the last one."
+            "Errors are distances from the plan in metres: root mean square over time, the largest, and the last one. A"
+            " trial goes on after a collision, and so do its errors."
             " Intervals are exact, of 95 %; p is McNemar's exact test of the same trials with feedback and without."
             " Undisturbed, all trials are the same, so there is one.",
         ]
@@ -257,7 +259,8 @@ def statements(result: Result) -> list[Statement]:
         said.append(
             Statement(
                 where="Sec. VI-A",
-                paper=f"the control policy can account for disturbances; {NAMES[name]}",
+                paper="the control policy can account for disturbances"
+                + ("" if name == "differential_drive" else f", said of the drive; here the {NAMES[name]}"),
                 test="the plan's end reached more often than without feedback, the 95 % intervals apart",
                 ours=f"{100 * value:.1f} % ({100 * low:.1f} to {100 * high:.1f}) with feedback,"
                 f" {100 * bare:.1f} % ({100 * bare_low:.1f} to {100 * bare_high:.1f}) without",

@@ -149,7 +149,7 @@ def report(result: Result) -> str:
         ("from, to (m)", place),
         ("status", plan["status"]),
         ("iterations", plan["iterations"]),
-        ("time (ms)", f"{plan['milliseconds']:.1f}"),
+        ("time of the iterations (ms)", f"{plan['milliseconds']:.1f}"),
         ("cost", f"{plan['cost']:.2f}"),
         ("least clearance (m)", f"{plan['clearance']:.3f}"),
         ("greatest speed (m/s)", f"{plan['speed']:.2f}"),
@@ -159,13 +159,17 @@ def report(result: Result) -> str:
         (f"executed {executed['trials']} times, disturbed", outcomes),
         ("reached", between(executed["reached"], ".3f")),
         ("tracking error rms, worst (m)", f"{executed['rms']:.3f}, {executed['worst']:.3f}"),
-        ("least clearance (m)", f"{executed['clearance']:.3f}"),
+        ("least clearance of these runs (m)", f"{executed['clearance']:.3f}"),
     ]
     return "\n\n".join(
         [
             "## Fig. 3: the quadrotor in the cage",
-            picture(result, "figure_3", f"Planned, drawn every half second, and {drawn} disturbed runs"),
-            picture(result, "figure_3_rendered", "The same as executed in MuJoCo, drawn every half second"),
+            picture(
+                result,
+                "figure_3",
+                f"Black: the plan; blue: the robot every half second; orange: {drawn} disturbed runs",
+            ),
+            picture(result, "figure_3_rendered", "The same as executed undisturbed in MuJoCo, every half second"),
             table(("", "value"), rows),
             f"Disturbances: {'; '.join(executed['disturbances'])}. The interval is exact (Clopper-Pearson, 95 %).",
         ]

@@ -183,7 +183,8 @@ def report(result: Result) -> str:
             picture(result, "state_dimension", "Time of an iteration against the number of states"),
             "Milliseconds an iteration, medians; the ratio with its 95 % bootstrap interval over rounds:",
             table(("", "drive, 3 states", "quadrotor, 12 states", "ratio"), rows),
-            "Chains of masses, which differ in nothing but their length; time grows as a power of their states:",
+            "Chains of masses, which differ in nothing but their length. The power of the number of states that time"
+            " grows as is that between the sizes in brackets; longer chains may grow faster:",
             table(("ms an iteration", *(f"{size} states" for size in sizes), "power"), chains),
         ]
     )

@@ -49,7 +49,8 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
     Raises:
       InputError: an unknown script, or a folder that cannot be written.
     """
-    chosen = [check_name("results", name, SCRIPTS) for name in scripts] or list(SCRIPTS)
+    asked = {check_name("results", name, SCRIPTS) for name in scripts} or set(SCRIPTS)
+    chosen = [name for name in SCRIPTS if name in asked]
     console.check_output("--out", out)
     found: dict[str, Found] = {}
     failures: list[Failure] = []
@@ -86,7 +87,11 @@ def _run(name: str, out: Path, *, quick: bool) -> Found | Failure:
     below = os.environ | {"TQDM_POSITION": "1"}  # its bars go below ours
     # Ctrl-C reaches it, too; `run` waits for it to end, and ends it if it does not.
     done = subprocess.run([str(part) for part in command], stdout=subprocess.PIPE, text=True, env=below, check=False)
-    return json.loads(done.stdout) if done.returncode == 0 else Failure(name, done.returncode)
+    try:
+        return json.loads(done.stdout) if done.returncode == 0 else Failure(name, done.returncode)
+    except ValueError:
+        sys.stderr.write(f"{name}: printed something that is not its result:\n{done.stdout[:1000]}\n")
+        return Failure(name, done.returncode)
 
 
 def page(saved: Mapping[str, Any]) -> str:
@@ -110,8 +115,10 @@ def page(saved: Mapping[str, Any]) -> str:
         " Non-Linear Dynamics and Non-Quadratic Cost*, American Control Conference, 2014.",
         f"Computed with {', '.join(f'{name} {version}' for name, version in versions.items())} on {saved['machine']}.",
         "## Which of the paper's statements hold",
-        _count(statements),
-        "\n".join(["| the paper says | counts as holding | what came out | | figure |", "| --- " * 5 + "|", *rows]),
+        f"{_count(statements)} A statement can have several tests; what counts as holding is this project's choice.",
+        "\n".join(
+            ["| the paper says | counts as holding | what came out | verdict | figure |", "| --- " * 5 + "|", *rows]
+        ),
     ]
     for name, one in found.items():
         options = "" if not saved["quick"] else " --quick"
@@ -122,7 +129,7 @@ def page(saved: Mapping[str, Any]) -> str:
 def _count(statements: Sequence[Mapping[str, Any]]) -> str:
     """How many hold, in words."""
     counts = {verdict: sum(one["holds"] is verdict for one in statements) for verdict in VERDICTS}
-    said = f"Of {len(statements)} statements, {counts[True]} hold and {counts[False]} do not"
+    said = f"Of {len(statements)} tests of what the paper says, {counts[True]} hold and {counts[False]} do not"
     return f"{said}; {counts[None]} could not be tested here." if counts[None] else f"{said}."
 
 

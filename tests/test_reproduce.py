@@ -49,16 +49,18 @@ def test_a_script_that_fails_does_not_stop_the_others(
 ) -> None:
     (scripts / "table_1.py").write_text(GOOD)
     (scripts / "figure_3.py").write_text("import sys; sys.exit('no such robot')")
-    assert main(["reproduce", "figure_3", "table_1", "--out", str(tmp_path / "out")]) == 1
+    (scripts / "figure_2.py").write_text("print('by the way')")
+    assert main(["reproduce", "figure_3", "table_1", "figure_2", "--out", str(tmp_path / "out")]) == 1
     printed = capfd.readouterr()
     assert "no such robot" in printed.err
+    assert "printed something that is not its result:\nby the way" in printed.err
     assert "FAILED figure_3: exit code 1" in printed.out
     assert "HOLDS          Sec. X: it works" in printed.out
     saved = json.loads((tmp_path / "out" / "results.json").read_text())
     assert list(saved["results"]) == ["table_1"]
     text = (tmp_path / "out" / "results.md").read_text()
     assert "| it works (Sec. X) | 1 is 1 | 1 | holds | [table_1](figures/table_1.png) |" in text
-    assert "Of 1 statements, 1 hold and 0 do not." in text
+    assert "Of 1 tests of what the paper says, 1 hold and 0 do not." in text
     assert main(["reproduce", "table_1", "--out", str(tmp_path / "out")]) == 0
 
 
@@ -167,5 +169,5 @@ def test_minimal_total_cost_states_obey_the_true_dynamics(quick: tuple[Path, dic
     }
     assert said["convergence", "upon convergence the minimal-total-cost states satisfy the true dynamics"]
     assert said["convergence", "upon convergence policy and inverse policy give the same controls there"]
-    assert said["figure_2", "7 iterations until convergence"]
+    assert said["figure_2", "7 iterations until convergence; from u*, prior"]
     assert said["figure_3", "a trajectory through the cage, without an initial one"]

@@ -6,6 +6,7 @@ JSON: the page of all results is made of it.
 """
 
 import json
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -47,7 +48,7 @@ class Statement:
     """What the paper says, and what came of it.
 
     Attributes:
-      where: in the paper. paper: what it says. test: when that counts as holding, decided before it was measured.
+      where: in the paper. paper: what it says. test: when that counts as holding here, a choice of ours.
       ours: what came out. holds: whether it does; None where it could not be found out, and `ours` says why.
       figure: which shows it, its name without the suffix.
     """
@@ -69,7 +70,11 @@ def run(
 ) -> None:
     """The script as a program: what it found as JSON, or as text."""
     config = tyro.cli(config_type, description=description)
-    result = main(config)
+    try:
+        result = main(config)
+    except ls.InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
     verdicts = statements(result)
     if config.json:
         said = {"result": result, "report": report(result), "statements": [asdict(verdict) for verdict in verdicts]}
