@@ -122,7 +122,7 @@ def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
     """Stage and final cost (K,) of each of K trajectories, states (K, T+1, n) and controls (K, T, m)."""
     costs = np.empty(len(states))
     told = arguments(problem)
-    flat = (np.ascontiguousarray(array).reshape(-1, array.shape[2]) for array in (states, controls))
+    flat = (_plain(array).reshape(-1, array.shape[2]) for array in (states, controls))
     core(problem).costs_of(len(states), problem.steps, *flat, told["stage"], told["final"], costs)
     return costs
 
@@ -172,11 +172,16 @@ def policy(states: Coordinates, controls: Coordinates) -> Callable[..., Array]:
 
     def evaluate(shown: Array, gain: Array, offset: Array, nominal: Array) -> Array:
         near, out = np.array(shown, dtype=np.float64), np.empty((len(shown), len(controls)))
-        law = (np.ascontiguousarray(part) for part in (gain, offset, nominal))
+        law = (_plain(part) for part in (gain, offset, nominal))
         core_of_laws.apply_law(len(shown), near, *law, low, high, out)
         return out
 
     return evaluate
+
+
+def _plain(array: Array) -> Array:
+    """In C's order, and not read-only, as arrays from files are: compiled functions take no other."""
+    return np.require(array, np.float64, ["C", "W"])
 
 
 def nearest(space: Coordinates, states: Array, nominal: Array) -> Array:
@@ -184,7 +189,7 @@ def nearest(space: Coordinates, states: Array, nominal: Array) -> Array:
     out = np.array(states, dtype=np.float64, order="C")
     with compiling:
         core_of_laws = _policy_core(len(space), 1, space.angles, space.rotation_vectors)
-    core_of_laws.turn_all(len(out), len(nominal), out.reshape(-1, len(space)), np.ascontiguousarray(nominal))
+    core_of_laws.turn_all(len(out), len(nominal), out.reshape(-1, len(space)), _plain(nominal))
     return out
 
 
