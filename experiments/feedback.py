@@ -8,7 +8,7 @@ feedback and without. Without, nothing is measured, so that the noise of measure
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -63,7 +63,7 @@ def main(config: Config) -> Result:
         policies = {FEEDBACK: solution, OPEN_LOOP: solution.open_loop()}
         # Undisturbed, every trial is the same.
         count = trials if strength > 0 else 1
-        disturbances = [scaled(disturbance, strength) for disturbance in scenario.disturbances]
+        disturbances = [disturbance.scaled(strength) for disturbance in scenario.disturbances]
         rollouts = {
             name: ls.simulate(scenario.plant(), policy, disturbances=disturbances, seed=config.seed, trials=count)
             for name, policy in policies.items()
@@ -81,16 +81,6 @@ def main(config: Config) -> Result:
     draw(config, result)
     draw_paths(config, result, scenarios, drawn)
     return result
-
-
-def scaled(disturbance: ls.Disturbance, strength: float) -> ls.Disturbance:
-    """The same, so many times as strong: standard deviations and impulses are multiplied."""
-    match disturbance:
-        case ls.ControlNoise() | ls.ForceNoise() | ls.MeasurementNoise():
-            return replace(disturbance, std=(strength * np.array(disturbance.std)).tolist())
-        case ls.Push():
-            return replace(disturbance, impulse=(strength * np.array(disturbance.impulse)).tolist())
-    raise NotImplementedError(f"the strength of {type(disturbance).__name__}")
 
 
 def measured(rollout: ls.Rollout) -> dict[str, Any]:

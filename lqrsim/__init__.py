@@ -54,11 +54,33 @@ if TYPE_CHECKING:
     from lqrsim.scenes import Scene as Scene
     from lqrsim.scenes import load_scene as load_scene
     from lqrsim.simulation.closed_loop import simulate as simulate
+    from lqrsim.simulation.disturbances import ActuatorLoss as ActuatorLoss
+    from lqrsim.simulation.disturbances import AxleMismatch as AxleMismatch
+    from lqrsim.simulation.disturbances import CommandDropouts as CommandDropouts
+    from lqrsim.simulation.disturbances import ControlDelay as ControlDelay
     from lqrsim.simulation.disturbances import ControlNoise as ControlNoise
+    from lqrsim.simulation.disturbances import DisplacedObstacles as DisplacedObstacles
     from lqrsim.simulation.disturbances import Disturbance as Disturbance
+    from lqrsim.simulation.disturbances import Dryden as Dryden
     from lqrsim.simulation.disturbances import ForceNoise as ForceNoise
+    from lqrsim.simulation.disturbances import FrictionMismatch as FrictionMismatch
+    from lqrsim.simulation.disturbances import GilbertElliott as GilbertElliott
+    from lqrsim.simulation.disturbances import Gusts as Gusts
+    from lqrsim.simulation.disturbances import InertiaMismatch as InertiaMismatch
+    from lqrsim.simulation.disturbances import InitialStateError as InitialStateError
+    from lqrsim.simulation.disturbances import MassMismatch as MassMismatch
+    from lqrsim.simulation.disturbances import MeanWind as MeanWind
+    from lqrsim.simulation.disturbances import MeasurementBias as MeasurementBias
+    from lqrsim.simulation.disturbances import MeasurementDropouts as MeasurementDropouts
+    from lqrsim.simulation.disturbances import MeasurementLatency as MeasurementLatency
     from lqrsim.simulation.disturbances import MeasurementNoise as MeasurementNoise
+    from lqrsim.simulation.disturbances import MotorLag as MotorLag
     from lqrsim.simulation.disturbances import Push as Push
+    from lqrsim.simulation.disturbances import Saturation as Saturation
+    from lqrsim.simulation.disturbances import ThrustMismatch as ThrustMismatch
+    from lqrsim.simulation.disturbances import TorqueNoise as TorqueNoise
+    from lqrsim.simulation.disturbances import WheelRadiusMismatch as WheelRadiusMismatch
+    from lqrsim.simulation.disturbances import preset as preset
     from lqrsim.simulation.plant import Plant as Plant
     from lqrsim.simulation.plant import PlantCheck as PlantCheck
     from lqrsim.simulation.plant import check_plant as check_plant
@@ -99,7 +121,35 @@ _HOME = {
     "scenarios": ["Scenario"],
     "scenes": ["Scene", "load_scene"],
     "simulation.closed_loop": ["simulate"],
-    "simulation.disturbances": ["ControlNoise", "Disturbance", "ForceNoise", "MeasurementNoise", "Push"],
+    "simulation.disturbances": [
+        "ActuatorLoss",
+        "AxleMismatch",
+        "CommandDropouts",
+        "ControlDelay",
+        "ControlNoise",
+        "DisplacedObstacles",
+        "Disturbance",
+        "Dryden",
+        "ForceNoise",
+        "FrictionMismatch",
+        "GilbertElliott",
+        "Gusts",
+        "InertiaMismatch",
+        "InitialStateError",
+        "MassMismatch",
+        "MeanWind",
+        "MeasurementBias",
+        "MeasurementDropouts",
+        "MeasurementLatency",
+        "MeasurementNoise",
+        "MotorLag",
+        "Push",
+        "Saturation",
+        "ThrustMismatch",
+        "TorqueNoise",
+        "WheelRadiusMismatch",
+        "preset",
+    ],
     "simulation.plant": ["Plant", "PlantCheck", "check_plant"],
     "solvers.continuous": ["ContinuousSolution", "smooth_continuous", "smooth_lq_continuous"],
     "solvers.ilqr": ["ilqr", "ilqr_many"],

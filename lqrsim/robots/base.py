@@ -19,6 +19,8 @@ class Robot(abc.ABC):
       body: the body in the MJCF that is the robot. Obstacles are everything else that is fixed to the world.
       joints: its joints in the MJCF. `qpos` and `qvel` below are theirs alone, in this order.
       actuators: its actuators in the MJCF, in the order of `actuation`.
+      wheels: the geoms in the MJCF that are the treads of its wheels, each on a body of its own; none by default.
+      drag: linear, against its velocity through the air, in N s/m; wind acts through it. None by default.
       radius: of its collision circle (planar) or sphere (spatial), in metres.
     """
 
@@ -26,6 +28,8 @@ class Robot(abc.ABC):
     body: ClassVar[str]
     joints: ClassVar[tuple[str, ...]]
     actuators: ClassVar[tuple[str, ...]]
+    wheels: ClassVar[tuple[str, ...]] = ()
+    drag: float = 0.0
     radius: float
 
     @property

@@ -28,6 +28,7 @@ class DifferentialDrive(Robot):
     body: ClassVar[str] = "create"
     joints: ClassVar[tuple[str, ...]] = ("create_base", "create_wheel_left", "create_wheel_right")
     actuators: ClassVar[tuple[str, ...]] = ("create_wheel_left", "create_wheel_right")
+    wheels: ClassVar[tuple[str, ...]] = ("create_tread_left", "create_tread_right")
 
     @property
     def dynamics(self) -> Dynamics:

@@ -29,7 +29,7 @@ class Plant:
       timestep: of the physics, in seconds.
 
     Raises:
-      InputError: there is no such robot in the scene: its body, a joint or an actuator is missing.
+      InputError: there is no such robot in the scene: its body, a joint, an actuator or a wheel is missing.
     """
 
     def __init__(self, robot: Robot, scene: Scene) -> None:
@@ -37,6 +37,7 @@ class Plant:
             "body": ([robot.body], [scene.model.body(i).name for i in range(scene.model.nbody)]),
             "joint": (robot.joints, [scene.model.joint(i).name for i in range(scene.model.njnt)]),
             "actuator": (robot.actuators, [scene.model.actuator(i).name for i in range(scene.model.nu)]),
+            "geom": (robot.wheels, [scene.model.geom(i).name for i in range(scene.model.ngeom)]),
         }
         for kind, (names, present) in wanted.items():
             for name in names:

@@ -2,12 +2,14 @@
 
 To add one, subclass `Disturbance` and give it a `start`. It is called once a run, and returns what the closed loop then
 calls in every control period, on all trials at once: functions, so that they may look at the state (wind that depends
-on where the robot is) or remember the past (a delay).
+on where the robot is) or remember the past (a delay). `scaled` says what a multiple of it is, for sweeps; `check`
+refuses a plant that can not have it.
 """
 
 import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -55,6 +57,17 @@ class Disturbance(abc.ABC):
         """In words and units, for the record; unless it is overridden, how the object is made."""
         return repr(self)
 
+    def scaled(self, strength: float) -> "Disturbance":
+        """The same, so many times as strong: 0 has no effect, 1 is itself. For a sweep over strengths.
+
+        Raises:
+          InputError: nothing says what this is, or that much of it means nothing.
+        """
+        raise InputError(f"{type(self).__name__}: got strength {strength}, want a disturbance that overrides `scaled`")
+
+    def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
+        """Raise InputError if the plant can not have this disturbance."""
+
     @abc.abstractmethod
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         """Begin a run of one trial a generator. A trial's numbers may come from its own generator only.
@@ -72,23 +85,45 @@ def normal(generators: Sequence[np.random.Generator], steps: int, size: int) -> 
     return numbers.transpose(1, 0, 2)
 
 
+def uniform(generators: Sequence[np.random.Generator], steps: int, size: int) -> Array:
+    """Numbers (K, steps, size) that are uniform between 0 and 1, each trial's from its own generator."""
+    return np.stack([generator.random((steps, size)) for generator in generators])
+
+
 def check_std(disturbance: Disturbance, std: Numbers) -> Numbers:
     """`std` as it is kept: a number, or a tuple of them. Raises InputError for what is negative or not finite."""
-    field = f"{type(disturbance).__name__}: std"
-    if np.ndim(std) == 0:
-        return check_number(field, std, at_least=0.0)
-    values = check_array(field, std, (None,))
-    if (values < 0).any():
-        raise InputError(f"{field}: got {values.min():g}, want numbers >= 0")
+    return check_numbers(disturbance, "std", std, at_least=0.0)
+
+
+def check_numbers(disturbance: Disturbance, name: str, numbers: Numbers, *, at_least: float = -np.inf) -> Numbers:
+    """A field as it is kept: a number, or a tuple of them. Raises InputError for what is too small or not finite."""
+    field = f"{type(disturbance).__name__}: {name}"
+    if np.ndim(numbers) == 0:
+        return check_number(field, numbers, at_least=at_least if np.isfinite(at_least) else None)
+    values = check_array(field, numbers, (None,))
+    if (values < at_least).any():
+        raise InputError(f"{field}: got {values.min():g}, want numbers >= {at_least:g}")
     return tuple(values.tolist())
 
 
-def fit(disturbance: Disturbance, std: npt.ArrayLike, names: Sequence[str]) -> Array:
-    """`std` as one number for each of `names`. Raises InputError if it has another number of them."""
-    values = np.asarray(std, dtype=np.float64)
+def check_strength(disturbance: Disturbance, strength: float) -> float:
+    """What `scaled` is given. Raises InputError for a negative one."""
+    return check_number(f"{type(disturbance).__name__}: strength", strength, at_least=0.0)
+
+
+def times(disturbance: Disturbance, numbers: Numbers, strength: float) -> Any:
+    """A number or a tuple of them, so many times as large. Raises InputError for a negative strength."""
+    product = check_strength(disturbance, strength) * np.asarray(numbers, dtype=np.float64)
+    return float(product) if product.ndim == 0 else tuple(product.tolist())
+
+
+def fit(disturbance: Disturbance, numbers: npt.ArrayLike, names: Sequence[str], field: str = "std") -> Array:
+    """A field as one number for each of `names`. Raises InputError if it has another number of them."""
+    values = np.asarray(numbers, dtype=np.float64)
     if values.ndim and len(values) != len(names):
         raise InputError(
-            f"{type(disturbance).__name__}: std: got {len(values)} numbers, want 1 or {len(names)}: {', '.join(names)}"
+            f"{type(disturbance).__name__}: {field}: got {len(values)} numbers, want 1 or {len(names)}:"
+            f" {', '.join(names)}"
         )
     return np.broadcast_to(values, len(names))
 

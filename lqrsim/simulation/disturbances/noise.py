@@ -1,7 +1,7 @@
-"""White noise, and pushes."""
+"""White noise on controls, measurements, forces and torques; and pushes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from lqrsim.simulation.disturbances.base import (
     check_std,
     fit,
     normal,
+    times,
     with_units,
     words,
 )
@@ -36,6 +37,9 @@ class ControlNoise(Disturbance):
     def describe(self, plant: Plant) -> str:
         return f"control noise, std {with_units(self, self.std, plant.robot.dynamics.control_coordinates)}"
 
+    def scaled(self, strength: float) -> "ControlNoise":
+        return replace(self, std=times(self, self.std, strength))
+
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         std = fit(self, self.std, plant.robot.dynamics.control_coordinates.names)
         noise = std * normal(generators, plan.steps, len(std))
@@ -57,6 +61,9 @@ class MeasurementNoise(Disturbance):
 
     def describe(self, plant: Plant) -> str:
         return f"measurement noise, std {with_units(self, self.std, plant.robot.dynamics.state_coordinates)}"
+
+    def scaled(self, strength: float) -> "MeasurementNoise":
+        return replace(self, std=times(self, self.std, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
@@ -81,9 +88,37 @@ class ForceNoise(Disturbance):
     def describe(self, plant: Plant) -> str:
         return f"force noise, std {words(self.std)} N"
 
+    def scaled(self, strength: float) -> "ForceNoise":
+        return replace(self, std=times(self, self.std, strength))
+
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         forces = fit(self, self.std, "xyz") * normal(generators, plan.steps, 3)
         return Effect(force=lambda step, states: forces[:, step])
+
+
+@dataclass(frozen=True)
+class TorqueNoise(Disturbance):
+    """A random torque on the robot, redrawn each control period and held over it.
+
+    Args:
+      std: standard deviation in N m; one number, or three about the world's axes.
+    """
+
+    std: Numbers
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "std", check_std(self, self.std))
+        fit(self, self.std, "xyz")
+
+    def describe(self, plant: Plant) -> str:
+        return f"torque noise, std {words(self.std)} N m"
+
+    def scaled(self, strength: float) -> "TorqueNoise":
+        return replace(self, std=times(self, self.std, strength))
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        torques = fit(self, self.std, "xyz") * normal(generators, plan.steps, 3)
+        return Effect(torque=lambda step, states: torques[:, step])
 
 
 @dataclass(frozen=True)
@@ -104,6 +139,9 @@ class Push(Disturbance):
 
     def describe(self, plant: Plant) -> str:
         return f"push of {words(self.impulse)} N s at {self.at:g} s"
+
+    def scaled(self, strength: float) -> "Push":
+        return replace(self, impulse=times(self, self.impulse, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         period = int(self.at / plan.dt + 1e-9)  # a time that is a knot up to rounding belongs to the period after it

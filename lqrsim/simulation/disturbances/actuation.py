@@ -1,0 +1,246 @@
+"""What is wrong with the actuators: late, slow, weak, or lost. White noise on them is in `noise.py`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from mujoco import batch
+
+from lqrsim.errors import Array, InputError, check_count, check_name, check_number
+from lqrsim.results import Trajectory
+from lqrsim.simulation.disturbances.base import (
+    Disturbance,
+    Effect,
+    Numbers,
+    check_numbers,
+    check_strength,
+    fit,
+    times,
+    with_units,
+)
+from lqrsim.simulation.disturbances.sensing import counted
+from lqrsim.simulation.plant import Plant
+
+_FIXED = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
+
+
+@dataclass(frozen=True)
+class ControlDelay(Disturbance):
+    """Commands arrive late; until the first does, the plan's controls are applied.
+
+    Args:
+      periods: how many control periods late.
+    """
+
+    periods: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "periods", check_count("ControlDelay: periods", self.periods, at_least=0))
+
+    def describe(self, plant: Plant) -> str:
+        return f"commands late by {counted(self.periods)}"
+
+    def scaled(self, strength: float) -> "ControlDelay":
+        """Rounded to whole periods."""
+        return replace(self, periods=int(times(self, self.periods, strength) + 0.5))
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        under_way: list[Array] = []
+
+        def actuate(step: int, controls: Array) -> Array:
+            under_way.append(controls.copy())
+            if len(under_way) > self.periods:
+                return under_way.pop(0)
+            return np.tile(plan.controls[step], (len(controls), 1))
+
+        return Effect(actuate=actuate)
+
+
+@dataclass(frozen=True)
+class MotorLag(Disturbance):
+    """Actuators follow their commands, within the limits, with a first-order lag, from the plan's first control on.
+
+    What is applied in a control period is the exact mean over it.
+
+    Args:
+      time_constant: in s.
+    """
+
+    time_constant: float
+
+    def __post_init__(self) -> None:
+        constant = check_number("MotorLag: time_constant", self.time_constant, at_least=0.0)
+        object.__setattr__(self, "time_constant", constant)
+
+    def describe(self, plant: Plant) -> str:
+        return f"motor lag, time constant {self.time_constant:g} s"
+
+    def scaled(self, strength: float) -> "MotorLag":
+        return replace(self, time_constant=times(self, self.time_constant, strength))
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        if self.time_constant == 0:
+            return Effect()
+        step_in_constants = plan.dt / self.time_constant
+        left = np.exp(-step_in_constants)  # of the distance to the command, at the end of the period
+        mean = -np.expm1(-step_in_constants) / step_in_constants  # and in the mean over it
+        space, reached = plant.robot.dynamics.control_coordinates, np.tile(plan.controls[0], (len(generators), 1))
+
+        def actuate(step: int, controls: Array) -> Array:
+            controls = space.clip(controls)
+            behind = reached - controls
+            reached[:] = controls + left * behind
+            return controls + mean * behind
+
+        return Effect(actuate=actuate)
+
+
+@dataclass(frozen=True)
+class Saturation(Disturbance):
+    """Limits of the controls that are narrower than the robot's own.
+
+    Args:
+      lowest, highest: in the control's unit, within the robot's limits; one number, or one a control; None keeps it.
+      share: instead of them, share of the robot's own limits that is left, 0 to 1.
+      strength: how far the limits go from the robot's own (0) to these (1), and beyond, until they meet.
+    """
+
+    lowest: Numbers | None = None
+    highest: Numbers | None = None
+    share: float | None = None
+    strength: float = 1.0
+
+    def __post_init__(self) -> None:
+        given = [name for name in ("lowest", "highest") if getattr(self, name) is not None]
+        if bool(given) == (self.share is not None):
+            got = "both" if given else "neither"
+            raise InputError(f"Saturation: share: got {got} it and limits, want lowest, highest or both, or a share")
+        for name in given:
+            object.__setattr__(self, name, check_numbers(self, name, getattr(self, name)))
+        if self.share is not None:
+            share = check_number("Saturation: share", self.share, at_least=0.0, at_most=1.0)
+            object.__setattr__(self, "share", share)
+        object.__setattr__(self, "strength", check_strength(self, self.strength))
+
+    def describe(self, plant: Plant) -> str:
+        space = plant.robot.dynamics.control_coordinates
+        if self.share is not None:
+            limits = f"{100 * self.share:g} % of the robot's own"
+        else:
+            sides = {"from": self.lowest, "to": self.highest}
+            limits = " ".join(f"{word} {with_units(self, v, space)}" for word, v in sides.items() if v is not None)
+        return f"controls limited {'to ' if self.share is not None else ''}{limits}" + (
+            f", strength {self.strength:g}" if self.strength != 1 else ""
+        )
+
+    def scaled(self, strength: float) -> "Saturation":
+        return replace(self, strength=times(self, self.strength, strength))
+
+    def limits(self, plant: Plant) -> tuple[Array, Array]:
+        """Lowest and highest controls, each (m,). Raises InputError if the robot's own do not contain them."""
+        space = plant.robot.dynamics.control_coordinates
+        own = np.array([space.low, space.high])
+        if self.share is not None:
+            if not np.isfinite(own).all():
+                raise InputError(f"Saturation: share: got robot {plant.robot.name} without limits, want one with them")
+            # Of a range that does not contain zero, only the far side comes nearer.
+            wanted = np.array([np.maximum(own[0], self.share * own[0]), np.minimum(own[1], self.share * own[1])])
+        else:
+            sides = zip(("lowest", "highest"), (self.lowest, self.highest), own, strict=True)
+            wanted = np.array([fit(self, o if v is None else v, space.names, name) for name, v, o in sides])
+        if (wanted != np.clip(wanted, *own)).any() or (wanted[0] > wanted[1]).any():
+            i = int(np.argmax((wanted != np.clip(wanted, *own)).any(axis=0) | (wanted[0] > wanted[1])))
+            raise InputError(
+                f"Saturation: got {wanted[0, i]:g} to {wanted[1, i]:g} for {space.names[i]}, want the first not"
+                f" above the second, within {plant.robot.name}'s {own[0, i]:g} to {own[1, i]:g}"
+            )
+        moved = wanted != own
+        if self.strength != 1:
+            if not np.isfinite(own[moved]).all():
+                raise InputError(
+                    f"Saturation: strength: got {self.strength:g} for robot {plant.robot.name}, which has no limits of"
+                    " its own to go from, want 1"
+                )
+            wanted[moved] = own[moved] + self.strength * (wanted[moved] - own[moved])
+        low, high = wanted
+        crossed = low > high
+        low[crossed] = high[crossed] = (low[crossed] + high[crossed]) / 2
+        return low, high
+
+    def check(self, plant: Plant) -> None:
+        self.limits(plant)
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        low, high = self.limits(plant)
+        return Effect(actuate=lambda step, controls: np.clip(controls, low, high))
+
+
+@dataclass(frozen=True)
+class ActuatorLoss(Disturbance):
+    """An actuator fails for good: what it exerts in MuJoCo goes to a share. A wheel that lost its drive turns freely.
+
+    Args:
+      actuator: one of the robot's `actuators`; None draws one for each trial.
+      at: seconds after the start; lost from the first control period on that begins then or later.
+      remaining: share of its force that is left, 0 to 1.
+    """
+
+    actuator: str | None = None
+    at: float = 0.0
+    remaining: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.actuator is not None and not isinstance(self.actuator, str):
+            raise InputError(f"ActuatorLoss: actuator: got {self.actuator!r}, want a name, or None to draw one")
+        object.__setattr__(self, "at", check_number("ActuatorLoss: at", self.at, at_least=0.0))
+        remaining = check_number("ActuatorLoss: remaining", self.remaining, at_least=0.0, at_most=1.0)
+        object.__setattr__(self, "remaining", remaining)
+
+    def describe(self, plant: Plant) -> str:
+        which = self.actuator or f"one of {', '.join(plant.robot.actuators)}"
+        return f"{which} down to {100 * self.remaining:g} % from {self.at:g} s on"
+
+    def scaled(self, strength: float) -> "ActuatorLoss":
+        """So many times as much is lost, at most all."""
+        lost = min(1.0, times(self, 1 - self.remaining, strength))
+        return replace(self, remaining=self.remaining if strength == 1 else 1 - lost)
+
+    def check(self, plant: Plant) -> None:
+        if self.actuator is not None:
+            check_name(f"ActuatorLoss: actuator of {plant.robot.name}", self.actuator, plant.robot.actuators)
+        check_gains(self, plant)
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        self.check(plant)
+        period = int(np.ceil(self.at / plan.dt - 1e-9))  # a time that is a knot up to rounding is that knot
+        if period >= plan.steps:
+            raise InputError(
+                f"ActuatorLoss: at: got {self.at:g} s, want a time before the last control period of the plan, which"
+                f" ends at {plan.horizon:g} s"
+            )
+        if self.actuator is None:
+            lost = plant.ctrl[[int(generator.integers(len(plant.ctrl))) for generator in generators]]
+        else:
+            lost = np.full(len(generators), plant.ctrl[plant.robot.actuators.index(self.actuator)])
+        trials, parameters = np.arange(len(generators)), []
+
+        def alter(simulations: batch.Batch) -> None:
+            parameters.extend(simulations.expand(field) for field in ("actuator_gainprm", "actuator_biasprm"))
+
+        def actuate(step: int, controls: Array) -> Array:
+            for values in parameters if step == period else ():
+                values[trials, lost] *= self.remaining
+            return controls
+
+        return Effect(alter=alter, actuate=actuate)
+
+
+def check_gains(disturbance: Disturbance, plant: Plant) -> None:
+    """Raise InputError unless what the robot's actuators exert is proportional to their gains and biases."""
+    for name, number in zip(plant.robot.actuators, plant.ctrl, strict=True):
+        if plant.model.actuator_gaintype[number] not in _FIXED or plant.model.actuator_biastype[number] not in (0, 1):
+            raise InputError(
+                f"{type(disturbance).__name__}: got robot {plant.robot.name} with actuator {name!r} of a kind whose"
+                " gain is no plain number, want fixed or affine gains and biases"
+            )

@@ -1,0 +1,229 @@
+"""Robots that are not quite the model that the policy was made for.
+
+Each of these multiplies something in a trial's own MuJoCo model by a factor: 1 plus a normal number that is cut at
+three standard deviations, drawn for each trial; or a fixed factor.
+"""
+
+import abc
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from mujoco import batch
+
+from lqrsim.errors import Array, InputError, check_number
+from lqrsim.results import Trajectory
+from lqrsim.simulation.disturbances.actuation import check_gains
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, Numbers, check_numbers, check_strength, fit, words
+from lqrsim.simulation.plant import Plant
+
+CUT = 3.0  # standard deviations
+
+
+@dataclass(frozen=True)
+class Mismatch(Disturbance):
+    """What all of them share.
+
+    Args:
+      std: relative standard deviation of the factor about 1, below 1/3, so that what is left is positive.
+      factor: instead of it, the factor itself, > 0; one number, or one for each of `parts`.
+    """
+
+    std: float | None = None
+    factor: Numbers | None = None
+
+    what: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        name = type(self).__name__
+        if (self.std is None) == (self.factor is None):
+            got = "neither of" if self.std is None else "both"
+            raise InputError(f"{name}: got {got} std and factor, want one of them")
+        if self.std is not None:
+            object.__setattr__(self, "std", check_number(f"{name}: std", self.std, at_least=0.0, below=1 / CUT))
+        if self.factor is not None:
+            factor = check_numbers(self, "factor", self.factor)
+            if not np.min(factor) > 0:
+                raise InputError(f"{name}: factor: got {np.min(factor):g}, want numbers > 0")
+            object.__setattr__(self, "factor", factor)
+
+    @abc.abstractmethod
+    def parts(self, plant: Plant) -> Sequence[str]:
+        """What has a factor of its own."""
+
+    @abc.abstractmethod
+    def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
+        """Change the models of the simulations by factors (K, parts)."""
+
+    def describe(self, plant: Plant) -> str:
+        if self.factor is not None:
+            return f"{self.what} times {words(self.factor)}"
+        return f"{self.what} off by {100 * (self.std or 0.0):g} % (std, cut at {CUT:g} std)"
+
+    def scaled(self, strength: float) -> "Mismatch":
+        """The standard deviation so many times as large; of a fixed factor, the power."""
+        strength = check_strength(self, strength)
+        if self.factor is None:
+            return replace(self, std=strength * (self.std or 0.0))
+        factor = np.asarray(self.factor) ** strength
+        return replace(self, factor=float(factor) if factor.ndim == 0 else tuple(factor.tolist()))
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        self.check(plant)
+        parts = self.parts(plant)
+        if self.factor is None:
+            factors = 1 + (self.std or 0.0) * np.array([[cut_normal(one) for _ in parts] for one in generators])
+        else:
+            factors = np.tile(fit(self, self.factor, parts, "factor"), (len(generators), 1))
+        return Effect(alter=lambda simulations: self.multiply(plant, simulations, factors))
+
+
+class MassMismatch(Mismatch):
+    """Another mass, as of a load at the centre of mass of each of the robot's bodies; the inertia stays.
+
+    Drawn for each trial from a normal distribution that is cut at three std, or a fixed factor.
+    """
+
+    what = "mass"
+
+    def parts(self, plant: Plant) -> Sequence[str]:
+        return ("mass",)
+
+    def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
+        simulations.expand("body_mass")[:, bodies(plant)] *= factors
+
+
+class InertiaMismatch(Mismatch):
+    """Another inertia of the robot's bodies about their centres of mass, by one factor about all axes; the mass stays.
+
+    Drawn for each trial from a normal distribution that is cut at three std, or a fixed factor.
+    """
+
+    what = "inertia"
+
+    def parts(self, plant: Plant) -> Sequence[str]:
+        return ("inertia",)
+
+    def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
+        simulations.expand("body_inertia")[:, bodies(plant)] *= factors[:, :, None]
+
+
+class ThrustMismatch(Mismatch):
+    """Actuators that exert more or less than they are told, each its own: what is along their gain, for forces only.
+
+    Drawn for each trial and actuator from a normal distribution that is cut at three std, or fixed factors.
+    """
+
+    what = "thrust"
+
+    def check(self, plant: Plant) -> None:
+        check_gains(self, plant)
+        if plant.model.actuator_biastype[plant.ctrl].any():
+            raise InputError(
+                f"ThrustMismatch: got robot {plant.robot.name}, whose actuators are servos, want one whose actuators"
+                " exert forces"
+            )
+
+    def parts(self, plant: Plant) -> Sequence[str]:
+        return plant.robot.actuators
+
+    def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
+        simulations.expand("actuator_gainprm")[:, plant.ctrl] *= factors[:, :, None]
+
+
+class WheelMismatch(Mismatch):
+    """What the mismatches of wheels share: they need a robot that has some."""
+
+    def check(self, plant: Plant) -> None:
+        if not plant.robot.wheels:
+            raise InputError(
+                f"{type(self).__name__}: got robot {plant.robot.name}, which has no wheels, want one that names their"
+                " treads in `wheels`"
+            )
+
+    def parts(self, plant: Plant) -> Sequence[str]:
+        return plant.robot.wheels
+
+
+class WheelRadiusMismatch(WheelMismatch):
+    """Wheels that are larger or smaller, each its own; the robot stands level all the same.
+
+    Drawn for each trial and wheel from a normal distribution that is cut at three std, or fixed factors.
+    """
+
+    what = "wheel radius"
+
+    def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
+        wheels, hubs = treads(plant)
+        # How large a geom is stands in three fields of the model, and set_const derives none from the others.
+        simulations.expand("geom_size")[:, wheels] *= factors[:, :, None]
+        simulations.expand("geom_rbound")[:, wheels] *= factors
+        simulations.expand("geom_aabb")[:, wheels, 3:] *= factors[:, :, None]
+        # An axle that is higher by as much as the wheel is larger keeps the tread on the floor, and the casters off it.
+        raised = plant.model.geom_size[wheels, 0] * (factors - 1)
+        simulations.expand("body_pos")[:, hubs] += raised[:, :, None] * upward(plant, hubs)
+
+
+class AxleMismatch(WheelMismatch):
+    """Wheels that are further apart, or closer together.
+
+    Drawn for each trial from a normal distribution that is cut at three std, or a fixed factor.
+    """
+
+    what = "axle length"
+
+    def parts(self, plant: Plant) -> Sequence[str]:
+        return ("axle",)
+
+    def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
+        _, hubs = treads(plant)
+        from_middle = plant.model.body_pos[hubs] - plant.model.body_pos[hubs].mean(axis=0)
+        simulations.expand("body_pos")[:, hubs] += (factors - 1)[:, :, None] * from_middle
+
+
+class FrictionMismatch(WheelMismatch):
+    """Another sliding friction between the wheels and the floor, the same for all wheels.
+
+    Drawn for each trial from a normal distribution that is cut at three std, or a fixed factor.
+    """
+
+    what = "friction of the wheels"
+
+    def parts(self, plant: Plant) -> Sequence[str]:
+        return ("friction",)
+
+    def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
+        wheels, _ = treads(plant)
+        simulations.expand("geom_friction")[:, wheels, 0] *= factors
+
+
+def cut_normal(generator: np.random.Generator) -> float:
+    """A standard normal number, drawn again while it is beyond the cut."""
+    while abs(number := generator.standard_normal()) > CUT:
+        pass
+    return number
+
+
+def bodies(plant: Plant) -> npt.NDArray[np.intp]:
+    """Ids of the robot's bodies: its own and those that hang on it."""
+    found = {plant.body}
+    for body in range(plant.body + 1, plant.model.nbody):  # parents come before their children
+        if plant.model.body_parentid[body] in found:
+            found.add(body)
+    return np.array(sorted(found), dtype=np.intp)
+
+
+def treads(plant: Plant) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Ids of the wheels' geoms, and of the bodies that they are on."""
+    geoms = np.array([plant.model.geom(name).id for name in plant.robot.wheels], dtype=np.intp)
+    return geoms, plant.model.geom_bodyid[geoms].astype(np.intp)
+
+
+def upward(plant: Plant, children: npt.NDArray[np.intp]) -> Array:
+    """The world's upward direction in the axes of each body's parent, (bodies, 3), as the model is drawn."""
+    drawn = mujoco.MjData(plant.model)
+    mujoco.mj_kinematics(plant.model, drawn)
+    return drawn.xmat[plant.model.body_parentid[children]].reshape(-1, 3, 3)[:, 2]

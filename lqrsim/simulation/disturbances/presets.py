@@ -1,0 +1,69 @@
+"""Named sets of disturbances, from calm to severe, of those that a plant can have."""
+
+import numpy as np
+
+from lqrsim.errors import InputError, check_name
+from lqrsim.simulation.disturbances.actuation import MotorLag
+from lqrsim.simulation.disturbances.base import Disturbance
+from lqrsim.simulation.disturbances.mismatch import (
+    AxleMismatch,
+    FrictionMismatch,
+    InertiaMismatch,
+    MassMismatch,
+    ThrustMismatch,
+    WheelRadiusMismatch,
+)
+from lqrsim.simulation.disturbances.noise import ControlNoise, ForceNoise, MeasurementNoise
+from lqrsim.simulation.disturbances.sensing import MeasurementDropouts
+from lqrsim.simulation.disturbances.surroundings import DisplacedObstacles, InitialStateError
+from lqrsim.simulation.disturbances.wind import Dryden
+from lqrsim.simulation.plant import Plant
+
+# Strengths, of which light is 1: as MIL-F-8785C has light, moderate and severe turbulence, 15, 30 and 45 knots.
+PRESETS = {"calm": 0.5, "light": 1.0, "moderate": 2.0, "strong": 2.5, "severe": 3.0}
+
+# What a state of each unit is measured to: RotorPy's 5e-4 m, 5e-3 m/s, 5e-4 rad, 5e-4 rad/s per root of Hz, at 100 Hz.
+MEASURED = {"m": 5e-3, "m/s": 5e-2, "rad": 5e-3, "rad/s": 5e-3}
+# How far off a run begins: our choice, of the order of a careful placement by hand.
+PLACED = {"m": 0.01, "m/s": 0.01, "rad": 0.01, "rad/s": 0.01}
+
+
+def preset(name: str, plant: Plant) -> list[Disturbance]:
+    """The set of that name: `PRESETS` has them. What comes in whole control periods is not in it: how long is one?
+
+    Raises:
+      InputError: there is none of that name.
+    """
+    strength = PRESETS[check_name("preset", name, PRESETS)]
+    return [one.scaled(strength) for one in _light(plant) if _can_have(plant, one)]
+
+
+def _light(plant: Plant) -> list[Disturbance]:
+    """All, at strength 1, in the order in which they happen."""
+    space, controls = plant.robot.dynamics.state_coordinates, plant.robot.dynamics.control_coordinates
+    ranges = np.subtract(controls.high, controls.low)
+    weight = float(plant.model.body_subtreemass[plant.body] * np.linalg.norm(plant.model.opt.gravity))
+    return [
+        InitialStateError([PLACED.get(unit, 0.0) for unit in space.units]),
+        DisplacedObstacles(0.01),  # our choice: as a map is drawn
+        MassMismatch(0.02),  # our choice: a battery, a camera
+        InertiaMismatch(0.1 / 3),  # +-10 % in all, SkyJEPA's data card
+        ThrustMismatch(0.12 / 3),  # +-12 % in all, SkyJEPA's data card
+        WheelRadiusMismatch(0.005),  # our choice: 0.2 mm of a wheel of the Create
+        AxleMismatch(0.01),  # our choice: where a tread touches the floor is not known better
+        FrictionMismatch(0.1),  # our choice: severe is between half and three halves
+        MeasurementNoise([MEASURED.get(unit, 0.0) for unit in space.units]),
+        MeasurementDropouts(0.01),  # our choice
+        ControlNoise(np.where(np.isfinite(ranges), 0.01 * ranges, 0.0).tolist()),  # our choice: 1 % of the range
+        MotorLag(0.024),  # severe is the Crazyflie's 0.072 s in RotorPy; the Hummingbird's is 0.005 s
+        ForceNoise(0.01 * weight),  # our choice: 1 % of the weight
+        Dryden("light", altitude=2.0),
+    ]
+
+
+def _can_have(plant: Plant, disturbance: Disturbance) -> bool:
+    try:
+        disturbance.check(plant)
+    except InputError:
+        return False
+    return True

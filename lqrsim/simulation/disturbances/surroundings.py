@@ -1,0 +1,82 @@
+"""A robot that begins elsewhere, and obstacles that are elsewhere."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lqrsim.errors import InputError
+from lqrsim.results import Trajectory
+from lqrsim.simulation.disturbances.base import (
+    Disturbance,
+    Effect,
+    Numbers,
+    check_std,
+    fit,
+    normal,
+    times,
+    with_units,
+    words,
+)
+from lqrsim.simulation.plant import Plant
+
+
+@dataclass(frozen=True)
+class InitialStateError(Disturbance):
+    """The robot does not begin where the plan does.
+
+    Args:
+      std: standard deviation in the state's unit; one number, or one a state.
+    """
+
+    std: Numbers
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "std", check_std(self, self.std))
+
+    def describe(self, plant: Plant) -> str:
+        return f"initial state off, std {with_units(self, self.std, plant.robot.dynamics.state_coordinates)}"
+
+    def scaled(self, strength: float) -> "InitialStateError":
+        return replace(self, std=times(self, self.std, strength))
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
+        error = std * normal(generators, 1, len(std))[:, 0]
+        return Effect(begin=lambda states: states + error)
+
+
+@dataclass(frozen=True)
+class DisplacedObstacles(Disturbance):
+    """Obstacles are not where the plan has them. Planes stay, and for a robot in the plane, heights.
+
+    Args:
+      std: standard deviation in m; one number, or three along the world's axes.
+    """
+
+    std: Numbers
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "std", check_std(self, self.std))
+        fit(self, self.std, "xyz")
+
+    def describe(self, plant: Plant) -> str:
+        return f"obstacles displaced, std {words(self.std)} m"
+
+    def scaled(self, strength: float) -> "DisplacedObstacles":
+        return replace(self, std=times(self, self.std, strength))
+
+    def check(self, plant: Plant) -> None:
+        if not any(obstacle.kind != "plane" for obstacle in plant.world.obstacles):
+            raise InputError(
+                f"DisplacedObstacles: got scene {plant.scene.name}, in which nothing but planes bounds robot"
+                f" {plant.robot.name}, want one with obstacles"
+            )
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        self.check(plant)
+        displaced = fit(self, self.std, "xyz") * normal(generators, len(plant.world), 3)
+        displaced[:, [obstacle.kind == "plane" for obstacle in plant.world.obstacles]] = 0.0
+        if len(plant.robot.dynamics.state_coordinates.position) == 2:
+            displaced[..., 2] = 0.0
+        return Effect(displaced=displaced)

@@ -1,0 +1,199 @@
+"""Wind: constant, in gusts, or Dryden's turbulence. It acts through the robot's linear drag: F = drag * wind."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lqrsim.errors import Array, InputError, check_array, check_name, check_number
+from lqrsim.results import Trajectory
+from lqrsim.simulation.disturbances.base import (
+    Disturbance,
+    Effect,
+    Numbers,
+    check_std,
+    fit,
+    normal,
+    times,
+    words,
+)
+from lqrsim.simulation.plant import Plant
+
+FOOT = 0.3048  # m
+KNOT = 1852 / 3600  # m/s
+SEVERITIES = {"light": 15 * KNOT, "moderate": 30 * KNOT, "severe": 45 * KNOT}  # m/s at 20 ft, MIL-F-8785C
+ROUGHNESS = 0.15  # ft, of the ground in MIL-F-8785C's mean wind near landing
+
+
+class Wind(Disturbance):
+    """What all winds share: they need a robot that the air drags along."""
+
+    def check(self, plant: Plant) -> None:
+        if not plant.robot.drag > 0:
+            raise InputError(
+                f"{type(self).__name__}: got robot {plant.robot.name}, which has no drag that wind could act through,"
+                " want one with a `drag` in N s/m"
+            )
+
+    def blow(self, plant: Plant, wind: Array) -> Effect:
+        """The effect of winds (K, T, 3) in m/s, held over each control period."""
+        forces = plant.robot.drag * wind
+        return Effect(force=lambda step, states: forces[:, step])
+
+
+@dataclass(frozen=True)
+class MeanWind(Wind):
+    """A constant wind.
+
+    Args:
+      velocity: in m/s along the world's axes, (3,).
+    """
+
+    velocity: Sequence[float]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "velocity", tuple(check_array("MeanWind: velocity", self.velocity, (3,)).tolist()))
+
+    def describe(self, plant: Plant) -> str:
+        return f"wind of {words(self.velocity)} m/s"
+
+    def scaled(self, strength: float) -> "MeanWind":
+        return replace(self, velocity=times(self, self.velocity, strength))
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        self.check(plant)
+        return self.blow(plant, np.broadcast_to(self.velocity, (len(generators), plan.steps, 3)))
+
+
+@dataclass(frozen=True)
+class Gusts(Wind):
+    """Gusts that rise and fade: an Ornstein-Uhlenbeck process on each axis, in its stationary state from the start.
+
+    Args:
+      std: of the wind in m/s; one number, or three along the world's axes.
+      time_constant: seconds in which the correlation falls to 1/e.
+    """
+
+    std: Numbers = 1.0
+    time_constant: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "std", check_std(self, self.std))
+        fit(self, self.std, "xyz")
+        constant = check_number("Gusts: time_constant", self.time_constant, above=0.0)
+        object.__setattr__(self, "time_constant", constant)
+
+    def describe(self, plant: Plant) -> str:
+        return f"gusts, std {words(self.std)} m/s, time constant {self.time_constant:g} s"
+
+    def scaled(self, strength: float) -> "Gusts":
+        return replace(self, std=times(self, self.std, strength))
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        self.check(plant)
+        noise = normal(generators, plan.steps, 3)
+        return self.blow(plant, fit(self, self.std, "xyz") * first_order(noise, plan.dt / self.time_constant))
+
+
+@dataclass(frozen=True)
+class Dryden(Wind):
+    """Dryden's turbulence near the ground, without its mean wind (MIL-F-8785C, below 1000 ft).
+
+    The robot is taken to be slow against the wind: the turbulence drifts by with the mean wind at its altitude.
+
+    Args:
+      wind: mean wind at 20 ft in m/s, or "light", "moderate" or "severe": 15, 30 or 45 knots.
+      altitude: above the ground in m; below 10 ft it counts as 10 ft.
+      direction: in which the mean wind blows, rad from the world's x axis towards its y axis.
+    """
+
+    wind: float | str = "light"
+    altitude: float = 2.0
+    direction: float = 0.0
+
+    def __post_init__(self) -> None:
+        if isinstance(self.wind, str):
+            check_name("Dryden: wind", self.wind, SEVERITIES)
+        else:
+            object.__setattr__(self, "wind", check_number("Dryden: wind", self.wind, at_least=0.0))
+        altitude = check_number("Dryden: altitude", self.altitude, at_least=0.0, at_most=1000 * FOOT)
+        object.__setattr__(self, "altitude", altitude)
+        object.__setattr__(self, "direction", check_number("Dryden: direction", self.direction))
+
+    @property
+    def wind_at_20_ft(self) -> float:
+        """In m/s."""
+        return SEVERITIES[self.wind] if isinstance(self.wind, str) else self.wind
+
+    @property
+    def airspeed(self) -> float:
+        """Mean wind at the altitude in m/s."""
+        return self.wind_at_20_ft * np.log(self._feet / ROUGHNESS) / np.log(20 / ROUGHNESS)
+
+    @property
+    def std(self) -> tuple[float, float, float]:
+        """Of the turbulence along the mean wind, across it and upward, in m/s."""
+        upward = 0.1 * self.wind_at_20_ft
+        level = upward / (0.177 + 0.000823 * self._feet) ** 0.4
+        return level, level, upward
+
+    @property
+    def lengths(self) -> tuple[float, float, float]:
+        """Scales of the turbulence along the mean wind, across it and upward, in m."""
+        level = self._feet / (0.177 + 0.000823 * self._feet) ** 1.2
+        return level * FOOT, level * FOOT, self._feet * FOOT
+
+    @property
+    def _feet(self) -> float:
+        return max(self.altitude / FOOT, 10.0)
+
+    def describe(self, plant: Plant) -> str:
+        severity = f"{self.wind} " if isinstance(self.wind, str) else ""
+        return f"{severity}Dryden turbulence at {self.altitude:g} m, wind {self.wind_at_20_ft:.3g} m/s at 20 ft"
+
+    def scaled(self, strength: float) -> "Dryden":
+        return replace(self, wind=times(self, self.wind_at_20_ft, strength))
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        self.check(plant)
+        noise = normal(generators, plan.steps, 5)
+        steps = self.airspeed * plan.dt / np.array(self.lengths)
+        along = self.std[0] * first_order(noise[..., :1], steps[0])[..., 0]
+        across = self.std[1] * second_order(noise[..., 1:3], steps[1])
+        upward = self.std[2] * second_order(noise[..., 3:], steps[2])
+        cosine, sine = np.cos(self.direction), np.sin(self.direction)
+        return self.blow(plant, np.stack([cosine * along - sine * across, sine * along + cosine * across, upward], -1))
+
+
+def first_order(noise: Array, step: float) -> Array:
+    """White noise (K, T, d) through 1 / (1 + s), a step being so many time constants; stationary, of variance 1."""
+    values, keep = np.empty_like(noise), np.exp(-step)
+    fresh = np.sqrt(-np.expm1(-2 * step))
+    values[:, 0] = noise[:, 0]
+    for t in range(1, noise.shape[1]):
+        values[:, t] = keep * values[:, t - 1] + fresh * noise[:, t]
+    return values
+
+
+def second_order(noise: Array, step: float) -> Array:
+    """White noise (K, T, 2) through (1 + sqrt(3) s) / (1 + s)^2: (K, T), stationary, of variance 1.
+
+    The state is p with p'' + 2 p' + p = 2 w, and p': of variance 1 each when stationary, and uncorrelated.
+    """
+    decay = np.exp(-step)
+    a, b, c, d = decay * (1 + step), decay * step, -decay * step, decay * (1 - step)
+    # What is new in a step has the covariance that keeps the stationary one: I - F F'.
+    covariance = np.eye(2) - np.array([[a * a + b * b, a * c + b * d], [a * c + b * d, c * c + d * d]])
+    variances, axes = np.linalg.eigh(covariance)
+    root = axes * np.sqrt(np.maximum(variances, 0.0))
+    values = np.empty(noise.shape[:2])
+    place, rate = noise[:, 0, 0], noise[:, 0, 1]
+    for t in range(noise.shape[1]):
+        if t:
+            first, second = noise[:, t, 0], noise[:, t, 1]
+            place, rate = (
+                a * place + b * rate + root[0, 0] * first + root[0, 1] * second,
+                c * place + d * rate + root[1, 0] * first + root[1, 1] * second,
+            )
+        values[:, t] = (place + np.sqrt(3) * rate) / 2
+    return values
