@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from test_disturbances import assert_white
-from tracking import hover, track, weave
+from tracking import hover, track
 
 from lqrsim.errors import InputError
 from lqrsim.robots.differential_drive import DifferentialDrive

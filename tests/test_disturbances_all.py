@@ -1,0 +1,254 @@
+"""What every disturbance has in common: found by name, validated, scaled, repeatable to the last bit, composable."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from tracking import hover, weave
+
+import lqrsim as ls
+from lqrsim.errors import InputError
+from lqrsim.robots.differential_drive import DifferentialDrive
+from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.scenes import load_scene
+from lqrsim.simulation import disturbances
+from lqrsim.simulation.closed_loop import simulate
+from lqrsim.simulation.disturbances import KINDS, PRESETS, Disturbance, GilbertElliott, preset
+from lqrsim.simulation.plant import Plant
+
+RECORDS = (
+    "states", "measured", "commanded", "applied", "forces", "torques", "displaced", "clearance", "contacts", "frames",
+)  # fmt: skip
+
+# One of each that both robots can have, and those of the one and the other.
+BOTH = [
+    ls.InitialStateError(0.01), ls.DisplacedObstacles(0.05), ls.MassMismatch(0.1), ls.InertiaMismatch(0.1),
+    ls.MeasurementNoise(0.005), ls.MeasurementBias(0.005), ls.MeasurementLatency(1),
+    ls.MeasurementDropouts(GilbertElliott(0.2, 0.5)), ls.ControlNoise(0.02), ls.CommandDropouts(0.2),
+    ls.ControlDelay(1), ls.MotorLag(0.05), ls.Saturation(share=0.9), ls.ActuatorLoss(at=0.2, remaining=0.7),
+    ls.ForceNoise(0.1), ls.TorqueNoise(0.002), ls.Push((0.1, 0.0, 0.0), at=0.1),
+]  # fmt: skip
+OWN = {
+    "cage": [ls.ThrustMismatch(0.05), ls.MeanWind((0.5, 0.2, 0.0)), ls.Gusts(0.5, 0.5), ls.Dryden("light")],
+    "arena": [ls.WheelRadiusMismatch(0.01), ls.AxleMismatch(0.02), ls.FrictionMismatch(0.1)],
+}
+EXAMPLES = {type(one).__name__: one for one in (*BOTH, *OWN["cage"], *OWN["arena"])}
+FITTING = [(name, one) for name, own in OWN.items() for one in (*BOTH, *own)]
+NAMED = [f"{type(one).__name__} in the {name}" for name, one in FITTING]
+
+
+@pytest.fixture(scope="module")
+def plants():
+    return {"arena": Plant(DifferentialDrive(), load_scene("arena")), "cage": Plant(Quadrotor(), load_scene("cage"))}
+
+
+@pytest.fixture(scope="module")
+def solutions():
+    return {"arena": weave(10), "cage": hover(10)}
+
+
+def assert_same(one, other, trials=slice(None)):
+    for name in RECORDS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name)[trials], err_msg=name)
+
+
+def test_every_class_is_found_by_its_name_and_exported():
+    assert set(EXAMPLES) == set(KINDS)
+    for name, kind in KINDS.items():
+        assert kind.__name__ == name
+        assert kind is getattr(ls, name) is getattr(disturbances, name)
+        assert dataclasses.is_dataclass(kind)
+        assert dataclasses.fields(kind)
+        assert kind.__doc__
+        assert "describe" in {key for base in kind.__mro__[:-3] for key in vars(base)}
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(EXAMPLES[name], dataclasses.fields(kind)[0].name, 0)
+    assert "GilbertElliott" in disturbances.__all__
+    assert set(disturbances.__all__) >= set(KINDS)
+
+
+@pytest.mark.parametrize(("fixture", "one"), FITTING, ids=NAMED)
+def test_a_trial_is_the_same_alone_and_among_nine_and_each_trial_is_its_own(plants, solutions, fixture, one):
+    plant, solution = plants[fixture], solutions[fixture]
+    together = simulate(plant, solution, disturbances=[one], seed=3, trials=9)
+    assert not together.diverged.any()
+    for trial in (0, 5, 8):
+        alone = simulate(plant, solution, disturbances=[one], seed=3, first_trial=trial)
+        assert_same(alone, together, slice(trial, trial + 1))
+    assert_same(simulate(plant, solution, disturbances=[one], seed=3, trials=9), together)
+    # It does something.
+    calm = simulate(plant, solution)
+    changed = any((getattr(together, name) != getattr(calm, name)).any() for name in RECORDS)
+    assert changed or isinstance(one, ls.Saturation)  # whose limits these plans keep
+
+
+@pytest.mark.parametrize("fixture", ["arena", "cage"])
+def test_all_compose(plants, solutions, fixture):
+    plant, solution, every = plants[fixture], solutions[fixture], [*BOTH, *OWN[fixture]]
+    together = simulate(plant, solution, disturbances=every, seed=1, trials=9)
+    assert not together.diverged.any()
+    assert len(set(together.disturbances)) == len(every)
+    for trial in (0, 8):
+        alone = simulate(plant, solution, disturbances=every, seed=1, first_trial=trial)
+        assert_same(alone, together, slice(trial, trial + 1))
+    # In any order, twice over, and each with each other.
+    assert not simulate(plant, solution, disturbances=[*every[::-1], *every], trials=2).diverged.any()
+    for first in every:
+        for second in every:
+            rollout = simulate(plant, weave(4) if fixture == "arena" else hover(8), disturbances=[first, second])
+            assert not rollout.diverged.any()
+
+
+def test_what_changes_the_same_thing_multiplies_and_adds(plants):
+    cage, solution = plants["cage"], hover(6)
+    twice = simulate(cage, solution, disturbances=[ls.MassMismatch(factor=1.1), ls.MassMismatch(factor=1.2)])
+    once = simulate(cage, solution, disturbances=[ls.MassMismatch(factor=1.32)])
+    np.testing.assert_allclose(twice.states, once.states, atol=1e-12)
+    lost = [ls.ActuatorLoss("quadrotor_rotor_2", remaining=0.5), ls.ThrustMismatch(factor=0.8)]
+    both = simulate(cage, solution, disturbances=lost)
+    same = simulate(cage, solution, disturbances=[ls.ThrustMismatch(factor=(0.8, 0.4, 0.8, 0.8))])
+    np.testing.assert_allclose(both.states, same.states, atol=1e-12)
+    winds = simulate(
+        cage, solution, disturbances=[ls.MeanWind((1, 0, 0)), ls.MeanWind((0, 2, 0)), ls.Push((0, 0, 1), 0)]
+    )
+    np.testing.assert_allclose(winds.forces[0, :2], [[0.15, 0.3, 30], [0.15, 0.3, 0]])
+
+
+@pytest.mark.parametrize(("fixture", "one"), FITTING, ids=NAMED)
+def test_strength_0_is_no_effect_and_strength_1_itself(plants, solutions, fixture, one):
+    plant, solution = plants[fixture], solutions[fixture]
+    none = simulate(plant, solution, disturbances=[one.scaled(0)], trials=2)
+    for name in RECORDS:
+        # The constants that MuJoCo derives from an altered model are rounded anew.
+        calm = getattr(simulate(plant, solution, trials=2), name)
+        np.testing.assert_allclose(getattr(none, name), calm, rtol=0, atol=1e-9, err_msg=name)
+    itself = simulate(plant, solution, disturbances=[one], trials=2)
+    assert_same(simulate(plant, solution, disturbances=[one.scaled(1)], trials=2), itself)
+    assert type(one.scaled(2)) is type(one)
+    assert one.scaled(2) != one
+    simulate(plant, solution, disturbances=[one.scaled(2)])
+    for bad in (-1.0, np.nan, np.inf, "twice"):
+        with pytest.raises(InputError, match=f"^{type(one).__name__}: strength: got .*, want a finite number >= 0$"):
+            one.scaled(bad)
+
+
+def test_strengths_in_between():
+    assert ls.MeasurementNoise((0.1, 0.2)).scaled(0.5) == ls.MeasurementNoise((0.05, 0.1))
+    assert ls.MassMismatch(factor=1.21).scaled(0.5).factor == pytest.approx(1.1)
+    assert ls.MassMismatch(0.1).scaled(2) == ls.MassMismatch(0.2)
+    assert ls.ControlDelay(1).scaled(2.5) == ls.ControlDelay(3)
+    assert ls.MeasurementDropouts(0.4).scaled(3) == ls.MeasurementDropouts(1.0)
+    assert ls.ActuatorLoss(remaining=0.6).scaled(0.5).remaining == pytest.approx(0.8)
+    assert ls.ActuatorLoss(remaining=0.6).scaled(4).remaining == 0.0
+    assert ls.Dryden("light").scaled(3).std == pytest.approx(ls.Dryden("severe").std)  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(InputError, match=r"^MassMismatch: std: got 0.4, want a finite number >= 0 < 0.333333$"):
+        ls.MassMismatch(0.1).scaled(4)
+
+    class Silent(Disturbance):
+        def start(self, plant, plan, generators):
+            return disturbances.Effect()
+
+    with pytest.raises(InputError, match=r"^Silent: got strength 2, want a disturbance that overrides `scaled`$"):
+        Silent().scaled(2)
+
+
+SIGNED = {"impulse", "velocity", "lowest", "highest", "direction"}  # numbers that may be negative
+BAD = [(name, field.name) for name, one in EXAMPLES.items() for field in dataclasses.fields(one)]
+
+
+@pytest.mark.parametrize(("name", "field"), BAD)
+def test_a_bad_number_is_refused_in_one_line_that_names_class_and_field(name, field):
+    one = EXAMPLES[name]
+    values = {f.name: getattr(one, f.name) for f in dataclasses.fields(one)}
+    # Of fields that exclude each other, the others are left out.
+    apart = {"lowest": {"share"}, "highest": {"share"}, "factor": {"std"}}.get(field, set())
+    values |= dict.fromkeys(apart)
+    bad = [np.nan, np.inf, -np.inf, [np.nan] * 3, object()] + ([] if field in SIGNED else [-1.0, -1])
+    if not (name == "ActuatorLoss" and field == "actuator"):
+        bad.append("much")
+    for value in bad:
+        with pytest.raises(InputError) as caught:
+            type(one)(**values | {field: value})
+        message = str(caught.value)
+        assert re.match(rf"{name}: {field}: got .*, want ", message), message
+        assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ls.MeasurementLatency(1.5), "^MeasurementLatency: periods: got 1.5, want a whole number >= 0$"),
+        (lambda: ls.ControlDelay(True), "^ControlDelay: periods: got True, want a whole number >= 0$"),
+        (lambda: ls.MeasurementDropouts(1.01), "^MeasurementDropouts: loss: got 1.01, want a finite number >= 0 <= 1$"),
+        (lambda: ls.CommandDropouts(2), "^CommandDropouts: loss: got 2, want a finite number >= 0 <= 1$"),
+        (lambda: GilbertElliott(0.1, 0.0), "^GilbertElliott: to_good: got 0.0, want a finite number > 0 <= 1$"),
+        (lambda: GilbertElliott(1.1, 0.1), "^GilbertElliott: to_bad: got 1.1, want"),
+        (lambda: GilbertElliott(0.1, 0.1, np.nan), "^GilbertElliott: lost_when_good: got nan, want"),
+        (lambda: GilbertElliott(0.1, 0.1, 0, -1), "^GilbertElliott: lost_when_bad: got -1, want"),
+        (lambda: ls.Gusts(1.0, 0.0), "^Gusts: time_constant: got 0.0, want a finite number > 0$"),
+        (lambda: ls.Dryden("sever"), r"^Dryden: wind: got 'sever', want one of: light, .* \(did you mean severe\?\)$"),
+        (lambda: ls.Dryden(altitude=400.0), "^Dryden: altitude: got 400.0, want a finite number >= 0 <= 304.8$"),
+        (lambda: ls.Saturation(), "^Saturation: share: got neither it and limits, want"),
+        (lambda: ls.Saturation(share=1.1), "^Saturation: share: got 1.1, want"),
+        (lambda: ls.ActuatorLoss(remaining=1.1), "^ActuatorLoss: remaining: got 1.1, want"),
+        (lambda: ls.MassMismatch(), "^MassMismatch: got neither of std and factor, want one of them$"),
+        (lambda: ls.AxleMismatch(0.1, 1.1), "^AxleMismatch: got both std and factor, want one of them$"),
+        (lambda: ls.ThrustMismatch(0.34), "^ThrustMismatch: std: got 0.34, want a finite number >= 0 < 0.333333$"),
+        (lambda: ls.MassMismatch(factor=0.0), "^MassMismatch: factor: got 0, want numbers > 0$"),
+    ],
+)
+def test_numbers_beyond_their_bounds_are_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_descriptions_are_in_words_and_units(plants):
+    words = {name: [one.describe(plant) for one in (*BOTH, *OWN[name])] for name, plant in plants.items()}
+    assert words["cage"] == [
+        "initial state off, std 0.01 m, 0.01 m/s, 0.01 rad, 0.01 rad/s",
+        "obstacles displaced, std 0.05 m",
+        "mass off by 10 % (std, cut at 3 std)",
+        "inertia off by 10 % (std, cut at 3 std)",
+        "measurement noise, std 0.005 m, 0.005 m/s, 0.005 rad, 0.005 rad/s",
+        "measurement bias, std 0.005 m, 0.005 m/s, 0.005 rad, 0.005 rad/s",
+        "measurements late by 1 control period",
+        "28.6 % of measurements lost, in bad spells of 2 control periods on average",
+        "control noise, std 0.02 N",
+        "20 % of commands lost",
+        "commands late by 1 control period",
+        "motor lag, time constant 0.05 s",
+        "controls limited to 90 % of the robot's own",
+        "one of quadrotor_rotor_1, quadrotor_rotor_2, quadrotor_rotor_3, quadrotor_rotor_4 down to 70 % from 0.2 s on",
+        "force noise, std 0.1 N",
+        "torque noise, std 0.002 N m",
+        "push of (0.1, 0, 0) N s at 0.1 s",
+        "thrust off by 5 % (std, cut at 3 std)",
+        "wind of (0.5, 0.2, 0) m/s",
+        "gusts, std 0.5 m/s, time constant 0.5 s",
+        "light Dryden turbulence at 2 m, wind 7.72 m/s at 20 ft",
+    ]
+    assert words["arena"][-3:] == [
+        "wheel radius off by 1 % (std, cut at 3 std)",
+        "axle length off by 2 % (std, cut at 3 std)",
+        "friction of the wheels off by 10 % (std, cut at 3 std)",
+    ]
+    assert ls.Saturation(lowest=0.5, highest=2.0).describe(plants["cage"]) == "controls limited from 0.5 N to 2 N"
+    assert ls.AxleMismatch(factor=1.1).describe(plants["arena"]) == "axle length times 1.1"
+
+
+@pytest.mark.parametrize("fixture", ["arena", "cage"])
+def test_presets_have_what_a_plant_can_have_and_grow(plants, solutions, fixture):
+    plant, worst = plants[fixture], []
+    for name in PRESETS:
+        chosen = preset(name, plant)
+        rollout = simulate(plant, weave(60) if fixture == "arena" else hover(), disturbances=chosen, trials=20)
+        assert not rollout.diverged.any()
+        worst.append(np.median(rollout.tracking_error.max(axis=1)))
+    assert list(PRESETS) == ["calm", "light", "moderate", "strong", "severe"]
+    assert worst == sorted(worst)
+    kinds = {type(one).__name__ for one in preset("moderate", plant)}
+    assert ("Dryden" in kinds, "ThrustMismatch" in kinds) == (fixture == "cage",) * 2
+    assert ("AxleMismatch" in kinds) == (fixture == "arena")
+    with pytest.raises(InputError, match=r"^preset: got 'mild', want one of: calm, light, moderate, strong, severe"):
+        preset("mild", plant)
