@@ -178,7 +178,7 @@ def test_a_bad_number_is_refused_in_one_line_that_names_class_and_field(name, fi
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ls.MeasurementLatency(1.5), "^MeasurementLatency: periods: got 1.5, want a whole number >= 0$"),
+        (lambda: ls.MeasurementLatency(-1), "^MeasurementLatency: periods: got -1, want a whole number >= 0$"),
         (lambda: ls.ControlDelay(True), "^ControlDelay: periods: got True, want a whole number >= 0$"),
         (lambda: ls.MeasurementDropouts(1.01), "^MeasurementDropouts: loss: got 1.01, want a finite number >= 0 <= 1$"),
         (lambda: ls.CommandDropouts(2), "^CommandDropouts: loss: got 2, want a finite number >= 0 <= 1$"),

@@ -85,7 +85,7 @@ def one_sided(frequency, std, length, airspeed, order):
 def test_the_spectrum_of_dryden_is_that_of_the_standard(cage):
     turbulence, trials, steps = Dryden("light", altitude=2.0), 200, 4096
     winds = blown(cage, turbulence, trials, steps)
-    frequency, density = welch(winds, fs=1 / DT, window="hann", nperseg=1024, detrend=False, axis=1)
+    frequency, density = welch(winds, fs=1 / DT, window="hann", nperseg=1024, axis=1, detrend=False)  # pyright: ignore[reportArgumentType]
     mean, error = density.mean(axis=0), density.std(axis=0) / np.sqrt(trials)
     # Up to a tenth of the sampling rate: beyond it what is sampled folds back more than the tolerance. The lowest bins
     # are the window's width. Averages of 200 trials have standard errors near 3 %; folding adds up to
