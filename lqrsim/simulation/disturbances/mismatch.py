@@ -158,10 +158,7 @@ class WheelRadiusMismatch(WheelMismatch):
 
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         wheels, hubs = treads(plant)
-        # How large a geom is stands in three fields of the model, and set_const derives none from the others.
         simulations.expand("geom_size")[:, wheels] *= factors[:, :, None]
-        simulations.expand("geom_rbound")[:, wheels] *= factors
-        simulations.expand("geom_aabb")[:, wheels, 3:] *= factors[:, :, None]
         # An axle that is higher by as much as the wheel is larger keeps the tread on the floor, and the casters off it.
         raised = plant.model.geom_size[wheels, 0] * (factors - 1)
         simulations.expand("body_pos")[:, hubs] += raised[:, :, None] * upward(plant, hubs)
