@@ -179,6 +179,7 @@ class _Streams(Sequence[np.random.Generator]):
 
     def __init__(self, seed: int, trials: range, stream: int) -> None:
         self._seed, self._trials, self._stream = seed, trials, stream
+        self._made: dict[int, np.random.Generator] = {}
 
     def __len__(self) -> int:
         return len(self._trials)
@@ -186,8 +187,11 @@ class _Streams(Sequence[np.random.Generator]):
     def __getitem__(self, place: Any) -> Any:
         if isinstance(place, slice):
             return _Streams(self._seed, self._trials[place], self._stream)
-        key = np.random.SeedSequence(self._seed, spawn_key=(self._trials[place], self._stream))
-        return np.random.Generator(np.random.Philox(key))
+        trial = self._trials[place]
+        if trial not in self._made:
+            key = np.random.SeedSequence(self._seed, spawn_key=(trial, self._stream))
+            self._made[trial] = np.random.Generator(np.random.Philox(key))
+        return self._made[trial]
 
 
 def _check_solution(solution: Solution, controller: Controller, plant: Plant) -> None:
