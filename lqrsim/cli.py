@@ -228,6 +228,42 @@ class Render:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Report:
+    """Write the report of a stress test: one HTML page with tables, curves and videos of the worst trials.
+
+    The page needs no network and no other file. It can be written of a stress test that has not ended, and says so.
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """What `lqrsim stress` wrote."""
+    out: Annotated[Path | None, _optional("FILE.html")] = None
+    """The page. By default report.html in that folder."""
+    videos: int = 4
+    """How many of the worst trials to run again and film."""
+    scenario: Annotated[str | None, _optional("SCENARIO")] = None
+    """Whose robot and scene to use, as in `lqrsim solve`. By default the one that was run, if `lqrsim list` has it."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim import console
+        from lqrsim.errors import InputError
+        from lqrsim.references import resolve
+        from lqrsim.stress.results import Results
+        from lqrsim.view.report import report
+
+        page = self.out or self.folder / "report.html"
+        if page.suffix != ".html":
+            raise InputError(f"--out: got {page}, want a name that ends in .html")
+        console.check_output("--out", page.parent)
+        results = Results(self.folder)
+        scenario = resolve(self.scenario) if self.scenario else None
+        with console.progress("reporting", "part") as progress:
+            report(results, page, videos=self.videos, scenario=scenario, progress=progress)
+        console.say(f"wrote {page}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Demo:
     """Solve, execute and film: the main job, for both robots.
 
@@ -309,7 +345,7 @@ class Cache:
         return 0
 
 
-Command = List | Solve | Simulate | Render | Demo | Reproduce | Cache
+Command = List | Solve | Simulate | Render | Report | Demo | Reproduce | Cache
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

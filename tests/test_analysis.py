@@ -45,6 +45,9 @@ def test_trials_that_are_all_alike_are_no_sample() -> None:
     found = success(Cell("smooth", "calm", 0.0), table_of(["reached"] * 200, worst=0.1))
     assert found.alike
     assert (found.exact.low, found.exact.high) == (1.0, 1.0)
+    cells = Cell("smooth", "calm", 0.0), Cell("open_loop", "calm", 0.0)
+    same = table_of(["reached"] * 200, worst=0.1), table_of(["collided"] * 200, worst=0.1)
+    assert comparisons(dict(zip(cells, same, strict=True))) == []
 
 
 def test_what_breaks_first_is_sure_to_be_below_the_rate() -> None:

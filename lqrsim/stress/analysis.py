@@ -49,10 +49,14 @@ def success(cell: Cell, outcomes: Outcomes, *, confidence: float = CONFIDENCE) -
     """How often the trials of a cell succeeded, and how sure that is. Raises InputError for no trials."""
     reached, trials = int(succeeded(outcomes).sum()), len(outcomes)
     exact, band = rate(reached, trials, confidence=confidence), wilson(reached, trials, confidence=confidence)
-    alike = trials > 1 and all(np.ptp(values) == 0 for values in (outcomes.rms, outcomes.worst, outcomes.effort))
+    alike = _alike(outcomes)
     if alike:
         exact = band = Estimate(exact.value, exact.value, exact.value, confidence)
     return Success(cell, reached, trials, exact, band, alike)
+
+
+def _alike(outcomes: Outcomes) -> bool:
+    return len(outcomes) > 1 and all(np.ptp(one) == 0 for one in (outcomes.rms, outcomes.worst, outcomes.effort))
 
 
 def degradation(table: Table, policy: str, sweep: str, *, confidence: float = CONFIDENCE) -> list[Success]:
@@ -120,7 +124,8 @@ class Comparison:
 def comparisons(table: Table, *, resamples: int = 2000, seed: int = 0) -> list[Comparison]:
     """The first policy of the table against each other one, in every sweep and at every strength at which it meets it.
 
-    Differences are on the same trials, intervals are those of a paired bootstrap.
+    Differences are on the same trials, intervals are those of a paired bootstrap. Where the trials of both are all
+    alike, they are one trial and there is nothing to test.
 
     Raises:
       InputError: two policies ran other trials.
@@ -130,7 +135,9 @@ def comparisons(table: Table, *, resamples: int = 2000, seed: int = 0) -> list[C
     for other in policies[1:]:
         for cell in table:
             second = Cell(other, cell.sweep, cell.strength)
-            if cell.policy == policies[0] and second in table:
+            if cell.policy != policies[0] or second not in table:
+                continue
+            if not (_alike(table[cell]) and _alike(table[second])):
                 found.append(_compared(cell, second, table[cell], table[second], resamples, seed))
     adjusted = holm([one.pairs.p_value for one in found])
     return [
