@@ -27,6 +27,7 @@ def simulate(
     frames: bool = True,
     contacts: bool = True,
     threads: int | None = None,
+    generators: Callable[[int, int], np.random.Generator] | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Rollout:
     """Execute the solution's policy closed-loop in MuJoCo, from the first state of its plan.
@@ -43,6 +44,7 @@ def simulate(
       contacts: whether obstacles stop the robot, or it goes through them, which takes a quarter less time and is the
         same until the first collision.
       threads: of MuJoCo's; by default as many as there are processors.
+      generators: (trial, number of the disturbance) -> where its numbers come from, in place of the seed.
       progress: called after each control period with the number of periods done and of all.
 
     Raises:
@@ -58,7 +60,11 @@ def simulate(
     plan = solution.trajectory
     _check_solution(solution, controller, plant)
     substeps = plant.substeps(plan.dt)
-    effects = _start(disturbances, plant, solution, seed, range(first_trial, first_trial + trials))
+
+    def seeded(trial: int, stream: int) -> np.random.Generator:
+        return np.random.Generator(np.random.Philox(np.random.SeedSequence(seed, spawn_key=(trial, stream))))
+
+    effects = _start(disturbances, plant, solution, generators or seeded, range(first_trial, first_trial + trials))
     displaced = np.zeros((trials, len(plant.world), 3))
     for effect in effects:
         displaced += 0.0 if effect.displaced is None else effect.displaced
@@ -163,15 +169,18 @@ def _records(trials: int, steps: int, size: int) -> Array:
 
 
 def _start(
-    disturbances: Sequence[Disturbance], plant: Plant, solution: Solution, seed: int, trials: range
+    disturbances: Sequence[Disturbance],
+    plant: Plant,
+    solution: Solution,
+    generators: Callable[[int, int], np.random.Generator],
+    trials: range,
 ) -> list[Effect]:
     effects = []
     for stream, disturbance in enumerate(disturbances):
         if not isinstance(disturbance, Disturbance):
             raise InputError(f"disturbances: got {disturbance!r}, want Disturbance objects, such as ControlNoise(0.05)")
-        keys = [np.random.SeedSequence(seed, spawn_key=(trial, stream)) for trial in trials]
-        generators = [np.random.Generator(np.random.Philox(key)) for key in keys]
-        effects.append(disturbance.start(plant, solution.trajectory, generators))
+        own = [generators(trial, stream) for trial in trials]
+        effects.append(disturbance.start(plant, solution.trajectory, own))
     return effects
 
 
