@@ -172,7 +172,7 @@ def policy(states: Coordinates, controls: Coordinates) -> Callable[..., Array]:
 
     def evaluate(shown: Array, gain: Array, offset: Array, nominal: Array) -> Array:
         near, out = np.array(shown, dtype=np.float64), np.empty((len(shown), len(controls)))
-        law = (np.ascontiguousarray(part) for part in (gain, offset, nominal))
+        law = (np.array(part, order="C") for part in (gain, offset, nominal))  # copies: what was loaded is read-only
         core_of_laws.apply_law(len(shown), near, *law, low, high, out)
         return out
 

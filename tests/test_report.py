@@ -2,19 +2,21 @@
 
 import base64
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim.simulation.outcomes import Outcomes, outcomes
-from lqrsim.stress.cells import Cell
+from lqrsim.cli import main
+from lqrsim.simulation.outcomes import Outcomes
+from lqrsim.stress.asked import Campaign, Cell
+from lqrsim.stress.campaign import run
+from lqrsim.stress.results import Results
 from lqrsim.view import gl
 from lqrsim.view.report import report
 
@@ -27,55 +29,13 @@ STRENGTHS = (0.0, 1.0, 4.0)
 TRIALS = 12
 
 
-@dataclass(frozen=True)
-class Campaign:
-    scenario: str = "differential_drive"
-    sweeps: Mapping[str, tuple[ls.Disturbance, ...]] = field(default_factory=lambda: SWEEPS)
-    trials: int = TRIALS
-    seed: int = 3
-
-
-@dataclass(frozen=True)
-class Results:
-    table: dict[Cell, Outcomes]
-    solutions: dict[str, ls.Solution]
-    folder: Path = Path("runs/a test")
-    campaign: Campaign = Campaign()
-    complete: bool = True
-    manifest: Mapping[str, Any] = field(
-        default_factory=lambda: {"versions": {"lqrsim": "7"}, "machine": "an abacus", "campaign": {"name": NASTY}}
-    )
-
-    @property
-    def cells(self) -> list[Cell]:
-        return list(self.table)
-
-    def outcomes(self, cell: Cell, *, partial: bool = False) -> Outcomes:
-        assert partial or self.complete
-        return self.table[cell]
-
-
-def run(solutions: dict[str, ls.Solution], cell: Cell, first: int, trials: int, *, frames: bool) -> ls.Rollout:
-    disturbances: list[ls.Disturbance] = []
-    for one in SWEEPS[cell.sweep]:
-        assert isinstance(one, ls.ControlNoise | ls.ForceNoise | ls.MeasurementNoise)
-        disturbances.append(replace(one, std=(cell.strength * np.array(one.std)).tolist()))
-    plant = ls.scenarios.get("differential_drive").plant()
-    options = {"seed": 3, "first_trial": first, "trials": trials, "frames": frames, "contacts": frames}
-    return ls.simulate(plant, solutions[cell.policy], disturbances=disturbances, **options)
-
-
-def again(results: Results, cell: Cell, trial: int) -> ls.Rollout:
-    return run(results.solutions, cell, trial, 1, frames=True)
-
-
 @pytest.fixture(scope="module")
-def results(drive_solution: ls.Solution, differential_drive: ls.Scenario) -> Results:
-    solutions = {"smooth": drive_solution, "open_loop": drive_solution.open_loop()}
-    plant, problem = differential_drive.plant(), differential_drive.problem
-    cells = [Cell(policy, sweep, strength) for policy in solutions for sweep in SWEEPS for strength in STRENGTHS]
-    table = {cell: outcomes(run(solutions, cell, 0, TRIALS, frames=False), plant, problem) for cell in cells}
-    return Results(table, solutions)
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    campaign = Campaign(
+        scenario="differential_drive", sweeps=SWEEPS, strengths=STRENGTHS, policies=("smooth", "open_loop"),
+        trials=TRIALS, seed=3, shard=5,
+    )  # fmt: skip
+    return run(campaign, tmp_path_factory.mktemp("campaigns") / "a test", workers=1)
 
 
 class Page(HTMLParser):
@@ -153,21 +113,21 @@ def test_page_says_what_was_asked(page: Page) -> None:
     text = " ".join(page.words)
     for said in (
         "differential_drive: the iRobot Create", "control noise, std 0.2 m/s; force noise, std 5 N", "of seed 3",
-        f"{TRIALS} of each combination, {TRIALS * 12} in all", "lqrsim 7", "an abacus", "lqrsim report 'runs/a test'",
+        f"{TRIALS} of each combination, {TRIALS * 12} in all", "numpy 2.", "lqrsim report '", "--resume",
     ):  # fmt: skip
         assert said in text
     assert "Not finished" not in text
 
 
 def test_tables_hold_what_was_measured(page: Page, results: Results) -> None:
-    one = results.table[Cell("open_loop", "measurements", 4.0)]
+    one = results.outcomes(Cell("open_loop", "measurements", 4.0))
     assert (one.outcome == "reached").all()  # nothing is measured in open loop
     assert [
         "4",
-        f"{int((results.table[Cell('smooth', 'measurements', 4.0)].outcome == 'reached').sum())}/{TRIALS}",
+        f"{int((results.outcomes(Cell('smooth', 'measurements', 4.0)).outcome == 'reached').sum())}/{TRIALS}",
     ] in [[row[0], row[1].partition(",")[0]] for row in page.rows]
     assert f"{TRIALS}/{TRIALS}, all alike" in [value for row in page.rows for value in row]
-    broken = results.table[Cell("open_loop", NASTY, 1.0)]
+    broken = results.outcomes(Cell("open_loop", NASTY, 1.0))
     assert ["open_loop", NASTY, "1"] in [row[:3] for row in page.rows]
     rms = np.quantile(broken.rms, 0.5, method="inverted_cdf")
     row = next(row for row in page.rows if row[:2] == ["open_loop", "1"])
@@ -181,9 +141,7 @@ def test_worst_trials_are_run_again_and_filmed(
         pytest.skip("no OpenGL here")
     monkeypatch.setattr("lqrsim.view.report.FPS", 1)  # as fast as it gets
     told: list[tuple[int, int]] = []
-    path = report(
-        results, tmp_path / "a.html", videos=2, replay=again, progress=lambda done, total: told.append((done, total))
-    )
+    path = report(results, tmp_path / "a.html", videos=2, progress=lambda done, total: told.append((done, total)))
     page = Page(path.read_text(encoding="utf-8"))
     films = page.of("video")
     assert len(films) == 2
@@ -197,7 +155,7 @@ def test_worst_trials_are_run_again_and_filmed(
             stream = video.streams.video[0]
             assert (stream.width, stream.height, stream.average_rate) == (640, 360, 1)
     words = " ".join(page.words)
-    assert re.search(r"lqrsim replay 'runs/a test' --cell open_loop '<script>.*' 4 --trial \d+", words)
+    assert re.search(r"lqrsim replay '.*/a test' --cell 'open_loop,<script>.*,4' --trial \d+", words)
     assert told == [(done, 4) for done in (0, 1, 2, 3, 4, 4)]
 
 
@@ -206,34 +164,45 @@ def test_page_says_why_there_are_no_videos(results: Results, tmp_path: Path, mon
         raise ls.InputError("OpenGL: got none, want one")
 
     monkeypatch.setattr(gl, "bind", none)
-    page = Page(report(results, tmp_path / "a.html", videos=1, replay=again).read_text(encoding="utf-8"))
+    page = Page(report(results, tmp_path / "a.html", videos=1).read_text(encoding="utf-8"))
     assert not page.of("video")
     assert "no pictures can be drawn here: OpenGL: got none" in " ".join(page.words)
     assert "lqrsim replay" in " ".join(page.words)
 
 
 def test_page_of_what_has_not_ended(results: Results, tmp_path: Path) -> None:
-    first, *_, last = results.table
-    table = {first: results.table[first], last: replace(results.table[last])}
-    table[last] = Outcomes(**{name: values[:5] for name, values in table[last].columns().items()})  # pyright: ignore[reportArgumentType]
-    path = report(replace(results, table=table, complete=False), tmp_path / "a.html", videos=0)
-    assert f"Not finished: {TRIALS + 5} of {2 * TRIALS} trials" in " ".join(Page(path.read_text()).words)
+    folder = tmp_path / "part"
+    shutil.copytree(results.folder, folder)
+    gone = sorted((folder / "shards").iterdir())[1:]
+    for shard in gone:
+        shard.unlink()
+    path = report(Results(folder), tmp_path / "a.html", videos=0)
+    assert f"Not finished: 5 of {12 * TRIALS} trials" in " ".join(Page(path.read_text(encoding="utf-8")).words)
+    (next((folder / "shards").iterdir())).unlink()
+    with pytest.raises(ls.InputError, match="no trial has ended yet"):
+        report(Results(folder), tmp_path / "b.html", videos=0)
+    assert not (tmp_path / "b.html").exists()
 
 
-def test_trials_that_did_not_run_through_are_told(results: Results, tmp_path: Path) -> None:
-    cell = Cell("smooth", NASTY, 1.0)
-    outcome = results.table[cell].outcome.astype("<U9")
-    outcome[:2] = "error"
-    table = results.table | {cell: replace(results.table[cell], outcome=outcome)}
-    page = Page(report(replace(results, table=table), tmp_path / "a.html", videos=0).read_text(encoding="utf-8"))
+def test_trials_that_did_not_run_through_are_told(
+    results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell, given = Cell("smooth", NASTY, 1.0), results.outcomes
+
+    def erred(one: Cell, *, partial: bool = False) -> Outcomes:
+        found = given(one, partial=partial)
+        return replace(found, outcome=np.array(["error", "error", *found.outcome[2:]])) if one == cell else found
+
+    monkeypatch.setattr(results, "outcomes", erred)
+    page = Page(report(results, tmp_path / "a.html", videos=0).read_text(encoding="utf-8"))
     assert "2 trials did not run through; they count as failures." in page.words
 
 
-def test_bad_input_is_named(results: Results, tmp_path: Path) -> None:
-    with pytest.raises(ls.InputError, match="no trial has ended yet"):
-        report(replace(results, table={}), tmp_path / "a.html")
-    with pytest.raises(ls.InputError, match="videos: got -1"):
-        report(results, tmp_path / "a.html", videos=-1)
-    with pytest.raises(ls.InputError, match=r"want --scenario mine\.py:make"):
-        report(replace(results, campaign=Campaign(scenario="mine.py:make")), tmp_path / "a.html")
-    assert list(tmp_path.iterdir()) == []
+def test_command_writes_the_page(results: Results, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "page.html"
+    assert main(["report", str(results.folder), "--out", str(page), "--videos", "0"]) == 0
+    assert str(page) in capsys.readouterr().out
+    assert page.read_bytes() == report(results, tmp_path / "again.html", videos=0).read_bytes()
+    for words in (["--out", "page.txt"], ["--videos", "-1"]):
+        assert main(["report", str(results.folder), *words]) == 2
+    assert main(["report", str(tmp_path)]) == 2

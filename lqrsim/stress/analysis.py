@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number
 from lqrsim.simulation.outcomes import Outcomes
-from lqrsim.stress.cells import Cell
+from lqrsim.stress.asked import Cell
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, Pairs, bootstrap, compare, holm, rate, wilson
 
 Table = Mapping[Cell, Outcomes]

@@ -5,12 +5,13 @@ import json
 import os
 import shlex
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files as packaged
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -18,13 +19,12 @@ from PIL import Image
 
 from lqrsim.errors import InputError, check_count
 from lqrsim.files import replacing
-from lqrsim.references import resolve
-from lqrsim.rollout import Rollout
 from lqrsim.scenarios import Scenario
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.outcomes import OUTCOMES, Outcomes
+from lqrsim.simulation.outcomes import OUTCOMES
 from lqrsim.stress import analysis
-from lqrsim.stress.cells import Cell
+from lqrsim.stress.asked import Campaign, Cell
+from lqrsim.stress.results import Results, replay
 from lqrsim.stress.statistics import Estimate
 from lqrsim.view import gl
 from lqrsim.view.curves import plot_errors, plot_success
@@ -34,40 +34,6 @@ LARGEST = 1_500_000  # bytes of a video
 SIZES = (640, 360), (480, 270), (320, 180)  # the first with which a video is small enough
 FPS = 15
 EACH = 3  # worst trials that are listed of each policy and sweep
-
-
-class Campaign(Protocol):
-    """What is asked of a campaign; see stress/campaign.py."""
-
-    @property
-    def scenario(self) -> str: ...
-    @property
-    def sweeps(self) -> Mapping[str, Sequence[Disturbance]]: ...
-    @property
-    def trials(self) -> int: ...
-    @property
-    def seed(self) -> int: ...
-
-
-class Results(Protocol):
-    """What is asked of results; see stress/results.py."""
-
-    @property
-    def folder(self) -> Path: ...
-    @property
-    def manifest(self) -> Mapping[str, Any]: ...
-    @property
-    def campaign(self) -> Campaign: ...
-    @property
-    def cells(self) -> Sequence[Cell]: ...
-    @property
-    def complete(self) -> bool: ...
-    def outcomes(self, cell: Cell, *, partial: bool = False) -> Outcomes:
-        """All its trials."""
-        ...
-
-
-Replay = Callable[[Any, Cell, int], Rollout]
 
 
 @dataclass(frozen=True)
@@ -84,25 +50,24 @@ def report(
     out: str | os.PathLike[str],
     *,
     videos: int = 4,
-    scenario: Scenario | None = None,
-    replay: Replay | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Path:
     """Writes one HTML page of a campaign, with everything in it; returns its path.
 
     Args:
       videos: how many of the worst trials to run again and film. Without OpenGL the page says that there are none.
-      scenario: that was run; by default the one that the campaign names, if it is one of lqrsim's own.
-      replay: (results, cell, trial) -> that trial again; by default `lqrsim.stress.results.replay`.
       progress: called with the parts that are done, and all of them.
 
     Raises:
-      InputError: nothing has been run yet, an unknown scenario, or a file that cannot be written.
+      InputError: nothing has been run yet; something is damaged; the scenario is one of yours, and `results` was not
+        given it; or the page cannot be written.
     """
     check_count("videos", videos, at_least=0)
-    scenario = resolve(results.campaign.scenario, registered_only=True) if scenario is None else scenario
-    found = {cell: results.outcomes(cell, partial=not results.complete) for cell in results.cells}
-    table = {cell: outcomes for cell, outcomes in found.items() if len(outcomes)}
+    scenario, missing = results.trials.scenario, Counter[Cell]()
+    for cell, _, count in results.missing:
+        missing[cell] += count
+    begun = [cell for cell in results.cells if missing[cell] < results.campaign.trials]
+    table = {cell: results.outcomes(cell, partial=True) for cell in begun}
     if not table:
         raise InputError(f"results: got {results.folder}, in which no trial has ended yet, want some that have")
     parts = 2 + videos
@@ -115,7 +80,7 @@ def report(
             _sweep(name, table, scenario, results.campaign, Path(folder)) for name in results.campaign.sweeps
         ]
         tell(2, parts)
-        films = _films(results, table, videos, replay, Path(folder))
+        films = _films(results, table, videos, Path(folder))
         page["videos_note"] = next(films)
         page["videos"] = []
         for number, film in enumerate(films):
@@ -139,9 +104,7 @@ def _page(results: Results, table: analysis.Table, scenario: Scenario) -> dict[s
     if erred:
         warnings.append(f"{erred} trials did not run through; they count as failures.")
     folder = shlex.quote(str(results.folder))
-    commands = {"This page again": f"lqrsim report {folder}"}
-    if manifest.get("command"):
-        commands = {"The campaign again": str(manifest["command"])} | commands
+    commands = {"To go on with the campaign, or to repair it": results.command, "This page": f"lqrsim report {folder}"}
     return {
         "title": f"Stress test of {scenario.name}",
         "warnings": warnings,
@@ -253,8 +216,7 @@ def _between(value: float, low: float, high: float, scale: float = 1.0) -> str:
 
 
 def _modes(table: analysis.Table) -> Rows:
-    kinds = [outcome for outcome in (*OUTCOMES, "error") if outcome != "reached"]
-    kinds = list(dict.fromkeys(kinds))
+    kinds = [outcome for outcome in OUTCOMES if outcome != "reached"]
     rows = []
     for cell, outcomes in table.items():
         modes = analysis.modes(outcomes)
@@ -377,7 +339,7 @@ def _text(path: Path) -> str:
     return base64.b64encode(path.read_bytes()).decode("ascii")
 
 
-def _films(results: Results, table: analysis.Table, count: int, replay: Replay | None, folder: Path) -> Iterator[Any]:
+def _films(results: Results, table: analysis.Table, count: int, folder: Path) -> Iterator[Any]:
     """What there is to say of them all, and then each of them."""
     chosen = [
         next((one for one in _worst_of(table, group) if one.outcome != "error"), None) for group in _groups(table)
@@ -398,11 +360,9 @@ def _films(results: Results, table: analysis.Table, count: int, replay: Replay |
             "The worst trial of a policy and a sweep, policies taking turns, run again from its number alone. Line:"
             " the plan; trace: what was driven, coloured by tracking error."
         )
-    if replay is None and chosen and not problem:
-        from lqrsim.stress.results import replay
     for one in chosen:
         film = {"label": _label(one), "command": _replay_command(results.folder, one), "data": "", "problem": problem}
-        yield film if problem or replay is None else film | _film(results, one, replay, folder)
+        yield film if problem else film | _film(results, one, folder)
 
 
 def _label(one: analysis.Trial) -> str:
@@ -414,11 +374,10 @@ def _label(one: analysis.Trial) -> str:
 
 
 def _replay_command(folder: Path, one: analysis.Trial) -> str:
-    cell = " ".join(shlex.quote(word) for word in _name(one.cell))
-    return f"lqrsim replay {shlex.quote(str(folder))} --cell {cell} --trial {one.trial}"
+    return shlex.join(["lqrsim", "replay", str(folder), "--cell", str(one.cell), "--trial", str(one.trial)])
 
 
-def _film(results: Results, one: analysis.Trial, replay: Replay, folder: Path) -> dict[str, Any]:
+def _film(results: Results, one: analysis.Trial, folder: Path) -> dict[str, Any]:
     """The video as text, or why there is none."""
     from lqrsim.view.render import render  # needs MuJoCo's OpenGL to be chosen
 

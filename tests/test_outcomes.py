@@ -1,0 +1,124 @@
+"""The table of trials: each entry against what the rollout says, worked out by hand; and solving again in the loop."""
+
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim.rollout import Rollout
+from lqrsim.simulation.controllers import Replanning
+from lqrsim.simulation.outcomes import OUTCOMES, outcomes
+from lqrsim.simulation.plant import Plant
+
+
+@pytest.fixture(scope="module")
+def plant(quadrotor: ls.Scenario) -> Plant:
+    return quadrotor.plant()
+
+
+@pytest.fixture(scope="module")
+def rough(plant: Plant, quadrotor_solution: ls.Solution) -> Rollout:
+    """Rough enough for some to collide, and one to be lost."""
+    noise = [ls.ForceNoise(0.5), ls.MeasurementNoise(0.02)]
+    return ls.simulate(plant, quadrotor_solution, disturbances=noise, trials=20, contacts=False, frames=False)
+
+
+def test_each_row_is_what_happened(plant: Plant, quadrotor: ls.Scenario, rough: Rollout) -> None:
+    table = outcomes(rough, plant, quadrotor.problem)
+    assert table.trial.tolist() == list(range(20))
+    assert {"reached", "collided"} <= set(table.outcome) <= set(OUTCOMES)
+    plan, dt = rough.plan, rough.plan.dt
+    for k in range(20):
+        distances = np.array([plant.world.distances(state[:3]) for state in rough.states[k]]) - rough.radius
+        hits = np.flatnonzero(distances.min(axis=1) < 0)
+        last = hits[0] if len(hits) else plan.steps
+        error = np.linalg.norm(rough.states[k, : last + 1, :3] - plan.states[: last + 1, :3], axis=1)
+        assert table.worst[k] == pytest.approx(error.max(), rel=1e-12)
+        assert table.rms[k] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
+        assert table.ended[k] == pytest.approx(last * dt)
+        assert table.clearance[k] == pytest.approx(distances[: last + 1].min(), abs=1e-12)
+        assert table.effort[k] == pytest.approx(dt * np.sum(rough.applied[k, :last] ** 2), rel=1e-12)
+        if len(hits):
+            assert table.outcome[k] == "collided"
+            assert table.obstacle[k] == plant.world.names[int(distances[last].argmin())]
+            assert np.isnan(table.cost[k])
+            assert np.isnan(table.final[k])
+        else:
+            assert table.outcome[k] == ("reached" if error[-1] <= rough.goal_radius else "timed out")
+            assert table.obstacle[k] == ""
+            assert table.final[k] == error[-1]
+
+
+def test_cost_is_that_of_the_plan_where_nothing_disturbs(
+    plant: Plant, quadrotor: ls.Scenario, quadrotor_solution: ls.Solution
+) -> None:
+    """The plan is followed to 1e-10 m; what the soft start costs is not of the trial."""
+    table = outcomes(ls.simulate(plant, quadrotor_solution, frames=False), plant, quadrotor.problem)
+    away = quadrotor_solution.trajectory.states[0] - quadrotor.problem.start
+    initial = 0.5 * 500.0 * float(away @ away)
+    assert table.cost[0] + initial == pytest.approx(quadrotor_solution.cost, rel=1e-6)
+
+
+def test_contacts_change_nothing_before_the_first_collision(
+    plant: Plant, quadrotor_solution: ls.Solution, rough: Rollout
+) -> None:
+    noise = [ls.ForceNoise(0.5), ls.MeasurementNoise(0.02)]
+    solid = ls.simulate(plant, quadrotor_solution, disturbances=noise, trials=20)
+    collided = 0
+    for k in range(20):
+        hits = np.flatnonzero(rough.clearance[k] < 0)
+        last = hits[0] if len(hits) else rough.plan.steps
+        collided += len(hits) > 0
+        # MuJoCo's contacts begin within the period before the knot at which the clearance is seen to be negative.
+        np.testing.assert_array_equal(solid.states[k, :last], rough.states[k, :last])
+    assert collided
+
+
+def test_a_lost_trial_is_diverged_and_counts_until_then(plant: Plant, quadrotor_solution: ls.Solution) -> None:
+    wild = ls.simulate(plant, quadrotor_solution, disturbances=[ls.ForceNoise(1e12)], trials=3, contacts=False)
+    table = outcomes(wild, plant)
+    assert set(table.outcome) <= {"diverged", "collided"}
+    assert np.isfinite(table.worst).all()
+    assert np.isnan(table.cost).all()
+
+
+@pytest.fixture(scope="module")
+def again(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> Replanning:
+    return Replanning(quadrotor.problem, quadrotor_solution, every=1.0)
+
+
+class TestReplanning:
+    def test_undisturbed_it_keeps_to_the_plan(self, plant: Plant, again: Replanning, quadrotor_solution) -> None:
+        """What is left of an optimum is optimal; plans stop within 1e-4 of the cost, which here is centimetres."""
+        run = ls.simulate(plant, quadrotor_solution, controller=again, frames=False)
+        assert run.tracking_error.max() < 0.03
+        assert run.outcome == ("reached",)
+
+    def test_each_trial_gets_what_it_gets_alone(self, plant: Plant, again: Replanning, quadrotor_solution) -> None:
+        noise = [ls.ForceNoise(0.2)]
+        together = ls.simulate(plant, quadrotor_solution, controller=again, disturbances=noise, trials=3, frames=False)
+        alone = ls.simulate(
+            plant, quadrotor_solution, controller=again, disturbances=noise, first_trial=2, frames=False
+        )
+        np.testing.assert_array_equal(alone.states[0], together.states[2])
+
+    def test_it_does_solve_again(self, plant: Plant, again: Replanning, quadrotor_solution) -> None:
+        """A push that the first plan only fights; the controls differ from the policy's from the next solve on."""
+        push = [ls.Push((0.3, 0.0, 0.0), at=0.5)]
+        policy = ls.simulate(plant, quadrotor_solution, disturbances=push, frames=False)
+        solved = ls.simulate(plant, quadrotor_solution, controller=again, disturbances=push, frames=False)
+        differ = np.abs(policy.commanded - solved.commanded)[0].max(axis=1) > 1e-6
+        assert np.flatnonzero(differ)[0] == 30
+
+    def test_where_no_solve_succeeds_the_law_goes_on(
+        self, plant: Plant, quadrotor: ls.Scenario, quadrotor_solution
+    ) -> None:
+        """Within an obstacle no problem may begin."""
+        again = Replanning(quadrotor.problem, quadrotor_solution, every=0.1)
+        push = [ls.Push((3.0, 3.0, 0.0), at=0.0)]
+        run = ls.simulate(plant, quadrotor_solution, controller=again, disturbances=push, contacts=False, frames=False)
+        assert run.collided.all()
+        assert np.isfinite(run.commanded).all()
+
+    def test_a_rate_beyond_the_control_rate_is_refused(self, quadrotor: ls.Scenario, quadrotor_solution) -> None:
+        with pytest.raises(ls.InputError, match=r"Replanning: every: got 0\.01, want a finite number >= 0\.033"):
+            Replanning(quadrotor.problem, quadrotor_solution, every=0.01)
