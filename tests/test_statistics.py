@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lqrsim as ls
-from lqrsim.stress.statistics import bootstrap, compare, rate
+from lqrsim.stress.statistics import bootstrap, compare, holm, rate, wilson
 
 
 def at_least(successes: int, trials: int, p: float) -> float:
@@ -51,6 +51,25 @@ def test_exact_interval_covers(p: float) -> None:
         found = rate(k, trials)
         covered += (found.low <= p <= found.high) * comb(trials, k) * p**k * (1 - p) ** (trials - k)
     assert covered >= 0.95
+
+
+@given(st.integers(1, 500).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_wilson_s_interval_is_where_the_score_test_just_rejects(case: tuple[int, int]) -> None:
+    """Its definition: |rate - p| is 1.96 standard deviations of p at both ends."""
+    successes, trials = case
+    found = wilson(successes, trials)
+    for end in (found.low, found.high):
+        distance = abs(found.value - end)
+        assert distance == pytest.approx(1.959964 * np.sqrt(end * (1 - end) / trials), abs=1e-6)
+    assert found.low <= found.value + 1e-12
+    assert found.value <= found.high + 1e-12
+
+
+def test_holm_s_procedure() -> None:
+    """By hand: of three, the smallest is tripled, the next doubled, and none falls below one before it."""
+    np.testing.assert_allclose(holm([0.04, 0.01, 0.03]), [0.06, 0.03, 0.06])
+    np.testing.assert_allclose(holm([0.9, 0.8]), 1.0)
+    assert len(holm([])) == 0
 
 
 def test_paired_test_is_the_sign_test_of_those_that_differ() -> None:

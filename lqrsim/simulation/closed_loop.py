@@ -29,6 +29,7 @@ def simulate(
     frames: bool = True,
     contacts: bool = True,
     threads: int | None = None,
+    generators: Callable[[int, int], np.random.Generator] | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Rollout:
     """Execute the solution's policy closed-loop in MuJoCo, from the first state of its plan.
@@ -45,6 +46,7 @@ def simulate(
       contacts: whether obstacles stop the robot, or it goes through them, which takes a quarter less time and is the
         same until the first collision.
       threads: of MuJoCo's; by default as many as there are processors.
+      generators: (trial, number of the disturbance) -> where its numbers come from, in place of the seed.
       progress: called after each control period with the number of periods done and of all.
 
     Raises:
@@ -60,7 +62,11 @@ def simulate(
     plan = solution.trajectory
     _check_solution(solution, controller, plant)
     substeps = plant.substeps(plan.dt)
-    effects = _start(disturbances, plant, solution, seed, range(first_trial, first_trial + trials))
+
+    def seeded(trial: int, stream: int) -> np.random.Generator:
+        return np.random.Generator(np.random.Philox(np.random.SeedSequence(seed, spawn_key=(trial, stream))))
+
+    effects = _start(disturbances, plant, solution, generators or seeded, range(first_trial, first_trial + trials))
     displaced = np.zeros((trials, len(plant.world), 3))
     for effect in effects:
         displaced += 0.0 if effect.displaced is None else effect.displaced
@@ -164,21 +170,25 @@ def _records(trials: int, steps: int, size: int) -> Array:
 
 
 def _start(
-    disturbances: Sequence[Disturbance], plant: Plant, solution: Solution, seed: int, trials: range
+    disturbances: Sequence[Disturbance],
+    plant: Plant,
+    solution: Solution,
+    generators: Callable[[int, int], np.random.Generator],
+    trials: range,
 ) -> list[Effect]:
     effects = []
     for stream, disturbance in enumerate(disturbances):
         if not isinstance(disturbance, Disturbance):
             raise InputError(f"disturbances: got {disturbance!r}, want Disturbance objects, such as ControlNoise(0.05)")
-        effects.append(disturbance.start(plant, solution.trajectory, _Streams(seed, trials, stream)))
+        effects.append(disturbance.start(plant, solution.trajectory, _Streams(generators, trials, stream)))
     return effects
 
 
 class _Streams(Sequence[np.random.Generator]):
     """The generator of each trial, made when it is asked for: some disturbances draw nothing."""
 
-    def __init__(self, seed: int, trials: range, stream: int) -> None:
-        self._seed, self._trials, self._stream = seed, trials, stream
+    def __init__(self, make: Callable[[int, int], np.random.Generator], trials: range, stream: int) -> None:
+        self._make, self._trials, self._stream = make, trials, stream
         self._made: dict[int, np.random.Generator] = {}
 
     def __len__(self) -> int:
@@ -186,11 +196,10 @@ class _Streams(Sequence[np.random.Generator]):
 
     def __getitem__(self, place: Any) -> Any:
         if isinstance(place, slice):
-            return _Streams(self._seed, self._trials[place], self._stream)
+            return [self[number] for number in range(*place.indices(len(self)))]
         trial = self._trials[place]
         if trial not in self._made:
-            key = np.random.SeedSequence(self._seed, spawn_key=(trial, self._stream))
-            self._made[trial] = np.random.Generator(np.random.Philox(key))
+            self._made[trial] = self._make(trial, self._stream)
         return self._made[trial]
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -31,11 +32,24 @@ def rate(successes: int, trials: int, *, confidence: float = CONFIDENCE) -> Esti
     Raises:
       InputError: no trials, or more successes than trials.
     """
+    return _rate(successes, trials, confidence, "exact")
+
+
+def wilson(successes: int, trials: int, *, confidence: float = CONFIDENCE) -> Estimate:
+    """A success rate with Wilson's interval, which is narrower and covers as often as it says on average: for plots.
+
+    Raises:
+      InputError: as `rate` does.
+    """
+    return _rate(successes, trials, confidence, "wilson")
+
+
+def _rate(successes: int, trials: int, confidence: float, method: Literal["exact", "wilson"]) -> Estimate:
     check_count("trials", trials)
     if check_count("successes", successes, at_least=0) > trials:
         raise InputError(f"successes: got {successes}, want at most the {trials} trials")
     check_number("confidence", confidence, above=0, below=1)
-    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method="exact")
+    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method=method)
     return Estimate(successes / trials, float(interval.low), float(interval.high), confidence)
 
 
@@ -66,6 +80,16 @@ def compare(first: npt.ArrayLike, second: npt.ArrayLike) -> Pairs:
     return Pairs(only_first, only_second, float(stats.binomtest(only_first, split).pvalue) if split else 1.0)
 
 
+def holm(p_values: npt.ArrayLike) -> Array:
+    """The p-values of several tests, made larger so that any one false alarm is as rare as they say (Holm, 1979)."""
+    values = np.asarray(p_values, dtype=np.float64)
+    order = np.argsort(values, kind="stable")
+    raised = np.minimum(np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1)), 1.0)
+    adjusted = np.empty(len(values))
+    adjusted[order] = raised
+    return adjusted
+
+
 def bootstrap(
     statistic: Callable[..., Array | float],
     *samples: npt.ArrayLike,
@@ -93,7 +117,7 @@ def bootstrap(
         paired=True,
         vectorized=True,
         n_resamples=resamples,
-        batch=1000,  # bounds the memory
+        batch=max(1, min(1000, 10_000_000 // len(arrays[0]))),  # bounds the memory
         confidence_level=confidence,
         method="percentile",  # BCa is undefined for medians of counts, which we have
         rng=np.random.default_rng(seed),

@@ -1,0 +1,182 @@
+"""How likely a rare failure is, by splitting: through levels of a score, each not so rare given the one before.
+
+A trial is a function of a vector z of standard normal numbers (given.py), and fails if its score is positive. A first
+run finds levels that about `keep` of the vectors exceed given the level before, and how far to move at each of them.
+The repetitions that count use these levels and moves: N vectors; those above the level are kept and copied in place of
+the others; each is moved by preconditioned Crank-Nicolson steps, z' = sqrt(1 - b^2) z + b xi, that are refused if the
+score falls below the level, and so leave the distribution above it as it is. The estimate is the product of the shares
+above each level. With levels and moves fixed beforehand its mean is the probability exactly, for any number of
+particles and moves (Del Moral, Feynman-Kac Formulae, 2004, Theorem 7.4.2); levels taken from the particles themselves
+would bias it by the order of 1/N (Cerou, Del Moral, Furon & Guyader, Statistics and Computing 22, 2012).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from lqrsim.errors import Array, InputError, check_count, check_number
+from lqrsim.stress.statistics import CONFIDENCE, Estimate
+
+Score = Callable[[Array], Array]
+ACCEPTED = 0.4  # the share of moves for which a first run aims
+
+
+@dataclass(frozen=True)
+class Rare:
+    """How likely failure is.
+
+    Attributes:
+      probability: the mean of the repetitions, with the interval of Student's t; none is below 0.
+      standard_error: of that mean. repetitions: (R,), independent and each without bias.
+      levels: of the score, the last one 0. sizes: b of the moves at each but the last.
+      simulations: scores that were asked for in all, the first run included.
+      failures: (k, d) vectors that fail, of the repetitions, distributed as failures are. scores: (k,) theirs.
+    """
+
+    probability: Estimate
+    standard_error: float
+    repetitions: Array
+    levels: Array
+    sizes: Array
+    simulations: int
+    failures: Array
+    scores: Array
+
+
+def split(
+    score: Score,
+    size: int,
+    *,
+    particles: int = 500,
+    keep: float = 0.1,
+    moves: int = 5,
+    repetitions: int = 10,
+    seed: int = 0,
+    confidence: float = CONFIDENCE,
+    most_levels: int = 40,
+    progress: Callable[[int, int], object] | None = None,
+) -> Rare:
+    """The probability that the score of a standard normal vector is positive.
+
+    Args:
+      score: of vectors (K, size), (K,); positive is failure.
+      particles: N of each repetition. keep: share that exceeds the next level. moves: of each particle at a level.
+      repetitions: independent ones; the interval is of how much they differ.
+      most_levels: with as many the first run gives up.
+      progress: called with the runs that are done, and all of them.
+
+    Raises:
+      InputError: an option is out of range, a score is NaN, or no failure was found.
+    """
+    check_count("size", size)
+    check_count("particles", particles, at_least=10)
+    check_number("keep", keep, at_least=2 / particles, at_most=0.5)
+    check_count("moves", moves)
+    check_count("repetitions", repetitions, at_least=2)
+    count = _Count(score)
+    first, *rest = np.random.SeedSequence(seed).spawn(repetitions + 1)
+    levels, sizes = _levels(count, size, particles, keep, moves, most_levels, np.random.default_rng(first))
+    shares, failures, scores = [], [], []
+    for number, key in enumerate(rest):
+        if progress is not None:
+            progress(number + 1, repetitions + 1)
+        share, failed, theirs = _run(count, size, particles, moves, levels, sizes, np.random.default_rng(key))
+        shares.append(share)
+        failures.append(failed)
+        scores.append(theirs)
+    if progress is not None:
+        progress(repetitions + 1, repetitions + 1)
+    found = np.array(shares)
+    error = float(found.std(ddof=1) / np.sqrt(repetitions))
+    reach = float(stats.t.ppf(0.5 + confidence / 2, repetitions - 1)) * error
+    mean = float(found.mean())
+    return Rare(
+        Estimate(mean, max(mean - reach, 0.0), mean + reach, confidence),
+        error,
+        found,
+        levels,
+        sizes,
+        count.asked,
+        np.concatenate(failures),
+        np.concatenate(scores),
+    )
+
+
+class _Count:
+    """A score that counts how often it is asked."""
+
+    def __init__(self, score: Score) -> None:
+        self.score, self.asked = score, 0
+
+    def __call__(self, vectors: Array) -> Array:
+        found = np.asarray(self.score(vectors), dtype=np.float64)
+        self.asked += len(vectors)
+        if found.shape != (len(vectors),) or np.isnan(found).any():
+            raise InputError(f"score: got shape {found.shape} or NaN, want a number for each of {len(vectors)} vectors")
+        return found
+
+
+def _levels(
+    score: Score, size: int, particles: int, keep: float, moves: int, most: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """The first run: levels, the last one 0, and how far to move at each but the last."""
+    vectors = rng.standard_normal((particles, size))
+    scores = score(vectors)
+    levels: list[float] = []
+    sizes: list[float] = []
+    b = 0.5
+    while len(levels) < most:
+        level = float(np.quantile(scores, 1 - keep, method="inverted_cdf"))
+        if level >= 0 and (scores > 0).any():
+            return np.array([*levels, 0.0]), np.array(sizes)
+        if not (scores > level).any():
+            break
+        vectors, scores = _branch(vectors, scores, level, rng)
+        for _ in range(moves):
+            vectors, scores, accepted = _move(score, vectors, scores, level, b, rng)
+            b = float(np.clip(b * np.exp(accepted - ACCEPTED), 1e-3, 1.0))
+        levels.append(level)
+        sizes.append(b)
+    raise InputError(f"score: got no failure in {len(levels)} levels up to {scores.max():g}, want some")
+
+
+def _run(
+    score: Score, size: int, particles: int, moves: int, levels: Array, sizes: Array, rng: np.random.Generator
+) -> tuple[float, Array, Array]:
+    """One repetition: the product of the shares, and the failures with their scores."""
+    vectors = rng.standard_normal((particles, size))
+    scores = score(vectors)
+    product = 1.0
+    for level, b in zip(levels[:-1], sizes, strict=True):
+        product *= float(np.mean(scores > level))
+        if product == 0:
+            break
+        vectors, scores = _branch(vectors, scores, level, rng)
+        for _ in range(moves):
+            vectors, scores, _ = _move(score, vectors, scores, level, b, rng)
+    failed = scores > levels[-1]
+    return product * float(failed.mean()), vectors[failed], scores[failed]
+
+
+def _branch(vectors: Array, scores: Array, level: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """As many as there were, of those above the level: each as often as any other, but for chance where that is odd."""
+    above = np.flatnonzero(scores > level)
+    times, left = divmod(len(scores), len(above))
+    chosen = np.concatenate([np.repeat(above, times), rng.choice(above, left, replace=False)])
+    return vectors[chosen], scores[chosen]
+
+
+def _move(
+    score: Score, vectors: Array, scores: Array, level: float, b: float, rng: np.random.Generator
+) -> tuple[Array, Array, float]:
+    """One move of each that stays above the level; and the share of those that were accepted."""
+    proposed = np.sqrt(1 - b * b) * vectors + b * rng.standard_normal(vectors.shape)
+    theirs = score(proposed)
+    accepted = theirs > level
+    return (
+        np.where(accepted[:, None], proposed, vectors),
+        np.where(accepted, theirs, scores),
+        float(accepted.mean()),
+    )

@@ -1,0 +1,141 @@
+"""The answers of a stress test, on tables small enough to be worked out by hand, and on tables with known rates."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+import lqrsim as ls
+from lqrsim.simulation.outcomes import Outcomes
+from lqrsim.stress.analysis import breaks, comparisons, degradation, modes, quantiles, success, worst
+from lqrsim.stress.asked import Cell
+
+
+def table_of(outcome: Sequence[str], *, first: int = 0, **columns: ArrayLike) -> Outcomes:
+    count = len(outcome)
+    over = np.isin(outcome, ("collided", "diverged", "error"))
+    given: dict[str, ArrayLike] = {
+        "obstacle": ["post" if one == "collided" else "" for one in outcome],
+        "ended": np.where(over, 1.0, 5.0), "worst": 0.1 + 0.001 * np.arange(count), "rms": 0.05,
+        "final": np.where(over, np.nan, 0.02), "clearance": np.where(over, -0.01, 0.3), "effort": 1.0,
+        "saturated": 0.0, "cost": np.where(over, np.nan, 2.0),
+    }  # fmt: skip
+    filled = {name: np.broadcast_to(values, count).copy() for name, values in (given | columns).items()}
+    return Outcomes(trial=np.arange(first, first + count), outcome=np.array(outcome), **filled)  # pyright: ignore[reportArgumentType]
+
+
+def mixed(reached: int, trials: int) -> Outcomes:
+    return table_of(["reached"] * reached + ["collided"] * (trials - reached))
+
+
+def test_degradation_is_in_the_order_of_strength_with_exact_intervals() -> None:
+    table = {
+        Cell("smooth", "wind", strength): mixed(reached, 300) for strength, reached in ((2, 0), (0, 300), (1, 285))
+    }
+    curve = degradation(table, "smooth", "wind")
+    assert [(point.cell.strength, point.reached) for point in curve] == [(0, 300), (1, 285), (2, 0)]
+    assert curve[2].exact.high == pytest.approx(1 - 0.025 ** (1 / 300), rel=1e-9)
+    # Wilson's interval lies within that of Clopper and Pearson here.
+    assert curve[1].exact.low < curve[1].band.low < 0.95 < curve[1].band.high < curve[1].exact.high
+
+
+def test_trials_that_are_all_alike_are_no_sample() -> None:
+    """Without a disturbance 200 trials are one; an interval would be of nothing."""
+    found = success(Cell("smooth", "calm", 0.0), table_of(["reached"] * 200, worst=0.1))
+    assert found.alike
+    assert (found.exact.low, found.exact.high) == (1.0, 1.0)
+    cells = Cell("smooth", "calm", 0.0), Cell("open_loop", "calm", 0.0)
+    same = table_of(["reached"] * 200, worst=0.1), table_of(["collided"] * 200, worst=0.1)
+    assert comparisons(dict(zip(cells, same, strict=True))) == []
+
+
+def test_what_breaks_first_is_sure_to_be_below_the_rate() -> None:
+    """Of 200, 190 are 95 %, and 185 could still be (interval up to 96 %); 180 could not (up to 93.8 %)."""
+    rates = {"strong": (200, 200, 190), "weak": (200, 185, 180), "weaker": (200, 180, 20)}
+    table = {
+        Cell(policy, "wind", strength): mixed(reached, 200)
+        for policy, of_strength in rates.items()
+        for strength, reached in zip((0.0, 1.0, 2.0), of_strength, strict=True)
+    }
+    found = breaks(table)
+    assert [(one.policy, one.strength) for one in found] == [("weaker", 1.0), ("weak", 2.0), ("strong", None)]
+    assert found[0].success is not None
+    assert found[0].success.high < 0.95
+    assert [one.strength for one in breaks(table, below=1.0)] == [1.0, 1.0, 2.0]
+
+
+def test_policies_are_compared_on_the_same_trials() -> None:
+    """Of ten trials three are won by the first alone, one by the second; rms differs by 0.02 m where both reached."""
+    won = ["reached"] * 9 + ["collided"]
+    lost = ["reached"] * 6 + ["timed out"] * 3 + ["reached"]
+    first, second = Cell("smooth", "wind", 1.0), Cell("open_loop", "wind", 1.0)
+    one = comparisons({first: table_of(won, rms=0.03), second: table_of(lost, rms=0.05)})[0]
+    assert (one.pairs.only_first, one.pairs.only_second, one.both) == (3, 1, 6)
+    assert one.success.value == pytest.approx(0.2)
+    assert one.success.low < 0 < one.success.high
+    assert one.rms is not None
+    np.testing.assert_allclose((one.rms.value, one.rms.low, one.rms.high), -0.02, rtol=1e-12)
+    with pytest.raises(ls.InputError, match="want the same, in the same order"):
+        comparisons({first: table_of(won), second: table_of(lost, first=10)})
+
+
+def test_the_interval_of_a_difference_covers() -> None:
+    """Of 300 studies of 100 pairs whose rates differ by 0.1, 95 % less four standard deviations hold the 0.1."""
+    rng = np.random.default_rng(2)
+    covered = 0
+    for _ in range(300):
+        kind = rng.choice(4, p=(0.2, 0.1, 0.5, 0.2), size=100)
+        one, other = (["reached" if k in good else "timed out" for k in kind] for good in ((0, 2), (1, 2)))
+        cells = Cell("a", "s", 1.0), Cell("b", "s", 1.0)
+        found = comparisons(dict(zip(cells, (table_of(one), table_of(other)), strict=True)), resamples=400)[0].success
+        covered += found.low <= 0.1 <= found.high
+    assert covered >= 300 * 0.95 - 4 * np.sqrt(300 * 0.95 * 0.05)
+
+
+def test_several_comparisons_raise_the_p_values() -> None:
+    table = {Cell("a", "s", strength): mixed(20, 20) for strength in (1.0, 2.0)}
+    table |= {Cell("b", "s", 1.0): mixed(10, 20), Cell("b", "s", 2.0): mixed(14, 20)}
+    first, second = comparisons(table)
+    assert first.adjusted == pytest.approx(2 * first.pairs.p_value)
+    assert second.adjusted == pytest.approx(second.pairs.p_value)
+
+
+def test_failure_modes_are_counted_by_outcome_and_obstacle() -> None:
+    outcome = ["reached", "collided", "collided", "diverged", "collided", "error"]
+    found = modes(table_of(outcome, obstacle=["", "b", "a", "", "b", ""]))
+    assert list(found.items()) == [
+        (("collided", "b"), 2), (("collided", "a"), 1), (("diverged", ""), 1), (("error", ""), 1)
+    ]  # fmt: skip
+
+
+def test_quantiles_are_of_those_that_have_the_measure() -> None:
+    outcomes = table_of(["reached"] * 3 + ["collided"], final=[1.0, 2.0, 3.0, np.nan], clearance=np.inf)
+    np.testing.assert_array_equal(quantiles(outcomes, "final"), [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(quantiles(outcomes, "clearance"), np.inf)
+    assert np.isnan(quantiles(table_of(["error"], final=np.nan), "final")).all()
+
+
+def test_worst_trials_are_ranked_as_it_says() -> None:
+    weak = table_of(
+        ["reached", "collided", "timed out", "collided", "reached"],
+        ended=[5, 2.0, 5, 1.0, 5], clearance=[0.1, -0.1, 0.2, -0.01, 0.1], worst=[0.3, 0.1, 0.1, 0.1, 0.4],
+    )  # fmt: skip
+    strong = table_of(["diverged", "error"], first=7, ended=[1.5, np.nan], clearance=np.nan)
+    cells = Cell("p", "s", 1.0), Cell("p", "s", 2.0)
+    found = worst(dict(zip(cells, (weak, strong), strict=True)))
+    assert [(one.cell.strength, one.trial) for one in found] == [
+        (2.0, 8), (1.0, 3), (2.0, 7), (1.0, 1), (1.0, 4), (1.0, 0), (1.0, 2)
+    ]  # fmt: skip
+    assert (found[1].outcome, found[1].obstacle, found[1].ended) == ("collided", "post", 1.0)
+    assert len(worst({cells[0]: weak}, 2)) == 2
+
+
+def test_bad_input_is_named() -> None:
+    table = {Cell("smooth", "wind", 1.0): mixed(1, 2)}
+    with pytest.raises(ls.InputError, match=r"policy: got 'smoth'.*did you mean smooth"):
+        degradation(table, "smoth", "wind")
+    with pytest.raises(ls.InputError, match="measure: got 'speed'"):
+        quantiles(table[Cell("smooth", "wind", 1.0)], "speed")
+    with pytest.raises(ls.InputError, match="below: got 2"):
+        breaks(table, below=2)

@@ -1,0 +1,203 @@
+"""Rare failures: trials as functions of numbers, and probabilities by splitting against what is known exactly."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import lqrsim as ls
+from lqrsim.stress.given import Given, Trials, collision, miss
+from lqrsim.stress.splitting import split
+from lqrsim.stress.statistics import rate
+
+
+def along(size: int, distance: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Fails beyond a plane so far from the origin: a known probability, and a known nearest failure."""
+    return lambda z: z @ np.full(size, 1 / np.sqrt(size)) - distance
+
+
+# Numbers that are given
+
+
+@pytest.mark.parametrize(
+    ("draw", "distribution"),
+    [
+        (lambda g, n: g.standard_normal(n), stats.norm()),
+        (lambda g, n: g.normal(2.0, 3.0, n), stats.norm(2, 3)),
+        (lambda g, n: g.random(n), stats.uniform()),
+        (lambda g, n: g.uniform(-1.0, 4.0, size=(n,)), stats.uniform(-1, 5)),
+        (lambda g, n: g.exponential(2.0, n), stats.expon(scale=2)),
+    ],
+)
+def test_numbers_have_the_distribution_that_was_asked_for(draw: Callable[..., Any], distribution: Any) -> None:
+    numbers = np.random.default_rng(5).standard_normal(4000)
+    assert stats.kstest(draw(Given(numbers), 4000), distribution.cdf).pvalue > 0.001
+
+
+def test_whole_numbers_and_choices_have_their_shares() -> None:
+    given = Given(np.random.default_rng(5).standard_normal(9000))
+    assert stats.chisquare(np.bincount(given.integers(2, 5, size=3000))[2:]).pvalue > 0.001
+    assert stats.chisquare(np.bincount(given.choice(3, 3000, p=(0.2, 0.5, 0.3))), (600, 1500, 900)).pvalue > 0.001
+    assert sorted(given.choice([4, 5, 6], 3, replace=False)) == [4, 5, 6]
+    assert given.used == 6003
+
+
+def test_sizes_are_those_of_numpy() -> None:
+    numpy = np.random.default_rng(0)
+    given: Any = Given(np.random.default_rng(1).standard_normal(100))
+    for name, arguments in (
+        ("standard_normal", {}), ("standard_normal", {"size": (2, 3)}), ("random", {}), ("random", {"size": 4}),
+        ("normal", {"loc": [0.0, 1.0]}), ("normal", {"scale": 2.0}), ("uniform", {"low": [0.0, 1.0], "high": 2.0}),
+        ("integers", {"low": 4}), ("integers", {"low": 1, "high": 3, "size": 5}), ("choice", {"a": 3}),
+        ("choice", {"a": [1.5, 2.5], "size": (2, 2)}), ("choice", {"a": 4, "size": 2, "replace": False}),
+    ):  # fmt: skip
+        assert np.shape(getattr(given, name)(**arguments)) == np.shape(getattr(numpy, name)(**arguments)), name
+
+
+def test_what_can_not_be_given_is_named() -> None:
+    with pytest.raises(ls.InputError, match="got draws by poisson"):
+        Given(np.zeros(3)).poisson(2.0)
+    with pytest.raises(ls.InputError, match="numbers: got 3"):
+        Given(np.zeros(3)).standard_normal(4)
+
+
+# Trials of a robot
+
+
+@pytest.fixture(scope="module")
+def disturbances() -> list[ls.Disturbance]:
+    return [ls.ForceNoise(0.2), ls.MeasurementNoise(0.005), ls.Push((0.1, 0.0, 0.0), at=1.0)]
+
+
+def test_the_same_numbers_give_the_trial_that_simulate_gives(
+    quadrotor: ls.Scenario, quadrotor_solution: ls.Solution, disturbances: list[ls.Disturbance]
+) -> None:
+    trials = Trials(quadrotor.plant(), quadrotor_solution, disturbances, contacts=True)
+    assert trials.sizes == (150 * 3, 151 * 12, 0)
+    simulated = ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=disturbances, seed=2, trials=3)
+    keys = [[np.random.SeedSequence(2, spawn_key=(trial, stream)) for stream in (0, 1)] for trial in range(3)]
+    numbers = np.array([
+        np.concatenate([
+            np.random.Generator(np.random.Philox(key)).standard_normal(count)
+            for key, count in zip(pair, trials.sizes, strict=False)
+        ])
+        for pair in keys
+    ])  # fmt: skip
+    np.testing.assert_array_equal(trials.rollout(numbers).states, simulated.states)
+    np.testing.assert_array_equal(trials(numbers), -simulated.clearance.min(axis=1))
+    assert trials.simulations == 3
+    # Nothing drawn is nothing that goes wrong, but for what is not random.
+    push = ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=disturbances[2:])
+    np.testing.assert_allclose(trials.rollout(np.zeros((1, trials.size))).states, push.states, atol=1e-12)
+
+
+def test_scores_are_positive_where_trials_fail(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    rollout = ls.simulate(
+        quadrotor.plant(), quadrotor_solution.open_loop(), disturbances=[ls.ForceNoise(0.1)], trials=60, frames=False
+    )
+    np.testing.assert_array_equal(collision(rollout) > 0, rollout.collided)
+    np.testing.assert_array_equal(miss(rollout) > 0, ~rollout.reached)
+    assert 5 < rollout.reached.sum() < 55
+
+
+# Splitting, where the probability is known
+
+
+@pytest.mark.parametrize("size", [2, 200])
+def test_a_plane_one_in_a_million(size: int) -> None:
+    """Within four standard errors, which are at most a seventh of it: 1 % of what plain Monte Carlo takes for that."""
+    found = split(along(size, 4.75), size, repetitions=20, seed=1)
+    exact = stats.norm.sf(4.75)
+    assert found.standard_error < exact / 7
+    assert abs(found.probability.value - exact) < 4 * found.standard_error
+    plain = (1 - exact) * exact / found.standard_error**2
+    assert found.simulations < plain / 50
+    assert found.probability.low < exact < found.probability.high
+
+
+def test_outside_of_a_ball_one_in_a_million() -> None:
+    """Many directions at once, against the chi-square distribution."""
+    radius = np.sqrt(stats.chi2.isf(1e-6, 20))
+    found = split(lambda z: np.linalg.norm(z, axis=1) - radius, 20, repetitions=20, seed=1)
+    assert abs(found.probability.value - 1e-6) < 4 * found.standard_error
+    assert found.standard_error < 1e-6 / 7
+
+
+def test_two_opposite_planes_are_both_found() -> None:
+    found = split(lambda z: np.abs(z[:, 0]) - 4.0, 5, repetitions=20, seed=1)
+    assert abs(found.probability.value - 2 * stats.norm.sf(4)) < 4 * found.standard_error
+    assert 0.2 < np.mean(found.failures[:, 0] > 0) < 0.8
+
+
+def test_repetitions_have_no_bias_and_the_standard_error_is_theirs() -> None:
+    """Few particles and one move, where levels from the particles themselves would be off: 2,000 repetitions."""
+    found = split(along(4, 3.5), 4, particles=40, moves=1, keep=0.25, repetitions=2000, seed=4)
+    exact = stats.norm.sf(3.5)
+    assert abs(found.probability.value - exact) < 4 * found.standard_error
+    assert found.standard_error < 0.05 * exact
+
+
+def test_intervals_cover() -> None:
+    """Of 100 studies 95 % less four standard deviations; an eighth of a standard error is lost to skewness."""
+    exact = stats.norm.sf(3.0)
+    found = [
+        split(along(3, 3.0), 3, particles=200, repetitions=8, seed=seed).probability for seed in range(100)
+    ]  # fmt: skip
+    covered = sum(one.low <= exact <= one.high for one in found)
+    assert covered >= 100 * 0.95 - 4 * np.sqrt(100 * 0.95 * 0.05)
+
+
+def test_failures_are_failures_and_simulations_are_counted() -> None:
+    asked = []
+
+    def score(z: np.ndarray) -> np.ndarray:
+        asked.append(len(z))
+        return along(6, 3.0)(z)
+
+    one, again = (split(score, 6, particles=100, repetitions=3, seed=9) for _ in range(2))
+    assert (one.scores > 0).all()
+    np.testing.assert_array_equal(one.scores, along(6, 3.0)(one.failures))
+    assert one.simulations == again.simulations == sum(asked) / 2
+    np.testing.assert_array_equal(one.repetitions, again.repetitions)
+    assert one.levels[-1] == 0
+    assert (np.diff(one.levels) > 0).all()
+
+
+def test_what_is_not_rare_needs_no_levels() -> None:
+    found = split(along(2, 0.5), 2, repetitions=10)
+    assert found.levels.tolist() == [0.0]
+    assert found.probability.low < stats.norm.sf(0.5) < found.probability.high
+
+
+def test_a_quadrotor_against_plain_monte_carlo(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    """Wind in which 1 to 2 % of the trials collide: the two agree within four standard errors of their difference."""
+    trials = Trials(quadrotor.plant(), quadrotor_solution, [ls.ForceNoise(0.19)])
+    rng = np.random.default_rng(8)
+    plain = trials(rng.standard_normal((2000, trials.size))) > 0
+    expected = rate(int(plain.sum()), len(plain))
+    assert 0.002 < expected.value < 0.03
+    found = split(trials, trials.size, particles=100, moves=2, keep=0.25, repetitions=4, seed=2)
+    error = np.hypot(found.standard_error, np.sqrt(expected.value * (1 - expected.value) / len(plain)))
+    assert abs(found.probability.value - expected.value) < 4 * error
+    assert found.standard_error < expected.value
+    # The numbers of a failure are all that is needed to see it again.
+    again = trials.rollout(found.failures[:1], frames=False)
+    assert again.outcome == ("collided",)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: split(along(2, 1), 0), "size: got 0"),
+        (lambda: split(along(2, 1), 2, particles=3), "particles: got 3"),
+        (lambda: split(along(2, 1), 2, keep=0.9), "keep: got 0.9"),
+        (lambda: split(along(2, 1), 2, repetitions=1), "repetitions: got 1"),
+        (lambda: split(lambda z: np.full(len(z), np.nan), 2), "score: got shape .* or NaN"),
+        (lambda: split(lambda z: np.minimum(z[:, 0], 1.0) - 2.0, 2), "score: got no failure in .* levels up to -1"),
+    ],
+)
+def test_bad_input_is_named(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(ls.InputError, match=message):
+        call()
