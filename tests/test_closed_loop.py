@@ -3,18 +3,21 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 from tracking import hover, track, weave
 
+from lqrsim import files
 from lqrsim.dynamics import Dynamics
 from lqrsim.errors import InputError
-from lqrsim.results import Status, Trajectory
+from lqrsim.results import Solution, Status, Trajectory
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.scenarios import Scenario
 from lqrsim.scenes import load_scene
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import ControlNoise, Disturbance, Effect, ForceNoise, MeasurementNoise
@@ -305,3 +308,12 @@ def test_a_plan_that_is_not_finite_is_refused(cage):
 def test_bad_options_are_told(cage, options, message):
     with pytest.raises(InputError, match=message):
         simulate(cage, hover(5), **options)
+
+
+def test_a_saved_policy_runs_as_the_one_that_was_saved(
+    differential_drive: Scenario, drive_solution: Solution, tmp_path: Path
+) -> None:
+    """What is loaded is read-only."""
+    loaded = files.load_solution(files.save(drive_solution, tmp_path / "solution.npz"))
+    runs = [simulate(differential_drive.plant(), solution) for solution in (drive_solution, loaded)]
+    np.testing.assert_array_equal(runs[0].states, runs[1].states)
