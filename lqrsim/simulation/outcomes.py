@@ -11,7 +11,7 @@ from lqrsim.problem import Problem
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.plant import Plant
 
-OUTCOMES = ("reached", "timed out", "collided", "diverged")
+OUTCOMES = ("reached", "timed out", "collided", "diverged", "error")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +19,7 @@ class Outcomes:
     """One entry a trial; the first collision ends a trial, and what is measured is of the time until then.
 
     Attributes:
-      trial: its number. outcome: one of OUTCOMES.
+      trial: its number. outcome: one of OUTCOMES; "error" is for campaigns, of trials that could not be run.
       obstacle: what it collided with; empty where it did not.
       ended: when it collided or was lost, in seconds; the horizon where neither happened.
       worst, rms: tracking error in metres. final: at the end of the plan; NaN for what ended before.

@@ -1,0 +1,183 @@
+"""What a campaign is asked to do: plain data, to JSON and back."""
+
+import dataclasses
+import itertools
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lqrsim.errors import InputError, check_count, check_name, check_number, excerpt
+from lqrsim.simulation.disturbances import Disturbance
+
+POLICIES = ("smooth", "ilqr", "open_loop", "replan")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One combination. All cells share the trials' random numbers."""
+
+    policy: str
+    sweep: str
+    strength: float
+
+    def __str__(self) -> str:
+        return f"{self.policy},{self.sweep},{self.strength:g}"
+
+
+@dataclass(frozen=True)
+class Shard:
+    """The unit of work, which is lost or kept as a whole: some trials of a cell, which go into one file."""
+
+    cell: int
+    first: int
+    count: int
+
+    @property
+    def file(self) -> str:
+        """The name of its file: the number of the cell and that of the first trial."""
+        return f"{self.cell:04d}-{self.first:09d}.parquet"
+
+
+def shards_of(cell: int, trials: int, size: int) -> Iterator[Shard]:
+    """The shards of the cell with that number."""
+    for first in range(0, trials, size):
+        yield Shard(cell, first, min(size, trials - first))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Campaign:
+    """What is asked.
+
+    Attributes:
+      scenario: what is run, as `lqrsim solve` takes it.
+      sweeps: name -> disturbances at strength 1. strengths: what they are multiplied by.
+      policies: which of POLICIES: "smooth" is lqrsim.smooth's, "ilqr" that of lqrsim.ilqr; "open_loop" is the plan of
+        smooth without feedback; "replan" solves again and again as it goes.
+      trials: of each cell. seed: of all random numbers.
+      replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
+      shard: trials of a file. time_limit: seconds that a shard may take before it counts as hung.
+
+    Raises:
+      InputError: something is not as described.
+    """
+
+    scenario: str
+    sweeps: Mapping[str, tuple[Disturbance, ...]]
+    strengths: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0)
+    policies: tuple[str, ...] = POLICIES
+    trials: int = 200
+    seed: int = 0
+    replan_every: float | None = None
+    shard: int = 500
+    time_limit: float = 300.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.scenario, str) or not self.scenario:
+            raise InputError(f"scenario: got {excerpt(self.scenario)}, want a reference, such as 'quadrotor'")
+        if not isinstance(self.sweeps, Mapping) or not self.sweeps:
+            raise InputError(f"sweeps: got {excerpt(self.sweeps)}, want at least one: name -> disturbances")
+        for name, disturbances in self.sweeps.items():
+            if not isinstance(name, str) or not name or "," in name:
+                raise InputError(f"sweeps: got the name {excerpt(name)}, want one without a comma")
+            for one in disturbances:
+                if not isinstance(one, Disturbance):
+                    raise InputError(f"sweeps: {name}: got {excerpt(one)}, want Disturbance objects")
+        numbers = tuple(check_number("strengths", strength, at_least=0.0) for strength in self.strengths)
+        for policy in self.policies:
+            check_name("policies", policy, POLICIES)
+        for field, values in (("strengths", numbers), ("policies", tuple(self.policies))):
+            if not values or len(set(values)) < len(values):
+                raise InputError(f"{field}: got {excerpt(values)}, want at least one, and each once")
+            object.__setattr__(self, field, values)
+        object.__setattr__(self, "sweeps", {name: tuple(sweep) for name, sweep in self.sweeps.items()})
+        for field, least in (("trials", 1), ("seed", 0), ("shard", 1)):
+            object.__setattr__(self, field, check_count(field, getattr(self, field), at_least=least))
+        if self.replan_every is not None:
+            object.__setattr__(self, "replan_every", check_number("replan_every", self.replan_every, above=0.0))
+        object.__setattr__(self, "time_limit", check_number("time_limit", self.time_limit, above=0.0))
+
+    @property
+    def cells(self) -> list[Cell]:
+        """All combinations, in the order of their numbers."""
+        together = itertools.product(self.sweeps, self.strengths, self.policies)
+        return [Cell(policy, sweep, strength) for sweep, strength, policy in together]
+
+    def shards(self) -> Iterator[Shard]:
+        """All of the work, in order."""
+        for number in range(len(self.cells)):
+            yield from shards_of(number, self.trials, self.shard)
+
+    def disturbances(self, cell: Cell) -> list[Disturbance]:
+        """What a cell's trials meet."""
+        return [scaled(disturbance, cell.strength) for disturbance in self.sweeps[cell.sweep]]
+
+    def as_json(self) -> dict[str, Any]:
+        """What `from_json` makes the same campaign of."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        sweeps = {name: [_described(disturbance) for disturbance in sweep] for name, sweep in self.sweeps.items()}
+        return fields | {"sweeps": sweeps, "strengths": list(self.strengths), "policies": list(self.policies)}
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any]) -> "Campaign":
+        """The campaign that `as_json` described; its scenario must have been resolved, if it has its own disturbances.
+
+        Raises:
+          InputError: it is damaged, or has a disturbance that is not known here.
+        """
+        try:
+            sweeps = {name: tuple(_made(one) for one in sweep) for name, sweep in fields["sweeps"].items()}
+            return cls(**{**fields, "sweeps": sweeps})
+        except (KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"campaign: got {excerpt(fields)}, want what lqrsim wrote ({error})") from None
+
+
+def scaled(disturbance: Disturbance, strength: float) -> Disturbance:
+    """The same, so many times as strong."""
+    own = getattr(disturbance, "scaled", None)
+    if own is not None:
+        return own(strength)
+    for field in ("std", "impulse"):
+        if hasattr(disturbance, field):
+            stronger = (strength * np.array(getattr(disturbance, field))).tolist()
+            return dataclasses.replace(disturbance, **{field: stronger})  # pyright: ignore[reportArgumentType]
+    raise InputError(f"{type(disturbance).__name__}: got no method scaled(strength), want one")
+
+
+def _described(disturbance: Disturbance) -> dict[str, Any]:
+    if not dataclasses.is_dataclass(disturbance):
+        raise InputError(f"{type(disturbance).__name__}: got a class of its own kind, want a dataclass")
+    settings = {field.name: getattr(disturbance, field.name) for field in dataclasses.fields(disturbance) if field.init}
+    return {"kind": type(disturbance).__qualname__, **{name: _plain(value) for name, value in settings.items()}}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple | list):
+        return [_plain(one) for one in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {str(name): _plain(one) for name, one in value.items()}
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise InputError(f"sweeps: got {excerpt(value)} in a disturbance, want numbers, strings, and lists of them")
+
+
+def _made(fields: Mapping[str, Any]) -> Disturbance:
+    kinds = {kind.__qualname__: kind for kind in _kinds(Disturbance)}
+    settings = {name: _restored(value) for name, value in fields.items() if name != "kind"}
+    return kinds[check_name("disturbance", fields["kind"], sorted(kinds))](**settings)
+
+
+def _restored(value: Any) -> Any:
+    return tuple(_restored(one) for one in value) if isinstance(value, list) else value
+
+
+def _kinds(base: type[Disturbance]) -> Iterator[type[Disturbance]]:
+    """Every kind that is defined here, users' own too; of one whose file was loaded twice, the newer."""
+    for kind in base.__subclasses__():
+        yield from _kinds(kind)
+        if getattr(sys.modules.get(kind.__module__), kind.__qualname__, None) is kind:
+            yield kind

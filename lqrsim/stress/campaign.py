@@ -1,0 +1,194 @@
+"""Many trials of policies under disturbances of growing strength, into a folder; it can be interrupted anywhere.
+
+    campaign = Campaign(scenario="quadrotor", sweeps={"gusts": (ls.ForceNoise(0.2),)})
+    results = run(campaign, "runs/stress/quadrotor")
+
+A trial's rows depend on the campaign alone: not on how many workers there are, on what they do at once, or on how often
+the campaign was interrupted.
+"""
+
+import json
+import logging
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lqrsim import files
+from lqrsim.errors import InputError, check_count, excerpt
+from lqrsim.machine import description, processors
+from lqrsim.references import resolve
+from lqrsim.results import Trajectory
+from lqrsim.scenarios import Scenario
+from lqrsim.stress.asked import POLICIES as POLICIES
+from lqrsim.stress.asked import Campaign as Campaign
+from lqrsim.stress.asked import Cell as Cell
+from lqrsim.stress.asked import Shard
+from lqrsim.stress.executors import Done, here
+from lqrsim.stress.lock import sole_writer
+from lqrsim.stress.results import FORMAT, VERSION, Results, digest_of, read_manifest
+from lqrsim.stress.shards import Damaged, write
+from lqrsim.stress.trials import Job, solve
+from lqrsim.versions import versions
+
+_log = logging.getLogger("lqrsim")
+
+_OWN = {"manifest.json", "campaign.lock", "policies", "shards", "damaged"}
+
+
+def run(
+    campaign: Campaign,
+    folder: str | os.PathLike[str],
+    *,
+    workers: int | None = None,
+    batch: int = 256,
+    scheduler: str | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Results:
+    """Run what is asked and not there yet; the same call goes on where it was stopped, and what is done stays.
+
+    Args:
+      folder: takes everything.
+      workers: processes on this machine; by default one a processor. 0: do it in this process.
+      batch: how many trials a worker simulates together; changes nothing but time and memory.
+      scheduler: address of a dask cluster that does the work in place of processes on this machine.
+      progress: called with the number of trials that there are and of all: first, and after each shard.
+
+    Raises:
+      InputError: something that is asked can not be run; the folder is another campaign's, no campaign's, being
+        written, or on a full disk; or the cluster can not be reached.
+    """
+    folder = Path(folder)
+    workers = processors() if workers is None else check_count("workers", workers, at_least=0)
+    check_count("batch", batch)
+    scenario = resolve(campaign.scenario)
+    _rehearse(campaign, scenario)
+    _look_at(folder)
+    with sole_writer(folder):
+        _begin(campaign, scenario, folder)
+        results = Results(folder, scenario=campaign.scenario)
+        left = _left(results)
+        if left and (now := versions()) != results.manifest["versions"]:
+            was = results.manifest["versions"]
+            changed = ", ".join(
+                f"{name} {new} (was {was.get(name)})" for name, new in now.items() if new != was.get(name)
+            )
+            raise InputError(f"versions: got {changed}, want those that {folder} was begun with, or another folder")
+        job = Job(campaign.as_json(), results.manifest["digest"], results.trials.solutions, batch)
+        total = campaign.trials * len(results.cells)
+        done = total - sum(shard.count for shard in left)
+        if progress is not None:
+            progress(done, total)
+        for shard, contents in _execute(job, left, workers):
+            write(contents, results.path(shard))
+            done += shard.count
+            if progress is not None:
+                progress(done, total)
+        for cell in results.cells:
+            if (found := results.tally(cell).total()) != campaign.trials:
+                raise InputError(f"folder: got {found} trials of {cell}, want {campaign.trials}: {results.command}")
+    return results
+
+
+def _execute(job: Job, shards: list[Shard], workers: int) -> Done:
+    return here(job, shards)
+
+
+def _rehearse(campaign: Campaign, scenario: Scenario) -> None:
+    """Raise InputError now for what every trial would raise it for, before anything is solved or written."""
+    problem, plant = scenario.problem, scenario.plant()
+    n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
+    start = np.zeros(n) if problem.start is None else problem.start
+    standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
+    plant.substeps(problem.dt)
+    for cell in campaign.cells:
+        for disturbance in campaign.disturbances(cell):
+            try:
+                disturbance.start(plant, standing, [np.random.default_rng(campaign.seed)])
+            except InputError as error:
+                raise InputError(f"sweeps: {cell.sweep} at strength {cell.strength:g}: {error}") from None
+            except Exception:  # may depend on the trial, or on the plan; then it is those trials' error
+                _log.debug("%s can not be rehearsed", disturbance, exc_info=True)
+    if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
+        raise InputError(f"replan_every: got {campaign.replan_every:g} s, want at least {problem.dt:g}")
+
+
+def _look_at(folder: Path) -> None:
+    """Raise InputError for a folder that is not empty, and no campaign's."""
+    if folder.is_dir() and not (folder / "manifest.json").exists():
+        others = sorted(name for name in os.listdir(folder) if name not in _OWN and not name.startswith(".unfinished-"))
+        if others:
+            raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty one or a campaign's")
+
+
+def _begin(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
+    """Solve and write the policies, and then the manifest; or see that it is the same campaign that was begun."""
+    asked = {
+        "campaign": json.loads(json.dumps(campaign.as_json())),
+        "model": digest_of(scenario.scene.xml.encode()),
+        "problem": scenario.problem.digest,
+    }
+    if (folder / "manifest.json").exists():
+        _compare(asked, read_manifest(folder), folder)
+        return
+    hashes = {}
+    for policy, solution in solve(campaign.policies, scenario).items():
+        if not solution.success:
+            _log.warning("%s did not converge (%s); its plan is run as it is", policy, solution.status.name)
+        path = files.save(solution, folder / "policies" / f"{policy}.npz")
+        hashes[policy] = digest_of(path.read_bytes())
+    asked |= {"policies": hashes}
+    lasting = asked | {"campaign": {name: value for name, value in asked["campaign"].items() if name != "time_limit"}}
+    manifest = {
+        "format": FORMAT, "version": VERSION, **asked,
+        "digest": digest_of(json.dumps(lasting, sort_keys=True).encode()),
+        "cells": [(cell.policy, cell.sweep, cell.strength) for cell in campaign.cells],
+        "versions": versions(), "machine": description(),
+    }  # fmt: skip
+    write(json.dumps(manifest, indent=1).encode(), folder / "manifest.json")
+
+
+def _compare(asked: dict[str, Any], manifest: dict[str, Any], folder: Path) -> None:
+    for field, value in asked["campaign"].items():
+        was = manifest["campaign"].get(field)
+        if field != "time_limit" and value != was:
+            raise InputError(
+                f"{field}: got {excerpt(value)}, want {excerpt(was)}, as {folder} has it, or another folder"
+            )
+    for field, what in (("model", "MJCF"), ("problem", "problem")):
+        if asked[field] != manifest[field]:
+            raise InputError(f"scenario: got a {what} that is not the one {folder} was begun with, want another folder")
+
+
+def _left(results: Results) -> list[Shard]:
+    """What is to be done; what is damaged is moved aside, and remains of writing are removed."""
+    for remains in results.folder.glob("**/.unfinished-*"):
+        remains.unlink(missing_ok=True)
+    there = results.there()
+    return [shard for shard in results.shards() if shard not in there or not _good(results, shard)]
+
+
+def _good(results: Results, shard: Shard) -> bool:
+    try:
+        results.read(shard)
+    except Damaged as error:
+        path = results.path(shard)
+        aside = next(name for name in _names(results.folder / "damaged" / path.name) if not name.exists())
+        try:
+            aside.parent.mkdir(exist_ok=True)
+            path.replace(aside)
+        except OSError as problem:
+            raise InputError(f"shard: got {path}, which is damaged and can not be moved ({problem.strerror})") from None
+        _log.warning("%s was damaged (%s); moved to %s, and done again", path.name, error, aside)
+        return False
+    return True
+
+
+def _names(path: Path) -> Iterator[Path]:
+    yield path
+    number = 1
+    while True:
+        yield path.with_name(f"{path.name}.{number}")
+        number += 1

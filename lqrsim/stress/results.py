@@ -1,0 +1,201 @@
+"""What a campaign came to: a folder that is opened and checked, its tables, and any of its trials once more."""
+
+import hashlib
+import json
+import os
+import shlex
+from collections import Counter
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lqrsim import files
+from lqrsim.errors import InputError, check_count, check_name
+from lqrsim.references import resolve
+from lqrsim.results import Solution
+from lqrsim.rollout import Rollout
+from lqrsim.simulation.outcomes import Outcomes
+from lqrsim.stress.asked import Campaign, Cell, Shard, shards_of
+from lqrsim.stress.shards import Damaged, Table, read
+from lqrsim.stress.trials import Trials
+
+FORMAT, VERSION = "lqrsim campaign", 1
+
+
+class Results:
+    """The folder of a campaign, finished or not.
+
+    Args:
+      folder: that `run` wrote.
+      scenario: the campaign's, where it is a function of yours: a file is data, and never chooses code to run.
+
+    Attributes:
+      manifest: what the folder says of itself. cells: of the campaign.
+
+    Raises:
+      InputError: it is not a campaign's, damaged, or of another version.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], *, scenario: str | None = None) -> None:
+        self.folder = Path(folder)
+        self.manifest = read_manifest(self.folder)
+        self.cells = [Cell(*cell) for cell in self.manifest["cells"]]
+        self._scenario = scenario
+        asked = self.manifest["campaign"]["scenario"]
+        if scenario is not None and scenario != asked:
+            raise InputError(f"scenario: got {scenario}, want {asked}, which {self.folder} was run on")
+
+    @cached_property
+    def campaign(self) -> Campaign:
+        """What was asked. Raises InputError where it has disturbances of yours, and no scenario was given."""
+        _ = self.trials.scenario
+        return self.trials.campaign
+
+    @cached_property
+    def trials(self) -> Trials:
+        """What runs its trials. Raises InputError as `campaign` does, or where a policy is damaged."""
+        scenario = resolve(self.manifest["campaign"]["scenario"], registered_only=self._scenario is None)
+        campaign = Campaign.from_json(self.manifest["campaign"])
+        return Trials(campaign, scenario, {policy: self.solution(policy) for policy in campaign.policies})
+
+    @property
+    def complete(self) -> bool:
+        """Whether every trial has its row."""
+        return not self.missing
+
+    @property
+    def missing(self) -> list[tuple[Cell, int, int]]:
+        """What is still to be run: cell, first trial, how many."""
+        there = self.there()
+        return [(self.cells[shard.cell], shard.first, shard.count) for shard in self.shards() if shard not in there]
+
+    def outcomes(self, cell: Cell, *, partial: bool = False) -> Outcomes:
+        """All trials of a cell, in order. Raises InputError for what is damaged, or not finished unless `partial`."""
+        tables = [table for _, table in self.tables(cell, partial=partial)]
+        if not tables:
+            raise InputError(f"cell: got {cell}, of which there is nothing yet, want one that was begun")
+        names = [name for name in tables[0] if name != "reason"]
+        columns: dict[str, Any] = {name: np.concatenate([table[name] for table in tables]) for name in names}
+        return Outcomes(**columns)
+
+    def tally(self, cell: Cell, *, partial: bool = False) -> Counter[str]:
+        """How many trials of a cell ended how; it reads the cell in parts. Raises InputError as `outcomes` does."""
+        found: Counter[str] = Counter()
+        for _, table in self.tables(cell, partial=partial):
+            found.update(table["outcome"].tolist())
+        return found
+
+    def reasons(self, cell: Cell) -> dict[int, str]:
+        """Why trials of a cell are an "error", by their numbers."""
+        return {
+            int(trial): str(reason)
+            for _, table in self.tables(cell, partial=True)
+            for trial, reason in zip(table["trial"], table["reason"], strict=True)
+            if reason
+        }
+
+    def solution(self, policy: str) -> Solution:
+        """What a policy was made from. Raises InputError if its file is damaged."""
+        path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
+        if path.is_file() and digest_of(path.read_bytes()) != self.manifest["policies"][policy]:
+            raise InputError(f"policy: got {path}, which is damaged, want what the campaign wrote: run it elsewhere")
+        return files.load_solution(path)
+
+    def shards(self, cell: Cell | None = None) -> Iterator[Shard]:
+        """The work of a cell, or all of it."""
+        asked = self.manifest["campaign"]
+        for number in range(len(self.cells)) if cell is None else [self.number(cell)]:
+            yield from shards_of(number, asked["trials"], asked["shard"])
+
+    def there(self) -> set[Shard]:
+        """The shards that have a file."""
+        folder = self.folder / "shards"
+        names = set(os.listdir(folder)) if folder.is_dir() else set()
+        return {shard for shard in self.shards() if shard.file in names}
+
+    def number(self, cell: Cell) -> int:
+        """The place of a cell among `cells`. Raises InputError if it is none of them."""
+        if cell not in self.cells:
+            first, last = self.cells[0], self.cells[-1]
+            raise InputError(f"cell: got {cell}, want one of the {len(self.cells)}, from {first} to {last}")
+        return self.cells.index(cell)
+
+    def path(self, shard: Shard) -> Path:
+        """Its file."""
+        return self.folder / "shards" / shard.file
+
+    def read(self, shard: Shard) -> Table:
+        """The rows of a shard. Raises Damaged."""
+        return read(self.path(shard), shard, self.manifest["digest"])
+
+    def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[tuple[Shard, Table]]:
+        """The shards of a cell one by one. Raises InputError for what is damaged, or missing unless `partial`."""
+        for shard in self.shards(cell):
+            path = self.path(shard)
+            if not path.is_file():
+                if partial:
+                    continue
+                last = shard.first + shard.count - 1
+                raise InputError(
+                    f"cell: got {cell}, without trials {shard.first} to {last}, want it finished: {self.command}"
+                )
+            try:
+                table = self.read(shard)
+            except Damaged as error:
+                raise InputError(f"shard: got {path}, which is damaged ({error}), repair it: {self.command}") from None
+            yield shard, table
+
+    @property
+    def command(self) -> str:
+        """The command that goes on with the campaign, and repairs what is damaged."""
+        return shlex.join(
+            ["lqrsim", "stress", self.manifest["campaign"]["scenario"], "--resume", "--out", str(self.folder)]
+        )
+
+
+def replay(
+    results: Results | str | os.PathLike[str],
+    cell: Cell,
+    trial: int,
+    *,
+    frames: bool = True,
+    contacts: bool = True,
+) -> Rollout:
+    """The very trial of a campaign again, to the bit until its first collision; and to its end without contacts.
+
+    Raises:
+      InputError: no such cell or trial, or the scenario is one of yours and `Results` was not given it.
+    """
+    results = results if isinstance(results, Results) else Results(results)
+    results.number(cell)
+    if check_count("trial", trial, at_least=0) >= results.manifest["campaign"]["trials"]:
+        raise InputError(f"trial: got {trial}, want less than {results.manifest['campaign']['trials']}")
+    return results.trials.run(cell, trial, frames=frames, contacts=contacts)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """What a campaign's folder says of itself. Raises InputError."""
+    path = folder / "manifest.json"
+    if not path.is_file():
+        raise InputError(f"folder: got {folder}, want one that `lqrsim stress` wrote, with a manifest.json")
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        found, version = manifest["format"], manifest["version"]
+        whole = {"campaign", "cells", "policies", "digest", "model", "problem", "versions"} <= manifest.keys()
+    except OSError as error:
+        raise InputError(f"folder: got {path}, want a file that can be read ({error.strerror or error})") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"folder: got {path}, which is damaged, want what lqrsim wrote") from None
+    if found != FORMAT or version != VERSION:
+        raise InputError(f"folder: got {path}, a {found!r} {version}, want a {FORMAT!r} {VERSION}")
+    if not whole:
+        raise InputError(f"folder: got {path}, which is damaged, want what lqrsim wrote")
+    return manifest
+
+
+def digest_of(contents: bytes) -> str:
+    """Hash of a file's contents."""
+    return hashlib.sha256(contents).hexdigest()

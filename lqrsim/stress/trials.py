@@ -1,0 +1,130 @@
+"""Running a campaign's trials: the same in this process, in one on this machine, and on another machine."""
+
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from lqrsim.errors import InputError
+from lqrsim.references import resolve
+from lqrsim.results import Solution
+from lqrsim.rollout import Rollout
+from lqrsim.scenarios import Scenario
+from lqrsim.simulation.closed_loop import simulate
+from lqrsim.simulation.controllers import Controller, Feedback, Replanning
+from lqrsim.simulation.outcomes import Outcomes, outcomes
+from lqrsim.solvers.ilqr import ilqr
+from lqrsim.solvers.smoother import smooth
+from lqrsim.stress.asked import Campaign, Cell, Shard
+from lqrsim.stress.shards import Table, pack
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a worker is told.
+
+    Attributes:
+      campaign: in JSON. digest: of it. solutions: behind its policies.
+      batch: how many trials to simulate together.
+      run: tells this run from all others, also of the same campaign.
+    """
+
+    campaign: Mapping[str, Any]
+    digest: str
+    solutions: Mapping[str, Solution]
+    batch: int
+    run: str = field(default_factory=lambda: uuid.uuid4().hex)
+
+
+def solve(policies: tuple[str, ...], scenario: Scenario) -> dict[str, Solution]:
+    """The solution behind each policy. Raises InputError if one can not be run at all."""
+    found: dict[str, Solution] = {}
+    if {*policies} - {"ilqr"}:
+        smoothed = smooth(scenario.problem)
+        found |= {"smooth": smoothed, "open_loop": smoothed.open_loop(), "replan": smoothed}
+    if "ilqr" in policies:
+        found["ilqr"] = ilqr(scenario.problem)
+    for policy in policies:
+        if not np.isfinite(found[policy].trajectory.states).all():
+            raise InputError(f"policies: got {policy}, whose plan is not finite ({found[policy].status.name})")
+    return {policy: found[policy] for policy in policies}
+
+
+class Trials:
+    """Runs trials of a campaign's cells."""
+
+    def __init__(self, campaign: Campaign, scenario: Scenario, solutions: Mapping[str, Solution]) -> None:
+        self.campaign, self.scenario, self.solutions = campaign, scenario, solutions
+        self.plant = scenario.plant()
+
+    def run(self, cell: Cell, first: int, count: int = 1, *, frames: bool, contacts: bool) -> Rollout:
+        """So many trials of a cell, from the first on."""
+        return simulate(
+            self.plant,
+            self.solutions[cell.policy],
+            controller=self._controller(cell.policy),
+            disturbances=self.campaign.disturbances(cell),
+            seed=self.campaign.seed,
+            trials=count,
+            first_trial=first,
+            frames=frames,
+            contacts=contacts,
+            threads=1,
+        )
+
+    def outcomes(self, rollout: Rollout) -> Outcomes:
+        """How the trials of a rollout ended."""
+        return outcomes(rollout, self.plant, self.scenario.problem)
+
+    def table(self, shard: Shard, batch: int) -> Table:
+        """The rows of a shard. Where an exception ends a batch, its trials are run one by one."""
+        cell = self.campaign.cells[shard.cell]
+        last = shard.first + shard.count
+        parts: list[Table] = []
+        for first in range(shard.first, last, batch):
+            count = min(batch, last - first)
+            try:
+                parts.append(self._rows(cell, first, count))
+            except Exception:  # of a disturbance, a scenario or a controller, whatever it is: the trial failed
+                parts += [self._row(cell, trial) for trial in range(first, first + count)]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _rows(self, cell: Cell, first: int, count: int) -> Table:
+        table = self.outcomes(self.run(cell, first, count, frames=False, contacts=False)).columns()
+        return table | {"reason": np.full(count, "")}
+
+    def _row(self, cell: Cell, trial: int) -> Table:
+        try:
+            return self._rows(cell, trial, 1)
+        except Exception as error:
+            return failed(trial, 1, " ".join(f"{type(error).__name__}: {error}".split()))
+
+    def _controller(self, policy: str) -> Controller:
+        solution, problem = self.solutions[policy], self.scenario.problem
+        if policy != "replan":
+            return Feedback(solution.policy)
+        every = self.campaign.replan_every
+        if every is None:
+            every = max(problem.dt, problem.steps * problem.dt / 10)
+        return Replanning(problem, solution, every=every)
+
+
+def failed(first: int, count: int, reason: str) -> Table:
+    """Rows of trials that came to nothing."""
+    columns: Table = {column.name: np.full(count, np.nan) for column in fields(Outcomes)}
+    columns |= {"trial": np.arange(first, first + count), "outcome": np.full(count, "error")}
+    return columns | {"obstacle": np.full(count, ""), "reason": np.full(count, reason)}
+
+
+def work(job: Job, shard: Shard) -> bytes:
+    """The file of a shard, made in this process."""
+    if job.run not in _prepared:
+        _prepared.clear()
+        scenario = resolve(job.campaign["scenario"])  # first, for it may bring disturbances of its own
+        _prepared[job.run] = Trials(Campaign.from_json(job.campaign), scenario, job.solutions)
+    return pack(_prepared[job.run].table(shard, job.batch), shard, job.digest)
+
+
+_prepared: dict[str, Trials] = {}  # of the last run that this process worked for
