@@ -7,6 +7,7 @@ A trial's rows depend on the campaign alone: not on how many workers there are, 
 the campaign was interrupted.
 """
 
+import contextlib
 import json
 import logging
 import os
@@ -22,15 +23,15 @@ from lqrsim.machine import description, processors
 from lqrsim.references import resolve
 from lqrsim.results import Trajectory
 from lqrsim.scenarios import Scenario
+from lqrsim.stress import cluster, executors
 from lqrsim.stress.asked import POLICIES as POLICIES
 from lqrsim.stress.asked import Campaign as Campaign
 from lqrsim.stress.asked import Cell as Cell
 from lqrsim.stress.asked import Shard
-from lqrsim.stress.executors import Done, here
 from lqrsim.stress.lock import sole_writer
-from lqrsim.stress.results import FORMAT, VERSION, Results, digest_of, read_manifest
+from lqrsim.stress.results import FORMAT, VERSION, Results, digest_of, digest_of_solution, read_manifest
 from lqrsim.stress.shards import Damaged, write
-from lqrsim.stress.trials import Job, solve
+from lqrsim.stress.trials import Job, lean, solve
 from lqrsim.versions import versions
 
 _log = logging.getLogger("lqrsim")
@@ -66,22 +67,27 @@ def run(
     scenario = resolve(campaign.scenario)
     _rehearse(campaign, scenario)
     _look_at(folder)
-    with sole_writer(folder):
+    with contextlib.ExitStack() as stack:
+        client = None if scheduler is None else stack.enter_context(cluster.connected(scheduler))
+        stack.enter_context(sole_writer(folder))
         _begin(campaign, scenario, folder)
         results = Results(folder, scenario=campaign.scenario)
         left = _left(results)
-        if left and (now := versions()) != results.manifest["versions"]:
-            was = results.manifest["versions"]
-            changed = ", ".join(
-                f"{name} {new} (was {was.get(name)})" for name, new in now.items() if new != was.get(name)
-            )
-            raise InputError(f"versions: got {changed}, want those that {folder} was begun with, or another folder")
-        job = Job(campaign.as_json(), results.manifest["digest"], results.trials.solutions, batch)
+        if left:
+            _check_versions(results)
+            results.trials.warm_up()  # so that what is compiled is there for the workers
+        job = _job(results, campaign, batch)
         total = campaign.trials * len(results.cells)
         done = total - sum(shard.count for shard in left)
         if progress is not None:
             progress(done, total)
-        for shard, contents in _execute(job, left, workers):
+        if client is not None:
+            work = cluster.spread(job, left, client, campaign.time_limit)
+        elif workers:
+            work = executors.local(job, left, min(workers, len(left)), campaign.time_limit)
+        else:
+            work = executors.here(job, left)
+        for shard, contents in stack.enter_context(contextlib.closing(work)):
             write(contents, results.path(shard))
             done += shard.count
             if progress is not None:
@@ -92,8 +98,18 @@ def run(
     return results
 
 
-def _execute(job: Job, shards: list[Shard], workers: int) -> Done:
-    return here(job, shards)
+def _job(results: Results, campaign: Campaign, batch: int) -> Job:
+    solutions = {policy: lean(solution) for policy, solution in results.trials.solutions.items()}
+    return Job(campaign.as_json(), results.manifest["digest"], solutions, batch)
+
+
+def _check_versions(results: Results) -> None:
+    was, now = results.manifest["versions"], versions()
+    changed = [f"{name} {new} (was {was.get(name)})" for name, new in now.items() if new != was.get(name)]
+    if changed:
+        raise InputError(
+            f"versions: got {', '.join(changed)}, want those {results.folder} was begun with, or another folder"
+        )
 
 
 def _rehearse(campaign: Campaign, scenario: Scenario) -> None:
@@ -133,16 +149,19 @@ def _begin(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
     if (folder / "manifest.json").exists():
         _compare(asked, read_manifest(folder), folder)
         return
-    hashes = {}
+    policies = {}
     for policy, solution in solve(campaign.policies, scenario).items():
         if not solution.success:
             _log.warning("%s did not converge (%s); its plan is run as it is", policy, solution.status.name)
         path = files.save(solution, folder / "policies" / f"{policy}.npz")
-        hashes[policy] = digest_of(path.read_bytes())
-    asked |= {"policies": hashes}
-    lasting = asked | {"campaign": {name: value for name, value in asked["campaign"].items() if name != "time_limit"}}
+        policies[policy] = {"digest": digest_of_solution(solution), "sha256": digest_of(path.read_bytes())}
+    # All that the rows depend on, and nothing that differs when the same is begun again.
+    lasting = asked | {
+        "campaign": {name: value for name, value in asked["campaign"].items() if name != "time_limit"},
+        "policies": {policy: hashes["digest"] for policy, hashes in policies.items()},
+    }
     manifest = {
-        "format": FORMAT, "version": VERSION, **asked,
+        "format": FORMAT, "version": VERSION, **asked, "policies": policies,
         "digest": digest_of(json.dumps(lasting, sort_keys=True).encode()),
         "cells": [(cell.policy, cell.sweep, cell.strength) for cell in campaign.cells],
         "versions": versions(), "machine": description(),

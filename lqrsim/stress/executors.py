@@ -1,14 +1,174 @@
-"""Who does a campaign's work. Each way takes shards and gives back their files' bytes, in any order."""
+"""Processes of this machine that do a campaign's work, watched over: they may die, or hang, and the work goes on.
 
-from collections.abc import Iterable, Iterator
+Python's own pools give all work up when one process dies, and do not say on what it died; hence this one.
+"""
 
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Generator, Iterable, Iterator
+from multiprocessing.connection import Connection, wait
+
+from lqrsim.errors import InputError
 from lqrsim.stress.asked import Shard
-from lqrsim.stress.trials import Job, work
+from lqrsim.stress.trials import Job, failed_work, prepare, work
 
-Done = Iterator[tuple[Shard, bytes]]
+Done = Generator[tuple[Shard, bytes]]
+
+ATTEMPTS = 3  # of a shard, and to start a process
+_START = 300.0  # s; a process that is not ready by then never will be
+_ONE_THREAD = ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMBA")
+_context = multiprocessing.get_context("spawn")  # forking a process that has threads is not safe
 
 
 def here(job: Job, shards: Iterable[Shard]) -> Done:
-    """This process does it; what ends it ends the campaign, until it is resumed."""
+    """This process does the work; what ends it ends the campaign, until it is resumed."""
     for shard in shards:
         yield shard, work(job, shard)
+
+
+def local(job: Job, shards: list[Shard], workers: int, time_limit: float) -> Done:
+    """Processes do the work; the files of shards as they come.
+
+    A process that dies is replaced, and its shard done again; a shard on which it dies thrice, or that takes longer
+    than the time limit, is one of failed trials.
+
+    Raises:
+      InputError: processes can not be started.
+    """
+    queue, attempts, stillborn = deque(shards), Counter[Shard](), 0
+    busy: list[_Worker] = []
+    idle: list[_Worker] = []
+    try:
+        while queue or busy:
+            while queue and len(busy) < workers:
+                worker = idle.pop() if idle else _Worker(job)
+                worker.take(queue.popleft(), time_limit)
+                busy.append(worker)
+            nearest = min(worker.deadline for worker in busy)
+            wait([worker.connection for worker in busy], max(0.0, nearest - time.monotonic()))
+            for worker in list(busy):
+                shard, answer = worker.shard, worker.answer(time_limit)
+                if answer is None:
+                    continue
+                busy.remove(worker)
+                if isinstance(answer, bytes):
+                    idle.append(worker)
+                    yield shard, answer
+                    continue
+                worker.end()
+                attempts[shard] += worker.ready
+                stillborn = 0 if worker.ready else stillborn + 1
+                if stillborn == ATTEMPTS:
+                    raise InputError(
+                        f"workers: got processes that do not start ({answer}), want a script to call run() under"
+                        ' `if __name__ == "__main__":`, or workers=0'
+                    )
+                if worker.late or attempts[shard] == ATTEMPTS:
+                    yield shard, failed_work(job, shard, answer)
+                else:
+                    queue.appendleft(shard)
+    finally:
+        for worker in [*idle, *busy]:
+            worker.end()
+
+
+class _Worker:
+    """A process, and the shard that it has."""
+
+    def __init__(self, job: Job) -> None:
+        self.connection, theirs = _context.Pipe()
+        self.process = _context.Process(target=_serve, args=(theirs, job), name="lqrsim worker", daemon=True)
+        with _one_thread(), _without_ctrl_c():
+            self.process.start()
+        theirs.close()  # so that its death is an end of file here
+        self.ready = self.late = False
+        self.deadline = time.monotonic() + _START
+
+    def take(self, shard: Shard, time_limit: float) -> None:
+        """Give it work."""
+        self.shard = shard
+        if self.ready:
+            self.deadline = time.monotonic() + time_limit
+        with contextlib.suppress(OSError):  # it has died, which its answer will tell
+            self.connection.send(shard)
+
+    def answer(self, time_limit: float) -> bytes | str | None:
+        """The shard's file; or why there will be none; or None where it is still being done."""
+        try:
+            while self.connection.poll():
+                message = self.connection.recv()
+                if message is not None:
+                    return message
+                self.ready = True  # its clock starts now
+                self.deadline = time.monotonic() + time_limit
+        except (EOFError, OSError):
+            self.process.join(5.0)
+            return f"its worker ended {ATTEMPTS} times, at last with {_exit(self.process.exitcode)}"
+        if time.monotonic() < self.deadline:
+            return None
+        self.late = self.ready
+        return f"took longer than {time_limit:g} s, and was stopped"
+
+    def end(self) -> None:
+        """Stop the process, whatever it does."""
+        self.connection.close()
+        self.process.kill()
+        self.process.join()
+
+
+def _serve(connection: Connection, job: Job) -> None:
+    """What a worker does."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all of a terminal's processes; the driver decides
+    prepare(job)
+    with contextlib.suppress(EOFError, OSError):  # the driver is gone
+        connection.send(None)
+        while True:
+            connection.send(work(job, connection.recv()))
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _exit(code: int | None) -> str:
+    if code is not None and code < 0:
+        return f"signal {-code} ({signal.strsignal(-code)})"
+    return f"exit code {code}"
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """What is started in this block computes with one thread: there are as many processes as processors."""
+    names = [f"{name}_NUM_THREADS" for name in _ONE_THREAD]
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """What is started in this block is not interrupted while it starts either; for this process it only waits."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -100,7 +100,7 @@ class Results:
     def solution(self, policy: str) -> Solution:
         """What a policy was made from. Raises InputError if its file is damaged."""
         path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
-        if path.is_file() and digest_of(path.read_bytes()) != self.manifest["policies"][policy]:
+        if path.is_file() and digest_of(path.read_bytes()) != self.manifest["policies"][policy]["sha256"]:
             raise InputError(f"policy: got {path}, which is damaged, want what the campaign wrote: run it elsewhere")
         return files.load_solution(path)
 
@@ -199,3 +199,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 def digest_of(contents: bytes) -> str:
     """Hash of a file's contents."""
     return hashlib.sha256(contents).hexdigest()
+
+
+def digest_of_solution(solution: Solution) -> str:
+    """Hash of what running it depends on: not of how long it took to find."""
+    plan, policy = solution.trajectory, solution.policy
+    arrays = plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt])
+    return digest_of(b"".join(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes() for array in arrays))

@@ -1,0 +1,108 @@
+"""A running dask cluster that does a campaign's work. Tables come back as bytes, so that no folder need be shared."""
+
+import contextlib
+import itertools
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from lqrsim.errors import InputError
+from lqrsim.stress.asked import Shard
+from lqrsim.stress.executors import Done
+from lqrsim.stress.trials import Job, failed_work, work
+from lqrsim.versions import versions
+
+_POLL = 0.5  # s between two looks at what takes too long
+_lock = threading.Lock()
+
+
+@contextlib.contextmanager
+def connected(address: str) -> Iterator[Any]:
+    """A dask client. Raises InputError where there is no cluster with workers that can do the work to the bit."""
+    try:
+        import distributed
+    except ImportError:
+        raise InputError(
+            "scheduler: got one without dask, want it installed: pip install 'lqrsim[distributed]'"
+        ) from None
+    try:
+        client = distributed.Client(address, timeout=10, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"scheduler: got {address}, want a dask scheduler that answers ({error})") from None
+    with contextlib.closing(client):
+        try:
+            found: Any = client.run(versions)
+        except Exception as error:  # whatever a worker has
+            raise InputError(f"scheduler: got {address}, whose workers do not run lqrsim ({error})") from None
+        if not found:
+            raise InputError(f"scheduler: got {address}, which has no workers, want at least one")
+        for worker, theirs in found.items():
+            if theirs != versions():
+                other = ", ".join(
+                    f"{name} {theirs.get(name)}" for name, own in versions().items() if theirs.get(name) != own
+                )
+                raise InputError(f"scheduler: got worker {worker} with {other}, want the versions that are here")
+        yield client
+
+
+def spread(job: Job, shards: list[Shard], client: Any, time_limit: float) -> Done:
+    """The files of shards as they come. Dask does the work of dead workers again, and gives it up if they die on it.
+
+    Raises:
+      InputError: the scheduler is gone.
+    """
+    from distributed import wait
+
+    left = iter(shards)
+    flying: dict[Any, Shard] = {}
+    begun: dict[Shard, tuple[str, float]] = {}  # where and when; a worker counts from when it begins
+    client.subscribe_topic(job.run, lambda event: begun.update({Shard(*event[1][1]): (event[1][0], time.monotonic())}))
+    try:
+        while True:
+            room = 2 * max(1, sum(client.nthreads().values())) - len(flying)  # one to do, and one to do next
+            for shard in itertools.islice(left, max(0, room)):
+                flying[client.submit(_task, job, shard, key=f"{job.run}-{shard.file}")] = shard
+            if not flying:
+                return
+            with contextlib.suppress(TimeoutError), client.as_current():
+                wait(list(flying), timeout=_POLL, return_when="FIRST_COMPLETED")
+            for future, shard in list(flying.items()):
+                if future.done():
+                    del flying[future]
+                    yield shard, _collected(job, shard, future)
+                elif time.monotonic() - begun.get(shard, ("", time.monotonic()))[1] > time_limit:
+                    del flying[future]
+                    _stop(client, future, begun[shard][0])
+                    yield shard, failed_work(job, shard, f"took longer than {time_limit:g} s, and was stopped")
+    except OSError as error:  # also dask's own, of connections
+        raise InputError(f"scheduler: got none any more ({error}), want it to answer: run the same again") from None
+    finally:
+        client.unsubscribe_topic(job.run)
+        client.cancel(list(flying))
+
+
+def _collected(job: Job, shard: Shard, future: Any) -> bytes:
+    if future.status == "finished":
+        return future.result()
+    if future.status in ("cancelled", "lost"):
+        raise InputError("scheduler: got it restarted, want it to keep what it is given: run the same again")
+    error = future.exception()
+    return failed_work(job, shard, " ".join(f"{type(error).__name__}: {error}".split()))
+
+
+def _stop(client: Any, future: Any, worker: str) -> None:
+    """End the worker, for nothing else ends a thread; its nanny starts another."""
+    future.cancel()
+    with contextlib.suppress(Exception):  # it may be gone, or have no nanny
+        client.restart_workers([worker], timeout=30, raise_for_error=False)
+
+
+def _task(job: Job, shard: Shard) -> bytes:
+    """In a worker; one at a time, for a process has one set of workspaces."""
+    from distributed import get_worker
+
+    with _lock:
+        worker = get_worker()
+        worker.log_event(job.run, [worker.address, [shard.cell, shard.first, shard.count]])
+        return work(job, shard)
