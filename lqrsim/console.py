@@ -74,3 +74,34 @@ def progress(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
                 say(f"{what} {total} {unit}s ...")
 
         yield update
+
+
+@contextlib.contextmanager
+def long_progress(what: str, unit: str, every: float = 10.0) -> Iterator[Callable[[int, int], None]]:
+    """For what takes minutes or hours, and may have been begun before: how fast it goes, and how long it will take.
+
+    A bar on a terminal; elsewhere a line now and then. The first call says how many are done already.
+    """
+    from tqdm import tqdm
+
+    watched = sys.stderr.isatty()
+    begun = told = time.monotonic()
+    before: int | None = None
+    with tqdm(desc=what, unit=f" {unit}s", leave=False, delay=1.0, disable=not watched) as bar:
+
+        def update(done: int, total: int) -> None:
+            nonlocal before, told
+            if before is None:
+                before = bar.initial = bar.n = done
+                if done and done < total:
+                    say(f"{done} of {total} {unit}s are there, {total - done} to go")
+            bar.total = total
+            bar.update(done - bar.n)
+            now = time.monotonic()
+            if not watched and done > before and (now - told > every or (done == total and now - begun > every)):
+                told = now
+                rate = (done - before) / (now - begun)
+                left = tqdm.format_interval((total - done) / rate)
+                say(f"{what}: {done} of {total} {unit}s, {rate:.3g} {unit}s/s, {left} left")
+
+        yield update

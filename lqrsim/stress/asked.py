@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +25,16 @@ class Cell:
 
     def __str__(self) -> str:
         return f"{self.policy},{self.sweep},{self.strength:g}"
+
+    @classmethod
+    def named(cls, text: str, cells: Sequence["Cell"]) -> "Cell":
+        """One of `cells`, by its number or as policy,sweep,strength. Raises InputError if there is none."""
+        if text.isdecimal() and int(text) < len(cells):
+            return cells[int(text)]
+        for cell in cells:
+            if text == str(cell):
+                return cell
+        raise InputError(f"cell: got {text!r}, want 0 to {len(cells) - 1}, or as {cells[0]} to {cells[-1]}")
 
 
 @dataclass(frozen=True)

@@ -170,8 +170,9 @@ def _begin(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
 
 
 def _compare(asked: dict[str, Any], manifest: dict[str, Any], folder: Path) -> None:
-    for field, value in asked["campaign"].items():
-        was = manifest["campaign"].get(field)
+    now, before = (_flat(one["campaign"]) for one in (asked, manifest))
+    for field in [*now, *before]:
+        value, was = now.get(field), before.get(field)
         if field != "time_limit" and value != was:
             raise InputError(
                 f"{field}: got {excerpt(value)}, want {excerpt(was)}, as {folder} has it, or another folder"
@@ -179,6 +180,12 @@ def _compare(asked: dict[str, Any], manifest: dict[str, Any], folder: Path) -> N
     for field, what in (("model", "MJCF"), ("problem", "problem")):
         if asked[field] != manifest[field]:
             raise InputError(f"scenario: got a {what} that is not the one {folder} was begun with, want another folder")
+
+
+def _flat(campaign: dict[str, Any]) -> dict[str, Any]:
+    """Its fields, with each sweep as one of them."""
+    sweeps = {f"sweeps: {name}": sweep for name, sweep in campaign["sweeps"].items()}
+    return sweeps | {name: value for name, value in campaign.items() if name != "sweeps"}
 
 
 def _left(results: Results) -> list[Shard]:

@@ -17,9 +17,10 @@ from lqrsim.errors import InputError, check_count, check_name
 from lqrsim.references import resolve
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
-from lqrsim.simulation.outcomes import Outcomes
+from lqrsim.simulation.outcomes import OUTCOMES, Outcomes
 from lqrsim.stress.asked import Campaign, Cell, Shard, shards_of
 from lqrsim.stress.shards import Damaged, Table, read
+from lqrsim.stress.statistics import CONFIDENCE, rate
 from lqrsim.stress.trials import Trials
 
 FORMAT, VERSION = "lqrsim campaign", 1
@@ -88,6 +89,27 @@ class Results:
             found.update(table["outcome"].tolist())
         return found
 
+    def summary(self) -> str:
+        """A line for each cell: how its trials ended, and how sure the rate is; then why trials came to nothing."""
+        width = max(len(name) for name in ["sweep", *self.manifest["campaign"]["sweeps"]])
+        others = [name for name in OUTCOMES if name != "reached"]
+        interval = f"reached, {100 * CONFIDENCE:g} % interval"
+        head = f"{'sweep':<{width}} {'strength':>8} {'policy':<10} {interval:>33}"
+        lines, reasons = [head + "".join(f" {name:>9}" for name in others)], Counter[str]()
+        for cell in self.cells:
+            ends = self.tally(cell, partial=True)
+            if not (total := ends.total()):
+                continue
+            sure = rate(ends["reached"], total)
+            among = f"{ends['reached']}/{total}"
+            share = f"{among:>13} {100 * sure.value:5.1f} [{100 * sure.low:5.1f}, {100 * sure.high:5.1f}]"
+            line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<10} {share:>33}"
+            lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
+            if ends["error"]:
+                reasons.update(self.reasons(cell).values())
+        lines += [f"{count} trials came to nothing: {reason}" for reason, count in reasons.most_common(5)]
+        return "\n".join(lines)
+
     def reasons(self, cell: Cell) -> dict[int, str]:
         """Why trials of a cell are an "error", by their numbers."""
         return {
@@ -134,19 +156,19 @@ class Results:
     def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[tuple[Shard, Table]]:
         """The shards of a cell one by one. Raises InputError for what is damaged, or missing unless `partial`."""
         for shard in self.shards(cell):
-            path = self.path(shard)
-            if not path.is_file():
-                if partial:
-                    continue
-                last = shard.first + shard.count - 1
-                raise InputError(
-                    f"cell: got {cell}, without trials {shard.first} to {last}, want it finished: {self.command}"
-                )
-            try:
-                table = self.read(shard)
-            except Damaged as error:
-                raise InputError(f"shard: got {path}, which is damaged ({error}), repair it: {self.command}") from None
-            yield shard, table
+            if self.path(shard).is_file() or not partial:
+                yield shard, self.table(shard)
+
+    def table(self, shard: Shard) -> Table:
+        """The rows of a shard. Raises InputError if it is missing or damaged."""
+        path = self.path(shard)
+        if not path.is_file():
+            trials = f"{shard.first} to {shard.first + shard.count - 1}"
+            raise InputError(f"cell: got {self.cells[shard.cell]} without trials {trials}, finish it: {self.command}")
+        try:
+            return self.read(shard)
+        except Damaged as error:
+            raise InputError(f"shard: got {path}, which is damaged ({error}), repair it: {self.command}") from None
 
     @property
     def command(self) -> str:
@@ -174,6 +196,19 @@ def replay(
     if check_count("trial", trial, at_least=0) >= results.manifest["campaign"]["trials"]:
         raise InputError(f"trial: got {trial}, want less than {results.manifest['campaign']['trials']}")
     return results.trials.run(cell, trial, frames=frames, contacts=contacts)
+
+
+def agrees(results: Results, cell: Cell, trial: int) -> bool:
+    """Whether a trial that is run again, through the obstacles as in the campaign, gives its row again, to the bit.
+
+    Raises:
+      InputError: as `replay` does; or the row is missing or damaged.
+    """
+    again = results.trials.outcomes(replay(results, cell, trial, frames=False, contacts=False)).columns()
+    shard = next(shard for shard in results.shards(cell) if trial < shard.first + shard.count)
+    table, place = results.table(shard), trial - shard.first
+    row = {name: table[name][place : place + 1] for name in again}
+    return all(row[name].tobytes() == value.astype(row[name].dtype).tobytes() for name, value in again.items())
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:

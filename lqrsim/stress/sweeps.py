@@ -1,0 +1,31 @@
+"""Sweeps by name: `scenario`, the disturbances of its own demo, or a preset; `NAME:Kind` is one kind of it."""
+
+import importlib.util
+from collections.abc import Sequence
+
+from lqrsim.errors import InputError, check_name
+from lqrsim.scenarios import Scenario
+from lqrsim.simulation.disturbances import Disturbance
+
+_PRESETS = "lqrsim.simulation.disturbances.presets"
+
+
+def sweep(name: str, scenario: Scenario) -> tuple[Disturbance, ...]:
+    """The disturbances of a name, at strength 1. Raises InputError for an unknown one, or a kind that it has not."""
+    whole, colon, kind = name.partition(":")
+    found = tuple(_named(whole, scenario))
+    if not found:
+        raise InputError(f"sweep: got {name!r}, which has no disturbances, want one that has")
+    if not colon:
+        return found
+    kinds = [type(disturbance).__name__ for disturbance in found]
+    check_name(f"kind of sweep {whole}", kind, dict.fromkeys(kinds))
+    return tuple(disturbance for disturbance in found if type(disturbance).__name__ == kind)
+
+
+def _named(name: str, scenario: Scenario) -> Sequence[Disturbance]:
+    if name == "scenario":
+        return scenario.disturbances
+    if importlib.util.find_spec(_PRESETS) is None:
+        raise InputError(f"sweep: got {name!r}, want one of: scenario")
+    return importlib.import_module(_PRESETS).preset(name, scenario.plant())

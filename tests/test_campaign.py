@@ -1,0 +1,493 @@
+"""Campaigns: the same bits whatever happens on the way, and one line for what can not be."""
+
+import errno
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim.cli import main
+from lqrsim.errors import InputError
+from lqrsim.references import resolve
+from lqrsim.simulation.controllers import Control, Controller, Feedback
+from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
+from lqrsim.stress import trials
+from lqrsim.stress.campaign import Campaign, Cell, run
+from lqrsim.stress.results import Results, agrees, replay
+from lqrsim.stress.shards import Damaged, unpack
+
+OWN = """
+import dataclasses
+import os
+import signal
+import time
+
+import numpy as np
+
+import lqrsim as ls
+from lqrsim.simulation.disturbances import Disturbance, Effect
+
+
+@dataclasses.dataclass(frozen=True)
+class Trouble(Disturbance):
+    kind: str
+    share: float
+
+    def scaled(self, strength):
+        return self
+
+    def start(self, plant, plan, generators):
+        bad = np.array([generator.random() < self.share for generator in generators])
+
+        def actuate(step, controls):
+            if step == 10 and bad.any():
+                if self.kind == "raise":
+                    raise RuntimeError("two\\nlines")
+                if self.kind == "sleep":
+                    time.sleep(600)
+                if self.kind == "die":
+                    os.kill(os.getpid(), signal.SIGKILL)
+            return controls
+
+        return Effect(actuate=actuate)
+
+
+def troubled(kind: str = "raise", share: float = 0.1) -> ls.Scenario:
+    given = ls.scenarios.quadrotor()
+    return dataclasses.replace(given, disturbances=(ls.ControlNoise(0.05), Trouble(kind, share)))
+
+
+def malformed() -> ls.Scenario:
+    with open(os.path.join(os.path.dirname(__file__), "bad.xml"), "w") as file:
+        file.write("<mujoco><worldbody><geom")
+    return dataclasses.replace(ls.scenarios.quadrotor(), scene=ls.load_scene(file.name))
+"""
+
+CAMPAIGN = Campaign(
+    scenario="quadrotor",
+    sweeps={"noise": (ControlNoise(0.05), ForceNoise(0.15))},
+    strengths=(1.0,),
+    policies=("smooth", "open_loop"),
+    trials=60,
+    shard=8,
+)
+COMMAND = (
+    "quadrotor --sweep scenario:ControlNoise --strengths 1 --policies smooth open_loop --trials 60 --shard 8".split()
+)
+LINUX = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((folder / "shards").iterdir())}
+
+
+def same_bits(folder: Path, reference: Results) -> None:
+    assert Results(folder).complete
+    assert files(folder) == files(reference.folder)
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """Run in this process, one trial at a time."""
+    return run(CAMPAIGN, tmp_path_factory.mktemp("campaign") / "reference", workers=0, batch=1)
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("own") / "own.py"
+    path.write_text(OWN, encoding="utf-8")
+    return path
+
+
+def troubled(own: Path, kind: str, **changes: object) -> Campaign:
+    reference = f"{own}:troubled,kind={kind}"
+    disturbances = resolve(reference).disturbances
+    return replace(
+        CAMPAIGN, scenario=reference, sweeps={"own": disturbances}, policies=("smooth",), trials=24, **changes
+    )
+
+
+def damage(path: Path, how: str) -> None:
+    contents = bytearray(path.read_bytes())
+    if how == "truncated":
+        contents = contents[: len(contents) // 2]
+    elif how == "empty":
+        contents = bytearray()
+    else:
+        contents[int(how)] ^= 4
+    path.write_bytes(contents)
+
+
+# The same bits.
+
+
+def test_rows_are_those_of_one_rollout(reference: Results, quadrotor: ls.Scenario) -> None:
+    cell = Cell("smooth", "noise", 1.0)
+    table = reference.outcomes(cell)
+    rollout = ls.simulate(
+        quadrotor.plant(), reference.solution("smooth"), disturbances=CAMPAIGN.disturbances(cell), trials=60,
+        contacts=False, frames=False,
+    )  # fmt: skip
+    assert table.trial.tolist() == list(range(60))
+    assert tuple(table.outcome) == rollout.outcome
+    assert reference.tally(cell).total() == 60
+    assert reference.complete
+    assert reference.campaign == CAMPAIGN
+
+
+@pytest.mark.parametrize(("workers", "batch"), [(0, 7), (0, 256), (1, 256), (2, 7)])
+def test_workers_and_batches_do_not_matter(reference: Results, tmp_path: Path, workers: int, batch: int) -> None:
+    run(CAMPAIGN, tmp_path, workers=workers, batch=batch)
+    same_bits(tmp_path, reference)
+
+
+@LINUX
+def test_a_killed_worker_is_replaced(reference: Results, tmp_path: Path) -> None:
+    killed = []
+
+    def kill(done: int, total: int) -> None:
+        children = [child for child in multiprocessing.active_children() if child.name == "lqrsim worker"]
+        if children and len(killed) < 2:
+            killed.append(children[0].pid)
+            children[0].kill()
+
+    run(CAMPAIGN, tmp_path, workers=2, progress=kill)
+    assert len(killed) == 2
+    same_bits(tmp_path, reference)
+    assert not multiprocessing.active_children()
+
+
+@LINUX
+def test_a_killed_driver_is_resumed(tmp_path: Path) -> None:
+    assert main(["stress", *COMMAND, "--workers", "1", "--out", str(tmp_path / "reference")]) == 0
+    folder, draws = tmp_path / "killed", random.Random(3)
+    command = [sys.executable, "-m", "lqrsim.cli", "stress", *COMMAND, "--workers", "2", "--out", str(folder)]
+    counts = []
+    for _ in range(3):
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        ) as driver:
+            begun, before = time.monotonic(), len(list(folder.glob("shards/*")))
+            while time.monotonic() < begun + 20 and len(list(folder.glob("shards/*"))) == before:
+                time.sleep(0.01)
+            time.sleep(draws.uniform(0, 0.2))
+            driver.kill()
+            driver.wait()
+            counts.append(len(list(folder.glob("shards/*.parquet"))))
+            gone = time.monotonic() + 10
+            while time.monotonic() < gone:
+                try:
+                    os.killpg(driver.pid, 0)
+                except ProcessLookupError:
+                    break
+                time.sleep(0.05)
+            else:
+                pytest.fail("workers outlive the driver")
+    assert counts == sorted(counts)
+    assert main(["stress", *COMMAND, "--workers", "0", "--out", str(folder)]) == 0
+    same_bits(folder, Results(tmp_path / "reference"))
+
+
+def test_finished_is_finished(reference: Results, monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*_: object) -> None:
+        raise AssertionError
+
+    before = {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
+    monkeypatch.setattr(trials, "work", never)
+    run(CAMPAIGN, reference.folder)
+    run(replace(CAMPAIGN, time_limit=1.0), reference.folder)  # not a part of what is asked
+    assert before == {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
+
+
+@LINUX
+def test_dask_does_the_same(reference: Results, tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    killed = []
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+
+        def kill(done: int, total: int) -> None:
+            if done and not killed:
+                killed.append(cluster.workers[0].process.pid)
+                os.kill(killed[0], signal.SIGKILL)
+
+        run(CAMPAIGN, tmp_path, scheduler=cluster.scheduler_address, progress=kill)
+    assert killed
+    same_bits(tmp_path, reference)
+
+
+# What goes wrong in trials.
+
+
+def test_an_exception_costs_its_own_trials_only(own: Path, tmp_path: Path) -> None:
+    campaign = troubled(own, "raise")
+    results = run(campaign, tmp_path, workers=0, batch=5)
+    (cell,) = results.cells
+    reasons = results.reasons(cell)
+    table = results.outcomes(cell)
+    assert 0 < len(reasons) < 12
+    assert set(reasons.values()) == {"RuntimeError: two lines"}
+    assert sorted(reasons) == np.flatnonzero(table.outcome == "error").tolist()
+    assert results.tally(cell)["reached"] == 24 - len(reasons)
+    assert np.isnan(table.worst[sorted(reasons)]).all()
+    assert f"{len(reasons)} trials came to nothing: RuntimeError: two lines" in results.summary()
+
+
+@LINUX
+@pytest.mark.parametrize(
+    ("kind", "says"), [("sleep", "took longer than 2 s"), ("die", "its worker ended 3 times, at last with signal 9")]
+)
+def test_what_hangs_or_kills_its_worker_costs_its_shard(own: Path, tmp_path: Path, kind: str, says: str) -> None:
+    healthy = run(troubled(own, "none"), tmp_path / "healthy", workers=0)
+    results = run(troubled(own, kind, time_limit=2.0), tmp_path / kind, workers=2)
+    (cell,) = results.cells
+    for shard in results.shards(cell):
+        table, good = results.table(shard), healthy.table(shard)
+        if (table["outcome"] == "error").any():
+            assert all(reason.startswith(says) for reason in table["reason"].tolist())
+        else:
+            assert all(table[name].tobytes() == good[name].tobytes() for name in ("trial", "worst", "cost"))
+    assert 0 < results.tally(cell)["error"] < 24
+
+
+def test_a_policy_that_returns_nan_is_diverged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Mad(Feedback):
+        def start(self, trials: int) -> Control:
+            sane = super().start(trials)
+            return lambda step, shown: np.where(step == 20, np.nan, sane(step, shown))
+
+    def mad(own: trials.Trials, policy: str) -> Controller:
+        return (Mad if policy == "open_loop" else Feedback)(own.solutions[policy].policy)
+
+    monkeypatch.setattr(trials.Trials, "_controller", mad)
+    results = run(CAMPAIGN, tmp_path, workers=0)
+    assert results.tally(Cell("open_loop", "noise", 1.0)) == {"diverged": 60}
+    assert results.tally(Cell("smooth", "noise", 1.0))["reached"] > 50
+
+
+def test_a_simulation_that_blows_up_is_diverged(tmp_path: Path) -> None:
+    campaign = replace(CAMPAIGN, sweeps={"storm": (ForceNoise(1e12),)}, trials=8)
+    results = run(campaign, tmp_path, workers=0)
+    for cell in results.cells:
+        assert results.tally(cell) == {"diverged": 8}
+
+
+# What goes wrong with the folder.
+
+
+@pytest.mark.parametrize("how", ["truncated", "empty", "100", "-1", "-60", "-1500"])
+def test_a_damaged_shard_is_named_and_repaired(reference: Results, tmp_path: Path, how: str) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(reference.folder, folder)
+    shard = folder / "shards" / "0001-000000016.parquet"
+    damage(shard, how)
+    if shard.read_bytes() == files(reference.folder)[shard.name]:
+        pytest.fail("the damage did none")
+    with pytest.raises(
+        InputError, match=r"0001-000000016\.parquet, which is damaged .* lqrsim stress quadrotor --resume"
+    ):
+        Results(folder).outcomes(Cell("open_loop", "noise", 1.0))
+    Results(folder).outcomes(Cell("smooth", "noise", 1.0))
+    run(CAMPAIGN, folder, workers=0)
+    same_bits(folder, reference)
+    assert (folder / "damaged" / shard.name).exists()
+
+
+def test_no_flipped_bit_is_missed(reference: Results) -> None:
+    shard = next(reference.shards())
+    contents, draws = reference.path(shard).read_bytes(), random.Random(0)
+    whole = unpack(contents, shard, reference.manifest["digest"])
+    for _ in range(300):
+        flipped = bytearray(contents)
+        flipped[draws.randrange(len(flipped))] ^= 1 << draws.randrange(8)
+        try:
+            table = unpack(bytes(flipped), shard, reference.manifest["digest"])
+        except Damaged:
+            continue
+        assert all(table[name].tobytes() == whole[name].tobytes() for name in whole)  # in what nothing depends on
+
+
+def test_a_shard_of_another_campaign_is_not_taken(reference: Results, tmp_path: Path) -> None:
+    campaign = replace(CAMPAIGN, seed=1)
+    other = run(campaign, tmp_path, workers=0)
+    name = "0000-000000000.parquet"
+    good = (other.folder / "shards" / name).read_bytes()
+    (other.folder / "shards" / name).write_bytes((reference.folder / "shards" / name).read_bytes())
+    run(campaign, tmp_path, workers=0)
+    assert (other.folder / "shards" / name).read_bytes() == good
+
+
+def test_a_full_disk_stops_it_until_there_is_room(
+    reference: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fsync, calls = os.fsync, []
+
+    def full(handle: int) -> None:
+        calls.append(handle)
+        if len(calls) > 4:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        run(CAMPAIGN, tmp_path, workers=2)
+    monkeypatch.undo()
+    assert not multiprocessing.active_children()
+    partial = Results(tmp_path)
+    assert len(partial.missing) == 16 - 3
+    assert len(partial.outcomes(CAMPAIGN.cells[0], partial=True)) in (8, 16, 24)
+    with pytest.raises(InputError, match="without trials"):
+        partial.outcomes(CAMPAIGN.cells[0])
+    run(CAMPAIGN, tmp_path, workers=0)
+    same_bits(tmp_path, reference)
+
+
+def test_one_writer_at_a_time(tmp_path: Path) -> None:
+    code = "import sys, time; from pathlib import Path; from lqrsim.stress.lock import sole_writer\n"
+    code += "with sole_writer(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+    campaign = replace(CAMPAIGN, trials=2)
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(InputError, match="another process writes"):
+            run(campaign, tmp_path, workers=0)
+        holder.kill()
+        holder.wait()
+    assert run(campaign, tmp_path, workers=0).complete  # the lock of a dead process is none
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"trials": 61}, "trials: got 61, want 60"),
+        ({"seed": 1}, "seed: got 1, want 0"),
+        ({"sweeps": {"noise": (ControlNoise(0.1),)}}, "sweeps: noise: got"),
+        ({"scenario": "quadrotor,query=1"}, "scenario: got 'quadrotor,query=1', want 'quadrotor'"),
+    ],
+)
+def test_another_campaign_is_refused(reference: Results, changes: dict[str, object], says: str) -> None:
+    before = files(reference.folder)
+    with pytest.raises(InputError) as refused:
+        run(replace(CAMPAIGN, **changes), reference.folder)  # pyright: ignore[reportArgumentType]
+    assert says in str(refused.value)
+    assert files(reference.folder) == before
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda path: path.mkdir(), "with a manifest.json"),
+        (lambda path: path.write_text("x"), "with a manifest.json"),
+        (lambda path: (path.mkdir(), (path / "manifest.json").write_text("{")), "damaged"),
+        (lambda path: (path.mkdir(), (path / "manifest.json").write_text('{"format": 1, "version": 1}')), "want a"),
+    ],
+)
+def test_what_is_no_campaign_is_not_opened(tmp_path: Path, make: Callable[[Path], object], says: str) -> None:
+    make(tmp_path / "folder")
+    with pytest.raises(InputError) as refused:
+        Results(tmp_path / "folder")
+    assert says in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("stress quadrotr", ["scenario: got 'quadrotr'"]),
+        ("stress quadrotor --sweep hurricane", ["hurricane"]),
+        ("stress quadrotor --sweep scenario:Gust", ["kind of sweep scenario: got 'Gust'", "ControlNoise"]),
+        ("stress quadrotor --trials 0", ["trials: got 0"]),
+        ("stress quadrotor --strengths -1", ["strengths: got -1"]),
+        ("stress quadrotor --strengths 1 1", ["strengths: got (1.0, 1.0)", "each once"]),
+        ("stress quadrotor --replan-every 0.001", ["replan_every: got 0.001 s"]),
+        ("stress quadrotor --workers -1", ["workers: got -1"]),
+        ("stress quadrotor --batch 0", ["batch: got 0"]),
+        ("stress quadrotor --resume", ["with a manifest.json"]),
+        ("stress {own}:malformed", ["MJCF"]),
+        ("replay {out} --cell 0 --trial 0", ["with a manifest.json"]),
+        ("replay {reference} --cell smooth,gusts,1 --trial 0", ["cell: got 'smooth,gusts,1'", "smooth,noise,1"]),
+        ("replay {reference} --cell 0 --trial 60", ["trial: got 60"]),
+    ],
+)
+def test_bad_input_is_one_line(
+    command: str, says: list[str], own: Path, reference: Results, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = [word.format(own=own, out=out, reference=reference.folder) for word in command.split()]
+    words += ["--out", str(out)] if words[0] == "stress" else []
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("lqrsim: error: ")
+    assert error.count("\n") == 1
+    assert all(part in error for part in says), error
+    assert not out.exists()
+
+
+def test_a_folder_with_other_things_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "thesis.tex").touch()
+    assert main(["stress", *COMMAND, "--out", str(tmp_path)]) == 2
+    assert "thesis.tex" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_scheduler_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    with pytest.raises(InputError, match="a dask scheduler that answers"):
+        run(CAMPAIGN, tmp_path / "out", scheduler="nonsense://here")
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"lqrsim\[distributed\]"):
+        run(CAMPAIGN, tmp_path / "out", scheduler="tcp://127.0.0.1:1")
+    assert not (tmp_path / "out").exists()
+
+
+# The commands.
+
+
+def test_stress_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, rollout = tmp_path / "out", tmp_path / "trial.npz"
+    assert main(["stress", *COMMAND, "--workers", "0", "--out", str(folder)]) == 0
+    results = Results(folder)
+    printed = capsys.readouterr().out
+    for cell in results.cells:
+        assert f"{results.tally(cell)['reached']}/60" in printed
+    assert f"wrote {folder}" in printed
+    cell = results.cells[1]
+    collided = int(np.flatnonzero(results.outcomes(cell).outcome == "collided")[0])
+    for name in ("1", str(cell)):
+        assert main(["replay", str(folder), "--cell", name, "--trial", str(collided), "--out", str(rollout)]) == 0
+        assert "the same to the bit" in capsys.readouterr().out
+    again = ls.load_rollout(rollout)
+    assert (again.first_trial, again.outcome) == (collided, ("collided",))
+    assert again.frames.shape[1] > 100
+    assert main(["stress", "quadrotor", "--resume", "--workers", "0", "--out", str(folder)]) == 0
+
+
+def test_a_trial_again_is_the_same_until_it_collides(reference: Results) -> None:
+    for cell in reference.cells:
+        for trial in (0, 17, 59):
+            assert agrees(reference, cell, trial)
+            free, solid = (
+                replay(reference, cell, trial, frames=contacts, contacts=contacts) for contacts in (False, True)
+            )
+            hit = np.flatnonzero(free.clearance[0] < 0)
+            until = hit[0] if len(hit) else free.states.shape[1]
+            np.testing.assert_array_equal(free.states[0, :until], solid.states[0, :until])
+
+
+def test_a_file_does_not_choose_what_code_runs(own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    campaign = troubled(own, "none")
+    run(replace(campaign, trials=2), tmp_path, workers=0)
+    results = Results(tmp_path)
+    assert results.tally(results.cells[0]).total() == 2
+    with pytest.raises(InputError, match="to run that code"):
+        replay(results, results.cells[0], 0)
+    assert replay(Results(tmp_path, scenario=campaign.scenario), results.cells[0], 0).trials == 1
