@@ -160,7 +160,10 @@ def _described(disturbance: Disturbance) -> dict[str, Any]:
     if not dataclasses.is_dataclass(disturbance):
         raise InputError(f"{type(disturbance).__name__}: got a class of its own kind, want a dataclass")
     settings = {field.name: getattr(disturbance, field.name) for field in dataclasses.fields(disturbance) if field.init}
-    return {"kind": type(disturbance).__qualname__, **{name: _plain(value) for name, value in settings.items()}}
+    return {
+        "kind": type(disturbance).__qualname__,
+        "settings": {name: _plain(value) for name, value in settings.items()},
+    }
 
 
 def _plain(value: Any) -> Any:
@@ -177,7 +180,7 @@ def _plain(value: Any) -> Any:
 
 def _made(fields: Mapping[str, Any]) -> Disturbance:
     kinds = {kind.__qualname__: kind for kind in _kinds(Disturbance)}
-    settings = {name: _restored(value) for name, value in fields.items() if name != "kind"}
+    settings = {name: _restored(value) for name, value in fields["settings"].items()}
     return kinds[check_name("disturbance", fields["kind"], sorted(kinds))](**settings)
 
 
