@@ -122,7 +122,7 @@ class Campaign:
 
     def disturbances(self, cell: Cell) -> list[Disturbance]:
         """What a cell's trials meet."""
-        return [scaled(disturbance, cell.strength) for disturbance in self.sweeps[cell.sweep]]
+        return [disturbance.scaled(cell.strength) for disturbance in self.sweeps[cell.sweep]]
 
     def as_json(self) -> dict[str, Any]:
         """What `from_json` makes the same campaign of."""
@@ -142,18 +142,6 @@ class Campaign:
             return cls(**{**fields, "sweeps": sweeps})
         except (KeyError, TypeError, AttributeError) as error:
             raise InputError(f"campaign: got {excerpt(fields)}, want what lqrsim wrote ({error})") from None
-
-
-def scaled(disturbance: Disturbance, strength: float) -> Disturbance:
-    """The same, so many times as strong."""
-    own = getattr(disturbance, "scaled", None)
-    if own is not None:
-        return own(strength)
-    for field in ("std", "impulse"):
-        if hasattr(disturbance, field):
-            stronger = (strength * np.array(getattr(disturbance, field))).tolist()
-            return dataclasses.replace(disturbance, **{field: stronger})  # pyright: ignore[reportArgumentType]
-    raise InputError(f"{type(disturbance).__name__}: got no method scaled(strength), want one")
 
 
 def _described(disturbance: Disturbance) -> dict[str, Any]:
