@@ -22,6 +22,7 @@ The whole chain, for both robots, is `lqrsim demo`. Step by step, each command r
   lqrsim solve quadrotor --out runs/quadrotor
   lqrsim simulate runs/quadrotor/solution.npz --force-noise 0.1 --seed 1
   lqrsim render runs/quadrotor/rollout.npz
+How often policies fail, under what, and how sure that is: `lqrsim stress quadrotor`.
 The paper's results, beside what came out here: `lqrsim reproduce`.
 
 Exit codes: 0 done, 1 not converged or out of bounds, 2 bad input. The version is printed by `lqrsim --version`."""
@@ -450,7 +451,7 @@ class Cache:
         return 0
 
 
-Command = List | Solve | Simulate | Render | Demo | Stress | Replay | Report | Reproduce | Cache
+Command = List | Solve | Simulate | Render | Demo | Stress | Replay | Reproduce | Cache
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

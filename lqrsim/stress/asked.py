@@ -122,7 +122,7 @@ class Campaign:
 
     def disturbances(self, cell: Cell) -> list[Disturbance]:
         """What a cell's trials meet."""
-        return [scaled(disturbance, cell.strength) for disturbance in self.sweeps[cell.sweep]]
+        return [disturbance.scaled(cell.strength) for disturbance in self.sweeps[cell.sweep]]
 
     def as_json(self) -> dict[str, Any]:
         """What `from_json` makes the same campaign of."""
@@ -144,23 +144,14 @@ class Campaign:
             raise InputError(f"campaign: got {excerpt(fields)}, want what lqrsim wrote ({error})") from None
 
 
-def scaled(disturbance: Disturbance, strength: float) -> Disturbance:
-    """The same, so many times as strong."""
-    own = getattr(disturbance, "scaled", None)
-    if own is not None:
-        return own(strength)
-    for field in ("std", "impulse"):
-        if hasattr(disturbance, field):
-            stronger = (strength * np.array(getattr(disturbance, field))).tolist()
-            return dataclasses.replace(disturbance, **{field: stronger})  # pyright: ignore[reportArgumentType]
-    raise InputError(f"{type(disturbance).__name__}: got no method scaled(strength), want one")
-
-
 def _described(disturbance: Disturbance) -> dict[str, Any]:
     if not dataclasses.is_dataclass(disturbance):
         raise InputError(f"{type(disturbance).__name__}: got a class of its own kind, want a dataclass")
     settings = {field.name: getattr(disturbance, field.name) for field in dataclasses.fields(disturbance) if field.init}
-    return {"kind": type(disturbance).__qualname__, **{name: _plain(value) for name, value in settings.items()}}
+    return {
+        "kind": type(disturbance).__qualname__,
+        "settings": {name: _plain(value) for name, value in settings.items()},
+    }
 
 
 def _plain(value: Any) -> Any:
@@ -177,7 +168,7 @@ def _plain(value: Any) -> Any:
 
 def _made(fields: Mapping[str, Any]) -> Disturbance:
     kinds = {kind.__qualname__: kind for kind in _kinds(Disturbance)}
-    settings = {name: _restored(value) for name, value in fields.items() if name != "kind"}
+    settings = {name: _restored(value) for name, value in fields["settings"].items()}
     return kinds[check_name("disturbance", fields["kind"], sorted(kinds))](**settings)
 
 

@@ -1,13 +1,11 @@
 """Sweeps by name: `scenario`, the disturbances of its own demo, or a preset; `NAME:Kind` is one kind of it."""
 
-import importlib.util
 from collections.abc import Sequence
 
 from lqrsim.errors import InputError, check_name
 from lqrsim.scenarios import Scenario
 from lqrsim.simulation.disturbances import Disturbance
-
-_PRESETS = "lqrsim.simulation.disturbances.presets"
+from lqrsim.simulation.disturbances.presets import PRESETS, preset
 
 
 def sweep(name: str, scenario: Scenario) -> tuple[Disturbance, ...]:
@@ -26,6 +24,5 @@ def sweep(name: str, scenario: Scenario) -> tuple[Disturbance, ...]:
 def _named(name: str, scenario: Scenario) -> Sequence[Disturbance]:
     if name == "scenario":
         return scenario.disturbances
-    if importlib.util.find_spec(_PRESETS) is None:
-        raise InputError(f"sweep: got {name!r}, want one of: scenario")
-    return importlib.import_module(_PRESETS).preset(name, scenario.plant())
+    check_name("sweep", name, ["scenario", *PRESETS])
+    return preset(name, scenario.plant())

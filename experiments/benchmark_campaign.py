@@ -1,0 +1,80 @@
+"""Whether a campaign that is killed again and again comes to the same bits: `lqrsim stress`, SIGKILL, the same command.
+
+    python experiments/benchmark_campaign.py            # 20 kills
+    python experiments/benchmark_campaign.py --quick    # 3
+
+Exits with 1 if a table differs from those of a campaign that was left alone, or a row is missing or there twice.
+"""
+
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from tqdm import tqdm
+
+from lqrsim.stress.results import Results
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    quick: bool = False
+    """Three kills."""
+    kills: int = 20
+    """How often the driver is killed."""
+    trials: int = 1000
+    """Of each of two policies."""
+    seed: int = 0
+    """Of the moments at which it is killed."""
+
+
+def main(config: Config) -> int:
+    kills, draws = 3 if config.quick else config.kills, random.Random(config.seed)
+    command = [sys.executable, "-m", "lqrsim.cli", "stress", "quadrotor", "--policies", "smooth", "open_loop"]
+    command += [
+        "--strengths",
+        "1",
+        "--trials",
+        str(config.trials),
+        "--shard",
+        str(max(1, config.trials // 25)),
+        "--out",
+    ]
+    with tempfile.TemporaryDirectory() as temporary:
+        alone, killed = Path(temporary) / "alone", Path(temporary) / "killed"
+        begun = time.monotonic()
+        finish([*command, str(alone)])
+        seconds = time.monotonic() - begun
+        there = []
+        for _ in tqdm(range(kills), desc="killing the driver", leave=False, delay=2.0, disable=None):
+            # Anywhere between the start of the program and its end, so that it also hits the solving and the writing.
+            with subprocess.Popen(
+                [*command, str(killed)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            ) as driver:
+                time.sleep(draws.uniform(0, 0.7 * seconds))
+                driver.kill()
+            there.append(len(list(killed.glob("shards/*.parquet"))))
+        finish([*command, str(killed)])
+        same = tables(alone) == tables(killed)
+        rows = [sorted(Results(killed).outcomes(cell).trial.tolist()) for cell in Results(killed).cells]
+    whole = all(row == list(range(config.trials)) for row in rows)
+    print(f"shards that were there after each of {kills} kills, of {2 * 25}: {' '.join(map(str, there))}")
+    print(f"every trial once: {'yes' if whole else 'NO'}; tables identical to the bit: {'yes' if same else 'NO'}")
+    return 0 if same and whole else 1
+
+
+def finish(command: list[str]) -> None:
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+def tables(folder: Path) -> dict[str, bytes]:
+    """The files, which are the same where the tables are."""
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("shards/*"))}
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Config)))
