@@ -451,7 +451,7 @@ class Cache:
         return 0
 
 
-Command = List | Solve | Simulate | Render | Demo | Stress | Replay | Reproduce | Cache
+Command = List | Solve | Simulate | Render | Demo | Stress | Replay | Report | Reproduce | Cache
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
