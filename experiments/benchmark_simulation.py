@@ -20,6 +20,7 @@ from typing import Any
 
 import tyro
 from mujoco import batch
+from quality.common import judge
 from solver_benchmark.common import median, take_turns
 
 import lqrsim as ls
@@ -191,10 +192,6 @@ def report(result: dict[str, Any]) -> str:
         f"memory at most {found['memory']:.2f} GB  {judge(found['memory'] < MEMORY, f'< {MEMORY:g}')}",
     ]
     return "\n".join(rows)
-
-
-def judge(met: bool, want: str) -> str:
-    return f"{'met' if met else 'MISSED'}: want {want}"
 
 
 if __name__ == "__main__":

@@ -24,7 +24,6 @@ from paper.common import (
     numbers,
     opening,
     picture,
-    progress,
     run,
     table,
 )
@@ -43,6 +42,7 @@ from paper.convergence_runs import (
     smooth,
 )
 from paper.rates import CLOSE, FEWEST, ROUNDING, rate
+from solver_benchmark.common import progress
 
 import lqrsim as ls
 from lqrsim.stress.statistics import bootstrap

@@ -23,10 +23,10 @@ from paper.common import (
     numbers,
     opening,
     picture,
-    progress,
     run,
     table,
 )
+from solver_benchmark.common import progress
 
 import lqrsim as ls
 from lqrsim.stress.statistics import compare, rate

@@ -27,7 +27,6 @@ from paper.common import (
     numbers,
     opening,
     picture,
-    progress,
     run,
     table,
 )
@@ -37,7 +36,7 @@ from peers.common import line
 from peers.common import versions as versions_of_peers
 from quality.common import PEERS, all_iterations, clearance, cost, others
 from quality.common import Config as Asked
-from solver_benchmark.common import take_turns
+from solver_benchmark.common import progress, take_turns
 
 import lqrsim as ls
 from lqrsim.errors import Array

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import tyro
@@ -25,7 +25,6 @@ from lqrsim.versions import versions
 from lqrsim.view import gl, style
 
 Result = dict[str, Any]
-Item = TypeVar("Item")
 
 FREE = (-np.inf, np.inf)  # limits of the controls: the paper's problems have none
 FIGURES = "figures"  # folder of the figures, in that of the output
@@ -137,11 +136,6 @@ def between(estimate: Sequence[float], spec: str = ".2f") -> str:
     """Such a list in words."""
     value, low, high = estimate
     return f"{value:{spec}} ({low:{spec}} to {high:{spec}})"
-
-
-def progress(what: Iterable[Item], name: str) -> Iterable[Item]:
-    """The same, with a bar if it takes long."""
-    return tqdm(what, desc=name, leave=False, delay=2.0, disable=None)
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from lqrsim.errors import Array
 from lqrsim.problem import Problem
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.plant import Plant
+from lqrsim.world import ROW, signed_distance
 
 OUTCOMES = ("reached", "timed out", "collided", "diverged", "error")
 
@@ -96,12 +97,11 @@ def _obstacles(
 ) -> npt.NDArray[np.str_]:
     """Names of what was hit, for the trials that hit something."""
     names = ["" for _ in collided]
-    place = list(rollout.state_coordinates.position)
+    place, table = list(rollout.state_coordinates.position), plant.world.table.ravel()
     for trial in np.flatnonzero(collided):
         point = np.zeros(3)
         point[: len(place)] = rollout.states[trial, last[trial], place]
-        distances = [
-            plant.world.distances(point - away)[number] for number, away in enumerate(rollout.displaced[trial])
-        ]
+        there = (point - rollout.displaced[trial]).tolist()  # seen from where each obstacle is
+        distances = [signed_distance(table, ROW * number, *seen) for number, seen in enumerate(there)]
         names[trial] = plant.world.names[int(np.argmin(distances))]
     return np.array(names, dtype=np.str_)

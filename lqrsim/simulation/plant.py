@@ -92,13 +92,11 @@ class Plant:
 
     def displace(self, simulations: batch.Batch, displaced: Array) -> None:
         """Move the obstacles of each simulation by (K, obstacles, 3) metres, world axes; `set_const` must follow."""
-        places = simulations.expand("geom_pos")
+        places, drawn = simulations.expand("geom_pos"), mujoco.MjData(self.model)
+        mujoco.mj_kinematics(self.model, drawn)
         for number, name in enumerate(self.world.names):
             geom = self.model.geom(name)
-            fixed_to = mujoco.MjData(self.model)
-            mujoco.mj_kinematics(self.model, fixed_to)
-            to_body = fixed_to.xmat[geom.bodyid[0]].reshape(3, 3).T
-            places[:, geom.id] += displaced[:, number] @ to_body.T
+            places[:, geom.id] += displaced[:, number] @ drawn.xmat[geom.bodyid[0]].reshape(3, 3)
 
     def _compile(self, *, contacts: bool = True) -> mujoco.MjModel:
         spec = mujoco.MjSpec.from_string(self.scene.xml)

@@ -1,6 +1,7 @@
 """What a campaign is asked to do: plain data, to JSON and back."""
 
 import dataclasses
+import inspect
 import itertools
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -180,5 +181,6 @@ def _kinds(base: type[Disturbance]) -> Iterator[type[Disturbance]]:
     """Every kind that is defined here, users' own too; of one whose file was loaded twice, the newer."""
     for kind in base.__subclasses__():
         yield from _kinds(kind)
-        if getattr(sys.modules.get(kind.__module__), kind.__qualname__, None) is kind:
+        defined = getattr(sys.modules.get(kind.__module__), kind.__qualname__, None) is kind
+        if defined and not inspect.isabstract(kind):
             yield kind

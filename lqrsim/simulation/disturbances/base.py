@@ -8,8 +8,8 @@ refuses a plant that can not have it.
 
 import abc
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -77,6 +77,28 @@ class Disturbance(abc.ABC):
         """
 
 
+@dataclass(frozen=True)
+class Spread(Disturbance):
+    """Base class of what is drawn with a standard deviation.
+
+    Args:
+      std: one number, or one for each of what it is drawn for.
+    """
+
+    std: Numbers
+
+    along: ClassVar[str] = ""  # what it is drawn for, where that is the same for every plant
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "std", check_numbers(self, "std", self.std, at_least=0.0))
+        if self.along:
+            fit(self, self.std, self.along)
+
+    def scaled(self, strength: float) -> Self:
+        """The standard deviation so many times as large."""
+        return replace(self, std=times(self, self.std, strength))
+
+
 def normal(generators: Sequence[np.random.Generator], steps: int, size: int) -> Array:
     """Standard normal numbers (K, steps, size), each trial's from its own generator."""
     numbers = np.empty((steps, len(generators), size))  # in memory as they are read: all trials of a step together
@@ -88,11 +110,6 @@ def normal(generators: Sequence[np.random.Generator], steps: int, size: int) -> 
 def uniform(generators: Sequence[np.random.Generator], steps: int, size: int) -> Array:
     """Numbers (K, steps, size) that are uniform between 0 and 1, each trial's from its own generator."""
     return np.stack([generator.random((steps, size)) for generator in generators])
-
-
-def check_std(disturbance: Disturbance, std: Numbers) -> Numbers:
-    """`std` as it is kept: a number, or a tuple of them. Raises InputError for what is negative or not finite."""
-    return check_numbers(disturbance, "std", std, at_least=0.0)
 
 
 def check_numbers(disturbance: Disturbance, name: str, numbers: Numbers, *, at_least: float = -np.inf) -> Numbers:

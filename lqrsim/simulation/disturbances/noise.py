@@ -10,8 +10,7 @@ from lqrsim.results import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
     Effect,
-    Numbers,
-    check_std,
+    Spread,
     fit,
     normal,
     times,
@@ -21,24 +20,15 @@ from lqrsim.simulation.disturbances.base import (
 from lqrsim.simulation.plant import Plant
 
 
-@dataclass(frozen=True)
-class ControlNoise(Disturbance):
+class ControlNoise(Spread):
     """White noise on each control, redrawn each control period.
 
     Args:
       std: standard deviation in the control's unit (N of a rotor, m/s of a wheel); one number, or one a control.
     """
 
-    std: Numbers
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "std", check_std(self, self.std))
-
     def describe(self, plant: Plant) -> str:
         return f"control noise, std {with_units(self, self.std, plant.robot.dynamics.control_coordinates)}"
-
-    def scaled(self, strength: float) -> "ControlNoise":
-        return replace(self, std=times(self, self.std, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         std = fit(self, self.std, plant.robot.dynamics.control_coordinates.names)
@@ -46,24 +36,15 @@ class ControlNoise(Disturbance):
         return Effect(actuate=lambda step, controls: controls + noise[:, step])
 
 
-@dataclass(frozen=True)
-class MeasurementNoise(Disturbance):
+class MeasurementNoise(Spread):
     """White noise on each state that the policy is shown.
 
     Args:
       std: standard deviation in the state's unit; one number, or one a state.
     """
 
-    std: Numbers
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "std", check_std(self, self.std))
-
     def describe(self, plant: Plant) -> str:
         return f"measurement noise, std {with_units(self, self.std, plant.robot.dynamics.state_coordinates)}"
-
-    def scaled(self, strength: float) -> "MeasurementNoise":
-        return replace(self, std=times(self, self.std, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
@@ -71,50 +52,34 @@ class MeasurementNoise(Disturbance):
         return Effect(measure=lambda step, states: states + noise[:, step])
 
 
-@dataclass(frozen=True)
-class ForceNoise(Disturbance):
+class ForceNoise(Spread):
     """A random force at the robot's centre of mass, redrawn each control period and held over it.
 
     Args:
       std: standard deviation in N; one number, or three along the world's axes.
     """
 
-    std: Numbers
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "std", check_std(self, self.std))
-        fit(self, self.std, "xyz")
+    along = "xyz"
 
     def describe(self, plant: Plant) -> str:
         return f"force noise, std {words(self.std)} N"
-
-    def scaled(self, strength: float) -> "ForceNoise":
-        return replace(self, std=times(self, self.std, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         forces = fit(self, self.std, "xyz") * normal(generators, plan.steps, 3)
         return Effect(force=lambda step, states: forces[:, step])
 
 
-@dataclass(frozen=True)
-class TorqueNoise(Disturbance):
+class TorqueNoise(Spread):
     """A random torque on the robot, redrawn each control period and held over it.
 
     Args:
       std: standard deviation in N m; one number, or three about the world's axes.
     """
 
-    std: Numbers
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "std", check_std(self, self.std))
-        fit(self, self.std, "xyz")
+    along = "xyz"
 
     def describe(self, plant: Plant) -> str:
         return f"torque noise, std {words(self.std)} N m"
-
-    def scaled(self, strength: float) -> "TorqueNoise":
-        return replace(self, std=times(self, self.std, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         torques = fit(self, self.std, "xyz") * normal(generators, plan.steps, 3)

@@ -13,8 +13,7 @@ from lqrsim.results import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
     Effect,
-    Numbers,
-    check_std,
+    Spread,
     check_strength,
     fit,
     normal,
@@ -25,24 +24,15 @@ from lqrsim.simulation.disturbances.base import (
 from lqrsim.simulation.plant import Plant
 
 
-@dataclass(frozen=True)
-class MeasurementBias(Disturbance):
+class MeasurementBias(Spread):
     """A constant error of each state that the policy is shown, drawn for each trial from a normal distribution.
 
     Args:
       std: standard deviation in the state's unit; one number, or one a state.
     """
 
-    std: Numbers
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "std", check_std(self, self.std))
-
     def describe(self, plant: Plant) -> str:
         return f"measurement bias, std {with_units(self, self.std, plant.robot.dynamics.state_coordinates)}"
-
-    def scaled(self, strength: float) -> "MeasurementBias":
-        return replace(self, std=times(self, self.std, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)

@@ -1,44 +1,31 @@
 """A robot that begins elsewhere, and obstacles that are elsewhere."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lqrsim.errors import InputError
 from lqrsim.results import Trajectory
 from lqrsim.simulation.disturbances.base import (
-    Disturbance,
     Effect,
-    Numbers,
-    check_std,
+    Spread,
     fit,
     normal,
-    times,
     with_units,
     words,
 )
 from lqrsim.simulation.plant import Plant
 
 
-@dataclass(frozen=True)
-class InitialStateError(Disturbance):
+class InitialStateError(Spread):
     """The robot does not begin where the plan does.
 
     Args:
       std: standard deviation in the state's unit; one number, or one a state.
     """
 
-    std: Numbers
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "std", check_std(self, self.std))
-
     def describe(self, plant: Plant) -> str:
         return f"initial state off, std {with_units(self, self.std, plant.robot.dynamics.state_coordinates)}"
-
-    def scaled(self, strength: float) -> "InitialStateError":
-        return replace(self, std=times(self, self.std, strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
@@ -46,25 +33,17 @@ class InitialStateError(Disturbance):
         return Effect(begin=lambda states: states + error)
 
 
-@dataclass(frozen=True)
-class DisplacedObstacles(Disturbance):
+class DisplacedObstacles(Spread):
     """Obstacles are not where the plan has them. Planes stay, and for a robot in the plane, heights.
 
     Args:
       std: standard deviation in m; one number, or three along the world's axes.
     """
 
-    std: Numbers
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "std", check_std(self, self.std))
-        fit(self, self.std, "xyz")
+    along = "xyz"
 
     def describe(self, plant: Plant) -> str:
         return f"obstacles displaced, std {words(self.std)} m"
-
-    def scaled(self, strength: float) -> "DisplacedObstacles":
-        return replace(self, std=times(self, self.std, strength))
 
     def check(self, plant: Plant) -> None:
         if not any(obstacle.kind != "plane" for obstacle in plant.world.obstacles):

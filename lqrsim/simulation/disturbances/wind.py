@@ -11,7 +11,7 @@ from lqrsim.simulation.disturbances.base import (
     Disturbance,
     Effect,
     Numbers,
-    check_std,
+    check_numbers,
     fit,
     normal,
     times,
@@ -78,7 +78,7 @@ class Gusts(Wind):
     time_constant: float = 1.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "std", check_std(self, self.std))
+        object.__setattr__(self, "std", check_numbers(self, "std", self.std, at_least=0.0))
         fit(self, self.std, "xyz")
         constant = check_number("Gusts: time_constant", self.time_constant, above=0.0)
         object.__setattr__(self, "time_constant", constant)
