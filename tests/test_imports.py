@@ -53,6 +53,7 @@ ROOMS = (
     ("view",),
     ("console",),
     ("demo", "reproduce"),
+    ("commands",),
     ("cli",),
 )
 
@@ -64,7 +65,7 @@ ALLOWED = {
     "numba": ("core", "pointers"),
     "llvmlite": ("pointers",),
     "sympy": ("tracing", "dynamics", "rotations", "robots", "costs"),
-    "tyro": ("cli",),
+    "tyro": ("cli", "commands"),
     "pyarrow": ("stress",),
     "distributed": ("stress",),
     "jinja2": ("view",),

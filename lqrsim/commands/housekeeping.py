@@ -1,0 +1,90 @@
+"""Commands that run everything, and that look after what is kept."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Solve, execute and film: the main job, for both robots.
+
+    Each is solved from a cold start with smooth(); its policy is run undisturbed and then disturbed; the solution, both
+    rollouts, a figure and a video are written.
+
+    Exits with 1 if a plan did not converge or an undisturbed run leaves its plan by more than the scenario's bound.
+    """
+
+    robots: Annotated[tuple[str, ...], arg(metavar="SCENARIO ...")] = ("differential_drive", "quadrotor")
+    """Scenarios, by the names that `lqrsim list` prints; settings follow after commas: quadrotor,query=3."""
+    out: Annotated[Path, arg(metavar="FOLDER")] = Path("videos")
+    """Each scenario gets a folder in it."""
+    seed: int = 0
+    """Of the disturbances."""
+    video: bool = True
+    """--no-video leaves the videos out."""
+    quick: bool = False
+    """Smaller videos with fewer frames, for a first look."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim.demo import demo
+
+        return demo(self.robots, out=self.out, seed=self.seed, video=self.video, quick=self.quick)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reproduce:
+    """Run the experiments of the paper again and say which of its statements hold, each with its figure.
+
+    Writes results.md, which sums them up, results.json, which has every number, and the figures as png and pdf. Takes
+    some minutes. Other people's solvers are compared with where the bench extra is installed.
+
+    Exits with 1 if an experiment failed; whether the paper's statements hold does not count.
+    """
+
+    results: Annotated[Positional[tuple[str, ...]], arg(metavar="RESULT ...")] = ()
+    """Which: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback. By default all."""
+    out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/paper")
+    """Where to write."""
+    quick: bool = False
+    """A small part of each, for a first look."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim.reproduce import reproduce
+
+        return reproduce(self.results, out=self.out, quick=self.quick)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cache:
+    """Show what is kept of compiled solvers and derived formulas, or remove it.
+
+    Without it everything works the same, and each kind of problem is compiled again, some 10 seconds.
+    """
+
+    clear: bool = False
+    """Remove all of it."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim import cache
+        from lqrsim.errors import InputError
+
+        if self.clear:
+            try:
+                print(f"removed {cache.clear()} items from {cache.folder()}")
+            except OSError as error:
+                raise InputError(f"--clear: got {cache.folder()}, want files that can be removed ({error})") from None
+            return 0
+        items = cache.items()
+        for item in items:
+            used = time.strftime("%Y-%m-%d %H:%M", time.localtime(item.used))
+            print(f"{item.size / 1e6:8.2f} MB  last used {used}  {item.what}")
+        total = sum(item.size for item in items) / 1e6
+        print(f"{len(items)} items, {total:.1f} of at most {cache.LIMIT / 1e6:.0f} MB, in {cache.folder()}")
+        return 0

@@ -1,0 +1,169 @@
+"""Commands that solve and execute."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from lqrsim.commands.options import Folder, optional
+
+if TYPE_CHECKING:
+    from lqrsim.simulation.disturbances import Disturbance
+
+
+@dataclass(frozen=True, kw_only=True)
+class List:
+    """Print the scenarios: name, robot, scene, states and controls with their units."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim import scenarios
+        from lqrsim.references import resolve
+
+        for name in scenarios.names():
+            scenario = resolve(name)
+            problem = scenario.problem
+            print(f"{name}: {scenario.summary}")
+            print(f"  robot:    {scenario.robot.name} in scene {scenario.scene.name}")
+            print(f"  horizon:  {problem.steps} steps of {problem.dt:.4g} s")
+            print(f"  states:   {', '.join(problem.dynamics.state_coordinates.labels)}")
+            print(f"  controls: {', '.join(problem.dynamics.control_coordinates.labels)}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solve:
+    """Compute a feedback policy for a scenario and write it to solution.npz.
+
+    Prints each iteration as it ends, then the status and, if it failed, the remedy. The solution is written in any
+    case; the exit code is 1 if the solver did not converge.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    """A name that `lqrsim list` prints, or a function of yours that returns a Scenario: file.py:name or module:name.
+    Settings follow after commas, as in quadrotor,query=3."""
+    out: Folder = None
+    """Folder for solution.npz. By default runs/ and the name of the scenario."""
+    solver: Literal["smooth", "ilqr"] = "smooth"
+    """smooth: iterated LQR smoothing. ilqr: the baseline with line search, from the scenario's exact start."""
+    stop: Literal["optimal", "cost"] = "optimal"
+    """cost: the cost has settled, which is the paper's test. optimal: so have the gap and first-order optimality."""
+    tolerance: float = 1e-4
+    """Relative change of the cost below which it has settled, and the measure of the other tests."""
+    max_iterations: Annotated[int | None, optional("INT")] = None
+    """Give up after so many. By default the solver's own limit."""
+    starts: Annotated[int | None, optional("INT")] = None
+    """How many ways to the goal smooth tries for a few iterations, to go on with the best. By default 7."""
+    paper_start: bool = False
+    """Begin as the paper does in place of that: from the nominal control, with the scenario's prior."""
+    clearance: Annotated[float | None, optional("METRES")] = None
+    """Keep at least this much between the robot and all obstacles, at the steps. By default they only cost."""
+    control_limits: Annotated[tuple[float, float] | None, optional("LOWEST HIGHEST")] = None
+    """Plan with these limits of every control, in its unit. By default those of the actuators."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim import console, files
+        from lqrsim.constraints import Clearance
+        from lqrsim.errors import InputError
+        from lqrsim.references import resolve, short_name
+
+        folder = self.out or Path("runs") / short_name(self.scenario)
+        console.check_output("--out", folder)
+        scenario = resolve(self.scenario)
+        problem = scenario.problem
+        if self.clearance is not None:
+            kept = Clearance(scenario.scene.world, radius=scenario.robot.radius, margin=self.clearance)
+            problem = replace(problem, constraints=[*problem.constraints, kept])
+        if self.control_limits is not None:
+            problem = replace(problem, control_limits=self.control_limits)
+        options: dict[str, object] = {"stop": self.stop, "tolerance": self.tolerance}
+        if self.max_iterations is not None:
+            options["max_iterations"] = self.max_iterations
+        if self.starts is not None or self.paper_start:
+            if self.solver != "smooth":
+                raise InputError(f"--starts, --paper-start: got one for {self.solver}, want them with --solver smooth")
+            options["starts"] = self.starts
+        if self.paper_start:
+            if scenario.paper_start is None:
+                raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario that the paper has")
+            options["start"] = scenario.paper_start
+        solution = replace(console.solve(problem, self.solver, **options), scenario=self.scenario)
+        console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
+        return 0 if solution.success else 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """Execute a policy closed-loop in MuJoCo and write the runs to rollout.npz.
+
+    Prints a line for each trial. Without a disturbance it is the plain closed loop. The same seed gives the same bits.
+    """
+
+    solution: Annotated[Positional[Path], arg(metavar="SOLUTION")]
+    """What `lqrsim solve` wrote."""
+    scenario: Annotated[str | None, optional("SCENARIO")] = None
+    """Whose robot and scene to use, as in `lqrsim solve`. By default the one that was solved, if `lqrsim list` has it.
+    A file is data and never chooses code to run: name a function of yours here."""
+    out: Folder = None
+    """Folder for rollout.npz. By default that of the solution."""
+    control_noise: Annotated[float, arg(metavar="STD")] = 0.0
+    """Standard deviation of white noise on each control, in the control's unit (m/s wheel speed, N rotor force)."""
+    force_noise: Annotated[float, arg(metavar="STD")] = 0.0
+    """Standard deviation of a random force at the centre of mass, redrawn each control period, in N along each axis."""
+    measurement_noise: Annotated[tuple[float, ...], optional("STD ...")] = ()
+    """Standard deviation of white noise on each measured state, in its unit: one number a state, or one for all."""
+    push: Annotated[tuple[float, float, float, float] | None, optional("X Y Z AT")] = None
+    """One push: its impulse in N s along the world's axes, and when it comes, in s."""
+    seed: int = 0
+    """Of all random draws."""
+    trials: int = 1
+    """How many runs."""
+    first_trial: int = 0
+    """Number of the first: trial 7 alone is --first-trial 7, and the same to the last bit as among others."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim import console, files
+        from lqrsim.errors import InputError
+        from lqrsim.references import resolve
+        from lqrsim.simulation.closed_loop import simulate
+
+        folder = self.out or self.solution.parent
+        console.check_output("--out", folder)
+        solution = files.load_solution(self.solution)
+        if not self.scenario and not solution.scenario:
+            raise InputError(
+                "--scenario: got none, and the solution names none, want the one whose robot and scene to use"
+            )
+        scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario)
+        with console.progress("simulating", "step") as progress:
+            rollout = simulate(
+                scenario.plant(),
+                solution,
+                disturbances=self._disturbances(),
+                seed=self.seed,
+                trials=self.trials,
+                first_trial=self.first_trial,
+                progress=progress,
+            )
+        console.say(rollout.summary())
+        console.say(f"wrote {files.save(rollout, folder / 'rollout.npz')}")
+        return 0
+
+    def _disturbances(self) -> "list[Disturbance]":
+        from lqrsim.simulation.disturbances import ControlNoise, ForceNoise, MeasurementNoise, Push
+
+        found: list[Disturbance] = []
+        if self.control_noise:
+            found.append(ControlNoise(self.control_noise))
+        if self.force_noise:
+            found.append(ForceNoise(self.force_noise))
+        if self.measurement_noise:
+            std = self.measurement_noise
+            found.append(MeasurementNoise(std[0] if len(std) == 1 else std))
+        if self.push:
+            *impulse, at = self.push
+            found.append(Push(impulse, at=at))
+        return found

@@ -1,0 +1,150 @@
+"""Commands of the stress test."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from lqrsim.commands.options import Folder, optional
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stress:
+    """Run many trials of several policies under disturbances of growing strength, and count how they end.
+
+    What is stopped, however it is stopped, goes on with the same command; the tables are the same to the bit whatever
+    the workers, the batches and the interruptions. Prints the share of each that reached its goal with the exact
+    interval. `docs/file_format.md` says what is in the folder.
+
+    Exits with 1 if trials came to nothing for an error.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    """As in `lqrsim solve`."""
+    sweep: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("scenario",)
+    """Disturbances: scenario for those of the scenario's demo, or a preset; NAME:KIND for one kind of them alone."""
+    strengths: Annotated[tuple[float, ...], arg(metavar="FACTOR ...")] = (0.0, 0.5, 1.0, 1.5, 2.0)
+    """What the disturbances are multiplied by."""
+    policies: tuple[Literal["smooth", "ilqr", "open_loop", "replan"], ...] = ("smooth", "ilqr", "open_loop", "replan")
+    """open_loop: the plan of smooth without feedback. replan: solves again as it goes. All meet the same numbers."""
+    trials: int = 200
+    """Of each sweep, strength and policy."""
+    seed: int = 0
+    """Of all random draws."""
+    replan_every: Annotated[float | None, optional("SECONDS")] = None
+    """Between two solves of replan. By default a tenth of the horizon."""
+    shard: int = 500
+    """Trials of a file, which is what an interruption costs at most for each worker."""
+    time_limit: Annotated[float, arg(metavar="SECONDS")] = 300.0
+    """What a shard may take before it counts as hung, and its trials as errors."""
+    out: Folder = None
+    """Folder of the campaign. By default runs/stress/ and the name of the scenario."""
+    resume: bool = False
+    """Go on with the campaign in the folder, with what it was begun with in place of the options above."""
+    workers: Annotated[int | None, optional("INT")] = None
+    """Processes on this machine. By default one a processor."""
+    batch: int = 256
+    """Trials that a worker simulates together; changes nothing but time and memory."""
+    scheduler: Annotated[str | None, optional("ADDRESS")] = None
+    """Of a dask cluster that does the work in place of this machine, such as tcp://10.0.0.1:8786."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim import console
+        from lqrsim.references import resolve, short_name
+        from lqrsim.stress.campaign import Campaign, run
+        from lqrsim.stress.results import Results
+        from lqrsim.stress.sweeps import sweep
+
+        folder = self.out or Path("runs/stress") / short_name(self.scenario)
+        if self.resume:
+            campaign = Results(folder, scenario=self.scenario).campaign
+        else:
+            scenario = resolve(self.scenario)
+            campaign = Campaign(
+                scenario=self.scenario,
+                sweeps={name: sweep(name, scenario) for name in self.sweep},
+                strengths=self.strengths,
+                policies=self.policies,
+                trials=self.trials,
+                seed=self.seed,
+                replan_every=self.replan_every,
+                shard=self.shard,
+                time_limit=self.time_limit,
+            )
+        options = {"workers": self.workers, "batch": self.batch, "scheduler": self.scheduler}
+        with console.long_progress("stressing", "trial") as progress:
+            results = run(campaign, folder, progress=progress, **options)
+        console.say(results.summary())
+        console.say(f"wrote {folder}")
+        return 1 if any(results.tally(cell)["error"] for cell in results.cells) else 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """Run one trial of a campaign again, to the bit, and write it to rollout.npz, to be looked at with `lqrsim render`.
+
+    Says whether it gave its row in the campaign's table again; exits with 1 if not.
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """What `lqrsim stress` wrote."""
+    cell: Annotated[str, arg(metavar="CELL")]
+    """Which: policy,sweep,strength, such as smooth,scenario,1.5; or its number, with which its files' names begin."""
+    trial: int
+    """Number of the trial, from 0."""
+    scenario: Annotated[str | None, optional("SCENARIO")] = None
+    """That of the campaign, where it is a function of yours: a file is data and never chooses code to run."""
+    out: Annotated[Path, arg(metavar="FILE.npz")] = Path("rollout.npz")
+    """What to write."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim import console, files
+        from lqrsim.stress.asked import Cell
+        from lqrsim.stress.results import Results, agrees, replay
+
+        console.check_output("--out", self.out.parent)
+        results = Results(self.folder, scenario=self.scenario)
+        cell = Cell.named(self.cell, results.cells)
+        same = agrees(results, cell, self.trial)
+        rollout = replay(results, cell, self.trial)
+        console.say(rollout.summary())
+        console.say(f"{'the same' if same else 'NOT the same'} to the bit as in the table, until the first collision")
+        console.say(f"wrote {files.save(rollout, self.out)}")
+        return 0 if same else 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Write the report of a stress test: one HTML page with tables, curves and videos of the worst trials.
+
+    The page needs no network and no other file. It can be written of a stress test that has not ended, and says so.
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """What `lqrsim stress` wrote."""
+    out: Annotated[Path | None, optional("FILE.html")] = None
+    """The page. By default report.html in that folder."""
+    videos: int = 4
+    """How many of the worst trials to run again and film."""
+    scenario: Annotated[str | None, optional("SCENARIO")] = None
+    """That of the campaign, where it is a function of yours: a file is data and never chooses code to run."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim import console
+        from lqrsim.errors import InputError
+        from lqrsim.stress.results import Results
+        from lqrsim.view.report import report
+
+        page = self.out or self.folder / "report.html"
+        if page.suffix != ".html":
+            raise InputError(f"--out: got {page}, want a name that ends in .html")
+        console.check_output("--out", page.parent)
+        results = Results(self.folder, scenario=self.scenario)
+        with console.progress("reporting", "part") as progress:
+            report(results, page, videos=self.videos, progress=progress)
+        console.say(f"wrote {page}")
+        return 0
