@@ -181,6 +181,8 @@ def policy(states: Coordinates, controls: Coordinates) -> Callable[..., Array]:
 
 def _plain(array: Array) -> Array:
     """In C's order, and not read-only, as arrays from files are: compiled functions take no other."""
+    if array.dtype == np.float64 and array.flags.carray:
+        return array  # at once: in the loop it is most of what this takes
     return np.require(array, np.float64, ["C", "W"])
 
 

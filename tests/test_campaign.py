@@ -64,7 +64,7 @@ class Trouble(Disturbance):
         return Effect(actuate=actuate)
 
 
-def troubled(kind: str = "raise", share: float = 0.07) -> ls.Scenario:
+def troubled(kind: str = "raise", share: float = 0.17) -> ls.Scenario:
     given = ls.scenarios.quadrotor()
     return dataclasses.replace(given, disturbances=(ls.ControlNoise(0.05), Trouble(kind, share)))
 

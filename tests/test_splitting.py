@@ -80,7 +80,7 @@ def test_the_same_numbers_give_the_trial_that_simulate_gives(
     keys = [[np.random.SeedSequence(2, spawn_key=(trial, stream)) for stream in (0, 1)] for trial in range(3)]
     numbers = np.array([
         np.concatenate([
-            np.random.Generator(np.random.Philox(key)).standard_normal(count)
+            np.random.Generator(np.random.SFC64(key)).standard_normal(count)
             for key, count in zip(pair, trials.sizes, strict=False)
         ])
         for pair in keys

@@ -96,11 +96,11 @@ def _quaternion(rotation: Array) -> Array:
 def _rotation_vector(quaternion: Array) -> Array:
     """Rotation vectors (..., 3) of at most half a turn, of quaternions (..., 4) of any length and sign."""
     # q and -q are one rotation: the one with scalar part >= 0 is its half turn or less.
-    scalar = quaternion[..., :1]
-    sign = np.where(scalar < 0, -1.0, 1.0)
-    sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
+    scalar, x, y, z = (quaternion[..., i] for i in range(4))
+    sine = np.sqrt(x * x + y * y + z * z)
     # atan2 is exact at both ends, unlike acos near no turn and asin near half a turn.
-    angle = 2 * np.arctan2(sine, sign * scalar)
+    angle = 2 * np.arctan2(sine, np.abs(scalar))
+    # Without a turn the ratio is 2 / scalar, whatever the length; there the division is by zero.
     small = sine < 1e-12
-    ratio = np.where(small, 2.0 / np.where(small, np.abs(scalar), 1.0), angle / np.where(small, 1.0, sine))
-    return sign * ratio * quaternion[..., 1:]
+    ratio = np.divide(angle, sine, out=2.0 / np.abs(scalar), where=~small) if small.any() else angle / sine
+    return np.copysign(ratio, scalar)[..., None] * quaternion[..., 1:]

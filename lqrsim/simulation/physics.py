@@ -9,7 +9,7 @@ from mujoco import batch
 
 from lqrsim.errors import Array
 from lqrsim.machine import processors
-from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.plant import Indices, Plant
 
 FRAME_PERIOD = 1 / 30  # s; positions for drawing are recorded at least this often, if the physics step is not longer
 
@@ -46,12 +46,13 @@ class Physics:
         self._steps = substeps // self._part
         self._qpos, self._qvel = self.simulations.bind("qpos"), self.simulations.bind("qvel")
         self._ctrl, self._wrench = self.simulations.bind("ctrl"), self.simulations.bind("xfrc_applied")
+        self._in_qpos, self._in_qvel, self._in_ctrl = (_span(one) for one in (plant.qpos, plant.qvel, plant.ctrl))
         self.unstable = np.zeros(trials, dtype=bool)
 
     def place(self, states: Array) -> None:
         """Put the robots where analytic states (K, n) say."""
         qpos, qvel = self.plant.robot.configuration(states)
-        self._qpos[:, self.plant.qpos], self._qvel[:, self.plant.qvel] = qpos, qvel
+        self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel] = qpos, qvel
 
     def frame(self) -> Array:
         """MuJoCo's qpos now, (K, nq)."""
@@ -59,7 +60,7 @@ class Physics:
 
     def state(self) -> Array:
         """The analytic states (K, n), angles in any representative."""
-        return self.plant.robot.state(self._qpos[:, self.plant.qpos], self._qvel[:, self.plant.qvel])
+        return self.plant.robot.state(self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel])
 
     def advance(self, controls: Array, wrench: Array) -> tuple[np.ndarray, list[Array]]:
         """One control period under controls (K, m), forces and torques (K, 6).
@@ -68,7 +69,7 @@ class Physics:
           who touched an obstacle, (K,), and the frames.
         """
         touched, frames = np.zeros(len(controls), dtype=bool), []
-        self._ctrl[:, self.plant.ctrl] = self.plant.robot.actuation(controls)
+        self._ctrl[:, self._in_ctrl] = self.plant.robot.actuation(controls)
         self._wrench[:, self.plant.body] = wrench
         for _ in range(self._steps):
             try:
@@ -80,8 +81,16 @@ class Physics:
             if self.parts:
                 frames.append(self.frame())
         # MuJoCo resets an unstable simulation and goes on; only its warnings tell.
-        self.unstable |= (self.simulations.warning[:, _UNSTABLE, 1] > 0).any(axis=1)
+        warned = self.simulations.warning[..., 1]
+        if warned.any():
+            self.unstable |= (warned[:, _UNSTABLE] > 0).any(axis=1)
         return touched, frames
+
+
+def _span(indices: Indices) -> slice | Indices:
+    """The same place in an array; as a slice, which copies nothing, where they follow each other."""
+    first, last = int(indices.min(initial=0)), int(indices.max(initial=-1))
+    return slice(first, last + 1) if np.array_equal(indices, np.arange(first, last + 1)) else indices
 
 
 @contextlib.contextmanager
