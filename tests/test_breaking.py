@@ -8,7 +8,7 @@ from scipy import stats
 
 import lqrsim as ls
 from lqrsim.stress.breaking import in_words, smallest_failure
-from lqrsim.stress.given import Trials
+from lqrsim.stress.given import TrialScore
 
 
 @pytest.mark.parametrize("size", [2, 50])
@@ -67,7 +67,7 @@ def test_a_quadrotor_is_broken_by_less_than_what_broke_it(
     quadrotor: ls.Scenario, quadrotor_solution: ls.Solution
 ) -> None:
     """Gusts that break it need an eighth of a random failure's size, if they all push in the right direction."""
-    trials = Trials(quadrotor.plant(), quadrotor_solution, [ls.ForceNoise(0.2)])
+    trials = TrialScore(quadrotor.plant(), quadrotor_solution, [ls.ForceNoise(0.2)])
     drawn = 1.5 * np.random.default_rng(1).standard_normal((200, trials.size))
     failures = drawn[trials(drawn) > 0]
     assert len(failures) > 5

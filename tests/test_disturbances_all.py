@@ -252,3 +252,12 @@ def test_presets_have_what_a_plant_can_have_and_grow(plants, solutions, fixture)
     assert ("AxleMismatch" in kinds) == (fixture == "arena")
     with pytest.raises(InputError, match=r"^preset: got 'mild', want one of: calm, light, moderate, strong, severe"):
         preset("mild", plant)
+
+
+@pytest.mark.parametrize("fixture", ["arena", "cage"])
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_can_be_twice_as_strong(plants, solutions, fixture, name):
+    """The strengths that `lqrsim stress` sweeps over by default."""
+    twice = [one.scaled(2.0) for one in preset(name, plants[fixture])]
+    rollout = simulate(plants[fixture], solutions[fixture], disturbances=twice, trials=3)
+    assert len(rollout.disturbances) == len(twice)

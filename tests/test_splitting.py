@@ -8,7 +8,8 @@ import pytest
 from scipy import stats
 
 import lqrsim as ls
-from lqrsim.stress.given import Given, Trials, collision, miss
+from lqrsim.simulation.disturbances import preset
+from lqrsim.stress.given import Given, TrialScore, collision, miss
 from lqrsim.stress.splitting import split
 from lqrsim.stress.statistics import rate
 
@@ -74,7 +75,7 @@ def disturbances() -> list[ls.Disturbance]:
 def test_the_same_numbers_give_the_trial_that_simulate_gives(
     quadrotor: ls.Scenario, quadrotor_solution: ls.Solution, disturbances: list[ls.Disturbance]
 ) -> None:
-    trials = Trials(quadrotor.plant(), quadrotor_solution, disturbances, contacts=True)
+    trials = TrialScore(quadrotor.plant(), quadrotor_solution, disturbances, contacts=True)
     assert trials.sizes == (150 * 3, 151 * 12, 0)
     simulated = ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=disturbances, seed=2, trials=3)
     keys = [[np.random.SeedSequence(2, spawn_key=(trial, stream)) for stream in (0, 1)] for trial in range(3)]
@@ -91,6 +92,19 @@ def test_the_same_numbers_give_the_trial_that_simulate_gives(
     # Nothing drawn is nothing that goes wrong, but for what is not random.
     push = ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=disturbances[2:])
     np.testing.assert_allclose(trials.rollout(np.zeros((1, trials.size))).states, push.states, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["quadrotor", "differential_drive"])
+def test_any_numbers_give_trials_of_every_preset(
+    name: str, quadrotor_solution: ls.Solution, drive_solution: ls.Solution
+) -> None:
+    """However large: each number of a trial decides on its own part of it."""
+    solution = {"quadrotor": quadrotor_solution, "differential_drive": drive_solution}[name]
+    plant = ls.scenarios.get(name).plant()
+    trials = TrialScore(plant, solution, preset("light", plant), failure=miss)
+    scores = trials([np.zeros(trials.size), np.full(trials.size, 9.0), np.full(trials.size, -9.0)])
+    assert scores[0] < 0
+    assert not np.isnan(scores).any()
 
 
 def test_scores_are_positive_where_trials_fail(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
@@ -165,6 +179,14 @@ def test_failures_are_failures_and_simulations_are_counted() -> None:
     assert (np.diff(one.levels) > 0).all()
 
 
+def test_plain_trials_for_the_same_certainty() -> None:
+    """By their definition: so many of a known rate have the standard error that was found."""
+    found = split(along(3, 3.0), 3, particles=200, repetitions=8)
+    p, n = found.probability.value, found.plain
+    assert np.sqrt(p * (1 - p) / n) == pytest.approx(found.standard_error)
+    assert n > found.simulations
+
+
 def test_what_is_not_rare_needs_no_levels() -> None:
     found = split(along(2, 0.5), 2, repetitions=10)
     assert found.levels.tolist() == [0.0]
@@ -173,7 +195,7 @@ def test_what_is_not_rare_needs_no_levels() -> None:
 
 def test_a_quadrotor_against_plain_monte_carlo(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """Wind in which 1 to 2 % of the trials collide: the two agree within four standard errors of their difference."""
-    trials = Trials(quadrotor.plant(), quadrotor_solution, [ls.ForceNoise(0.19)])
+    trials = TrialScore(quadrotor.plant(), quadrotor_solution, [ls.ForceNoise(0.19)])
     rng = np.random.default_rng(8)
     plain = trials(rng.standard_normal((2000, trials.size))) > 0
     expected = rate(int(plain.sum()), len(plain))

@@ -68,7 +68,8 @@ def smallest_failure(
       progress: called with the rounds that are done, and all of them.
 
     Raises:
-      InputError: an option is out of range, none of the failures is one, or none was found.
+      InputError: an option is out of range, or none of the failures is one.
+      NoFailure: none was given, and none was found.
     """
     check_count("size", size)
     check_count("rounds", rounds, at_least=0)

@@ -114,13 +114,13 @@ def miss(rollout: Rollout) -> Array:
 
 
 @dataclass
-class Trials:
+class TrialScore:
     """Scores of trials as a function of what they draw: call it with numbers (K, size) for scores (K,).
 
     A trial fails if its score is positive. Numbers that are standard normal give the trials that `simulate` gives.
 
     Args:
-      score: of a rollout's trials, (K,). contacts: whether obstacles stop the robot; as in `simulate`.
+      failure: scores a rollout's trials, (K,). contacts: whether obstacles stop the robot; as in `simulate`.
       batch: how many trials are run at once.
 
     Attributes:
@@ -131,7 +131,7 @@ class Trials:
     solution: Solution
     disturbances: Sequence[Disturbance]
     controller: Controller | None = None
-    score: Callable[[Rollout], Array] = collision
+    failure: Callable[[Rollout], Array] = collision
     contacts: bool = False
     batch: int = 256
     threads: int | None = None
@@ -151,7 +151,7 @@ class Trials:
     def __call__(self, numbers: npt.ArrayLike) -> Array:
         every = check_array("numbers", numbers, (None, self.size))
         parts: Iterable[Array] = (every[first : first + self.batch] for first in range(0, len(every), self.batch))
-        scores = [self.score(self.rollout(part, frames=False)) for part in parts]
+        scores = [self.failure(self.rollout(part, frames=False)) for part in parts]
         self.simulations += len(every)
         return np.concatenate(scores) if scores else np.zeros(0)
 

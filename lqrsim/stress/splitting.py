@@ -23,12 +23,16 @@ Score = Callable[[Array], Array]
 ACCEPTED = 0.4  # the share of moves for which a first run aims
 
 
+class NoFailure(InputError):
+    """No failure was found: they are too rare, or there are none."""
+
+
 @dataclass(frozen=True)
 class Rare:
     """How likely failure is.
 
     Attributes:
-      probability: the mean of the repetitions, with the interval of Student's t; none is below 0.
+      probability: the mean of the repetitions, with the interval of Student's t; none is below 0 or above 1.
       standard_error: of that mean. repetitions: (R,), independent and each without bias.
       levels: of the score, the last one 0. sizes: b of the moves at each but the last.
       simulations: scores that were asked for in all, the first run included.
@@ -43,6 +47,13 @@ class Rare:
     simulations: int
     failures: Array
     scores: Array
+
+    @property
+    def plain(self) -> float:
+        """How many plain trials have the same standard error, in the mean; NaN where all repetitions agree."""
+        if self.standard_error == 0:
+            return float("nan")
+        return self.probability.value * (1 - self.probability.value) / self.standard_error**2
 
 
 def split(
@@ -68,7 +79,8 @@ def split(
       progress: called with the runs that are done, and all of them.
 
     Raises:
-      InputError: an option is out of range, a score is NaN, or no failure was found.
+      InputError: an option is out of range, or a score is NaN.
+      NoFailure: none was found.
     """
     check_count("size", size)
     check_count("particles", particles, at_least=10)
@@ -92,8 +104,10 @@ def split(
     error = float(found.std(ddof=1) / np.sqrt(repetitions))
     reach = float(stats.t.ppf(0.5 + confidence / 2, repetitions - 1)) * error
     mean = float(found.mean())
+    if mean == 0:
+        raise NoFailure(f"particles: got {particles}, of which none failed, want more")
     return Rare(
-        Estimate(mean, max(mean - reach, 0.0), mean + reach, confidence),
+        Estimate(mean, max(mean - reach, 0.0), min(mean + reach, 1.0), confidence),
         error,
         found,
         levels,
@@ -139,7 +153,7 @@ def _levels(
             b = float(np.clip(b * np.exp(accepted - ACCEPTED), 1e-3, 1.0))
         levels.append(level)
         sizes.append(b)
-    raise InputError(f"score: got no failure in {len(levels)} levels up to {scores.max():g}, want some")
+    raise NoFailure(f"score: got no failure in {len(levels)} levels up to {scores.max():g}, want some")
 
 
 def _run(

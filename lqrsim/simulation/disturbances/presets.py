@@ -14,7 +14,7 @@ from lqrsim.simulation.disturbances.mismatch import (
     WheelRadiusMismatch,
 )
 from lqrsim.simulation.disturbances.noise import ControlNoise, ForceNoise, MeasurementNoise
-from lqrsim.simulation.disturbances.sensing import MeasurementDropouts
+from lqrsim.simulation.disturbances.sensing import CommandDropouts, MeasurementDropouts
 from lqrsim.simulation.disturbances.surroundings import DisplacedObstacles, InitialStateError
 from lqrsim.simulation.disturbances.wind import Dryden
 from lqrsim.simulation.plant import Plant
@@ -29,7 +29,11 @@ PLACED = {"m": 0.01, "m/s": 0.01, "rad": 0.01, "rad/s": 0.01}
 
 
 def preset(name: str, plant: Plant) -> list[Disturbance]:
-    """The set of that name: `PRESETS` has them. What comes in whole control periods is not in it: how long is one?
+    """The set of that name: `PRESETS` has them. All of them can be twice as strong.
+
+    Not in it is what no strength can be given to without knowing the robot or the plan: latency and delay, which come
+    in whole control periods, while motion capture's 6 to 7 ms are less than half of one; a push, of which it matters
+    when it comes and from where; and the loss of an actuator, which a quadrotor does not survive.
 
     Raises:
       InputError: there is none of that name.
@@ -51,9 +55,10 @@ def _light(plant: Plant) -> list[Disturbance]:
         ThrustMismatch(0.12 / 3),  # +-12 % in all, SkyJEPA's data card
         WheelRadiusMismatch(0.005),  # our choice: 0.2 mm of a wheel of the Create
         AxleMismatch(0.01),  # our choice: where a tread touches the floor is not known better
-        FrictionMismatch(0.1),  # our choice: severe is between half and three halves
+        FrictionMismatch(0.05),  # our choice: severe is +-45 % in all
         MeasurementNoise([MEASURED.get(unit, 0.0) for unit in space.units]),
         MeasurementDropouts(0.01),  # our choice
+        CommandDropouts(0.01),  # our choice: the same link
         ControlNoise(np.where(np.isfinite(ranges), 0.01 * ranges, 0.0).tolist()),  # our choice: 1 % of the range
         MotorLag(0.024),  # severe is the Crazyflie's 0.072 s in RotorPy; the Hummingbird's is 0.005 s
         ForceNoise(0.01 * weight),  # our choice: 1 % of the weight
