@@ -54,6 +54,9 @@ if TYPE_CHECKING:
     from lqrsim.scenes import Scene as Scene
     from lqrsim.scenes import load_scene as load_scene
     from lqrsim.simulation.closed_loop import simulate as simulate
+    from lqrsim.simulation.controllers import Controller as Controller
+    from lqrsim.simulation.controllers import Feedback as Feedback
+    from lqrsim.simulation.controllers import Replanning as Replanning
     from lqrsim.simulation.disturbances import ActuatorLoss as ActuatorLoss
     from lqrsim.simulation.disturbances import AxleMismatch as AxleMismatch
     from lqrsim.simulation.disturbances import CommandDropouts as CommandDropouts
@@ -62,6 +65,7 @@ if TYPE_CHECKING:
     from lqrsim.simulation.disturbances import DisplacedObstacles as DisplacedObstacles
     from lqrsim.simulation.disturbances import Disturbance as Disturbance
     from lqrsim.simulation.disturbances import Dryden as Dryden
+    from lqrsim.simulation.disturbances import Effect as Effect
     from lqrsim.simulation.disturbances import ForceNoise as ForceNoise
     from lqrsim.simulation.disturbances import FrictionMismatch as FrictionMismatch
     from lqrsim.simulation.disturbances import GilbertElliott as GilbertElliott
@@ -81,6 +85,8 @@ if TYPE_CHECKING:
     from lqrsim.simulation.disturbances import TorqueNoise as TorqueNoise
     from lqrsim.simulation.disturbances import WheelRadiusMismatch as WheelRadiusMismatch
     from lqrsim.simulation.disturbances import preset as preset
+    from lqrsim.simulation.outcomes import Outcomes as Outcomes
+    from lqrsim.simulation.outcomes import outcomes as outcomes
     from lqrsim.simulation.plant import Plant as Plant
     from lqrsim.simulation.plant import PlantCheck as PlantCheck
     from lqrsim.simulation.plant import check_plant as check_plant
@@ -93,12 +99,24 @@ if TYPE_CHECKING:
     from lqrsim.solvers.smoother import smooth as smooth
     from lqrsim.solvers.smoother import smooth_many as smooth_many
     from lqrsim.solvers.start import InitialPrior as InitialPrior
+    from lqrsim.stress.asked import Campaign as Campaign
+    from lqrsim.stress.asked import Cell as Cell
+    from lqrsim.stress.breaking import smallest_failure as smallest_failure
+    from lqrsim.stress.campaign import run_campaign as run_campaign
+    from lqrsim.stress.given import TrialScore as TrialScore
+    from lqrsim.stress.given import collision as collision
+    from lqrsim.stress.given import miss as miss
+    from lqrsim.stress.results import Results as Results
+    from lqrsim.stress.results import replay as replay
+    from lqrsim.stress.splitting import NoFailure as NoFailure
+    from lqrsim.stress.splitting import split as split
     from lqrsim.value_functions import Moments as Moments
     from lqrsim.value_functions import Quadratic as Quadratic
     from lqrsim.value_functions import TotalCost as TotalCost
     from lqrsim.view.plots import plot_run as plot_run
     from lqrsim.view.render import render as render
     from lqrsim.view.render import still as still
+    from lqrsim.view.report import report as report
     from lqrsim.world import Obstacle as Obstacle
     from lqrsim.world import World as World
 
@@ -121,6 +139,7 @@ _HOME = {
     "scenarios": ["Scenario"],
     "scenes": ["Scene", "load_scene"],
     "simulation.closed_loop": ["simulate"],
+    "simulation.controllers": ["Controller", "Feedback", "Replanning"],
     "simulation.disturbances": [
         "ActuatorLoss",
         "AxleMismatch",
@@ -130,6 +149,7 @@ _HOME = {
         "DisplacedObstacles",
         "Disturbance",
         "Dryden",
+        "Effect",
         "ForceNoise",
         "FrictionMismatch",
         "GilbertElliott",
@@ -150,15 +170,23 @@ _HOME = {
         "WheelRadiusMismatch",
         "preset",
     ],
+    "simulation.outcomes": ["Outcomes", "outcomes"],
     "simulation.plant": ["Plant", "PlantCheck", "check_plant"],
     "solvers.continuous": ["ContinuousSolution", "smooth_continuous", "smooth_lq_continuous"],
     "solvers.ilqr": ["ilqr", "ilqr_many"],
     "solvers.linear_quadratic": ["smooth_lq"],
     "solvers.smoother": ["smooth", "smooth_many"],
     "solvers.start": ["InitialPrior"],
+    "stress.asked": ["Campaign", "Cell"],
+    "stress.breaking": ["smallest_failure"],
+    "stress.campaign": ["run_campaign"],
+    "stress.given": ["TrialScore", "collision", "miss"],
+    "stress.results": ["Results", "replay"],
+    "stress.splitting": ["NoFailure", "split"],
     "value_functions": ["Moments", "Quadratic", "TotalCost"],
     "view.plots": ["plot_run"],
     "view.render": ["render", "still"],
+    "view.report": ["report"],
     "world": ["Obstacle", "World"],
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}

@@ -24,7 +24,7 @@ from lqrsim.references import resolve
 from lqrsim.simulation.controllers import Control, Controller, Feedback
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
 from lqrsim.stress import trials
-from lqrsim.stress.campaign import Campaign, Cell, run
+from lqrsim.stress.campaign import Campaign, Cell, run_campaign
 from lqrsim.stress.results import Results, agrees, replay
 from lqrsim.stress.shards import Damaged, unpack
 
@@ -100,7 +100,7 @@ def same_bits(folder: Path, reference: Results) -> None:
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Results:
     """Run in this process, one trial at a time."""
-    return run(CAMPAIGN, tmp_path_factory.mktemp("campaign") / "reference", workers=0, batch=1)
+    return run_campaign(CAMPAIGN, tmp_path_factory.mktemp("campaign") / "reference", workers=0, batch=1)
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def test_rows_are_those_of_one_rollout(reference: Results, quadrotor: ls.Scenari
 
 @pytest.mark.parametrize(("workers", "batch"), [(0, 7), (0, 256), (1, 256), (2, 7)])
 def test_workers_and_batches_do_not_matter(reference: Results, tmp_path: Path, workers: int, batch: int) -> None:
-    run(CAMPAIGN, tmp_path, workers=workers, batch=batch)
+    run_campaign(CAMPAIGN, tmp_path, workers=workers, batch=batch)
     same_bits(tmp_path, reference)
 
 
@@ -164,7 +164,7 @@ def test_a_killed_worker_is_replaced(reference: Results, tmp_path: Path) -> None
             killed.append(children[0].pid)
             children[0].kill()
 
-    run(CAMPAIGN, tmp_path, workers=2, progress=kill)
+    run_campaign(CAMPAIGN, tmp_path, workers=2, progress=kill)
     assert len(killed) == 2
     same_bits(tmp_path, reference)
     assert not multiprocessing.active_children()
@@ -206,8 +206,8 @@ def test_finished_is_finished(reference: Results, monkeypatch: pytest.MonkeyPatc
 
     before = {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
     monkeypatch.setattr(trials, "work", never)
-    run(CAMPAIGN, reference.folder)
-    run(replace(CAMPAIGN, time_limit=1.0), reference.folder)  # not a part of what is asked
+    run_campaign(CAMPAIGN, reference.folder)
+    run_campaign(replace(CAMPAIGN, time_limit=1.0), reference.folder)  # not a part of what is asked
     assert before == {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
 
 
@@ -222,7 +222,7 @@ def test_dask_does_the_same(reference: Results, tmp_path: Path) -> None:
                 killed.append(cluster.workers[0].process.pid)
                 os.kill(killed[0], signal.SIGKILL)
 
-        run(CAMPAIGN, tmp_path, scheduler=cluster.scheduler_address, progress=kill)
+        run_campaign(CAMPAIGN, tmp_path, scheduler=cluster.scheduler_address, progress=kill)
     assert killed
     same_bits(tmp_path, reference)
 
@@ -232,7 +232,7 @@ def test_dask_does_the_same(reference: Results, tmp_path: Path) -> None:
 
 def test_an_exception_costs_its_own_trials_only(own: Path, tmp_path: Path) -> None:
     campaign = troubled(own, "raise")
-    results = run(campaign, tmp_path, workers=0, batch=5)
+    results = run_campaign(campaign, tmp_path, workers=0, batch=5)
     (cell,) = results.cells
     reasons = results.reasons(cell)
     table = results.outcomes(cell)
@@ -249,8 +249,8 @@ def test_an_exception_costs_its_own_trials_only(own: Path, tmp_path: Path) -> No
     ("kind", "says"), [("sleep", "took longer than 2 s"), ("die", "its worker ended 3 times, at last with signal 9")]
 )
 def test_what_hangs_or_kills_its_worker_costs_its_shard(own: Path, tmp_path: Path, kind: str, says: str) -> None:
-    healthy = run(troubled(own, "none"), tmp_path / "healthy", workers=0)
-    results = run(troubled(own, kind, time_limit=2.0), tmp_path / kind, workers=2)
+    healthy = run_campaign(troubled(own, "none"), tmp_path / "healthy", workers=0)
+    results = run_campaign(troubled(own, kind, time_limit=2.0), tmp_path / kind, workers=2)
     (cell,) = results.cells
     for shard in results.shards(cell):
         table, good = results.table(shard), healthy.table(shard)
@@ -271,14 +271,14 @@ def test_a_policy_that_returns_nan_is_diverged(tmp_path: Path, monkeypatch: pyte
         return (Mad if policy == "open_loop" else Feedback)(own.solutions[policy].policy)
 
     monkeypatch.setattr(trials.Trials, "_controller", mad)
-    results = run(CAMPAIGN, tmp_path, workers=0)
+    results = run_campaign(CAMPAIGN, tmp_path, workers=0)
     assert results.tally(Cell("open_loop", "scenario", 1.0)) == {"diverged": 60}
     assert results.tally(Cell("smooth", "scenario", 1.0))["reached"] > 50
 
 
 def test_a_simulation_that_blows_up_is_diverged(tmp_path: Path) -> None:
     campaign = replace(CAMPAIGN, sweeps={"storm": (ForceNoise(1e12),)}, trials=8)
-    results = run(campaign, tmp_path, workers=0)
+    results = run_campaign(campaign, tmp_path, workers=0)
     for cell in results.cells:
         assert results.tally(cell) == {"diverged": 8}
 
@@ -297,7 +297,7 @@ def test_a_damaged_shard_is_named_and_repaired(reference: Results, tmp_path: Pat
     ):
         Results(folder).outcomes(Cell("open_loop", "scenario", 1.0))
     Results(folder).outcomes(Cell("smooth", "scenario", 1.0))
-    run(CAMPAIGN, folder, workers=0)
+    run_campaign(CAMPAIGN, folder, workers=0)
     same_bits(folder, reference)
     assert (folder / "damaged" / shard.name).exists()
 
@@ -318,11 +318,11 @@ def test_no_flipped_bit_is_missed(reference: Results) -> None:
 
 def test_a_shard_of_another_campaign_is_not_taken(reference: Results, tmp_path: Path) -> None:
     campaign = replace(CAMPAIGN, seed=1)
-    other = run(campaign, tmp_path, workers=0)
+    other = run_campaign(campaign, tmp_path, workers=0)
     name = "0000-000000000.parquet"
     good = (other.folder / "shards" / name).read_bytes()
     (other.folder / "shards" / name).write_bytes((reference.folder / "shards" / name).read_bytes())
-    run(campaign, tmp_path, workers=0)
+    run_campaign(campaign, tmp_path, workers=0)
     assert (other.folder / "shards" / name).read_bytes() == good
 
 
@@ -339,7 +339,7 @@ def test_a_full_disk_stops_it_until_there_is_room(
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(InputError, match="No space left on device"):
-        run(CAMPAIGN, tmp_path, workers=2)
+        run_campaign(CAMPAIGN, tmp_path, workers=2)
     monkeypatch.undo()
     assert not multiprocessing.active_children()
     partial = Results(tmp_path)
@@ -347,7 +347,7 @@ def test_a_full_disk_stops_it_until_there_is_room(
     assert len(partial.outcomes(CAMPAIGN.cells[0], partial=True)) in (8, 16, 24)
     with pytest.raises(InputError, match="without trials"):
         partial.outcomes(CAMPAIGN.cells[0])
-    run(CAMPAIGN, tmp_path, workers=0)
+    run_campaign(CAMPAIGN, tmp_path, workers=0)
     same_bits(tmp_path, reference)
 
 
@@ -359,10 +359,10 @@ def test_one_writer_at_a_time(tmp_path: Path) -> None:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
         with pytest.raises(InputError, match="another process writes"):
-            run(campaign, tmp_path, workers=0)
+            run_campaign(campaign, tmp_path, workers=0)
         holder.kill()
         holder.wait()
-    assert run(campaign, tmp_path, workers=0).complete  # the lock of a dead process is none
+    assert run_campaign(campaign, tmp_path, workers=0).complete  # the lock of a dead process is none
 
 
 @pytest.mark.parametrize(
@@ -377,7 +377,7 @@ def test_one_writer_at_a_time(tmp_path: Path) -> None:
 def test_another_campaign_is_refused(reference: Results, changes: dict[str, object], says: str) -> None:
     before = files(reference.folder)
     with pytest.raises(InputError) as refused:
-        run(replace(CAMPAIGN, **changes), reference.folder)  # pyright: ignore[reportArgumentType]
+        run_campaign(replace(CAMPAIGN, **changes), reference.folder)  # pyright: ignore[reportArgumentType]
     assert says in str(refused.value)
     assert files(reference.folder) == before
 
@@ -441,10 +441,10 @@ def test_a_folder_with_other_things_is_left_alone(tmp_path: Path, capsys: pytest
 def test_a_scheduler_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="a dask scheduler that answers"):
-        run(CAMPAIGN, tmp_path / "out", scheduler="nonsense://here")
+        run_campaign(CAMPAIGN, tmp_path / "out", scheduler="nonsense://here")
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"lqrsim\[distributed\]"):
-        run(CAMPAIGN, tmp_path / "out", scheduler="tcp://127.0.0.1:1")
+        run_campaign(CAMPAIGN, tmp_path / "out", scheduler="tcp://127.0.0.1:1")
     assert not (tmp_path / "out").exists()
 
 
@@ -484,7 +484,7 @@ def test_a_trial_again_is_the_same_until_it_collides(reference: Results) -> None
 
 def test_a_file_does_not_choose_what_code_runs(own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     campaign = troubled(own, "none")
-    run(replace(campaign, trials=2), tmp_path, workers=0)
+    run_campaign(replace(campaign, trials=2), tmp_path, workers=0)
     results = Results(tmp_path)
     assert results.tally(results.cells[0]).total() == 2
     with pytest.raises(InputError, match="to run that code"):

@@ -15,7 +15,7 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.simulation.outcomes import Outcomes
 from lqrsim.stress.asked import Campaign, Cell
-from lqrsim.stress.campaign import run
+from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results
 from lqrsim.view import gl
 from lqrsim.view.report import report
@@ -35,7 +35,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
         scenario="differential_drive", sweeps=SWEEPS, strengths=STRENGTHS, policies=("smooth", "open_loop"),
         trials=TRIALS, seed=3, shard=5,
     )  # fmt: skip
-    return run(campaign, tmp_path_factory.mktemp("campaigns") / "a test", workers=1)
+    return run_campaign(campaign, tmp_path_factory.mktemp("campaigns") / "a test", workers=1)
 
 
 class Page(HTMLParser):

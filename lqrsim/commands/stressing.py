@@ -53,7 +53,7 @@ class Stress:
         """Carry the command out; its exit code."""
         from lqrsim import console
         from lqrsim.references import resolve, short_name
-        from lqrsim.stress.campaign import Campaign, run
+        from lqrsim.stress.campaign import Campaign, run_campaign
         from lqrsim.stress.results import Results
         from lqrsim.stress.sweeps import sweep
 
@@ -75,7 +75,7 @@ class Stress:
             )
         options = {"workers": self.workers, "batch": self.batch, "scheduler": self.scheduler}
         with console.long_progress("stressing", "trial") as progress:
-            results = run(campaign, folder, progress=progress, **options)
+            results = run_campaign(campaign, folder, progress=progress, **options)
         console.say(results.summary())
         console.say(f"wrote {folder}")
         return 1 if any(results.tally(cell)["error"] for cell in results.cells) else 0

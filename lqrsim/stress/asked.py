@@ -128,7 +128,7 @@ class Campaign:
     def as_json(self) -> dict[str, Any]:
         """What `from_json` makes the same campaign of."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        sweeps = {name: [_described(disturbance) for disturbance in sweep] for name, sweep in self.sweeps.items()}
+        sweeps = {name: [described(disturbance) for disturbance in sweep] for name, sweep in self.sweeps.items()}
         return fields | {"sweeps": sweeps, "strengths": list(self.strengths), "policies": list(self.policies)}
 
     @classmethod
@@ -145,7 +145,8 @@ class Campaign:
             raise InputError(f"campaign: got {excerpt(fields)}, want what lqrsim wrote ({error})") from None
 
 
-def _described(disturbance: Disturbance) -> dict[str, Any]:
+def described(disturbance: Disturbance) -> dict[str, Any]:
+    """Its kind and settings, for JSON. Raises InputError where they are not plain."""
     if not dataclasses.is_dataclass(disturbance):
         raise InputError(f"{type(disturbance).__name__}: got a class of its own kind, want a dataclass")
     settings = {field.name: getattr(disturbance, field.name) for field in dataclasses.fields(disturbance) if field.init}

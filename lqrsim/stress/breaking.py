@@ -89,6 +89,8 @@ def smallest_failure(
     best = _begin(counted, failures)
     history = [float(np.linalg.norm(best))]
     slope = np.zeros(size)
+    if progress is not None:
+        progress(0, rounds)
     for number in range(rounds):
         # The oldest rounds were elsewhere.
         slope = FORGETTING * slope + _slope(counted, best, pairs, spread, rng)

@@ -1,7 +1,7 @@
 """Many trials of policies under disturbances of growing strength, into a folder; it can be interrupted anywhere.
 
     campaign = Campaign(scenario="quadrotor", sweeps={"gusts": (ls.ForceNoise(0.2),)})
-    results = run(campaign, "runs/stress/quadrotor")
+    results = run_campaign(campaign, "runs/stress/quadrotor")
 
 A trial's rows depend on the campaign alone: not on how many workers there are, on what they do at once, or on how often
 the campaign was interrupted.
@@ -39,7 +39,7 @@ _log = logging.getLogger("lqrsim")
 _OWN = {"manifest.json", "campaign.lock", "policies", "shards", "damaged"}
 
 
-def run(
+def run_campaign(
     campaign: Campaign,
     folder: str | os.PathLike[str],
     *,
@@ -151,8 +151,6 @@ def _begin(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
         return
     policies = {}
     for policy, solution in solve(campaign.policies, scenario).items():
-        if not solution.success:
-            _log.warning("%s did not converge (%s); its plan is run as it is", policy, solution.status.name)
         path = files.save(solution, folder / "policies" / f"{policy}.npz")
         policies[policy] = {"digest": digest_of_solution(solution), "sha256": digest_of(path.read_bytes())}
     # All that the rows depend on, and nothing that differs when the same is begun again.

@@ -67,6 +67,7 @@ def split(
     seed: int = 0,
     confidence: float = CONFIDENCE,
     most_levels: int = 40,
+    level: Callable[[float], object] | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Rare:
     """The probability that the score of a standard normal vector is positive.
@@ -76,7 +77,8 @@ def split(
       particles: N of each repetition. keep: share that exceeds the next level. moves: of each particle at a level.
       repetitions: independent ones; the interval is of how much they differ.
       most_levels: with as many the first run gives up.
-      progress: called with the runs that are done, and all of them.
+      level: called with each level as the first run finds it.
+      progress: called with the repetitions that are done, and all of them.
 
     Raises:
       InputError: an option is out of range, or a score is NaN.
@@ -89,17 +91,17 @@ def split(
     check_count("repetitions", repetitions, at_least=2)
     count = _Count(score)
     first, *rest = np.random.SeedSequence(seed).spawn(repetitions + 1)
-    levels, sizes = _levels(count, size, particles, keep, moves, most_levels, np.random.default_rng(first))
+    levels, sizes = _levels(count, size, particles, keep, moves, most_levels, np.random.default_rng(first), level)
     shares, failures, scores = [], [], []
     for number, key in enumerate(rest):
         if progress is not None:
-            progress(number + 1, repetitions + 1)
+            progress(number, repetitions)
         share, failed, theirs = _run(count, size, particles, moves, levels, sizes, np.random.default_rng(key))
         shares.append(share)
         failures.append(failed)
         scores.append(theirs)
     if progress is not None:
-        progress(repetitions + 1, repetitions + 1)
+        progress(repetitions, repetitions)
     found = np.array(shares)
     error = float(found.std(ddof=1) / np.sqrt(repetitions))
     reach = float(stats.t.ppf(0.5 + confidence / 2, repetitions - 1)) * error
@@ -133,7 +135,14 @@ class _Count:
 
 
 def _levels(
-    score: Score, size: int, particles: int, keep: float, moves: int, most: int, rng: np.random.Generator
+    score: Score,
+    size: int,
+    particles: int,
+    keep: float,
+    moves: int,
+    most: int,
+    rng: np.random.Generator,
+    tell: Callable[[float], object] | None,
 ) -> tuple[Array, Array]:
     """The first run: levels, the last one 0, and how far to move at each but the last."""
     vectors = rng.standard_normal((particles, size))
@@ -143,6 +152,8 @@ def _levels(
     b = 0.5
     while len(levels) < most:
         level = float(np.quantile(scores, 1 - keep, method="inverted_cdf"))
+        if tell is not None:
+            tell(min(level, 0.0))
         if level >= 0 and (scores > 0).any():
             return np.array([*levels, 0.0]), np.array(sizes)
         if not (scores > level).any():

@@ -1,5 +1,6 @@
 """Running a campaign's trials: the same in this process, in one on this machine, and on another machine."""
 
+import logging
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -19,6 +20,8 @@ from lqrsim.solvers.ilqr import ilqr
 from lqrsim.solvers.smoother import smooth
 from lqrsim.stress.asked import Campaign, Cell, Shard
 from lqrsim.stress.shards import Table, pack
+
+_log = logging.getLogger("lqrsim")
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,18 @@ def solve(policies: tuple[str, ...], scenario: Scenario) -> dict[str, Solution]:
     for policy in policies:
         if not np.isfinite(found[policy].trajectory.states).all():
             raise InputError(f"policies: got {policy}, whose plan is not finite ({found[policy].status.name})")
+        if not found[policy].success:
+            _log.warning("%s did not converge (%s); its plan is run as it is", policy, found[policy].status.name)
     return {policy: found[policy] for policy in policies}
+
+
+def controller(policy: str, scenario: Scenario, solution: Solution, replan_every: float | None = None) -> Controller:
+    """What runs a policy; by default it plans again each tenth of the horizon."""
+    problem = scenario.problem
+    if policy != "replan":
+        return Feedback(solution.policy)
+    every = max(problem.dt, problem.steps * problem.dt / 10) if replan_every is None else replan_every
+    return Replanning(problem, solution, every=every)
 
 
 class Trials:
@@ -114,13 +128,7 @@ class Trials:
             return failed(trial, 1, " ".join(f"{type(error).__name__}: {error}".split()))
 
     def _controller(self, policy: str) -> Controller:
-        solution, problem = self.solutions[policy], self.scenario.problem
-        if policy != "replan":
-            return Feedback(solution.policy)
-        every = self.campaign.replan_every
-        if every is None:
-            every = max(problem.dt, problem.steps * problem.dt / 10)
-        return Replanning(problem, solution, every=every)
+        return controller(policy, self.scenario, self.solutions[policy], self.campaign.replan_every)
 
 
 def failed(first: int, count: int, reason: str) -> Table:

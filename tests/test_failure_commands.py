@@ -1,0 +1,188 @@
+"""`lqrsim rare` and `lqrsim break`: what they print holds, the same seed gives the same files, nothing is left over."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import lqrsim as ls
+from lqrsim.cli import main
+from lqrsim.references import resolve
+from lqrsim.stress.given import TrialScore
+
+# One random number decides: how far towards the wall behind it the robot begins.
+OWN = """
+import dataclasses
+
+import numpy as np
+
+import lqrsim as ls
+from lqrsim.simulation.disturbances import Effect
+
+
+@dataclasses.dataclass(frozen=True)
+class Shift(ls.Disturbance):
+    std: float
+    most: float
+
+    def scaled(self, strength):
+        return Shift(strength * self.std, self.most)
+
+    def describe(self, plant):
+        return f"shifted to the south, std {self.std:g} m"
+
+    def start(self, plant, plan, generators):
+        offset = np.zeros((len(generators), plan.states.shape[1]))
+        offset[:, 1] = [-min(self.std * generator.standard_normal(), self.most) for generator in generators]
+        return Effect(begin=lambda states: states + offset)
+
+
+def shifted(std: float = 0.1, most: float = 9.0, steps: int = 3) -> ls.Scenario:
+    given = ls.scenarios.differential_drive()
+    here = ls.QuadraticCost((5000.0, 5000.0, 50.0), about=given.problem.start)
+    problem = dataclasses.replace(given.problem, steps=steps, final_cost=here)
+    return dataclasses.replace(given, name="shifted", problem=problem, disturbances=(Shift(std, most),))
+
+
+def pushed() -> ls.Scenario:
+    return dataclasses.replace(shifted(), disturbances=(ls.Push((0.1, 0.0, 0.0), at=0.1),))
+
+
+def blocked() -> ls.Scenario:
+    given = ls.scenarios.quadrotor(query=3)
+    return dataclasses.replace(given, disturbances=(ls.ForceNoise(0.01),))
+"""
+OPEN = ["--policy", "open_loop"]  # it stays where it was shifted to
+SMALL = ["--particles", "60", "--repetitions", "5"]
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("own") / "own.py"
+    path.write_text(OWN, encoding="utf-8")
+    return str(path)
+
+
+def found(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def exact(scenario: ls.Scenario) -> float:
+    """How many standard deviations to the south it takes until it collides: by halving, one trial at a time."""
+    (shift,) = scenario.disturbances
+    trials = TrialScore(scenario.plant(), ls.smooth(scenario.problem).open_loop(), [shift])
+    low, high = 0.0, 40.0
+    assert trials([[high]])[0] > 0
+    while high - low > 1e-6:
+        middle = (low + high) / 2
+        low, high = (low, middle) if trials([[middle]])[0] > 0 else (middle, high)
+    return high
+
+
+def test_rare_measures_a_probability_that_is_known(
+    own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reference = f"{own}:shifted"
+    distance = exact(resolve(reference))
+    for name in ("one", "again"):
+        assert main(["rare", reference, *OPEN, *SMALL, "--shown", "3", "--out", str(tmp_path / name)]) == 0
+    printed = capsys.readouterr().out
+    rare = found(tmp_path / "one" / "rare.json")
+    numbers, asked = rare["found"], rare["asked"]
+    assert abs(numbers["probability"] - stats.norm.sf(distance)) < 4 * numbers["standard_error"]
+    assert 0 < numbers["standard_error"] < 0.5 * stats.norm.sf(distance)
+    p, n = numbers["probability"], numbers["plain_trials"]
+    assert np.sqrt(p * (1 - p) / n) == pytest.approx(numbers["standard_error"])
+    assert f"{p:.2g} [{numbers['low']:.2g}, {numbers['high']:.2g}] (95 % interval, 5 repetitions)" in printed
+    assert f"{numbers['simulations']:,} trials" in printed
+    assert (asked["scenario"], asked["policy"], asked["particles"]) == (reference, "open_loop", 60)
+    assert rare["disturbances"] == [{"kind": "Shift", "settings": {"std": 0.1, "most": 9.0}}]
+    # What is written fails, the worst first.
+    rollout = ls.load_rollout(tmp_path / "one" / "rollout.npz")
+    assert rollout.outcome == ("collided",) * 3
+    assert rollout.frames.shape[1] > 1
+    begun = rollout.states[:, 0, 1]
+    assert begun[0] == begun.min()
+    # The same seed, the same files.
+    same = [sorted((path.name, path.read_bytes()) for path in (tmp_path / name).iterdir()) for name in ("one", "again")]
+    assert [name for name, _ in same[0]] == ["rare.json", "rollout.npz"]
+    assert dict(same[0])["rare.json"] == dict(same[1])["rare.json"]
+    again = ls.load_rollout(tmp_path / "again" / "rollout.npz")
+    np.testing.assert_array_equal(again.states, rollout.states)
+
+
+def test_break_finds_a_distance_that_is_known(own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    reference = f"{own}:shifted,std=0.04"
+    distance = exact(resolve(reference)) / 2
+    words = ["--strength", "2", "--rounds", "1", "--out", str(tmp_path)]
+    assert main(["break", reference, *OPEN, *words]) == 0
+    printed = capsys.readouterr().out
+    numbers = found(tmp_path / "break.json")["found"]
+    assert distance < numbers["distance"] < 1.001 * distance
+    assert numbers["first_order_probability"] == pytest.approx(stats.norm.sf(numbers["distance"]))
+    assert numbers["numbers"] == pytest.approx([numbers["distance"]])
+    assert f"{numbers['distance']:.3g} standard deviations from none" in printed
+    assert "100.0 % of its square: shifted to the south, std 0.08 m (1 of the numbers)" in printed
+    rollout = ls.load_rollout(tmp_path / "rollout.npz")
+    assert rollout.outcome == ("collided",)
+    assert -0.001 < rollout.clearance[0].min() < 0
+
+
+def test_where_there_is_no_failure_it_says_so(own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ("rare", "break"):
+        small = SMALL if command == "rare" else []
+        words = [command, f"{own}:shifted,most=0.2", *OPEN, *small, "--out", str(tmp_path / "out")]
+        assert main(words) == 1
+        assert "no failure was found" in capsys.readouterr().out
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("rare quadrotr", ["scenario: got 'quadrotr'", "did you mean quadrotor?"]),
+        ("rare {own}:shifted --sweep gale", ["sweep: got 'gale'", "scenario, calm, light"]),
+        ("rare {own}:shifted --sweep scenario:Gusts", ["kind of sweep scenario: got 'Gusts'", "Shift"]),
+        ("rare {own}:shifted --strength 0", ["strength: got 0", "> 0"]),
+        ("rare {own}:shifted --strength nan", ["strength: got nan"]),
+        ("rare {own}:shifted --seed -1", ["seed: got -1"]),
+        ("rare {own}:shifted --particles 5", ["particles: got 5", ">= 20"]),
+        ("rare {own}:shifted --repetitions 1", ["repetitions: got 1"]),
+        ("rare {own}:shifted --shown 0", ["shown: got 0"]),
+        ("rare {own}:pushed", ["sweep: got 'scenario', in which nothing is random"]),
+        ("break {own}:pushed", ["sweep: got 'scenario', in which nothing is random"]),
+        ("break {own}:shifted --rounds -1", ["rounds: got -1"]),
+        ("break {own}:blocked", ["scenario: got", "smooth fails with nothing random"]),
+    ],
+)
+def test_bad_input_is_one_line(
+    command: str, says: list[str], own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main([*(word.format(own=own) for word in command.split()), "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("lqrsim: error: ")
+    assert error.count("\n") == 1
+    assert all(part in error for part in says), error
+    assert not out.exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send to another process")
+@pytest.mark.parametrize("command", ["rare", "break"])
+def test_ctrl_c_is_one_line_and_leaves_nothing(command: str, own: str, tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "lqrsim.cli", command, f"{own}:shifted,steps=150", "--out", str(tmp_path / "out")]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        while "a trial draws" not in process.stdout.readline():
+            assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert error.splitlines()[-1] == "lqrsim: stopped"
+    assert not (tmp_path / "out").exists()
