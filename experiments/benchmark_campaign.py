@@ -36,6 +36,8 @@ def main(config: Config) -> int:
     kills, draws = 3 if config.quick else config.kills, random.Random(config.seed)
     command = [sys.executable, "-m", "lqrsim.cli", "stress", "quadrotor", "--policies", "smooth", "open_loop"]
     command += [
+        "--sweep",
+        "scenario",
         "--strengths",
         "1",
         "--trials",

@@ -83,7 +83,7 @@ CAMPAIGN = Campaign(
     trials=60,
     shard=8,
 )
-OPTIONS = "--strengths 1 --policies smooth open_loop --trials 60 --shard 8"
+OPTIONS = "--sweep scenario --strengths 1 --policies smooth open_loop --trials 60 --shard 8"
 COMMAND = ["quadrotor", *OPTIONS.split()]  # the same
 LINUX = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
 
@@ -380,6 +380,17 @@ def test_another_campaign_is_refused(reference: Results, changes: dict[str, obje
         run_campaign(replace(CAMPAIGN, **changes), reference.folder)  # pyright: ignore[reportArgumentType]
     assert says in str(refused.value)
     assert files(reference.folder) == before
+
+
+def test_code_of_ones_own_that_has_changed_is_refused(own: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "own.py"
+    shutil.copy(own, copy)
+    campaign, folder = replace(troubled(copy, "none"), trials=2), tmp_path / "out"
+    run_campaign(campaign, folder, workers=0)
+    run_campaign(campaign, folder, workers=0)
+    copy.write_text(OWN.replace("< self.share", "> self.share"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"^Trouble: got a file that has changed since .*out was begun, want it as it"):
+        run_campaign(replace(troubled(copy, "none"), trials=2), folder, workers=0)
 
 
 @pytest.mark.parametrize(

@@ -22,10 +22,11 @@ class Stress:
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
     """As in `lqrsim solve`."""
-    sweep: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("scenario",)
-    """Disturbances: scenario for those of the scenario's demo, or a preset; NAME:KIND for one kind of them alone."""
+    sweep: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("light",)
+    """Disturbances: a preset (calm, light, moderate, strong, severe), or scenario for those of the scenario's demo;
+    NAME:KIND for one kind of them alone."""
     strengths: Annotated[tuple[float, ...], arg(metavar="FACTOR ...")] = (0.0, 0.5, 1.0, 1.5, 2.0)
-    """What the disturbances are multiplied by."""
+    """What the disturbances are multiplied by; 0.5 and 2 make light calm and moderate."""
     policies: tuple[Literal["smooth", "ilqr", "open_loop", "replan"], ...] = ("smooth", "ilqr", "open_loop", "replan")
     """open_loop: the plan of smooth without feedback. replan: solves again as it goes. All meet the same numbers."""
     trials: int = 200
@@ -91,7 +92,7 @@ class Replay:
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """What `lqrsim stress` wrote."""
     cell: Annotated[str, arg(metavar="CELL")]
-    """Which: policy,sweep,strength, such as smooth,scenario,1.5; or its number, with which its files' names begin."""
+    """Which: policy,sweep,strength, such as smooth,light,1.5; or its number, with which its files' names begin."""
     trial: int
     """Number of the trial, from 0."""
     scenario: Annotated[str | None, optional("SCENARIO")] = None

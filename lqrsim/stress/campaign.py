@@ -11,6 +11,7 @@ import contextlib
 import json
 import logging
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -145,6 +146,7 @@ def _begin(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
         "campaign": json.loads(json.dumps(campaign.as_json())),
         "model": digest_of(scenario.scene.xml.encode()),
         "problem": scenario.problem.digest,
+        "code": _code(campaign),
     }
     if (folder / "manifest.json").exists():
         _compare(asked, read_manifest(folder), folder)
@@ -178,6 +180,20 @@ def _compare(asked: dict[str, Any], manifest: dict[str, Any], folder: Path) -> N
     for field, what in (("model", "MJCF"), ("problem", "problem")):
         if asked[field] != manifest[field]:
             raise InputError(f"scenario: got a {what} that is not the one {folder} was begun with, want another folder")
+    for kind, digest in asked["code"].items():
+        if digest != manifest.get("code", {}).get(kind):
+            raise InputError(f"{kind}: got a file that has changed since {folder} was begun, want it as it was then")
+
+
+def _code(campaign: Campaign) -> dict[str, str | None]:
+    """Hash of the file of each disturbance that is not lqrsim's own; None where it is in none."""
+    kinds = {type(one) for sweep in campaign.sweeps.values() for one in sweep}
+    found: dict[str, str | None] = {}
+    for kind in sorted(kinds, key=lambda kind: kind.__qualname__):
+        if kind.__module__.partition(".")[0] != "lqrsim":
+            file = getattr(sys.modules.get(kind.__module__), "__file__", None)
+            found[kind.__qualname__] = None if file is None else digest_of(Path(file).read_bytes())
+    return found
 
 
 def _flat(campaign: dict[str, Any]) -> dict[str, Any]:
