@@ -2,14 +2,15 @@
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim import robots
+from lqrsim import cli, robots
 from lqrsim.cli import main
+from lqrsim.simulation.disturbances import KINDS, PRESETS
 from lqrsim.view import gl
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -85,3 +86,38 @@ def test_forms_starts_and_endings() -> None:
     np.testing.assert_allclose(names["least"], names["solution"].cost, rtol=1e-3)
     assert "pass of iteration" in names["safe"].detail
     assert names["control"].shape == (2,)
+
+
+def presets() -> str:
+    """The table of docs/stress_testing.md."""
+    plants = {name: ls.scenarios.get(name).plant() for name in ls.scenarios.names()}
+    words = {name: {type(one).__name__: one.describe(plant) for one in ls.preset("light", plant)}
+             for name, plant in plants.items()}  # fmt: skip
+    kinds = dict.fromkeys(kind for of_plant in words.values() for kind in of_plant)
+    lines = [
+        f"| `light` has | {' | '.join(plants)} |",
+        "|---" * (1 + len(plants)) + "|",
+        *(f"| `{kind}` | {' | '.join(words[name].get(kind, 'none') for name in plants)} |" for kind in kinds),
+        "",
+        ", ".join(f"`{name}` is {factor:g} times `light`" for name, factor in PRESETS.items() if factor != 1) + ".",
+    ]
+    return "\n".join(lines)
+
+
+def test_stress_testing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = (DOCS / "stress_testing.md").read_text(encoding="utf-8")
+    assert presets() in page
+    names = run_page("stress_testing.md")
+    assert names["results"].complete
+    assert names["rare"].probability.value > 0
+    assert set(KINDS) <= set(re.findall(r"`(\w+)`", page.split("## Presets")[0]))
+    small = ["--trials", "4", "--strengths", "1", "--policies", "smooth", "--workers", "0"]
+    assert main(["stress", "draught.py:draughty", "--sweep", "scenario", *small]) == 0
+    assert ls.Results("runs/stress/draughty").cells == [ls.Cell("smooth", "scenario", 1.0)]
+
+
+def test_commands_of_pages_exist() -> None:
+    commands = {command.__name__.lower() for command in get_args(cli.Command)}
+    for page in DOCS.glob("*.md"):
+        assert set(re.findall(r"^`*lqrsim (\w+)", page.read_text(encoding="utf-8"), re.MULTILINE)) <= commands, page

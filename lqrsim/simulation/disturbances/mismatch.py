@@ -62,7 +62,7 @@ class Mismatch(Disturbance):
     def describe(self, plant: Plant) -> str:
         if self.factor is not None:
             return f"{self.what} times {words(self.factor)}"
-        return f"{self.what} off by {100 * (self.std or 0.0):g} % (std, cut at {CUT:g} std)"
+        return f"{self.what} off by {100 * (self.std or 0.0):.3g} % (std, cut at {CUT:g} std)"
 
     def scaled(self, strength: float) -> "Mismatch":
         """The standard deviation so many times as large; of a fixed factor, the power."""
