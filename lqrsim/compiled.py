@@ -127,6 +127,15 @@ def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
     return costs
 
 
+def rollout(problem: Problem, gain: Array, offset: Array, state: Array) -> tuple[Array, Array]:
+    """Where the laws u_t = gain_t x + offset_t lead from a state, by the model: states (T+1, n) and controls (T, m)."""
+    states, controls = np.empty((problem.steps + 1, len(state))), np.empty((problem.steps, offset.shape[1]))
+    told, law = arguments(problem), (_plain(gain), _plain(offset))
+    costs = (told[name] for name in ("initial", "stage", "final"))
+    core(problem).rollout(problem.steps, state, *law, told["p"], told["dt"], *costs, states, controls)
+    return states, controls
+
+
 def no_multipliers(problem: Problem, inequalities: Inequalities, tolerance: float = 0.0) -> Array:
     """Those of a constraint that does not act yet; see `solvers/augmented.py`."""
     rows = inequalities.rows

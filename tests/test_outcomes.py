@@ -109,6 +109,22 @@ class TestReplanning:
         differ = np.abs(policy.commanded - solved.commanded)[0].max(axis=1) > 1e-6
         assert np.flatnonzero(differ)[0] == 30
 
+    @pytest.mark.parametrize("name", ["differential_drive", "quadrotor"])
+    def test_it_does_not_leave_for_a_worse_optimum(self, name: str, request: pytest.FixtureRequest) -> None:
+        """On the same trials what was solved again costs as much as what was not, but for what the noise costs."""
+        scenario: ls.Scenario = request.getfixturevalue(name)
+        solution = ls.smooth(scenario.problem)
+        again = Replanning(scenario.problem, solution, every=scenario.problem.dt * 15)
+        plant, costs = scenario.plant(), []
+        for controller in (None, again):
+            run = ls.simulate(
+                plant, solution, controller=controller, disturbances=scenario.disturbances, trials=20, contacts=False,
+                frames=False,
+            )  # fmt: skip
+            assert set(run.outcome) == {"reached"}
+            costs.append(outcomes(run, plant, scenario.problem).cost)
+        np.testing.assert_allclose(costs[1], costs[0], rtol=0.03)
+
     def test_where_no_solve_succeeds_the_law_goes_on(
         self, plant: Plant, quadrotor: ls.Scenario, quadrotor_solution
     ) -> None:

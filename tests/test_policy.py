@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
+from lqrsim import compiled
 
 
 def test_on_the_plan_it_plays_the_plan(drive_solution: ls.Solution) -> None:
@@ -12,6 +13,21 @@ def test_on_the_plan_it_plays_the_plan(drive_solution: ls.Solution) -> None:
     for t in (0, 1, 77, 149):
         control = drive_solution.policy(plan.states[t], plan.times[t])
         np.testing.assert_allclose(control, plan.controls[t], rtol=0, atol=1e-12)
+
+
+def test_where_a_law_leads(drive_solution: ls.Solution, differential_drive: ls.Scenario) -> None:
+    """Compiled, as in plain Python, also beside the plan and at the limits."""
+    policy, problem = drive_solution.policy, differential_drive.problem
+    state = drive_solution.trajectory.states[0] + (0.6, -0.5, 2.0)
+    states, controls = compiled.rollout(problem, policy.gain, policy.offset, state)
+    for t in range(problem.steps):
+        np.testing.assert_allclose(states[t], state, rtol=0, atol=1e-9)
+        control = problem.control_coordinates.clip(policy.control(state, t))
+        np.testing.assert_allclose(controls[t], control, rtol=0, atol=1e-9)
+        state = problem.dynamics.step(state, control, problem.dt)
+    np.testing.assert_allclose(states[-1], state, rtol=0, atol=1e-9)
+    low, high = problem.control_coordinates.low, problem.control_coordinates.high
+    assert ((controls == low) | (controls == high)).any()
 
 
 def test_knots_belong_to_the_law_that_begins_there(drive_solution: ls.Solution) -> None:

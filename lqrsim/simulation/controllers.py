@@ -12,7 +12,7 @@ from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_number
 from lqrsim.policy import AffinePolicy
 from lqrsim.problem import FixedState, Problem
-from lqrsim.results import Solution
+from lqrsim.results import Solution, Trajectory
 from lqrsim.solvers.smoother import smooth
 
 Control = Callable[[int, Array], Array]
@@ -70,8 +70,9 @@ class Feedback(Controller):
 class Replanning(Controller):
     """Solves again and again from where the robot is measured to be, for what is left of the horizon.
 
-    Each solve begins with what is left of the law before it; where one does not succeed, that law goes on. It takes no
-    time in the simulation. Costs that depend on the step's number are not supported.
+    Each solve begins with where the law in force leads from there, by the model, so that it ends in the local optimum
+    nearest to that; where one does not succeed, that law goes on. It takes no time in the simulation. Costs that depend
+    on the step's number are not supported.
 
     Args:
       problem: that was solved. solution: its solution.
@@ -110,11 +111,12 @@ class Replanning(Controller):
         if left < 1:
             return law, first
         done = step - first
-        rest = replace(law, gain=law.gain[done:], offset=law.offset[done:], nominal=law.nominal[done:])
-        here = law.state_coordinates.nearest(state, rest.nominal[0])
+        here = law.state_coordinates.nearest(state, law.nominal[done])
         try:
             problem = replace(self.problem, initial=FixedState(here), steps=left)
-            solution = smooth(problem, start=rest, threads=1)
+            # The law itself would not do: without its cost-to-go the first iteration may leave for a worse optimum.
+            ahead = Trajectory(*compiled.rollout(problem, law.gain[done:], law.offset[done:], here), problem.dt)
+            solution = smooth(problem, start=ahead, threads=1)
         except InputError:  # it begins within an obstacle
             return law, first
         return (solution.policy, step) if solution.success else (law, first)
