@@ -1,0 +1,83 @@
+"""Figures of the stress test: success over strength, and what breaks first."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from lqrsim.simulation.disturbances import PRESETS
+from lqrsim.stress.campaign import POLICIES
+from lqrsim.view import style
+from lqrsim.view.curves import LINES, MARKERS
+from lqrsim.view.style import LIMIT, PLAN, RUNS
+from paper.common import Result, Settings, figure
+
+NAMES = {"differential_drive": "differential drive", "quadrotor": "quadrotor"}
+WORDS = {"smooth": "smoothing", "ilqr": "iLQR", "open_loop": "open loop", "replan": "replanning"}
+
+
+def draw_together(config: Settings, result: Result) -> None:
+    with figure(config, result, "stress_test", (10, 4)) as drawn:
+        both = drawn.subplots(1, 2, sharey=True)
+        for axes, (name, robot) in zip(both, result["robots"].items(), strict=True):
+            draw_success(axes, robot["together"])
+            axes.set_title(NAMES[name])
+        both[0].set_ylabel("trials that reached their goal (%)")
+        drawn.legend(*both[0].get_legend_handles_labels(), loc="upper center", ncols=4, handlelength=3)
+        drawn.tight_layout(rect=(0, 0, 1, 0.93), w_pad=3)
+
+
+def draw_success(axes: Axes, cells: Sequence[dict[str, Any]]) -> None:
+    for number, policy in enumerate(POLICIES):
+        mine = [cell for cell in cells if cell["policy"] == policy]
+        strengths = [cell["strength"] for cell in mine]
+        value, low, high = 100 * np.array([cell["band"] for cell in mine]).T
+        axes.fill_between(strengths, low, high, color=RUNS[number], alpha=0.15, linewidth=0)
+        # Curves may lie on each other: those below are wider, and their markers larger.
+        axes.plot(
+            strengths, value, LINES[number], color=RUNS[number], marker=MARKERS[number], markersize=8 - 1.2 * number,
+            linewidth=2.4 - 0.4 * number, markerfacecolor="white", label=WORDS[policy], clip_on=False, zorder=3,
+        )  # fmt: skip
+    for name, strength in PRESETS.items():
+        axes.axvline(strength, color=LIMIT, linestyle=":", linewidth=0.8)
+        above(axes, strength, name)
+    axes.set(xscale="log", xlabel="strength of all disturbances together", ylim=(-3, 103))
+    style.plain_decades(axes.xaxis)
+
+
+def above(axes: Axes, strength: float, name: str) -> None:
+    """The name of a preset above the axes."""
+    axes.annotate(
+        name, (strength, 1), (0, 3), xycoords=("data", "axes fraction"), textcoords="offset points", color=LIMIT,
+        fontsize=8, rotation=60, ha="left", va="bottom", rotation_mode="anchor",
+    )  # fmt: skip
+
+
+def draw_alone(config: Settings, result: Result) -> None:
+    with figure(config, result, "stress_test_alone", (10, 4.2)) as drawn:
+        for axes, (name, robot) in zip(drawn.subplots(1, 2, sharex=True), result["robots"].items(), strict=True):
+            draw_halves(axes, robot["alone"])
+            axes.set_title(NAMES[name])
+        drawn.tight_layout(w_pad=3)
+
+
+def draw_halves(axes: Axes, kinds: Sequence[dict[str, Any]]) -> None:
+    for row, kind in enumerate(kinds):
+        half, low, high = (kind["half"][name] for name in ("value", "above", "below"))
+        first, last = kind["strengths"][0], kind["strengths"][-1]
+        axes.plot([low or first, high or last], [row, row], color=RUNS[0], linewidth=2.4, solid_capstyle="butt")
+        if half is not None:
+            axes.plot(half, row, "o", color=RUNS[0], markersize=6)
+        if high is None:  # beyond all that can be, or was tried
+            axes.plot(last, row, ">", color=RUNS[0], markersize=6, markerfacecolor="white")
+    for name, strength in PRESETS.items():
+        axes.axvline(strength, color=LIMIT, linestyle=":", linewidth=0.8)
+        above(axes, strength, name)
+    axes.set_yticks(range(len(kinds)), [kind["kind"] for kind in kinds], color=PLAN)
+    axes.invert_yaxis()
+    axes.margins(x=0.03)
+    axes.set(xscale="log", xlabel="strength at which half of the trials fail")
+    style.plain_decades(axes.xaxis)
+    axes.grid(axis="x", color="#e8ebee", linewidth=0.8)
+    axes.set_axisbelow(True)
