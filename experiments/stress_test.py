@@ -240,9 +240,9 @@ def report(result: Result) -> str:
             " which that is surely not yet and surely already so; an open arrow where that is beyond what was tried",
         ),
         "Smoothing's policy under one kind of disturbance at a time, made stronger in steps. Between two of them"
-        " success first falls through one half, which is interpolated. In brackets are the last strength up to which success is"
-        " surely above one half and the first at which it is surely below, by exact intervals of 95 %. Multiples of the"
-        " preset are not the same effort for all kinds: the third column says what they come to.",
+        " success first falls through one half, which is interpolated. In brackets are the last strength up to which"
+        " success is surely above one half and the first at which it is surely below, by exact intervals of 95 %."
+        " Multiples of the preset are not the same effort for all kinds: the third column says what they come to.",
     ]
     for name, robot in robots.items():
         count = sum(len(kind["strengths"]) for kind in robot["alone"])

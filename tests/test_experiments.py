@@ -222,3 +222,30 @@ def test_worlds_of_the_benchmark_of_quality(quality: ModuleType) -> None:
             start, goal = (state[:size] for state in (one.problem.start, one.problem.goal))
             assert (start - gap.middle)[gap.axis] * (goal - gap.middle)[gap.axis] < 0
             assert distances(world, np.array([start, goal])).min() > cost.radius
+
+
+@pytest.fixture(scope="module")
+def stress() -> ModuleType:
+    return import_module("stress_test")
+
+
+class TestStressTest:
+    def test_half_fail_where_success_falls_through_one_half(self, stress: ModuleType) -> None:
+        certain = [[rate, rate, rate] for rate in (1.0, 0.75, 0.25, 0.0)]
+        found = stress.half_fail([*zip((1.0, 2.0, 8.0, 16.0), certain, strict=True)])
+        assert found == {"value": pytest.approx(4.0), "above": 2.0, "below": 8.0}
+        unsure = [[1.0, 0.6, 1.0], [0.7, 0.4, 0.9], [0.3, 0.1, 0.6], [0.1, 0.0, 0.4]]
+        found = stress.half_fail([*zip((1.0, 2.0, 8.0, 16.0), unsure, strict=True)])
+        assert found == {"value": pytest.approx(4.0), "above": 1.0, "below": 16.0}
+
+    def test_half_may_fail_from_the_first_on_or_never(self, stress: ModuleType) -> None:
+        assert stress.half_fail([(1.0, [0.2, 0.1, 0.4])]) == {"value": 1.0, "above": None, "below": 1.0}
+        assert stress.half_fail([(1.0, [0.9, 0.8, 1.0])]) == {"value": None, "above": 1.0, "below": None}
+        assert stress.half_fail([(1.0, [0.9, 0.8, 1.0]), (2.0, [0.6, 0.4, 0.8])]) == {
+            "value": None, "above": 1.0, "below": None,
+        }  # fmt: skip
+
+    def test_only_strengths_that_can_be_and_differ_are_tried(self, stress: ModuleType) -> None:
+        assert stress.possible(ls.MassMismatch(0.1), (1.0, 2.0, 3.0, 4.0)) == [1.0, 2.0, 3.0]
+        assert stress.possible(ls.MeasurementDropouts(0.5), (1.0, 2.0, 3.0)) == [1.0, 2.0]
+        assert stress.possible(ls.MeasurementLatency(1), (1.0, 1.1, 2.0)) == [1.0, 2.0]

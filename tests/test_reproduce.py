@@ -102,7 +102,7 @@ def test_ctrl_c_ends_the_script_too_and_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_every_script_has_its_place_on_the_page() -> None:
-    """A script that reproduces something of the paper makes statements, and is run by `lqrsim reproduce`."""
+    """A script that reproduces something of the paper, or tells how sure that is, is run by `lqrsim reproduce`."""
     made = {path.stem for path in FOLDER.glob("*.py") if "def statements(" in path.read_text(encoding="utf-8")}
     assert made == set(reproduce.SCRIPTS)
 
@@ -160,6 +160,29 @@ def test_table_1_claims_what_its_plans_cost(quick: tuple[Path, dict[str, Any]]) 
         solution = ls.smooth(fixed, start=scenario.paper_start, stop="cost")
         assert truth.cost_of(problem, solution.trajectory.controls) == pytest.approx(cost, rel=1e-5)
         assert len(solution.iterations) == found["iterations"][query]
+
+
+def test_stress_test_counts_what_simulations_do(quick: tuple[Path, dict[str, Any]]) -> None:
+    """The same disturbances and numbers, without a campaign; the outcomes are the rollout's own."""
+    result = quick[1]["results"]["stress_test"]["result"]
+    for name, robot in result["robots"].items():
+        scenario = ls.scenarios.get(name)
+        plant, solution = scenario.plant(), ls.smooth(scenario.problem)
+        (cell,) = [one for one in robot["together"] if (one["policy"], one["strength"]) == ("smooth", 1.0)]
+        kinds = {"motor lag": ls.MotorLag, "initial state error": ls.InitialStateError}
+        light = ls.preset("light", plant)
+        run = ls.simulate(plant, solution, disturbances=light, trials=cell["trials"], contacts=False, frames=False)
+        assert run.outcome.count("reached") == cell["reached"]
+        assert sum(count for *_, count in cell["modes"]) == cell["trials"] - cell["reached"]
+        for alone in robot["alone"]:
+            if alone["kind"] in kinds:
+                (disturbance,) = [one for one in light if isinstance(one, kinds[alone["kind"]])]
+                strength, (rate, *_) = alone["strengths"][-1], alone["success"][-1]
+                run = ls.simulate(
+                    plant, solution, disturbances=[disturbance.scaled(strength)], trials=robot["trials_alone"],
+                    contacts=False, frames=False,
+                )  # fmt: skip
+                assert run.outcome.count("reached") == pytest.approx(rate * robot["trials_alone"])
 
 
 def test_minimal_total_cost_states_obey_the_true_dynamics(quick: tuple[Path, dict[str, Any]]) -> None:

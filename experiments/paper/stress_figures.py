@@ -18,11 +18,11 @@ WORDS = {"smooth": "smoothing", "ilqr": "iLQR", "open_loop": "open loop", "repla
 
 
 def draw_together(config: Settings, result: Result) -> None:
-    with figure(config, result, "stress_test", (10, 4)) as drawn:
+    with figure(config, result, "stress_test", (10, 4.5)) as drawn:
         both = drawn.subplots(1, 2, sharey=True)
         for axes, (name, robot) in zip(both, result["robots"].items(), strict=True):
             draw_success(axes, robot["together"])
-            axes.set_title(NAMES[name])
+            axes.set_title(NAMES[name], pad=42)
         both[0].set_ylabel("trials that reached their goal (%)")
         drawn.legend(*both[0].get_legend_handles_labels(), loc="upper center", ncols=4, handlelength=3)
         drawn.tight_layout(rect=(0, 0, 1, 0.93), w_pad=3)
@@ -50,15 +50,15 @@ def above(axes: Axes, strength: float, name: str) -> None:
     """The name of a preset above the axes."""
     axes.annotate(
         name, (strength, 1), (0, 3), xycoords=("data", "axes fraction"), textcoords="offset points", color=LIMIT,
-        fontsize=8, rotation=60, ha="left", va="bottom", rotation_mode="anchor",
+        fontsize=8, rotation=90, ha="center", va="bottom",
     )  # fmt: skip
 
 
 def draw_alone(config: Settings, result: Result) -> None:
-    with figure(config, result, "stress_test_alone", (10, 4.2)) as drawn:
+    with figure(config, result, "stress_test_alone", (10, 4.6)) as drawn:
         for axes, (name, robot) in zip(drawn.subplots(1, 2, sharex=True), result["robots"].items(), strict=True):
             draw_halves(axes, robot["alone"])
-            axes.set_title(NAMES[name])
+            axes.set_title(NAMES[name], pad=42)
         drawn.tight_layout(w_pad=3)
 
 
