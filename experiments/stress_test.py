@@ -30,11 +30,8 @@ from paper.common import (
 from paper.stress_figures import NAMES, WORDS, draw_alone, draw_together
 
 import lqrsim as ls
-from lqrsim.simulation.disturbances import PRESETS, Disturbance
-from lqrsim.simulation.outcomes import Outcomes
-from lqrsim.stress import analysis, campaign
-from lqrsim.stress.campaign import Campaign, Cell
-from lqrsim.stress.results import Results
+from lqrsim.simulation.disturbances import PRESETS
+from lqrsim.stress import analysis
 
 FAILURES = {"collided": "collided", "timed out": "timed out", "diverged": "lost", "error": "error"}
 # Of all disturbances together: those of the presets, and beyond, where they can be so strong.
@@ -67,18 +64,18 @@ def main(config: Config) -> Result:
     return result
 
 
-def finished(config: Config, asked: Campaign, folder: Path) -> Results:
+def finished(config: Config, asked: ls.Campaign, folder: Path) -> ls.Results:
     """The campaign, run to its end."""
     with counting(f"{NAMES[asked.scenario]}, {folder.name}") as told:
         workers = 0 if config.quick else config.workers
-        return campaign.run(asked, folder, workers=workers, progress=told)
+        return ls.run_campaign(asked, folder, workers=workers, progress=told)
 
 
 def together(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, Any]:
     """All disturbances of the presets at once, from the weakest preset up: each policy, and all against the first."""
     light = ls.preset("light", scenario.plant())
     strengths = [strength for strength in STRENGTHS if all(possible(one, [strength]) for one in light)]
-    asked = Campaign(
+    asked = ls.Campaign(
         scenario=scenario.name, sweeps={"light": tuple(light)}, seed=config.seed, shard=100,
         strengths=(0.25, 1.0) if config.quick else tuple(strengths),
         trials=min(config.trials, 8) if config.quick else config.trials,
@@ -121,21 +118,21 @@ def alone(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, Any]
     plant = scenario.plant()
     kinds = {in_words(one): one for one in ls.preset("light", plant)}
     grids = {name: possible(one, GRID) for name, one in kinds.items()}
-    found: dict[str, dict[float, Outcomes]] = {name: {} for name in kinds}
+    found: dict[str, dict[float, ls.Outcomes]] = {name: {} for name in kinds}
     asked = {name: {*grid[::stride], grid[-1]} for name, grid in grids.items()}
     for part in ("alone, coarse",) if config.quick else ("alone, coarse", "alone, fine"):
         cells = {(name, strength): f"{name} {strength:.3g}" for name in kinds for strength in sorted(asked[name])}
         sweeps = {cell: (kinds[name].scaled(strength),) for (name, strength), cell in cells.items()}
         results = finished(
             config,
-            Campaign(
+            ls.Campaign(
                 scenario=scenario.name, sweeps=sweeps, strengths=(1.0,), policies=("smooth",), trials=trials,
                 seed=config.seed, shard=50,
             ),
             folder / part,
         )  # fmt: skip
         for (name, strength), cell in cells.items():
-            found[name][strength] = results.outcomes(Cell("smooth", cell, 1.0))
+            found[name][strength] = results.outcomes(ls.Cell("smooth", cell, 1.0))
         for name, grid in grids.items():
             half = half_fail(success(found[name]))
             low, high = half["above"] or 0.0, half["below"] or np.inf
@@ -146,7 +143,7 @@ def alone(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, Any]
     return {"alone": rows, "trials_alone": trials}
 
 
-def told(name: str, one: Disturbance, plant: ls.Plant, found: dict[float, Outcomes]) -> dict[str, Any]:
+def told(name: str, one: ls.Disturbance, plant: ls.Plant, found: dict[float, ls.Outcomes]) -> dict[str, Any]:
     """What the result says of a kind."""
     points = success(found)
     strengths, half = [strength for strength, _ in points], half_fail(points)
@@ -160,17 +157,17 @@ def told(name: str, one: Disturbance, plant: ls.Plant, found: dict[float, Outcom
     }  # fmt: skip
 
 
-def success(found: dict[float, Outcomes]) -> list[tuple[float, list[float]]]:
+def success(found: dict[float, ls.Outcomes]) -> list[tuple[float, list[float]]]:
     """Strength and exact interval of success, the weakest first."""
     return [
-        (strength, interval(analysis.success(Cell("smooth", "", strength), outcomes).exact))
+        (strength, interval(analysis.success(ls.Cell("smooth", "", strength), outcomes).exact))
         for strength, outcomes in sorted(found.items())
     ]
 
 
-def possible(one: Disturbance, strengths: Sequence[float]) -> list[float]:
+def possible(one: ls.Disturbance, strengths: Sequence[float]) -> list[float]:
     """The strengths that the disturbance can have and that differ: not more losses than of everything."""
-    kept: dict[Disturbance, float] = {}
+    kept: dict[ls.Disturbance, float] = {}
     for strength in strengths:
         try:
             kept.setdefault(one.scaled(strength), strength)
@@ -201,7 +198,7 @@ def half_fail(points: Sequence[tuple[float, Sequence[float]]]) -> dict[str, floa
     }
 
 
-def in_words(one: Disturbance) -> str:
+def in_words(one: ls.Disturbance) -> str:
     """The name of its class: MotorLag is motor lag."""
     words = re.sub(r"(?<!^)(?=[A-Z])", " ", type(one).__name__).lower()
     return {"dryden": "Dryden turbulence"}.get(words, words)
