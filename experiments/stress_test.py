@@ -251,7 +251,7 @@ def report(result: Result) -> str:
 def of_policies(cells: Sequence[dict[str, Any]]) -> str:
     rows = []
     for cell in cells:
-        ends = {outcome: sum(mode[2] for mode in cell["modes"] if mode[0] == outcome) for outcome in FAILURES}
+        ends = ends_of(cell["modes"])
         hit = next((mode[1] for mode in cell["modes"] if mode[1]), "")
         against = cell.get("against")
         compared = ["", "", ""]
@@ -276,10 +276,15 @@ def of_kinds(kinds: Sequence[dict[str, Any]]) -> str:
             span = f"{f'under {first:.3g}' if low is None else f'{low:.3g}'} to"
             span += f" over {last:.3g}" if high is None else f" {high:.3g}"
             where = f"{span}" if half is None else f"{half:.2g} ({span})"
-        failed = sum(mode[2] for mode in kind["modes"])
-        how = f"{kind['modes'][0][0]}, {kind['modes'][0][2]} of {failed}" if failed else "-"
+        ends = ends_of(kind["modes"])
+        how = ", ".join(f"{count} {FAILURES[outcome]}" for outcome, count in ends.items() if count) or "-"
         rows.append([kind["kind"], where, brief(kind["there"]), how, brief(kind["light"])])
-    return table(("kind", "half fail at", "which is", "how, of all that fail there", "strength 1"), rows)
+    return table(("kind", "half fail at", "which is", "failures there", "strength 1"), rows)
+
+
+def ends_of(modes: Sequence[Sequence[Any]]) -> dict[str, int]:
+    """How many trials failed in each way."""
+    return {outcome: sum(count for end, _, count in modes if end == outcome) for outcome in FAILURES}
 
 
 def brief(text: str) -> str:

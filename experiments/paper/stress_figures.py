@@ -22,7 +22,7 @@ def draw_together(config: Settings, result: Result) -> None:
         both = drawn.subplots(1, 2, sharey=True)
         for axes, (name, robot) in zip(both, result["robots"].items(), strict=True):
             draw_success(axes, robot["together"])
-            axes.set_title(NAMES[name], pad=42)
+            axes.set_title(NAMES[name], pad=50)
         both[0].set_ylabel("trials that reached their goal (%)")
         drawn.legend(*both[0].get_legend_handles_labels(), loc="upper center", ncols=4, handlelength=3)
         drawn.tight_layout(rect=(0, 0, 1, 0.93), w_pad=3)
@@ -58,7 +58,7 @@ def draw_alone(config: Settings, result: Result) -> None:
     with figure(config, result, "stress_test_alone", (10, 4.6)) as drawn:
         for axes, (name, robot) in zip(drawn.subplots(1, 2, sharex=True), result["robots"].items(), strict=True):
             draw_halves(axes, robot["alone"])
-            axes.set_title(NAMES[name], pad=42)
+            axes.set_title(NAMES[name], pad=50)
         drawn.tight_layout(w_pad=3)
 
 
