@@ -22,7 +22,16 @@ _PACKAGED = [Path(__file__).parent / "experiments", Path(__file__).parent.parent
 EXPERIMENTS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
 
 # In the order of the page. Each prints, with --json, its result, its report in Markdown, and its statements.
-SCRIPTS = ("figure_2", "figure_3", "table_1", "convergence", "state_dimension", "state_of_the_art", "feedback", "stress_test")
+SCRIPTS = (
+    "figure_2",
+    "figure_3",
+    "table_1",
+    "convergence",
+    "state_dimension",
+    "state_of_the_art",
+    "feedback",
+    "stress_test",
+)
 
 Found = dict[str, Any]
 VERDICTS = {True: "holds", False: "**does not hold**", None: "not tested"}

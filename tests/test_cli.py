@@ -194,7 +194,9 @@ def test_bad_input_is_one_line(
     assert sorted(path.name for path in tmp_path.iterdir()) in (before, sorted([*before, "__pycache__"]))
 
 
-@pytest.mark.parametrize("command", ["", "list", "solve", "simulate", "render", "demo", "stress", "replay", "rare", "break"])
+@pytest.mark.parametrize(
+    "command", ["", "list", "solve", "simulate", "render", "demo", "stress", "replay", "rare", "break"]
+)
 def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main([*command.split(), "--help"])
