@@ -123,12 +123,15 @@ def page(saved: Mapping[str, Any]) -> str:
         "The paper: J. van den Berg, *Iterated LQR Smoothing for Locally-Optimal Feedback Control of Systems with"
         " Non-Linear Dynamics and Non-Quadratic Cost*, American Control Conference, 2014.",
         f"Computed with {', '.join(f'{name} {version}' for name, version in versions.items())} on {saved['machine']}.",
-        "## Which of the paper's statements hold",
-        f"{_count(statements)} A statement can have several tests; what counts as holding is this project's choice.",
-        "\n".join(
-            ["| the paper says | counts as holding | what came out | verdict | figure |", "| --- " * 5 + "|", *rows]
-        ),
     ]
+    if statements:
+        head = "| the paper says | counts as holding | what came out | verdict | figure |"
+        parts += [
+            "## Which of the paper's statements hold",
+            f"{_count(statements)} A statement can have several tests; what counts as holding"
+            " is this project's choice.",
+            "\n".join([head, "| --- " * 5 + "|", *rows]),
+        ]
     for name, one in found.items():
         options = "" if not saved["quick"] else " --quick"
         parts += [one["report"], f"`python experiments/{name}.py{options}`, {one['seconds']} s."]
@@ -149,4 +152,5 @@ def _verdicts(found: Mapping[str, Found], out: Path) -> Iterable[str]:
         yield f"{VERDICTS[one['holds']].strip('*').upper():<14} {one['where']}: {one['paper']}"
         yield f"{'':<14} {one['ours']}  [want: {one['test']}]"
         yield f"{'':<14} {out / 'figures' / one['figure']}.png"
-    yield _count(statements)
+    if statements:
+        yield _count(statements)
