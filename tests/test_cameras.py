@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim.view import cameras, gl
+from lqrsim.view import cameras, gl, marker
 from lqrsim.view.cameras import Camera
 from lqrsim.view.footage import Footage, Pane, digest, read
-from lqrsim.view.marker import COLOUR, marker
 from lqrsim.view.video import encoder
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
@@ -97,7 +96,7 @@ def footage(rollout: ls.Rollout) -> Footage:
         Pane(320, 0, 320, 240, trial=1, camera=cameras.side(rollout)),
         Pane(0, 240, 640, 240),
     )
-    return Footage((digest(rollout),), (marker(rollout),), Fraction(30000, 1001), 0.5, 3, panes)
+    return Footage((digest(rollout),), (marker.radius(rollout),), Fraction(30000, 1001), 0.5, 3, panes)
 
 
 def test_footage_survives_its_file(rollout: ls.Rollout, tmp_path: Path) -> None:
@@ -153,25 +152,23 @@ def test_digest_tells_runs_apart(rollout: ls.Rollout) -> None:
 
 
 @draws
-def test_marker_is_seen_from_above_in_its_colour_alone(rollout: ls.Rollout) -> None:
-    """Nothing of the robot hides it, and light and shade leave it as it is."""
+@pytest.mark.parametrize("kind", ["top", "side"])
+def test_mark_is_seen_where_the_robot_is_whatever_hides_it(kind: str, rollout: ls.Rollout) -> None:
+    """In its colour to the last bit, in light and shade, before the sky and behind beams."""
     gl.bind()
-    worn, camera, size = marker(rollout), cameras.top(rollout), (640, 480)
+    camera, size = getattr(cameras, kind)(rollout), (640, 480)
     model = mujoco.MjModel.from_xml_string(rollout.model)
     model.vis.quality.offsamples = 0
     data = mujoco.MjData(model)
-    data.qpos = rollout.frames[0, 0]
-    mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, size[1], size[0]) as renderer:
-        renderer.update_scene(data)
-        body = int(np.argmax(model.body_weldid != 0))
-        position, rotation = data.xpos[body], data.xmat[body].reshape(3, 3)
-        worn.draw(renderer.scene, position, rotation)
-        camera.place(renderer.scene, size[0] / size[1])
-        image = renderer.render()
-    mask = (image == 255 * np.array(COLOUR, dtype=np.uint8)).all(axis=2)
-    scale = size[1] / camera.height
-    assert mask.sum() == pytest.approx(np.pi * (worn.radius * scale) ** 2, rel=0.2)
-    rows, columns = np.nonzero(mask)
-    seen = np.array([columns.mean(), rows.mean()]) + 0.5
-    np.testing.assert_allclose(seen, camera.project(worn.centre(position, rotation), size), rtol=0, atol=0.4)
+        for frame in rollout.frames[0, ::30]:
+            data.qpos = frame
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data)
+            centre = data.xpos[marker.robot_body(model)]
+            marker.draw(renderer.scene, camera, centre, marker.radius(rollout))
+            camera.place(renderer.scene, size[0] / size[1])
+            rows, columns = np.nonzero((renderer.render() == 255 * np.array(marker.COLOUR)).all(axis=2))
+            assert len(rows) == pytest.approx(np.pi * (marker.radius(rollout) * size[1] / camera.height) ** 2, rel=0.15)
+            seen = np.array([columns.mean(), rows.mean()]) + 0.5
+            np.testing.assert_allclose(seen, camera.project(centre, size), rtol=0, atol=0.3)

@@ -16,7 +16,6 @@ from av.error import FFmpegError
 from lqrsim.errors import InputError, check_count, check_number
 from lqrsim.rollout import Rollout
 from lqrsim.view.cameras import Camera
-from lqrsim.view.marker import Marker
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
@@ -47,12 +46,13 @@ class Footage:
     """What identifies a video: frame `number` shows the moment `number / rate * speed` seconds after a run's start.
 
     Attributes:
-      runs: digests of the rollouts. markers: what each one's robot wears in the panes with a camera.
+      runs: digests of the rollouts. markers: radius in metres of the ball that each one's robot wears in panes with a
+        camera; see marker.py.
       rate: frames a second. speed: seconds of the run in a second of the video. frames: how many there are.
     """
 
     runs: tuple[str, ...]
-    markers: tuple[Marker, ...]
+    markers: tuple[float, ...]
     rate: Fraction
     speed: float
     frames: int
@@ -62,7 +62,7 @@ class Footage:
         """What `from_json` makes the same footage of."""
         panes = [vars(pane) | {"camera": pane.camera and pane.camera.as_json()} for pane in self.panes]
         parts = {"format": FORMAT, "version": VERSION, "runs": self.runs, "rate": str(self.rate), "speed": self.speed}
-        parts |= {"frames": self.frames, "markers": [one.as_json() for one in self.markers], "panes": panes}
+        parts |= {"frames": self.frames, "markers": self.markers, "panes": panes}
         return json.dumps(parts)
 
     @classmethod
@@ -80,7 +80,7 @@ class Footage:
         try:
             footage = cls(
                 runs=tuple(str(run) for run in parts["runs"]),
-                markers=tuple(Marker.from_json(one) for one in parts["markers"]),
+                markers=tuple(check_number("footage.markers", one, above=0) for one in parts["markers"]),
                 rate=Fraction(parts["rate"]),
                 speed=check_number("footage.speed", parts["speed"], above=0),
                 frames=check_count("footage.frames", parts["frames"]),
