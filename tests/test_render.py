@@ -10,11 +10,10 @@ import av
 import mujoco
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 import lqrsim as ls
-from lqrsim.view import gl
-from lqrsim.view import footage
+from lqrsim.view import footage, gl
 from lqrsim.view.overlays import ELLIPSOIDS, OVERLAYS, Overlay, Overlays, Scale
 from lqrsim.view.picture import picture
 from lqrsim.view.render import render, still
@@ -154,10 +153,9 @@ def test_draft_and_gif_show_the_same_run(flight: ls.Rollout, tmp_path: Path) -> 
         assert image.size == (320, 180)
         assert image.info["loop"] == 0
         durations, frames = [], []
-        for number in range(image.n_frames):
-            image.seek(number)
-            durations.append(image.info["duration"])
-            frames.append(np.asarray(image.convert("RGB")).astype(int))
+        for frame in ImageSequence.Iterator(image):
+            durations.append(frame.info["duration"])
+            frames.append(np.asarray(frame.convert("RGB")).astype(int))
     assert sum(durations) / 1e3 == pytest.approx(len(frames) / 3, abs=0.01)
     assert set(durations) <= {330, 340}
     video = decode(render(flight, tmp_path / "run.mp4", quality="draft", size=(320, 180), fps=3))
@@ -198,19 +196,17 @@ def test_video_says_what_it_shows(flight: ls.Rollout, tmp_path: Path) -> None:
 def test_marker_is_where_the_calibration_says(camera: str, rollout: ls.Rollout, tmp_path: Path) -> None:
     """Green pixels of a pane, against where the camera's own formula sees the marker on the simulator's body."""
     with picture(rollout, insets=(camera,), size=(640, 360)) as drawn:
-        pane, worn, data = drawn.panes[1], drawn.markers[0], mujoco.MjData(drawn.parts[0].track.model)
+        pane, data = drawn.panes[1], mujoco.MjData(drawn.parts[0].track.model)
         assert pane.camera is not None
         for time in (0.0, 2.0, 4.5):
             drawn.parts[0].track.pose(data, time)
-            body = drawn.parts[0].track.robot
-            place = worn.centre(data.xpos[body], data.xmat[body].reshape(3, 3))
-            want = pane.camera.project(place, (pane.width, pane.height))
+            want = pane.camera.project(data.xpos[drawn.parts[0].track.robot], (pane.width, pane.height))
             area = drawn.draw(time)[pane.top : pane.top + pane.height, pane.left : pane.left + pane.width].astype(int)
             green = area[..., 1] - area[..., [0, 2]].max(axis=2) > 70
             rows, columns = np.nonzero(green)
             assert len(rows) >= 3, f"at {time:g} s"
-            # The disc has an edge that is seen from the side, and a ball of three pixels is not round.
-            assert np.abs([columns.mean() + 0.5 - want[0], rows.mean() + 0.5 - want[1]]).max() < 1.0, f"at {time:g} s"
+            # A ball of a few pixels is not quite round.
+            assert np.abs([columns.mean() + 0.5 - want[0], rows.mean() + 0.5 - want[1]]).max() < 0.5, f"at {time:g} s"
 
 
 @draws
@@ -232,7 +228,7 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
 
 
 def test_tube_is_the_shadow_of_what_the_total_cost_allows(flight: ls.Rollout, quadrotor_solution: ls.Solution) -> None:
-    """Against the cost itself: over all states with a position on the ellipsoid its least is 2 above the least of all."""
+    """Against the cost: of all states with a position on the ellipsoid its least is 2 above the least of all."""
     overlays = Overlays(Track(flight, 0), quadrotor_solution, ("tube",), Scale(1.0, 1.0))
     assert overlays.tube is not None
     go, come = quadrotor_solution.cost_to_go, quadrotor_solution.cost_to_come

@@ -117,25 +117,24 @@ class Overlays:
             else:
                 pen.add(Geom.mjGEOM_SPHERE, wanted, [radius] * 3, (*PLAN, 0.10))
 
-    def draw_force(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> bool:
-        """Appends the arrow of what disturbs the robot, for one camera; whether there is one.
+    def draw_force(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
+        """Appends the arrow of what disturbs the robot, as one camera is to see it.
 
-        It begins where the robot's circle ends. There is none that points at the camera, or away from it: it would show
-        nothing and hide the robot.
+        It begins where the robot's circle ends. None points at the camera or away from it: that would show nothing, and
+        hide the robot.
         """
         if "forces" not in self.show:
-            return False
+            return
         track, forward = self.track, np.array(scene.camera[0].forward, dtype=np.float64)
         force, radius = track.force_at(time), track.rollout.radius
         strength, width = float(np.linalg.norm(force)), max(0.1 * radius, 1.5 * self.width)
         length = 4 * radius * strength / self.scale.force
         if length < 2 * width or abs(force @ forward) > END_ON * strength:
-            return False
+            return
         direction = force / strength
         start = data.xpos[track.robot] + radius * direction
         arrow = _Pen(scene, flat=track.planar).add(Geom.mjGEOM_ARROW, start, [1, 1, 1], (*FORCE, 1.0))
         mujoco.mjv_connector(arrow, Geom.mjGEOM_ARROW, width, start, start + length * direction)
-        return True
 
 
 class _Pen:
@@ -198,8 +197,9 @@ def _tube(track: Track, solution: Solution) -> tuple[Array, Array, Array]:
     covariance = come.covariance if isinstance(come, Moments) else np.linalg.inv(come.hessian)
     of_total = covariance @ np.linalg.inv(np.eye(covariance.shape[-1]) + go.hessian @ covariance)
     chosen = np.unique(np.linspace(0, len(of_total) - 1, ELLIPSOIDS).astype(int))
-    centres = track.places(TotalCost(go, come).minimizer()[chosen], np.arange(len(chosen)), np.arange(len(chosen)))
     position = list(track.rollout.state_coordinates.position)
+    centres = np.full((len(chosen), 3), track.floor)
+    centres[:, : len(position)] = TotalCost(go, come).minimizer()[chosen][:, position]
     block = of_total[chosen][:, position][:, :, position]
     variances, axes = np.linalg.eigh(0.5 * (block + np.swapaxes(block, 1, 2)))
     size = len(position)

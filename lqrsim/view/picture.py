@@ -11,10 +11,9 @@ import numpy as np
 from lqrsim.errors import InputError, check_count, check_name
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
-from lqrsim.view import gl
+from lqrsim.view import gl, marker
 from lqrsim.view.caption import Pixels
 from lqrsim.view.footage import Pane
-from lqrsim.view.marker import Marker, marker
 from lqrsim.view.overlays import OVERLAYS, Overlay, Overlays, scale
 from lqrsim.view.shots import CALIBRATED, WIDE, Shot, shot
 from lqrsim.view.stage import Box, Stage, stage
@@ -72,7 +71,8 @@ def picture(
     speed: float = 1.0,
 ) -> Iterator["Picture"]:
     """What `render` and `still` draw from; arguments and what is raised are theirs."""
-    look = QUALITIES[check_name("quality", quality, QUALITIES)]
+    check_name("quality", quality, QUALITIES)
+    look = QUALITIES[quality]
     size = _checked_size(look.size if size is None else size)
     for overlay in overlays:
         check_name("overlays", overlay, OVERLAYS)
@@ -103,8 +103,7 @@ def picture(
             views = [
                 (pane, shot(name, track, pane.aspect)) for name, pane in zip((camera, *insets), panes, strict=True)
             ]
-            worn = marker(track.rollout) if any(view.camera for _, view in views) else None
-            staged = stack.enter_context(stage(track, overlay, views, (box.width, box.height), worn))
+            staged = stack.enter_context(stage(track, overlay, views, (box.width, box.height)))
             parts.append(Part(track, box, views, overlay, staged, told))
         places = tuple(
             Pane(part.box.left + box.left, part.box.top + box.top, box.width, box.height, *which, view.camera)
@@ -134,9 +133,9 @@ class Picture:
         self.end = max(part.track.end for part in parts)
 
     @property
-    def markers(self) -> tuple[Marker, ...]:
-        """What the robot of each run wears where it wears any."""
-        return tuple(marker(run) for run in self.runs)
+    def markers(self) -> tuple[float, ...]:
+        """Radii in metres of the marks that the runs' robots wear in calibrated panes."""
+        return tuple(marker.radius(run) for run in self.runs)
 
     def draw(self, time: float, *, fade: float = 1.0, earlier: Iterable[float] = ()) -> Pixels:
         """The picture (height, width, 3) at `time`, with the robot also where it was earlier.

@@ -68,6 +68,7 @@ def _overview(track: Track, like: int | None, aspect: float) -> Shot:
     # From where every point is within both angles: as far back as the worst of each side asks for.
     rise = np.tan(np.radians(lens) / 2) * 0.96
     middle = points.mean(axis=0)
+    back = 0.0
     for _ in range(20):  # each centres what the one before saw
         local = points - middle
         x, y, z = local @ right, local @ up, local @ forward

@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -10,8 +11,8 @@ import numpy.typing as npt
 from mujoco.rendering.classic import gl_context
 
 from lqrsim.errors import Array
+from lqrsim.view import marker
 from lqrsim.view.caption import Pixels
-from lqrsim.view.marker import Marker
 from lqrsim.view.overlays import Overlays
 from lqrsim.view.shots import Shot
 from lqrsim.view.track import Track
@@ -37,7 +38,7 @@ class Box:
 
 @contextlib.contextmanager
 def stage(
-    track: Track, overlays: Overlays, views: Sequence[tuple[Box, Shot]], size: tuple[int, int], marker: Marker | None
+    track: Track, overlays: Overlays, views: Sequence[tuple[Box, Shot]], size: tuple[int, int]
 ) -> Iterator["Stage"]:
     """A trial in a picture of `size`, with the boxes in it that show it; needs OpenGL to be bound."""
     model = track.model
@@ -49,7 +50,7 @@ def stage(
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         try:
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
-            yield Stage(track, overlays, views, size, marker, window, context)
+            yield Stage(track, overlays, views, size, window, context)
         finally:
             window.make_current()
             context.free()
@@ -69,11 +70,10 @@ class Stage:
         overlays: Overlays,
         views: Sequence[tuple[Box, Shot]],
         size: tuple[int, int],
-        marker: Marker | None,
-        window: gl_context.GLContext,
+        window: Any,
         context: mujoco.MjrContext,
     ) -> None:
-        self.track, self.overlays, self.views, self.marker = track, overlays, views, marker
+        self.track, self.overlays, self.views = track, overlays, views
         self.window, self.context, self.model = window, context, track.model
         self.data, self.ghost = mujoco.MjData(self.model), mujoco.MjData(self.model)
         self.scene = mujoco.MjvScene(self.model, maxgeom=1000 + (ROBOTS + 1) * self.model.ngeom)
@@ -99,9 +99,6 @@ class Stage:
             self.track.pose(self.ghost, moment)
             mujoco.mjv_addGeoms(model, self.ghost, *self.extras, mujoco.mjtCatBit.mjCAT_DYNAMIC.value, scene)
         self.overlays.draw(scene, data, time)
-        if self.marker is not None:
-            body = self.track.robot
-            self.marker.draw(scene, data.xpos[body], data.xmat[body].reshape(3, 3))
         self.window.make_current()
         for (box, shot), faded in zip(self.views, self.faded, strict=True):
             shot.place(scene, data, time)
@@ -110,9 +107,13 @@ class Stage:
             with self._see_through(faded, own):
                 height = self.pixels.shape[0]
                 where = mujoco.MjrRect(box.left, height - box.top - box.height, box.width, box.height)
-                arrow = self.overlays.draw_force(scene, data, time)
+                common = scene.ngeom
+                self.overlays.draw_force(scene, data, time)
+                if shot.camera is not None:
+                    robot, worn = data.xpos[self.track.robot], marker.radius(self.track.rollout)
+                    marker.draw(scene, shot.camera, robot, worn)
                 mujoco.mjr_render(where, scene, self.context)
-                scene.ngeom -= arrow
+                scene.ngeom = common
         whole = mujoco.MjrRect(0, 0, self.pixels.shape[1], self.pixels.shape[0])
         mujoco.mjr_readPixels(self.pixels, None, whole, self.context)
         return self.pixels[::-1]

@@ -5,6 +5,7 @@ import numpy as np
 
 from lqrsim.errors import Array, InputError, check_count
 from lqrsim.rollout import Rollout
+from lqrsim.view.marker import robot_body
 
 SEEN = 0.2  # seconds for which a push is shown: one control period would be gone before it is seen, and noise flickers
 
@@ -39,7 +40,7 @@ class Track:
         self.force = _recent(rollout.forces[trial], rollout.plan.dt)
         self.end = float(rollout.times[-1])
         self.planar = len(rollout.state_coordinates.position) == 2
-        self.robot = int(np.argmax(self.model.body_weldid != 0))  # the first body that moves
+        self.robot = robot_body(self.model)
         self.floor = self._floor()
 
     def pose(self, data: mujoco.MjData, time: float) -> None:
