@@ -14,7 +14,8 @@ from PIL import Image, ImageSequence
 
 import lqrsim as ls
 from lqrsim.view import footage, gl
-from lqrsim.view.overlays import ELLIPSOIDS, OVERLAYS, Overlay, Overlays, Scale
+from lqrsim.view.choices import OVERLAYS, Overlay
+from lqrsim.view.overlays import ELLIPSOIDS, Overlays, Scale
 from lqrsim.view.picture import picture
 from lqrsim.view.render import render, still
 from lqrsim.view.track import Track

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import mujoco
 import numpy as np
@@ -14,10 +13,8 @@ from lqrsim.results import Solution
 from lqrsim.value_functions import Moments, TotalCost
 from lqrsim.view import caption
 from lqrsim.view.caption import Colour
+from lqrsim.view.choices import Overlay
 from lqrsim.view.track import Track
-
-Overlay = Literal["plan", "ghost", "trace", "forces", "measured", "tube", "caption"]
-OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
 
 # No colour of the error map, and none of the robots.
 PLAN = (0.78, 0.08, 0.42)

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -13,14 +13,14 @@ from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.view import gl, marker
 from lqrsim.view.caption import Pixels
+from lqrsim.view.choices import CALIBRATED, OVERLAYS, Overlay, Quality
 from lqrsim.view.footage import Pane
-from lqrsim.view.overlays import OVERLAYS, Overlay, Overlays, scale
-from lqrsim.view.shots import CALIBRATED, WIDE, Shot, shot
+from lqrsim.view.overlays import Overlays, scale
+from lqrsim.view.shots import WIDE, Shot, shot
 from lqrsim.view.stage import Box, Stage, stage
 from lqrsim.view.telling import Caption, Legend
 from lqrsim.view.track import Track
 
-Quality = Literal["draft", "standard", "publication"]
 RUNS = 6  # more can not be told apart side by side
 INSETS = 3
 SHARE = 0.4  # of a run's part of the picture, for its insets

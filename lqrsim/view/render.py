@@ -13,8 +13,8 @@ from lqrsim.files import replacing
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.view import footage
-from lqrsim.view.overlays import OVERLAYS, Overlay
-from lqrsim.view.picture import QUALITIES, Picture, Quality, picture
+from lqrsim.view.choices import OVERLAYS, Overlay, Quality
+from lqrsim.view.picture import QUALITIES, Picture, picture
 from lqrsim.view.stage import ROBOTS
 from lqrsim.view.video import encoder, gif
 

@@ -9,10 +9,9 @@ import numpy as np
 from lqrsim.errors import Array, check_name
 from lqrsim.view import cameras
 from lqrsim.view.cameras import Camera
+from lqrsim.view.choices import CALIBRATED, VIEWS
 from lqrsim.view.track import Track
 
-CALIBRATED = ("top", "side")
-VIEWS = ("overview", "chase", *CALIBRATED)
 WIDE = 1.7  # models' overviews are made for pictures of 16 : 9; in narrower ones they would cut off both sides
 OBLIQUE = np.array([0.55, 0.55, -0.63])  # where an overview looks, in a scene without one
 LENS = 40.0  # degrees, of cameras that are not the model's

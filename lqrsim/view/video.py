@@ -49,7 +49,8 @@ def encoder(
 @contextlib.contextmanager
 def gif(path: Path, rate: Fraction, samples: Sequence[Pixels]) -> Iterator[Callable[[Pixels], None]]:
     """As `encoder`, for a GIF; one palette for all of it, of the samples, so that colours do not flicker."""
-    palette = Image.fromarray(np.vstack(samples)).quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE)
+    # Also colours of which there is little, as of lines, which are what matters.
+    palette = Image.fromarray(np.vstack(samples)).quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, kmeans=2)
     frames: list[Image.Image] = []
 
     def encode(pixels: Pixels) -> None:
