@@ -60,7 +60,7 @@ ROOMS = (
 
 # Who may import a heavy package, inside a function too. Type checkers' imports do not count.
 ALLOWED = {
-    "mujoco": ("scenes", "simulation", "view.render", "view.gl", "view.marker", "view.cameras", "verify"),
+    "mujoco": ("scenes", "simulation", "view", "verify"),
     "matplotlib": ("view",),
     "av": ("view", "verify"),
     "numba": ("core", "pointers"),
