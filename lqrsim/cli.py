@@ -9,6 +9,7 @@ import tyro
 from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
 from lqrsim.commands.solving import List, Simulate, Solve
 from lqrsim.commands.stressing import Replay, Report, Stress
+from lqrsim.commands.verifying import Verify
 from lqrsim.commands.viewing import Render
 
 DESCRIPTION = """Feedback policies by iterated LQR smoothing, executed in MuJoCo under disturbances and shown on video.
@@ -22,7 +23,7 @@ The paper's results, beside what came out here: `lqrsim reproduce`.
 
 Exit codes: 0 done, 1 not converged or out of bounds, 2 bad input. The version is printed by `lqrsim --version`."""
 
-Command = List | Solve | Simulate | Render | Demo | Stress | Replay | Report | Reproduce | Cache
+Command = List | Solve | Simulate | Render | Verify | Demo | Stress | Replay | Report | Reproduce | Cache
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

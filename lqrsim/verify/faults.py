@@ -30,16 +30,23 @@ def explain(
     late = _slope(error, velocity)
     split, ahead = _break(error, velocity)
     after = np.arange(len(error)) >= split
-    candidates = [
-        (error - offset, f"a camera is off, which moves the robot by {np.round(1e3 * offset).astype(int).tolist()} mm"),
-        (error - late * velocity, f"pictures show the run {_frames(late, interval)}"),
-        (error - ahead * after[:, None] * velocity, f"from frame {numbers[split]} on, pictures show the run"
-         f" {_frames(ahead, interval)}: frames are {'missing' if ahead > 0 else 'shown twice'} there"),
-    ]  # fmt: skip
-    rest, said = min(candidates, key=lambda candidate: _length(candidate[0]).max())
-    if _length(rest).max() <= 2 * bound:
-        return said
-    return "pictures of another run than the record's: another seed, trial, or policy"
+    candidates: list[tuple[Array, str]] = []
+    if _length(offset) > bound / 2:
+        moved = np.round(1e3 * offset).astype(int).tolist()
+        candidates.append((error - offset, f"a camera is off: it moves the robot by {moved} mm"))
+    if abs(late) > interval / 4:
+        candidates.append((error - late * velocity, f"pictures show the run {_frames(late, interval)}"))
+    if abs(ahead) > interval / 4:
+        said = "left out" if ahead > 0 else "shown twice"
+        said = f"frames are {said} at frame {numbers[split]}: from there on, the run is {_frames(ahead, interval)}"
+        candidates.append((error - ahead * after[:, None] * velocity, said))
+    if candidates:
+        rest, said = min(candidates, key=lambda candidate: _length(candidate[0]).max())
+        if _length(rest).max() <= 2 * bound:
+            return said
+    if np.median(_length(error)) < bound:
+        return "the pictures are too small or too coarse"
+    return "pictures of another run than the record's: another seed, trial or policy; or another robot's body"
 
 
 def _single(wrong: npt.NDArray[np.intp], numbers: npt.NDArray[np.intp], seen: Array, actual: Array, near: float) -> str:
@@ -69,5 +76,6 @@ def _frames(seconds: float, interval: float) -> str:
     return f"{abs(seconds) / interval:.1f} frames {'early' if seconds > 0 else 'late'}"
 
 
-def _length(vectors: Array) -> Array:
-    return np.linalg.norm(vectors, axis=1)
+def _length(vectors: Array) -> npt.NDArray[np.float64]:
+    """Of vectors (..., d)."""
+    return np.linalg.norm(vectors, axis=-1)

@@ -51,18 +51,32 @@ def verify_video(
     views = [pane.camera for pane in panes if pane.camera is not None]
     pixels.place(views, np.zeros((0, len(views), 2)), size)  # says what is missing before it takes any time
     model = record.model(rollout, trial)
-    seen = []
-    for image in _decoded(path):
+    seen: list[list[Array]] = []
+    amiss = 0.0  # seconds between when a frame is shown and when it should be, at most
+    for time, image in _decoded(path):
+        amiss = max(amiss, abs(time - len(seen) / float(told.rate)))
         seen.append([_mark(image, pane, view, told.markers[run]) for pane, view in zip(panes, views, strict=True)])
         if progress:
             progress(len(seen), told.frames)
     count = min(len(seen), told.frames)
     times = told.times()[:count]
     places, apart = pixels.place(views, seen[:count], size)
-    known = digest in told.runs
+    known, interval = digest in told.runs, 1 / float(told.rate)
+    size_of_mark = min(
+        np.pi * (told.markers[run] * pane.height / view.height) ** 2 for pane, view in zip(panes, views, strict=True)
+    )
     others = (
         Test("run", known, f"the video says that it shows {', '.join(told.runs)}, this run is {digest}"),
-        Test("frames", len(seen) == told.frames, f"got {len(seen)}, want the {told.frames} that were written"),
+        Test(
+            "frames",
+            len(seen) == told.frames and amiss < interval / 4,
+            f"got {len(seen)}, want the {told.frames} that were written; {1e3 * amiss:.1f} ms from their times at most",
+        ),
+        Test(
+            "mark",
+            size_of_mark >= pixels.FEWEST,
+            f"{size_of_mark:.0f} pixels in the pane where it is smallest, want {pixels.FEWEST} or more",
+        ),
         record.consistent(rollout, trial, model, SAME * rollout.radius),
         *record.plan(rollout, solution),
     )
@@ -76,20 +90,24 @@ def verify_video(
         record.planned(rollout, times),
         apart,
         bound=BOUND * rollout.radius,
-        interval=told.speed / float(told.rate),
+        interval=told.speed * interval,
         others=others,
     )
 
 
-def _decoded(path: str | os.PathLike[str]) -> Iterator[npt.NDArray[np.uint8]]:
+def _decoded(path: str | os.PathLike[str]) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
+    """Each frame (height, width, 3), and when a player shows it, in seconds."""
     try:
         with av.open(str(path)) as container:
             for frame in container.decode(video=0):
-                yield np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
+                yield frame.time or 0.0, np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
     except (FFmpegError, OSError, IndexError) as error:
         raise InputError(f"video: got {path}, want one that can be read ({error})") from None
 
 
 def _mark(image: npt.NDArray[np.uint8], pane: Pane, view: Camera, radius: float) -> Array:
+    """What the view measures (2,) of the mark of that radius in metres."""
     part = image[pane.top : pane.top + pane.height, pane.left : pane.left + pane.width]
+    if part.shape[:2] != (pane.height, pane.width):
+        raise InputError(f"video: got frames of {image.shape[1]} x {image.shape[0]}, want them as lqrsim wrote them")
     return view.measure(pixels.mark(part, radius * pane.height / view.height), (pane.width, pane.height))

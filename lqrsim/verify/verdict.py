@@ -147,6 +147,8 @@ def _likely(
     interval: float,
 ) -> str:
     failed = {test.name for test in tests if not test.passed}
+    if "mark" in failed:
+        return "the panes are too small: render the video larger, or with fewer of them"
     if failed & {"position", "time", "scale", "views agree"}:
         return explain(np.flatnonzero(good), times, seen, actual, bound, interval)
     reasons = {

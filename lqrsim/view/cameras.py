@@ -90,9 +90,9 @@ def top(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
 
 
 def side(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
-    """From the side, level, with the same direction to the right as `top` has; the rest is as there."""
+    """From the side, level, so that the longer way lies across; the rest is as for `top`."""
     low, high = _bounds(rollout)
-    return _camera("side", low, high, _right(high - low, aspect), np.array([0.0, 0.0, 1.0]), aspect)
+    return _camera("side", low, high, _right(high - low, 1.0), np.array([0.0, 0.0, 1.0]), aspect)
 
 
 def _camera(name: str, low: Array, high: Array, right: Array, up: Array, aspect: float) -> Camera:
