@@ -34,12 +34,16 @@ class Verify:
         from lqrsim import console, files
         from lqrsim.verify.drawn import verify_run
         from lqrsim.verify.filmed import verify_video
+        from lqrsim.verify.record import follows
 
         is_run = self.file.suffix.lower() == ".npz"
         path = self.file if is_run else self.run_file or self.file.with_suffix(".npz")
         rollout, beside = files.load_rollout(path), path.with_name("solution.npz")
-        given = self.solution or (beside if beside.is_file() else None)
-        solution = None if given is None else files.load_solution(given)
+        solution = None
+        if self.solution or beside.is_file():
+            solution = files.load_solution(self.solution or beside)
+            # What lies beside a run may be another's; what is given is meant.
+            solution = solution if self.solution or follows(rollout, solution) else None
         with console.progress("verifying", "frame") as progress:
             if is_run:
                 found = verify_run(rollout, self.trial or 0, solution=solution, progress=progress)

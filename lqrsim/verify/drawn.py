@@ -65,7 +65,7 @@ def verify_run(
         apart,
         bound=BOUND * rollout.radius,
         interval=float(rollout.frame_times[1] - rollout.frame_times[0]),
-        others=record.plan(rollout, solution),
+        others=(record.plan(rollout, solution),),
     )
 
 
@@ -91,7 +91,6 @@ def _silhouettes(
     options.geomgroup[:], options.sitegroup[:] = [1, 0, 0, 0, 0, 0], 0
     body = robot_body(model)
     with mujoco.Renderer(model, SIZE[1], SIZE[0]) as renderer:
-        renderer.enable_segmentation_rendering()
         for frame in frames:
             data.qpos = frame
             mujoco.mj_kinematics(model, data)
@@ -100,5 +99,8 @@ def _silhouettes(
             for view in views:
                 renderer.update_scene(data, scene_option=options)
                 view.place(renderer.scene, SIZE[0] / SIZE[1])
-                masks.append(renderer.render()[..., 0] == geom)
+                # Numbers for colours, the renderer's own segmentation, without looking up what the one geom is.
+                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT.value] = 1
+                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR.value] = 1
+                masks.append(renderer.render()[..., 0] > 0)
             yield masks, data.geom_xpos[geom] - data.xpos[body]

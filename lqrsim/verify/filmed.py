@@ -78,7 +78,7 @@ def verify_video(
             f"{size_of_mark:.0f} pixels in the pane where it is smallest, want {pixels.FEWEST} or more",
         ),
         record.consistent(rollout, trial, model, SAME * rollout.radius),
-        *record.plan(rollout, solution),
+        record.plan(rollout, solution),
     )
     spots = " and ".join(f"{view.name} ({pane.width} x {pane.height})" for pane, view in zip(panes, views, strict=True))
     return judge(

@@ -54,10 +54,10 @@ def place(views: Sequence[Camera], measured: npt.ArrayLike, size: int) -> tuple[
       InputError: the views do not see all directions.
     """
     axes = np.vstack([view.axes for view in views])[:, :size] if views else np.zeros((0, size))
-    values = np.asarray(measured, dtype=np.float64).reshape(-1, len(axes))
     if np.linalg.matrix_rank(axes) < size:
         names = " and ".join(view.name for view in views) or "none"
         raise InputError(f"views: got {names}, want {'top and side' if size == 3 else 'top'} to tell where a robot is")
+    values = np.asarray(measured, dtype=np.float64).reshape(-1, len(axes))
     seen = np.linalg.norm(axes, axis=1) > 1e-6  # a direction out of the plane says nothing
     axes, values = axes[seen], values[:, seen]
     positions = values @ np.linalg.pinv(axes).T

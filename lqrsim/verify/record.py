@@ -79,15 +79,19 @@ def consistent(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: float
     return Test("record", bool(apart <= bound), said)
 
 
-def plan(rollout: Rollout, solution: Solution | None) -> tuple[Test, ...]:
-    """Whether the plan is the solution's, and the policy that was run too, with its gains or without."""
+def plan(rollout: Rollout, solution: Solution | None) -> Test:
+    """Whether the plan is the solution's, and it was the solution's policy that was run."""
     if solution is None:
-        return ()
+        return Test("plan", None, "whether it is the one that was followed takes the solution")
     same = np.array_equal(rollout.plan.states, solution.trajectory.states)
     same = same and np.array_equal(rollout.plan.controls, solution.trajectory.controls)
-    laws = [Feedback(one.policy).digest for one in (solution, solution.open_loop())]
-    followed = rollout.policy_digest in laws
+    followed = follows(rollout, solution)
     said = (
         f"{'as' if same else 'not as'} the solution has it, {'whose' if followed else 'but not whose'} policy was run"
     )
-    return (Test("plan", same and followed, said),)
+    return Test("plan", same and followed, said)
+
+
+def follows(rollout: Rollout, solution: Solution) -> bool:
+    """Whether the solution's policy was run, with its gains or without."""
+    return rollout.policy_digest in [Feedback(one.policy).digest for one in (solution, solution.open_loop())]
