@@ -18,6 +18,7 @@ The whole chain, for both robots, is `lqrsim demo`. Step by step, each command r
   lqrsim solve quadrotor --out runs/quadrotor
   lqrsim simulate runs/quadrotor/solution.npz --force-noise 0.1 --seed 1
   lqrsim render runs/quadrotor/rollout.npz
+  lqrsim verify runs/quadrotor/rollout.npz
 How often policies fail, under what, and how sure that is: `lqrsim stress quadrotor`.
 The paper's results, beside what came out here: `lqrsim reproduce`.
 

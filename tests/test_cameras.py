@@ -120,7 +120,7 @@ def test_other_files_are_refused(rollout: ls.Rollout, tmp_path: Path) -> None:
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(ls.InputError, match="want one that can be read"):
         read(tmp_path / "text.mp4")
-    with encoder(tmp_path / "other.mp4", (64, 64), Fraction(10)) as encode:
+    with encoder(tmp_path / "other.mp4", (64, 64), Fraction(10), crf=20, preset="ultrafast") as encode:
         encode(np.zeros((64, 64, 3), dtype=np.uint8))
     with pytest.raises(ls.InputError, match="want a video that `lqrsim render` wrote"):
         read(tmp_path / "other.mp4")
