@@ -38,7 +38,7 @@ def explain(
     if abs(late) > interval / 4:
         shown = _at(times, actual, times[numbers] + late)
         candidates.append((where - shown, f"pictures show the run {_frames(late, interval)}"))
-    if abs(ahead) > interval / 4:
+    if abs(ahead) > interval / 4 and split > FEW:  # before that, it is late or early as a whole
         shown = _at(times, actual, times[numbers] + ahead * (np.arange(len(numbers)) >= split))
         said = "left out" if ahead > 0 else "shown twice"
         said = f"frames are {said} at frame {numbers[split]}: from there on, the run is {_frames(ahead, interval)}"
