@@ -99,6 +99,8 @@ def picture(
         parts: list[Part] = []
         for track, box, overlay, told in zip(tracks, boxes, drawn, captions, strict=True):
             track.model.vis.quality.shadowsize, track.model.vis.quality.offsamples = look.shadows, look.samples
+            # Lines are boxes, whose sides one quadrilateral does for, with the sun far away; MuJoCo takes 16.
+            track.model.vis.quality.numquads = 1
             panes = _panes(Box(0, strip, box.width, box.height - strip), len(insets))
             views = [
                 (pane, shot(name, track, pane.aspect)) for name, pane in zip((camera, *insets), panes, strict=True)
