@@ -55,7 +55,7 @@ class Caption:
         return caption.text(lines, self.letters, width=self.paper.shape[1] if self.over else 0, bold=False)
 
     def _line(self, time: float) -> str:
-        return "     ".join(self._told(time))
+        return "   ".join(self._told(time))
 
     def _told(self, time: float) -> list[str]:
         track, clearance = self.track, self.track.number_at(self.track.clearance, time)
