@@ -71,9 +71,10 @@ def test_video_is_what_browsers_play(rollout: ls.Rollout, tmp_path: Path) -> Non
 @draws
 @pytest.mark.parametrize("fps", [0.7, 3])
 def test_frames_show_their_moment_at_any_rate(fps: float, drive: ls.Rollout, tmp_path: Path) -> None:
-    frames = decode(render(drive, tmp_path / "run.mp4", size=SMALL, fps=fps))
+    look: dict = {"size": SMALL, "overlays": ("plan", "ghost", "trace")}
+    frames = decode(render(drive, tmp_path / "run.mp4", fps=fps, **look))
     for number in (0, len(frames) // 2, len(frames) - 1):
-        path = still(drive, tmp_path / "still.png", time=number / fps, size=SMALL)
+        path = still(drive, tmp_path / "still.png", time=number / fps, **look)
         # Compared where they differ most, which is where the robot is; the rest is the same at any time. What
         # h264 loses there is a third or less of what one frame of motion changes.
         assert 2 * difference(frames[number], pixels(path)) < difference(frames[number - 1], pixels(path))

@@ -92,7 +92,7 @@ class Overlays:
         lift = np.array([0.0, 0.0, LIFT if track.planar else 0.0])
         if self.tube is not None:
             for centre, sizes, rotation in zip(*self.tube, strict=True):
-                pen.ellipsoid(centre + 0.5 * lift, sizes, (*TUBE, 0.14), rotation)
+                pen.add(Geom.mjGEOM_ELLIPSOID, centre + 0.5 * lift, sizes, (*TUBE, 0.14), rotation)
         if "trace" in self.show:
             done = int(np.searchsorted(self.knots, time, side="right"))
             points = np.vstack([self.trace[:done], track.driven(time)])
@@ -170,14 +170,6 @@ class _Pen:
         for number in np.flatnonzero(length > 1e-6):
             size = [width, thickness, 0.5 * length[number, 0]]
             self.add(Geom.mjGEOM_BOX, centres[number], size, colours[number], rotations[number])
-
-    def ellipsoid(self, centre: Array, sizes: Array, rgba: npt.ArrayLike, rotation: Array) -> None:
-        """With half axes `sizes` along the columns of the rotation; in the plane a disc with two of them."""
-        if self.flat:
-            geom = self.add(Geom.mjGEOM_CYLINDER, centre, [1, 1, 1], rgba, rotation)
-            geom.size[:] = sizes
-        else:
-            self.add(Geom.mjGEOM_ELLIPSOID, centre, sizes, rgba, rotation)
 
 
 def _tube(track: Track, solution: Solution) -> tuple[Array, Array, Array]:

@@ -13,16 +13,17 @@ from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.view import gl, marker
 from lqrsim.view.caption import Pixels
-from lqrsim.view.choices import CALIBRATED, OVERLAYS, Overlay, Quality
+from lqrsim.view.choices import OVERLAYS, Overlay, Quality
 from lqrsim.view.footage import Pane
 from lqrsim.view.overlays import Overlays, scale
-from lqrsim.view.shots import WIDE, Shot, shot
+from lqrsim.view.shots import Shot, leaves_room, shot
 from lqrsim.view.stage import Box, Stage, stage
 from lqrsim.view.telling import Caption, Legend
 from lqrsim.view.track import Track
 
 RUNS = 6  # more can not be told apart side by side
 INSETS = 3
+READABLE = 300  # height of a picture in pixels from which on captions take a small part of it
 SHARE = 0.4  # of a run's part of the picture, for its insets
 LINE, BLANK = (120, 128, 140), (255, 255, 255)  # between panes, and behind captions
 
@@ -86,8 +87,7 @@ def picture(
     ]
     names = _one_each("titles", list(titles), tracks) if titles else [None] * len(tracks)
     gl.bind()
-    # Over a wide picture of one run there is room; calibrated panes must not be covered, nor small ones.
-    over = len(tracks) == 1 and not insets and camera not in CALIBRATED and size[0] >= WIDE * size[1]
+    over = len(tracks) == 1 and not insets and size[1] >= READABLE and leaves_room(camera, tracks[0], size[0] / size[1])
     legend = Legend(drawn, common, size, over=over) if "caption" in overlays else None
     room = size[0], size[1] - (0 if legend is None or over else legend.height)
     boxes = _side_by_side(len(tracks), room)
@@ -99,6 +99,8 @@ def picture(
         parts: list[Part] = []
         for track, box, overlay, told in zip(tracks, boxes, drawn, captions, strict=True):
             track.model.vis.quality.shadowsize, track.model.vis.quality.offsamples = look.shadows, look.samples
+            # Lines are boxes, whose sides one quadrilateral does for, with the sun far away; MuJoCo takes 16.
+            track.model.vis.quality.numquads = 1
             panes = _panes(Box(0, strip, box.width, box.height - strip), len(insets))
             views = [
                 (pane, shot(name, track, pane.aspect)) for name, pane in zip((camera, *insets), panes, strict=True)

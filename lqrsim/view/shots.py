@@ -13,7 +13,7 @@ from lqrsim.view.choices import CALIBRATED, VIEWS
 from lqrsim.view.track import Track
 
 WIDE = 1.7  # models' overviews are made for pictures of 16 : 9; in narrower ones they would cut off both sides
-OBLIQUE = np.array([0.55, 0.55, -0.63])  # where an overview looks, in a scene without one
+OBLIQUE = np.array([0.30, 0.75, -0.60])  # where an overview looks, in a scene without one
 LENS = 40.0  # degrees, of cameras that are not the model's
 DISTANCE, HEIGHT = 11.0, 4.5  # of the one that follows, in robots' radii
 EASE = 0.8  # seconds over which it turns
@@ -38,8 +38,7 @@ def shot(name: str, track: Track, aspect: float) -> Shot:
     Raises:
       InputError: there is none of that name.
     """
-    model = track.model
-    own = [name for name in (model.camera(number).name for number in range(model.ncam)) if name]
+    model, own = track.model, _own(track)
     check_name("camera", name, [*VIEWS, *(other for other in own if other not in VIEWS)])
     if name in CALIBRATED:
         camera = (cameras.top if name == "top" else cameras.side)(track.rollout, aspect)
@@ -51,6 +50,17 @@ def shot(name: str, track: Track, aspect: float) -> Shot:
     view = mujoco.MjvCamera()
     view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED.value, model.camera(name).id
     return Shot(lambda scene, data, time: mujoco.mjv_updateCamera(model, data, view, scene))
+
+
+def leaves_room(name: str, track: Track, aspect: float) -> bool:
+    """Whether captions may lie over a view: it is wide, and not made to fit what it shows."""
+    return aspect >= WIDE and name not in CALIBRATED and (name == "chase" or name in _own(track))
+
+
+def _own(track: Track) -> list[str]:
+    """The names of the model's cameras."""
+    names = (track.model.camera(number).name for number in range(track.model.ncam))
+    return [name for name in names if name]
 
 
 def _overview(track: Track, like: int | None, aspect: float) -> Shot:

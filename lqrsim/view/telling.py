@@ -55,12 +55,13 @@ class Caption:
         return caption.text(lines, self.letters, width=self.paper.shape[1] if self.over else 0, bold=False)
 
     def _line(self, time: float) -> str:
-        return "     ".join(self._told(time))
+        return "   ".join(self._told(time))
 
     def _told(self, time: float) -> list[str]:
         track, clearance = self.track, self.track.number_at(self.track.clearance, time)
         told = [f"time {time:.1f} s" + (f" at {self.speed:g}x" if self.speed != 1 else "")]
-        told += [f"tracking error {1e3 * track.number_at(track.error, time):.0f} mm"]
+        error = track.number_at(track.error, time)
+        told += [f"tracking error {1e3 * error:.0f} mm" if error < 1 else f"tracking error {error:.2f} m"]
         told += [f"clearance {clearance:.2f} m"] if np.isfinite(clearance) else []
         if "forces" in self.overlays.show:
             told += [f"force {np.linalg.norm(track.force_at(time)):.2f} N"]
