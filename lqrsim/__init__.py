@@ -113,6 +113,9 @@ if TYPE_CHECKING:
     from lqrsim.value_functions import Moments as Moments
     from lqrsim.value_functions import Quadratic as Quadratic
     from lqrsim.value_functions import TotalCost as TotalCost
+    from lqrsim.verify.drawn import verify_run as verify_run
+    from lqrsim.verify.filmed import verify_video as verify_video
+    from lqrsim.verify.verdict import Verification as Verification
     from lqrsim.view.plots import plot_run as plot_run
     from lqrsim.view.render import render as render
     from lqrsim.view.render import still as still
@@ -184,6 +187,9 @@ _HOME = {
     "stress.results": ["Results", "replay"],
     "stress.splitting": ["NoFailure", "split"],
     "value_functions": ["Moments", "Quadratic", "TotalCost"],
+    "verify.drawn": ["verify_run"],
+    "verify.filmed": ["verify_video"],
+    "verify.verdict": ["Verification"],
     "view.plots": ["plot_run"],
     "view.render": ["render", "still"],
     "view.report": ["report"],

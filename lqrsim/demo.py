@@ -60,7 +60,7 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
         figure = plot_run(solution, runs, folder / "figure.png", world=scenario.scene.world)
         console.say(f"wrote {figure}")
         if video:
-            _film(runs["disturbed"], folder / "video.mp4", quick=quick)
+            _film(runs["disturbed"], solution, folder / "video.mp4", quick=quick)
         rows += [_row(reference, name, solution, rollout) for name, rollout in runs.items()]
     console.say("\n" + "\n".join([TABLE, *rows]))
     for failure in failures:
@@ -87,12 +87,15 @@ def _execute(scenario: Scenario, solution: Solution, path: Path, seed: int, *, d
     return rollout
 
 
-def _film(rollout: Rollout, path: Path, *, quick: bool) -> None:
+def _film(rollout: Rollout, solution: Solution, path: Path, *, quick: bool) -> None:
+    """With the calibrated panes from which the robot's position can be measured."""
     from lqrsim.view.render import render
 
-    size, fps = ((640, 360), 5) if quick else ((1280, 720), 30)
+    # From the side, all that moves on a floor does so along a line.
+    insets = ("top", "side") if len(rollout.state_coordinates.position) == 3 else ("top",)
+    quality, fps = ("draft", 5) if quick else ("standard", 30)
     with console.progress("rendering", "frame") as progress:
-        render(rollout, path, size=size, fps=fps, progress=progress)
+        render(rollout, path, insets=insets, solution=solution, quality=quality, fps=fps, progress=progress)
     console.say(f"wrote {path}")
 
 

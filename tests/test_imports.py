@@ -51,6 +51,7 @@ ROOMS = (
     ("references",),
     ("stress",),
     ("view",),
+    ("verify",),
     ("console",),
     ("demo", "reproduce"),
     ("commands",),
@@ -59,9 +60,9 @@ ROOMS = (
 
 # Who may import a heavy package, inside a function too. Type checkers' imports do not count.
 ALLOWED = {
-    "mujoco": ("scenes", "simulation", "view.render", "view.gl"),
+    "mujoco": ("scenes", "simulation", "view", "verify"),
     "matplotlib": ("view",),
-    "av": ("view",),
+    "av": ("view", "verify"),
     "numba": ("core", "pointers"),
     "llvmlite": ("pointers",),
     "sympy": ("tracing", "dynamics", "rotations", "robots", "costs"),

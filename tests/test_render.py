@@ -10,12 +10,15 @@ import av
 import mujoco
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 import lqrsim as ls
-from lqrsim.view import gl
-from lqrsim.view import render as rendering
+from lqrsim.view import footage, gl
+from lqrsim.view.choices import OVERLAYS, Overlay
+from lqrsim.view.overlays import ELLIPSOIDS, Overlays, Scale
+from lqrsim.view.picture import picture
 from lqrsim.view.render import render, still
+from lqrsim.view.track import Track
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
 SMALL = (320, 180)
@@ -68,9 +71,10 @@ def test_video_is_what_browsers_play(rollout: ls.Rollout, tmp_path: Path) -> Non
 @draws
 @pytest.mark.parametrize("fps", [0.7, 3])
 def test_frames_show_their_moment_at_any_rate(fps: float, drive: ls.Rollout, tmp_path: Path) -> None:
-    frames = decode(render(drive, tmp_path / "run.mp4", size=SMALL, fps=fps))
+    look: dict = {"size": SMALL, "overlays": ("plan", "ghost", "trace")}
+    frames = decode(render(drive, tmp_path / "run.mp4", fps=fps, **look))
     for number in (0, len(frames) // 2, len(frames) - 1):
-        path = still(drive, tmp_path / "still.png", time=number / fps, size=SMALL)
+        path = still(drive, tmp_path / "still.png", time=number / fps, **look)
         # Compared where they differ most, which is where the robot is; the rest is the same at any time. What
         # h264 loses there is a third or less of what one frame of motion changes.
         assert 2 * difference(frames[number], pixels(path)) < difference(frames[number - 1], pixels(path))
@@ -85,7 +89,8 @@ def difference(first: np.ndarray, second: np.ndarray) -> float:
 @draws
 def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
     """Where its geoms are, painting it changes what the default camera sees, obstacles before it or not."""
-    with rendering._stage(rollout, 0, None, (640, 360)) as stage:
+    with picture(rollout, size=(640, 360)) as drawn:
+        stage = drawn.parts[0].stage
         model = stage.model
         robot = np.isin(model.geom_group, (0, 1, 2)) & (model.body_weldid[model.geom_bodyid] != 0)
         painted, material = model.geom_rgba.copy(), model.geom_matid.copy()
@@ -96,18 +101,24 @@ def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
 
         for time in np.linspace(0, rollout.times[-1], 12):
             hide(~robot)
-            stage._pose(stage.data, time)
-            stage.renderer.update_scene(stage.data, stage.camera)
-            stage.renderer.enable_segmentation_rendering()
-            mask = stage.renderer.render()[..., 1] == mujoco.mjtObj.mjOBJ_GEOM.value
-            stage.renderer.disable_segmentation_rendering()
+            masked = segmented(model, stage.track, time)
             hide(np.zeros(0, dtype=int))
-            seen = stage.draw(time).astype(int)
+            seen = drawn.draw(time).astype(int)
             hide(robot)
-            unseen = stage.draw(time).astype(int)
-            assert mask.sum() > 30, f"at {time:.2f} s"
-            changed = np.abs(seen - unseen).max(axis=2)[mask] > 20
+            unseen = drawn.draw(time).astype(int)
+            assert masked.sum() > 30, f"at {time:.2f} s"
+            changed = np.abs(seen - unseen).max(axis=2)[masked] > 20
             assert changed.mean() > 0.4, f"at {time:.2f} s"
+
+
+def segmented(model: mujoco.MjModel, track: Track, time: float) -> np.ndarray:
+    """Which pixels of the overview show a geom."""
+    data = mujoco.MjData(model)
+    track.pose(data, time)
+    with mujoco.Renderer(model, 360, 640) as renderer:
+        renderer.enable_segmentation_rendering()
+        renderer.update_scene(data, "overview")
+        return renderer.render()[..., 1] == mujoco.mjtObj.mjOBJ_GEOM.value
 
 
 @draws
@@ -134,6 +145,112 @@ def test_same_rollout_gives_the_same_bytes(rollout: ls.Rollout, tmp_path: Path) 
     assert files[0] == files[1]
     files = [still(rollout, tmp_path / f"{name}.png", every=1, size=SMALL).read_bytes() for name in "ab"]
     assert files[0] == files[1]
+
+
+@draws
+def test_draft_and_gif_show_the_same_run(flight: ls.Rollout, tmp_path: Path) -> None:
+    """A GIF loops, in real time, and its colours are near those of the video."""
+    path = render(flight, tmp_path / "run.gif", quality="draft", fps=3)
+    with Image.open(path) as image:
+        assert image.size == (320, 180)
+        assert image.info["loop"] == 0
+        durations, frames = [], []
+        for frame in ImageSequence.Iterator(image):
+            durations.append(frame.info["duration"])
+            frames.append(np.asarray(frame.convert("RGB")).astype(int))
+    assert sum(durations) / 1e3 == pytest.approx(len(frames) / 3, abs=0.01)
+    assert set(durations) <= {330, 340}
+    video = decode(render(flight, tmp_path / "run.mp4", quality="draft", size=(320, 180), fps=3))
+    assert len(video) == len(frames)
+    assert max(np.abs(one - other).mean() for one, other in zip(frames, video, strict=True)) < 4
+    assert render(flight, tmp_path / "again.gif", quality="draft", fps=3).read_bytes() == path.read_bytes()
+
+
+@draws
+def test_speed_is_seconds_of_the_run_in_one_of_the_video(flight: ls.Rollout, tmp_path: Path) -> None:
+    slow = decode(render(flight, tmp_path / "slow.mp4", size=SMALL, fps=2, speed=0.5, overlays=("trace",)))
+    fast = decode(render(flight, tmp_path / "fast.mp4", size=SMALL, fps=1, speed=2, overlays=("trace",)))
+    assert (len(slow), len(fast)) == (21, 3)
+    # The second frame of the fast one shows 2 s, which the slow one does in its ninth.
+    assert 3 * difference(slow[8], fast[1]) < difference(slow[8], fast[2])
+
+
+@draws
+def test_video_says_what_it_shows(flight: ls.Rollout, tmp_path: Path) -> None:
+    """Two runs, each with the first camera and two calibrated ones: where the panes are, and that they are apart."""
+    other = dataclasses.replace(flight, seed=4)
+    path = render([flight, other], tmp_path / "run.mp4", size=(640, 360), fps=1, insets=("top", "side"))
+    found = footage.read(path)
+    assert found.runs == (footage.digest(flight), footage.digest(other))
+    assert (found.rate, found.speed, found.frames) == (1, 1.0, 6)
+    assert [pane.run for pane in found.panes] == [0, 0, 0, 1, 1, 1]
+    cameras = [None if pane.camera is None else pane.camera.name for pane in found.panes]
+    assert cameras == 2 * [None, "top", "side"]
+    covered = np.zeros((360, 640), dtype=int)
+    for pane in found.panes:
+        covered[pane.top : pane.top + pane.height, pane.left : pane.left + pane.width] += 1
+    assert covered.max() == 1
+    assert covered.mean() > 0.75  # the rest are captions
+
+
+@draws
+@pytest.mark.parametrize("camera", ["top", "side"])
+def test_marker_is_where_the_calibration_says(camera: str, rollout: ls.Rollout, tmp_path: Path) -> None:
+    """Green pixels of a pane, against where the camera's own formula sees the marker on the simulator's body."""
+    with picture(rollout, insets=(camera,), size=(640, 360)) as drawn:
+        pane, data = drawn.panes[1], mujoco.MjData(drawn.parts[0].track.model)
+        assert pane.camera is not None
+        for time in (0.0, 2.0, 4.5):
+            drawn.parts[0].track.pose(data, time)
+            want = pane.camera.project(data.xpos[drawn.parts[0].track.robot], (pane.width, pane.height))
+            area = drawn.draw(time)[pane.top : pane.top + pane.height, pane.left : pane.left + pane.width].astype(int)
+            green = area[..., 1] - area[..., [0, 2]].max(axis=2) > 70
+            rows, columns = np.nonzero(green)
+            assert len(rows) >= 3, f"at {time:g} s"
+            # A ball of a few pixels is not quite round.
+            assert np.abs([columns.mean() + 0.5 - want[0], rows.mean() + 0.5 - want[1]]).max() < 0.5, f"at {time:g} s"
+
+
+@draws
+def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solution, tmp_path: Path) -> None:
+    """Each changes the picture, and only where it is: a few percent of it."""
+    noisy = dataclasses.replace(flight, measured=flight.states + 0.05 * np.sin(np.arange(12)))
+
+    def shot(*overlays: Overlay) -> np.ndarray:
+        options: dict = {"time": 2.1, "size": (640, 360), "overlays": overlays, "solution": quadrotor_solution}
+        return pixels(still(noisy, tmp_path / "still.png", **options))
+
+    bare = shot()
+    for overlay in OVERLAYS:
+        changed = (np.abs(shot(overlay) - bare).max(axis=2) > 10).mean()
+        assert 1e-4 < changed < (0.2 if overlay == "caption" else 0.05), overlay
+    moved = dataclasses.replace(flight.plan, states=flight.plan.states + 0.1)
+    with pytest.raises(ls.InputError, match="solution: got one with another plan"):
+        still(dataclasses.replace(flight, plan=moved), tmp_path / "still.png", solution=quadrotor_solution)
+
+
+def test_tube_is_the_shadow_of_what_the_total_cost_allows(flight: ls.Rollout, quadrotor_solution: ls.Solution) -> None:
+    """Against the cost: of all states with a position on the ellipsoid its least is 2 above the least of all."""
+    overlays = Overlays(Track(flight, 0), quadrotor_solution, ("tube",), Scale(1.0, 1.0))
+    assert overlays.tube is not None
+    go, come = quadrotor_solution.cost_to_go, quadrotor_solution.cost_to_come
+    assert go is not None
+    assert isinstance(come, ls.Moments)
+    knots = np.unique(np.linspace(0, flight.plan.steps, ELLIPSOIDS).astype(int))
+    for number in (3, 12, 20):
+        centre, half_axes, rotation = (part[number] for part in overlays.tube)
+        knot = knots[number]
+        hessian = go.hessian[knot] + np.linalg.inv(come.covariance[knot])
+        shown, hidden = hessian[:3, :3], hessian[3:, 3:]
+        cross = hessian[:3, 3:]
+        for axis in range(3):
+            step = half_axes[axis] * rotation[:, axis]
+            rest = -np.linalg.solve(hidden, cross.T @ step)
+            least = 0.5 * (step @ shown @ step + 2 * step @ cross @ rest + rest @ hidden @ rest)
+            # Inverting the covariance costs some of the digits.
+            assert least == pytest.approx(2.0, rel=1e-4)
+        best = ls.TotalCost(go, come).minimizer()[knot, :3]
+        assert centre == pytest.approx(best, abs=1e-12)
 
 
 @draws
@@ -172,9 +289,16 @@ def test_diverged_trial_stands_still(flight: ls.Rollout, tmp_path: Path) -> None
         ({"size": (640,)}, r"size: got \(640,\), want a width and a height"),
         ({"size": (32, 360)}, "size: got 32, want a whole number >= 64"),
         ({"camera": "overvew"}, r"camera: got 'overvew', want one of: .*top.*did you mean overview"),
+        ({"insets": ("top", "above")}, "camera: got 'above', want one of: overview, chase, top, side"),
+        ({"insets": ("top", "side", "chase", "top")}, "insets: got 4, want 3 at most"),
+        ({"overlays": ("plan", "glost")}, "overlays: got 'glost', want one of: .*did you mean ghost"),
+        ({"quality": "good"}, "quality: got 'good', want one of: draft, standard, publication"),
+        ({"titles": ("one", "two")}, "titles: got 2, want one for each of 1 runs"),
+        ({"trial": ()}, "runs: got 0 to show, want 1 to 6"),
+        ({"speed": 0}, "speed: got 0, want"),
         ({"trial": 1}, "trial: got 1, want one of 0 to 0"),
         ({"fps": 0}, "fps: got 0, want"),
-        ({"path": "run.avi"}, "path: got .*run.avi', want a name that ends in .mp4"),
+        ({"path": "run.avi"}, "path: got .*run.avi', want a name that ends in .mp4 or .gif"),
         ({"path": "file/run.mp4"}, "want a file that can be written"),
     ],
 )

@@ -7,38 +7,79 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from lqrsim.commands.options import optional
+from lqrsim.view.choices import OVERLAYS, Overlay, Quality
 
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Render a run as an mp4 (h264, real time): obstacles, the plan, the trace actually driven, the robot."""
+    """Render a run as a video or a still: obstacles, the plan, the trace actually driven, what disturbs, the robot.
 
-    rollout: Annotated[Positional[Path], arg(metavar="ROLLOUT")]
+    Several runs, or several trials of one, are shown side by side and in step.
+
+      lqrsim render runs/quadrotor/rollout.npz --camera chase
+      lqrsim render RUN.npz --inset top side          # panes that `lqrsim verify` can measure
+      lqrsim render CALM.npz SEVERE.npz --title calm severe --out both.mp4
+      lqrsim render RUN.npz --out RUN.gif --speed 2
+      lqrsim render RUN.npz --out RUN.png --every 0.5 --quality publication
+    """
+
+    rollouts: Annotated[Positional[tuple[Path, ...]], arg(metavar="ROLLOUT ...", help_behavior_hint="")]
     """What `lqrsim simulate` wrote."""
-    out: Annotated[Path | None, optional("FILE.mp4")] = None
-    """The video. By default the rollout's path with .mp4 at its end."""
-    trial: int = 0
-    """Which row of the rollout, from 0."""
-    camera: Annotated[str | None, optional("NAME")] = None
-    """A camera of the scene. By default the one that shows the whole run."""
-    size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (1280, 720)
-    """In pixels."""
-    fps: int = 30
-    """Frames per second."""
+    out: Annotated[Path | None, optional("FILE")] = None
+    """What to write: FILE.mp4 (h264), FILE.gif, or FILE.png for a still. By default the rollout's path with .mp4."""
+    trial: Annotated[tuple[int, ...], arg(metavar="N ...")] = (0,)
+    """Which row of the rollout, from 0; several of one rollout, or one for each of several."""
+    camera: Annotated[str, arg(metavar="NAME")] = "overview"
+    """overview, chase, top or side, or another camera of the scene."""
+    inset: Annotated[tuple[str, ...], optional("NAME ...")] = ()
+    """More cameras, in panes beside the first. top and side are calibrated, and the robot wears a mark in them."""
+    title: Annotated[tuple[str, ...], optional("TEXT ...")] = ()
+    """Of each run. By default the robot and the scene."""
+    overlays: tuple[Overlay, ...] = OVERLAYS
+    """What is drawn over the scene. `tube` needs --solution."""
+    solution: Annotated[tuple[Path, ...], optional("SOLUTION ...")] = ()
+    """Whose run it is, one for all or one each: adds the tube in which the policy expects the robot."""
+    quality: Quality = "standard"
+    """Size, smooth edges, shadows, and how much a video is compressed: 640 x 360, 1280 x 720 or 1920 x 1080."""
+    size: Annotated[tuple[int, int] | None, optional("WIDTH HEIGHT")] = None
+    """In pixels. By default that of the quality, and half of it for a GIF."""
+    fps: Annotated[float | None, optional("RATE")] = None
+    """Frames per second of a video. By default 30, and 15 for a GIF."""
+    speed: float = 1.0
+    """Seconds of the run in a second of the video."""
+    time: Annotated[float | None, optional("SECONDS")] = None
+    """The moment of a still. By default the end."""
+    every: Annotated[float | None, optional("SECONDS")] = None
+    """In a still, show the robot also where it was at each multiple of this."""
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
         from lqrsim import console, files
         from lqrsim.errors import InputError
-        from lqrsim.view.render import render
+        from lqrsim.view.render import render, still
 
-        video = self.out or self.rollout.with_suffix(".mp4")
-        if video.suffix != ".mp4":
-            raise InputError(f"--out: got {video}, want a name that ends in .mp4")
-        console.check_output("--out", video.parent)
-        rollout = files.load_rollout(self.rollout)
-        with console.progress("rendering", "frame") as progress:
-            options = {"trial": self.trial, "camera": self.camera, "size": self.size, "fps": self.fps}
-            render(rollout, video, progress=progress, **options)
-        console.say(f"wrote {video}")
+        if not self.rollouts:
+            raise InputError("ROLLOUT: got none, want at least one that `lqrsim simulate` wrote")
+        out = self.out or self.rollouts[0].with_suffix(".mp4")
+        is_still = out.suffix.lower() == ".png"
+        if out.suffix.lower() not in (".mp4", ".gif", ".png"):
+            raise InputError(f"--out: got {out}, want a name that ends in .mp4, .gif or .png")
+        if not is_still and (self.time is not None or self.every is not None):
+            raise InputError(f"--time, --every: got them for {out.name}, want --out FILE.png: they are of stills")
+        console.check_output("--out", out.parent)
+        runs = [files.load_rollout(path) for path in self.rollouts]
+        solutions = [files.load_solution(path) for path in self.solution]
+        one_trial = len(self.trial) == 1
+        options = {
+            "trial": self.trial[0] if one_trial else self.trial, "camera": self.camera, "insets": self.inset,
+            "titles": self.title, "overlays": self.overlays, "quality": self.quality, "size": self.size,
+            "solution": solutions[0] if len(solutions) == 1 else solutions or None,
+        }  # fmt: skip
+        shown = runs[0] if len(runs) == 1 else runs
+        if is_still:
+            still(shown, out, time=self.time, every=self.every, **options)
+        else:
+            with console.progress("rendering", "frame") as progress:
+                render(shown, out, fps=self.fps, speed=self.speed, progress=progress, **options)
+        console.say(f"wrote {out}")
         return 0

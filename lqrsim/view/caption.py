@@ -15,12 +15,12 @@ INK, PAPER = (28, 32, 38, 255), (255, 255, 255, 200)
 
 
 @functools.lru_cache(maxsize=16)
-def text(lines: tuple[str, ...], height: int, *, width: int) -> Pixels:
+def text(lines: tuple[str, ...], height: int, *, width: int, bold: bool = True) -> Pixels:
     """Lines of text on translucent paper, (h, w, 4), at least `width` pixels wide.
 
-    The letters are `height` pixels high, and the first line is bold.
+    The letters are `height` pixels high, and the first line is bold unless it is not to be.
     """
-    fonts = [_font(height, bold=number == 0) for number in range(len(lines))]
+    fonts = [_font(height, bold=bold and number == 0) for number in range(len(lines))]
     needed = max(font.getlength(line) for font, line in zip(fonts, lines, strict=True))
     tile, draw = _paper(max(needed + 1.4 * height, width), (1.5 * len(lines) + 0.7) * height)
     for number, (font, line) in enumerate(zip(fonts, lines, strict=True)):
@@ -29,25 +29,46 @@ def text(lines: tuple[str, ...], height: int, *, width: int) -> Pixels:
 
 
 @functools.lru_cache(maxsize=16)
-def legend(entries: tuple[tuple[str, Colour], ...], full: str, height: int) -> Pixels:
-    """What the colours mean, (h, w, 4): those of the entries, and the map of the tracking error from 0 to `full`."""
+def legend(entries: tuple[tuple[str, Colour | None], ...], height: int, width: int) -> Pixels:
+    """What the colours mean, (h, w, 4), in rows of at most `width` pixels; None is the map of the tracking error."""
     font, swatch, space = _font(height), round(2.5 * height), 0.6 * height
-    driven = f"driven, tracking error 0 to {full}"
-    names = [*(name for name, _ in entries), driven]
-    tile, draw = _paper(sum(font.getlength(name) + swatch + 3 * space for name in names), 2.2 * height)
-    x = space
-    for name, colour in (*entries, (driven, None)):
-        for column in range(swatch):
-            shade = error_colours(np.array([column / swatch]))[0, :3] if colour is None else colour
-            draw.line((x + column, 0.9 * height, x + column, 1.4 * height), fill=tuple(round(255 * c) for c in shade))
-        draw.text((x + swatch + space, 0.45 * height), name, font=font, fill=INK)
-        x += font.getlength(name) + swatch + 3 * space
+    rows: list[list[tuple[float, str, Colour | None]]] = [[]]
+    x = widest = space
+    for name, colour in entries:
+        needed = font.getlength(name) + swatch + 3 * space
+        if rows[-1] and x + needed > width:
+            rows.append([])
+            x = space
+        rows[-1].append((x, name, colour))
+        x += needed
+        widest = max(widest, x)
+    tile, draw = _paper(widest, (1.6 * len(rows) + 0.6) * height)
+    for number, row in enumerate(rows):
+        top = (1.6 * number + 0.45) * height
+        for left, name, colour in row:
+            for column in range(swatch):
+                shade = error_colours(np.array([column / swatch]))[0, :3] if colour is None else colour
+                place = (left + column, top + 0.45 * height, left + column, top + 0.95 * height)
+                draw.line(place, fill=tuple(round(255 * part) for part in shade))
+            draw.text((left + swatch + space, top), name, font=font, fill=INK)
     return np.asarray(tile)
 
 
 def error_colours(fractions: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Colours (n, 4) of errors given as fractions (n,) of the full scale."""
     return np.asarray(matplotlib.colormaps["cividis"](np.asarray(fractions, dtype=np.float64)))
+
+
+def fit(words: str, height: int, width: int) -> list[str]:
+    """The text in lines of at most `width` pixels, if no word is longer, in letters that are `height` pixels high."""
+    font, lines = _font(height), [""]
+    for word in words.split():
+        longer = f"{lines[-1]} {word}" if lines[-1] else word
+        if lines[-1] and font.getlength(longer) > width:
+            lines.append(f"  {word}")
+        else:
+            lines[-1] = longer
+    return lines
 
 
 def paste(image: Pixels, tile: Pixels, *, left: int, top: int | None = None, bottom: int | None = None) -> None:

@@ -383,8 +383,9 @@ def _film(results: Results, one: analysis.Trial, folder: Path) -> dict[str, Any]
 
     try:
         rollout = replay(results, one.cell, one.trial)
+        title = f"{one.cell.policy}, {one.cell.sweep} at strength {one.cell.strength:g}, trial {one.trial}"
         for width, height in SIZES:
-            path = render(rollout, folder / "video.mp4", size=(width, height), fps=FPS)
+            path = render(rollout, folder / "video.mp4", titles=[title], size=(width, height), fps=FPS)
             if path.stat().st_size <= LARGEST:
                 return {"data": _text(path), "width": width, "height": height}
     except InputError as error:

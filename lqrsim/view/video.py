@@ -1,21 +1,38 @@
-"""Frames to h264 in an mp4 that browsers play while they load it."""
+"""Frames to a file: h264 in an mp4 that browsers play while they load it, or a GIF that plays anywhere and loops."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+import queue
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
 import av
+import numpy as np
 from av.video.reformatter import Colorspace
+from PIL import Image
 
 from lqrsim.view.caption import Pixels
+from lqrsim.view.footage import Footage
+
+WAITING = 3  # frames that may wait to be encoded
+COLOURS = 192  # of a GIF
 
 
 @contextlib.contextmanager
-def encoder(path: Path, size: tuple[int, int], rate: Fraction) -> Iterator[Callable[[Pixels], None]]:
-    """A function that appends a frame (height, width, 3); `size` is width and height, `rate` frames a second."""
+def encoder(
+    path: Path, size: tuple[int, int], rate: Fraction, *, crf: int, preset: str, footage: Footage | None = None
+) -> Iterator[Callable[[Pixels], None]]:
+    """A function that appends a frame (height, width, 3), and keeps it; `size` is width and height.
+
+    Args:
+      rate: frames a second. crf, preset: x264's, for how good and how small the video is.
+      footage: what the file says of itself.
+    """
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
-        stream = container.add_stream("libx264", rate=rate, options={"preset": "veryfast", "crf": "20"})
+        if footage is not None:
+            footage.embed(container)
+        stream = container.add_stream("libx264", rate=rate, options={"preset": preset, "crf": str(crf)})
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         # Say which matrix makes RGB of the pixels; players guess differently when it is left open.
         stream.codec_context.colorspace = stream.codec_context.color_primaries = stream.codec_context.color_trc = 1
@@ -24,5 +41,54 @@ def encoder(path: Path, size: tuple[int, int], rate: Fraction) -> Iterator[Calla
             frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
             container.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709)))
 
-        yield encode
+        with _meanwhile(encode) as put:
+            yield put
         container.mux(stream.encode())
+
+
+@contextlib.contextmanager
+def gif(path: Path, rate: Fraction, samples: Sequence[Pixels]) -> Iterator[Callable[[Pixels], None]]:
+    """As `encoder`, for a GIF; one palette for all of it, of the samples, so that colours do not flicker."""
+    # Also colours of which there is little, as of lines, which are what matters.
+    palette = Image.fromarray(np.vstack(samples)).quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, kmeans=2)
+    frames: list[Image.Image] = []
+
+    def encode(pixels: Pixels) -> None:
+        frames.append(Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE))
+
+    with _meanwhile(encode) as put:
+        yield put
+    # A GIF counts in hundredths of a second: frames last as long as keeps the whole in time.
+    ends = [round(100 * (number + 1) / rate) for number in range(len(frames))]
+    durations = (10 * np.diff([0, *ends])).tolist()
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=False)
+
+
+@contextlib.contextmanager
+def _meanwhile(work: Callable[[Pixels], None]) -> Iterator[Callable[[Pixels], None]]:
+    """A function that has `work` done on another thread, in order, while its caller draws the next frame."""
+    waiting: queue.Queue[Pixels | None] = queue.Queue(maxsize=WAITING)
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        while (pixels := waiting.get()) is not None:
+            if not failed:
+                try:
+                    work(pixels)
+                except BaseException as error:  # raised again by who puts
+                    failed.append(error)
+
+    def put(pixels: Pixels) -> None:
+        if failed:
+            raise failed[0]
+        waiting.put(pixels)
+
+    thread = threading.Thread(target=run, name="encoder", daemon=True)
+    thread.start()
+    try:
+        yield put
+    finally:
+        waiting.put(None)
+        thread.join()
+    if failed:
+        raise failed[0]

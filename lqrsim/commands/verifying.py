@@ -1,0 +1,53 @@
+"""The command that lets pixels testify."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from lqrsim.commands.options import optional
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verify:
+    """Verify from pixels that a run, or the video of one, shows what the record says.
+
+    A run is drawn, in calibrated fixed views; a video is decoded, and the robot's mark found in its panes `top` and
+    `side`. Positions from pixels are compared with the simulator's and with the plan. See docs/verifying.md.
+
+      lqrsim verify runs/quadrotor/rollout.npz
+      lqrsim verify runs/quadrotor/rollout.mp4 --run runs/quadrotor/rollout.npz
+    """
+
+    file: Annotated[Positional[Path], arg(metavar="RUN.npz|VIDEO.mp4")]
+    """What `lqrsim simulate` wrote, or what `lqrsim render` made of it with the cameras or insets top and side."""
+    run_file: Annotated[Path | None, optional("RUN.npz"), arg(name="run")] = None
+    """The run that the video shows. By default the video's path with .npz."""
+    trial: Annotated[int | None, optional("N")] = None
+    """Which row of the rollout, from 0. By default 0, or the first that the video shows."""
+    solution: Annotated[Path | None, optional("SOLUTION.npz")] = None
+    """Whose run it is, for whether the plan is the one that was followed. By default solution.npz beside the run."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code: 1 if a test failed."""
+        from lqrsim import console, files
+        from lqrsim.verify.drawn import verify_run
+        from lqrsim.verify.filmed import verify_video
+        from lqrsim.verify.record import follows
+
+        is_run = self.file.suffix.lower() == ".npz"
+        path = self.file if is_run else self.run_file or self.file.with_suffix(".npz")
+        rollout, beside = files.load_rollout(path), path.with_name("solution.npz")
+        solution = None
+        if self.solution or beside.is_file():
+            solution = files.load_solution(self.solution or beside)
+            # What lies beside a run may be another's; what is given is meant.
+            solution = solution if self.solution or follows(rollout, solution) else None
+        with console.progress("verifying", "frame") as progress:
+            if is_run:
+                found = verify_run(rollout, self.trial or 0, solution=solution, progress=progress)
+            else:
+                found = verify_video(self.file, rollout, trial=self.trial, solution=solution, progress=progress)
+        console.say(found.summary())
+        return 0 if found.passed else 1

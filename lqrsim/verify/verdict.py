@@ -1,0 +1,183 @@
+"""What came out of a verification: positions, how they compare, and a verdict in tests with bounds."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array
+from lqrsim.verify.faults import explain
+
+HIDDEN = 0.05  # of the frames that may not show what is tracked
+SCALE = 0.002
+VERDICTS = {True: "passed", False: "FAILED", None: "untold"}
+
+
+@dataclass(frozen=True)
+class Test:
+    """One thing that must hold. `passed`: None if it can not be told. `said`: what was measured and what was wanted."""
+
+    __test__ = False  # it is no test of pytest's
+
+    name: str
+    passed: bool | None
+    said: str
+
+
+@dataclass(frozen=True)
+class Verification:
+    """A run's positions as pixels tell them, N frames with d coordinates, and what they prove.
+
+    Attributes:
+      subject: what was verified. method: how its position was read from pixels.
+      times: (N,) seconds after the run's start that the frames should show.
+      seen: (N, d) positions from pixels in metres; NaN where the robot is hidden.
+      actual: (N, d) the simulator's. planned: (N, d) the plan's.
+      rms, worst: of the distance between seen and actual, in metres.
+      shift: by how many seconds the pictures are ahead of the run. scale: of the seen motion to the actual one.
+      tests: each with a verdict. likely: what is wrong, if one failed; empty if none did.
+    """
+
+    subject: str
+    method: str
+    times: Array
+    seen: Array
+    actual: Array
+    planned: Array
+    rms: float
+    worst: float
+    shift: float
+    scale: float
+    tests: tuple[Test, ...]
+    likely: str
+
+    @property
+    def passed(self) -> bool:
+        """Whether no test failed."""
+        return all(test.passed is not False for test in self.tests)
+
+    @property
+    def tracking_error(self) -> Array:
+        """Distance from the plan as pixels tell it, in metres, (N,)."""
+        return np.linalg.norm(self.seen - self.planned, axis=1)
+
+    def summary(self) -> str:
+        """The verdict, and a line for each test."""
+        error, recorded = self.tracking_error, np.linalg.norm(self.actual - self.planned, axis=1)
+        lines = [
+            f"{'verified' if self.passed else 'NOT VERIFIED'}: {self.subject}, by {self.method}",
+            f"  off the simulator's position by {1e3 * self.rms:.1f} mm rms, {1e3 * self.worst:.1f} mm at worst;"
+            f" {1e3 * self.shift:+.1f} ms ahead; scale {self.scale:.4f}",
+            f"  off the plan by {1e3 * _rms(error):.0f} mm rms, {1e3 * np.nanmax(error, initial=0):.0f} mm at worst;"
+            f" the record says {1e3 * _rms(recorded):.0f} and {1e3 * recorded.max():.0f} mm",
+        ]
+        lines += [f"  {VERDICTS[test.passed]}  {test.name}: {test.said}" for test in self.tests]
+        return "\n".join(lines + ([f"  likely: {self.likely}"] if self.likely else []))
+
+    __str__ = summary
+
+
+def judge(
+    subject: str,
+    method: str,
+    times: Array,
+    seen: Array,
+    actual: Array,
+    planned: Array,
+    apart: Array,
+    *,
+    bound: float,
+    interval: float,
+    others: tuple[Test, ...] = (),
+) -> Verification:
+    """Compares what was seen with what there was.
+
+    Args:
+      apart: (N,) metres by which the views differ about the same place.
+      bound: on the distance between seen and actual, in metres, in any frame.
+      interval: seconds between two frames; the shift must be less than a quarter of it.
+      others: tests made already.
+    """
+    good = np.asarray(np.isfinite(seen).all(axis=1))
+    hidden = Test(
+        "seen",
+        bool(good.mean() >= 1 - HIDDEN) and int(good.sum()) > 2,
+        f"in {good.sum()} of {len(good)} frames, want {100 * (1 - HIDDEN):.0f} % of them",
+    )
+    if good.sum() < 3:
+        return Verification(
+            subject, method, times, seen, actual, planned, np.nan, np.nan, np.nan, np.nan, (*others, hidden),
+            "the robot is not in the pictures, or is too small in them",
+        )  # fmt: skip
+    error, velocity = (seen - actual)[good], np.gradient(actual, times, axis=0)[good]
+    distance = np.linalg.norm(error, axis=1)
+    (shift, shift_error), (scale, scale_error) = _fit(error, velocity, actual[good])
+    # What hardly moves, or hardly anywhere, tells neither; then the fit's own uncertainty is what it is held to.
+    most, stretch = max(interval / 4, 4 * shift_error), max(SCALE, 4 * scale_error)
+    number = int(np.flatnonzero(good)[distance.argmax()])
+    most_apart, agreement = float(apart[good].max()), ()
+    if most_apart > 0:  # only one view leaves nothing to disagree about
+        said = f"at worst {1e3 * most_apart:.1f} mm apart, want {1e3 * bound:.1f} at most"
+        agreement = (Test("views agree", most_apart <= bound, said),)
+    tests = (
+        *others,
+        hidden,
+        Test(
+            "position",
+            bool(distance.max() <= bound),
+            f"at worst {1e3 * distance.max():.1f} mm off, at {times[number]:.2f} s, want {1e3 * bound:.1f} at most",
+        ),
+        *agreement,
+        Test("time", abs(shift) <= most, f"{1e3 * shift:+.1f} ms ahead, want {1e3 * most:.1f} at most either way"),
+        Test("scale", abs(scale) <= stretch, f"{1 + scale:.4f}, want 1 within {stretch:.4f}"),
+    )
+    likely = (
+        ""
+        if all(test.passed is not False for test in tests)
+        else _likely(tests, good, times, seen, actual, bound, interval)
+    )
+    return Verification(
+        subject, method, times, seen, actual, planned, _rms(distance), float(distance.max()), shift, 1 + scale, tests,
+        likely,
+    )  # fmt: skip
+
+
+def _likely(
+    tests: tuple[Test, ...],
+    good: npt.NDArray[np.bool_],
+    times: Array,
+    seen: Array,
+    actual: Array,
+    bound: float,
+    interval: float,
+) -> str:
+    failed = {test.name for test in tests if test.passed is False}
+    if "mark" in failed:
+        return "the panes are too small: render the video larger, or with fewer of them"
+    if failed & {"position", "time", "scale", "views agree"}:
+        return explain(np.flatnonzero(good), times, seen, actual, bound, interval)
+    reasons = {
+        "run": "the video is of another run, or this run's file is not what it was",
+        "plan": "the plan in this file is not the one that the policy followed",
+        "frames": "frames were cut from the video or added to it, or its speed was changed",
+        "record": "the file's pictures and states are not of the same run",
+        "seen": "something covers the robot, or it leaves the pictures",
+    }
+    return "; ".join(reason for name, reason in reasons.items() if name in failed)
+
+
+def _fit(error: Array, velocity: Array, actual: Array) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Shift in seconds and stretch that explain the errors (k, d), and their standard errors; an offset is free.
+
+    error = offset + shift * velocity + stretch * (actual - its mean), by least squares.
+    """
+    columns = [(part - part.mean(axis=0)).ravel() for part in (velocity, actual)]
+    inverse, rest = np.linalg.pinv(np.stack(columns, axis=1)), (error - error.mean(axis=0)).ravel()
+    found = inverse @ rest
+    noise = float(np.linalg.norm(rest - np.stack(columns, axis=1) @ found)) / max(np.sqrt(len(rest) - 4), 1)
+    uncertain = noise * np.linalg.norm(inverse, axis=1)
+    return (float(found[0]), float(uncertain[0])), (float(found[1]), float(uncertain[1]))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.nanmean(values**2))) if np.isfinite(values).any() else np.nan

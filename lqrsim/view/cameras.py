@@ -1,0 +1,119 @@
+"""Calibrated views: cameras that stand still and whose pixels are measurements of where something is.
+
+They are orthographic, as on an engineering drawing: a metre is as many pixels wherever it is seen. So the middle of a
+ball's pixels is its centre, exactly, at any distance and anywhere in the picture; and where a camera stands along its
+line of sight does not matter, so that it can not be wrong either.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array, InputError, check_array, check_number
+from lqrsim.rollout import Rollout
+
+if TYPE_CHECKING:
+    import mujoco
+
+Vector = tuple[float, float, float]
+
+NEAR, FAR = 0.01, 1000.0  # metres; depth is even along an orthographic view, so that this much costs nothing
+
+
+@dataclass(frozen=True)
+class Camera:
+    """An orthographic view of the world. Pixels are (column, row) from the upper left corner, centres at halves.
+
+    Attributes:
+      position: what is in the middle of the picture is on the line from here along `forward`. In metres.
+      forward, up: unit vectors, at right angles.
+      height: how much of the world the picture shows from its bottom to its top, in metres.
+    """
+
+    name: str
+    position: Vector
+    forward: Vector
+    up: Vector
+    height: float
+
+    @property
+    def axes(self) -> Array:
+        """(2, 3), unit vectors to the right and up in the picture: the two directions that it measures."""
+        return np.array([np.cross(self.forward, self.up), self.up])
+
+    def place(self, scene: "mujoco.MjvScene", aspect: float) -> None:
+        """Makes a scene, after its `update_scene`, one that is seen from here in a picture of width / height."""
+        for camera in scene.camera:
+            camera.pos, camera.forward, camera.up = self.position, self.forward, self.up
+            camera.orthographic = 1
+            camera.frustum_near, camera.frustum_far, camera.frustum_center = NEAR, FAR, 0
+            camera.frustum_bottom, camera.frustum_top = -0.5 * self.height, 0.5 * self.height
+            camera.frustum_width = 0.5 * self.height * aspect
+
+    def project(self, points: npt.ArrayLike, size: tuple[int, int]) -> Array:
+        """Pixels (..., 2) at which points (..., 3) are seen in a picture of `size` width and height."""
+        seen = (np.asarray(points, dtype=np.float64) - self.position) @ self.axes.T
+        return 0.5 * np.array(size) + seen * (size[1] / self.height) * [1, -1]
+
+    def measure(self, pixels: npt.ArrayLike, size: tuple[int, int]) -> Array:
+        """Coordinates (..., 2) along `axes`, in metres from the world's origin, of what is seen at pixels (..., 2)."""
+        off = (np.asarray(pixels, dtype=np.float64) - 0.5 * np.array(size)) * [1, -1]
+        return self.axes @ self.position + off * (self.height / size[1])
+
+    def as_json(self) -> dict[str, Any]:
+        """What `from_json` makes the same camera of."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, parts: Mapping[str, Any]) -> "Camera":
+        """Raises InputError unless it is what `as_json` gives."""
+        try:
+            name, height = str(parts["name"]), parts["height"]
+            vectors = {key: check_array(f"camera.{key}", parts[key], (3,)) for key in ("position", "forward", "up")}
+        except (KeyError, TypeError) as error:
+            raise InputError(f"camera: got {parts!r}, want a camera's parts ({error})") from None
+        directions = np.array([vectors["forward"], vectors["up"]])
+        if not np.allclose(directions @ directions.T, np.eye(2), rtol=0, atol=1e-6):
+            raise InputError(f"camera: got forward and up {directions.tolist()}, want unit vectors at right angles")
+        position, forward, up = (tuple(vector.tolist()) for vector in vectors.values())
+        return cls(name, position, forward, up, check_number("camera.height", height, above=0))
+
+
+def top(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
+    """From above: all of a run, its plan and all trials, with a margin, in a picture of width / height `aspect`."""
+    low, high = _bounds(rollout)
+    right = _right(high - low, aspect)
+    return _camera("top", low, high, right, np.cross([0.0, 0.0, 1.0], right), aspect)
+
+
+def side(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
+    """From the side, level, so that the longer way lies across; the rest is as for `top`."""
+    low, high = _bounds(rollout)
+    return _camera("side", low, high, _right(high - low, 1.0), np.array([0.0, 0.0, 1.0]), aspect)
+
+
+def _camera(name: str, low: Array, high: Array, right: Array, up: Array, aspect: float) -> Camera:
+    span, forward = high - low, np.cross(up, right)
+    height = max(float(abs(up) @ span), float(abs(right) @ span) / aspect)
+    # So far away that nothing around the run is behind it.
+    position = 0.5 * (low + high) - (10 + 5 * float(span.max())) * forward
+    vectors = (tuple(vector.tolist()) for vector in (position, forward, up))
+    return Camera(name, *vectors, height=height)
+
+
+def _bounds(rollout: Rollout) -> tuple[Array, Array]:
+    """The lowest and highest corner (3,) of what a fixed camera shows; robots in the plane are at height zero."""
+    columns = list(rollout.state_coordinates.position)
+    places = np.vstack([rollout.plan.states, *rollout.states])[:, columns]
+    low, high = np.zeros(3), np.zeros(3)
+    low[: len(columns)], high[: len(columns)] = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
+    margin = rollout.radius + 0.05 * float((high - low).max())
+    return low - margin, high + margin
+
+
+def _right(span: Array, aspect: float) -> Array:
+    """The direction to the right in the picture: x or y, so that the longer side lies along the picture's."""
+    return np.array([1.0, 0.0, 0.0] if (span[0] >= span[1]) == (aspect >= 1) else [0.0, 1.0, 0.0])

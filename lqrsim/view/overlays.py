@@ -1,0 +1,204 @@
+"""What pictures show beside the scene: drawn as geoms of MuJoCo's, over what the model has."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from mujoco import mjtGeom as Geom
+
+from lqrsim.errors import Array, InputError
+from lqrsim.results import Solution
+from lqrsim.value_functions import Moments, TotalCost
+from lqrsim.view import caption
+from lqrsim.view.caption import Colour
+from lqrsim.view.choices import Overlay
+from lqrsim.view.track import Track
+
+# No colour of the error map, and none of the robots.
+PLAN = (0.78, 0.08, 0.42)
+FORCE = (0.0, 0.50, 0.36)
+MEASURED = (0.10, 0.10, 0.12)
+TUBE = (0.47, 0.30, 0.78)
+SEGMENTS = 120  # a line is drawn with no more than this many
+DOTS = 30  # measured states that are shown, the last ones
+ELLIPSOIDS = 24
+SIGMAS = 2.0  # of the ellipsoids; the total cost on them is this squared and halved above its least
+END_ON = 0.9  # cosine of the angle to the line of sight
+LIFT = 0.006  # metres between the floor and the lines on it
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What colours and lengths mean, the same for all runs in a picture.
+
+    Attributes:
+      error: in metres, the end of the colours of the trace. force: in N, that of the longest arrow.
+    """
+
+    error: float
+    force: float
+
+
+def scale(tracks: Sequence[Track]) -> Scale:
+    """One for all of them, and all of their time."""
+    error = max(float(track.error.max()) for track in tracks)
+    force = max(float(np.linalg.norm(track.force, axis=1).max()) for track in tracks)
+    return Scale(_round_up(max(error, 0.01)), force)
+
+
+class Overlays:
+    """Those of one trial.
+
+    Args:
+      solution: of which the run is, for the tube.
+      show: which; those of which there is nothing to show are left out, as the tube without a solution.
+
+    Raises:
+      InputError: the solution is not that of the run, or has no total cost.
+    """
+
+    def __init__(self, track: Track, solution: Solution | None, show: Sequence[Overlay], scale: Scale) -> None:
+        self.track, self.show, self.scale = track, set(show), scale
+        self.width = 0.0035 * track.model.stat.extent
+        steps = track.rollout.plan.steps
+        knots = np.unique(np.linspace(0, steps, min(steps, SEGMENTS) + 1).astype(int))
+        self.knots = track.rollout.times[knots]
+        self.plan, self.trace = track.planned(self.knots), track.driven(self.knots)
+        self.errors = np.interp(self.knots, track.times, track.error)
+        self.measured = track.places(track.measured, track.times, track.times)
+        if np.array_equal(track.measured, track.states):
+            self.show.discard("measured")
+        if scale.force < 1e-6:
+            self.show.discard("forces")
+        self.tube = _tube(track, solution) if "tube" in self.show and solution is not None else None
+
+    def legend(self) -> list[tuple[str, Colour]]:
+        """What the colours mean, but for those of the trace."""
+        entries = {
+            "plan": ("planned", PLAN),
+            "forces": (f"force, longest {self.scale.force:.2g} N", FORCE),
+            "measured": ("measured", MEASURED),
+        }
+        found = [entry for overlay, entry in entries.items() if overlay in self.show]
+        if self.tube is not None:
+            found.append((f"{SIGMAS:g} sigma: total cost ≤ least + {SIGMAS**2 / 2:g}", TUBE))
+        return found
+
+    def draw(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
+        """Appends the geoms of a moment to the scene; `data` is posed as it was then."""
+        pen, track = _Pen(scene, flat=self.track.planar), self.track
+        lift = np.array([0.0, 0.0, LIFT if track.planar else 0.0])
+        if self.tube is not None:
+            for centre, sizes, rotation in zip(*self.tube, strict=True):
+                pen.add(Geom.mjGEOM_ELLIPSOID, centre + 0.5 * lift, sizes, (*TUBE, 0.14), rotation)
+        if "trace" in self.show:
+            done = int(np.searchsorted(self.knots, time, side="right"))
+            points = np.vstack([self.trace[:done], track.driven(time)])
+            errors = np.append(self.errors[:done], track.number_at(track.error, time))
+            colours = caption.error_colours(0.5 * (errors[1:] + errors[:-1]) / self.scale.error)
+            pen.ribbon(points + lift, (2.6 if track.planar else 1.1) * self.width, colours)
+        if "plan" in self.show:
+            colours = np.tile((*PLAN, 1.0), (len(self.plan) - 1, 1))
+            pen.ribbon(self.plan + 2 * lift, 0.8 * self.width, colours)
+        if "measured" in self.show:
+            seen = int(np.searchsorted(track.times, time, side="right"))
+            for place in self.measured[max(seen - DOTS, 0) : seen]:
+                height = 0.2 * LIFT if track.planar else self.width
+                pen.add(Geom.mjGEOM_BOX, place + 3 * lift, [self.width, self.width, height], (*MEASURED, 1.0))
+        if "ghost" in self.show:
+            wanted, radius = track.planned(time), track.rollout.radius
+            if track.planar:
+                pen.add(Geom.mjGEOM_CYLINDER, wanted + 3 * lift, [radius, LIFT, 0], (*PLAN, 0.35))
+            else:
+                pen.add(Geom.mjGEOM_SPHERE, wanted, [radius] * 3, (*PLAN, 0.10))
+
+    def draw_force(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
+        """Appends the arrow of what disturbs the robot, as one camera is to see it.
+
+        It begins where the robot's circle ends. None points at the camera or away from it: that would show nothing, and
+        hide the robot.
+        """
+        if "forces" not in self.show:
+            return
+        track, forward = self.track, np.array(scene.camera[0].forward, dtype=np.float64)
+        force, radius = track.force_at(time), track.rollout.radius
+        strength, width = float(np.linalg.norm(force)), max(0.1 * radius, 1.5 * self.width)
+        length = 4 * radius * strength / self.scale.force
+        if length < 2 * width or abs(force @ forward) > END_ON * strength:
+            return
+        direction = force / strength
+        start = data.xpos[track.robot] + radius * direction
+        arrow = _Pen(scene, flat=track.planar).add(Geom.mjGEOM_ARROW, start, [1, 1, 1], (*FORCE, 1.0))
+        mujoco.mjv_connector(arrow, Geom.mjGEOM_ARROW, width, start, start + length * direction)
+
+
+class _Pen:
+    """Appends geoms to a scene. Flat: lines lie on a floor, and the sun is on them; else they hang in space."""
+
+    def __init__(self, scene: mujoco.MjvScene, *, flat: bool) -> None:
+        self.scene, self.flat = scene, flat
+
+    def add(
+        self, kind: Geom, position: Array, size: npt.ArrayLike, rgba: npt.ArrayLike, rotation: Array | None = None
+    ) -> mujoco.MjvGeom:
+        geom = self.scene.geoms[self.scene.ngeom]
+        matrix = np.eye(3) if rotation is None else rotation
+        mujoco.mjv_initGeom(
+            geom,
+            kind,
+            np.asarray(size, dtype=np.float64),
+            np.asarray(position, dtype=np.float64),
+            matrix.ravel(),
+            np.asarray(rgba, dtype=np.float32),
+        )
+        geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, 0
+        geom.specular, geom.emission = 0, 0 if self.flat else 0.3
+        self.scene.ngeom += 1
+        return geom
+
+    def ribbon(self, points: Array, width: float, colours: Array) -> None:
+        """A line through points (k, 3) with a colour (k-1, 4) each segment, of boxes: far cheaper than capsules."""
+        along = np.diff(points, axis=0)
+        length = np.linalg.norm(along, axis=1, keepdims=True)
+        z = along / np.where(length > 0, length, 1)
+        side = np.cross(np.where(np.abs(z[:, 2:]) < 0.99, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]), z)
+        x = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+        rotations, centres = np.stack([x, np.cross(z, x), z], axis=-1), points[:-1] + 0.5 * along
+        thickness = 0.2 * LIFT if self.flat else width
+        for number in np.flatnonzero(length > 1e-6):
+            size = [width, thickness, 0.5 * length[number, 0]]
+            self.add(Geom.mjGEOM_BOX, centres[number], size, colours[number], rotations[number])
+
+
+def _tube(track: Track, solution: Solution) -> tuple[Array, Array, Array]:
+    """Centres (k, 3), half axes (k, 3) and rotations (k, 3, 3) of the ellipsoids along the plan.
+
+    Of all states whose total cost is at most so much above its least, these are the positions: what is an ellipsoid of
+    the state casts one on the position, with that block of the covariance.
+    """
+    if not np.array_equal(solution.trajectory.states, track.rollout.plan.states):
+        raise InputError("solution: got one with another plan than that of the run, want the one that was executed")
+    go, come = solution.cost_to_go, solution.cost_to_come
+    if go is None or come is None:
+        raise InputError(f"solution: got one of {solution.solver}, which has no total cost, want one of smooth")
+    covariance = come.covariance if isinstance(come, Moments) else np.linalg.inv(come.hessian)
+    of_total = covariance @ np.linalg.inv(np.eye(covariance.shape[-1]) + go.hessian @ covariance)
+    chosen = np.unique(np.linspace(0, len(of_total) - 1, ELLIPSOIDS).astype(int))
+    position = list(track.rollout.state_coordinates.position)
+    centres = np.full((len(chosen), 3), track.floor)
+    centres[:, : len(position)] = TotalCost(go, come).minimizer()[chosen][:, position]
+    block = of_total[chosen][:, position][:, :, position]
+    variances, axes = np.linalg.eigh(0.5 * (block + np.swapaxes(block, 1, 2)))
+    size = len(position)
+    half_axes, rotations = np.full((len(chosen), 3), 0.1 * LIFT), np.tile(np.eye(3), (len(chosen), 1, 1))
+    half_axes[:, :size], rotations[:, :size, :size] = SIGMAS * np.sqrt(np.maximum(variances, 0.0)), axes
+    rotations[:, :, 0] *= np.linalg.det(rotations)[:, None]
+    return centres, half_axes, rotations
+
+
+def _round_up(value: float) -> float:
+    """The next of 1, 1.5, 2, 3, 5, 7, 10, 15, ..."""
+    power = 10.0 ** np.floor(np.log10(value) + 1e-9)
+    return float(power * next(step for step in (1, 1.5, 2, 3, 5, 7, 10) if step * power >= value * (1 - 1e-9)))

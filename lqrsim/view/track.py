@@ -1,0 +1,106 @@
+"""One trial of a rollout as pictures need it: the model at any moment, and where the robot is and should be."""
+
+import mujoco
+import numpy as np
+
+from lqrsim.errors import Array, InputError, check_count
+from lqrsim.rollout import Rollout
+from lqrsim.view.marker import robot_body
+
+SEEN = 0.2  # seconds for which a push is shown: one control period would be gone before it is seen, and noise flickers
+
+
+class Track:
+    """A trial; where it diverged, it ends with its last finite state and stands still.
+
+    Attributes:
+      model: to draw. robot: the body of the model that is the robot. planar: whether it moves in the plane.
+      floor: height of what it stands on in the first frame, in metres.
+      end: seconds from the first state to the last one of the plan.
+      times: (k,) of the finite states; states, measured: (k, n); error, clearance: (k,) in metres.
+      force: (T, 3) in N, averaged over a moment.
+    """
+
+    def __init__(self, rollout: Rollout, trial: int) -> None:
+        """Raises InputError: there is no such trial, or nothing of it that could be drawn."""
+        if not 0 <= check_count("trial", trial, at_least=0) < rollout.trials:
+            raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
+        if len(rollout.state_coordinates.position) not in (2, 3):
+            raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
+        self.rollout, self.trial = rollout, trial
+        self.model = _model(rollout)
+        whole = np.isfinite(rollout.frames[trial]).all(axis=1)
+        alive = np.isfinite(rollout.states[trial]).all(axis=1)
+        if not (whole.any() and alive.any()):
+            raise InputError(f"rollout: got trial {trial} without one finite state, want something to draw")
+        self.frame_times, self.frames = rollout.frame_times[whole], rollout.frames[trial][whole]
+        self.times, self.states = rollout.times[alive], rollout.states[trial, alive]
+        self.measured = rollout.measured[trial, alive]
+        self.error, self.clearance = rollout.tracking_error[trial, alive], rollout.clearance[trial, alive]
+        self.force = _recent(rollout.forces[trial], rollout.plan.dt)
+        self.end = float(rollout.times[-1])
+        self.planar = len(rollout.state_coordinates.position) == 2
+        self.robot = robot_body(self.model)
+        self.floor = self._floor()
+
+    def pose(self, data: mujoco.MjData, time: float) -> None:
+        """Puts the model where it was at `time`, between two recorded frames if need be."""
+        first = int(np.clip(np.searchsorted(self.frame_times, time, side="right") - 1, 0, max(len(self.frames) - 2, 0)))
+        data.qpos[:] = self.frames[first]
+        if len(self.frames) > 1:
+            start, end = self.frame_times[first : first + 2]
+            motion = np.zeros(self.model.nv)
+            mujoco.mj_differentiatePos(self.model, motion, 1.0, self.frames[first], self.frames[first + 1])
+            mujoco.mj_integratePos(self.model, data.qpos, motion, float(np.clip((time - start) / (end - start), 0, 1)))
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
+        mujoco.mj_camlight(self.model, data)
+
+    def driven(self, at: Array | float) -> Array:
+        """Where the robot was at these times, (..., 3); on the floor, if it moves in the plane."""
+        return self.places(self.states, self.times, at)
+
+    def planned(self, at: Array | float) -> Array:
+        """Where it was meant to be, (..., 3)."""
+        return self.places(self.rollout.plan.states, self.rollout.times, at)
+
+    def places(self, states: Array, times: Array, at: Array | float) -> Array:
+        """The positions (..., 3) of states (k, n) at `times`, at other times."""
+        columns = [np.interp(at, times, states[:, i]) for i in self.rollout.state_coordinates.position]
+        return np.stack([*columns, np.full_like(columns[0], self.floor)][:3], axis=-1)
+
+    def force_at(self, time: float) -> Array:
+        """The force (3,) in N that has disturbed the robot lately."""
+        return self.force[min(int(time / self.rollout.plan.dt + 1e-9), len(self.force) - 1)]
+
+    def number_at(self, values: Array, time: float) -> float:
+        """One of `error` and `clearance` at a time."""
+        return float(np.interp(time, self.times, values))
+
+    def lost(self, time: float) -> bool:
+        """Whether the trial had diverged by then."""
+        return bool(self.rollout.diverged[self.trial]) and time > self.times[-1]
+
+    def _floor(self) -> float:
+        data = mujoco.MjData(self.model)
+        self.pose(data, 0.0)
+        centre, drop = data.xpos[self.robot], np.array([0.0, 0.0, -1.0])
+        hit = mujoco.mj_ray(self.model, data, centre, drop, None, True, self.robot, np.zeros(1, np.int32))
+        return float(centre[2] - max(hit, 0.0))
+
+
+def _model(rollout: Rollout) -> mujoco.MjModel:
+    try:
+        model = mujoco.MjModel.from_xml_string(rollout.model)
+    except (ValueError, mujoco.FatalError) as error:
+        raise InputError(f"rollout.model: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
+    if model.nq != rollout.frames.shape[-1]:
+        raise InputError(f"rollout.frames: got {rollout.frames.shape[-1]} numbers each, want the model's {model.nq}")
+    return model
+
+
+def _recent(forces: Array, dt: float) -> Array:
+    """Mean forces (T, 3) over the moment before each period's end."""
+    window = max(round(SEEN / dt), 1)
+    total = np.cumsum(np.vstack([np.zeros((window, 3)), np.nan_to_num(forces)]), axis=0)
+    return (total[window:] - total[:-window]) / window

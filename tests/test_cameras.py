@@ -1,0 +1,174 @@
+"""Calibrated cameras, against MuJoCo's own pictures, and what videos say of themselves."""
+
+import dataclasses
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import mujoco
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim.view import cameras, gl, marker
+from lqrsim.view.cameras import Camera
+from lqrsim.view.footage import Footage, Pane, digest, read
+from lqrsim.view.video import encoder
+
+draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
+TILTED = Camera("tilted", (3.0, -4.0, 5.0), (0.0, 0.6, -0.8), (0.0, 0.8, 0.6), 4.0)
+
+
+@pytest.fixture(scope="module", params=["differential_drive", "quadrotor"])
+def rollout(request: pytest.FixtureRequest) -> ls.Rollout:
+    name = {"differential_drive": "drive_solution", "quadrotor": "quadrotor_solution"}[request.param]
+    scenario = request.getfixturevalue(request.param)
+    solution = request.getfixturevalue(name)
+    return ls.simulate(scenario.plant(), solution, disturbances=scenario.disturbances, seed=1, trials=2)
+
+
+@draws
+@pytest.mark.parametrize("size", [(640, 480), (320, 480)])
+@pytest.mark.parametrize("kind", ["top", "side", "tilted"])
+def test_projection_is_where_mujoco_draws(kind: str, size: tuple[int, int], rollout: ls.Rollout) -> None:
+    gl.bind()
+    aspect = size[0] / size[1]
+    camera = TILTED if kind == "tilted" else getattr(cameras, kind)(rollout, aspect)
+    # A cross of balls over the picture, at different depths, which an orthographic picture does not show.
+    across, depth = np.array([[0, 0], [0.4, 0.1], [-0.45, 0.3], [0.2, -0.45], [-0.3, -0.4]]), [10, 7, 12, 9, 15]
+    right, up = camera.axes
+    places = [
+        np.array(camera.position) + camera.height * (aspect * x * right + y * up) + far * np.array(camera.forward)
+        for (x, y), far in zip(across, depth, strict=True)
+    ]
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><visual><quality offsamples="0"/></visual><worldbody><body/></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with mujoco.Renderer(model, size[1], size[0]) as renderer:
+        for place in places:
+            renderer.update_scene(data)
+            scene = renderer.scene
+            ball, colour = np.full(3, 0.03 * camera.height), np.ones(4, dtype=np.float32)
+            mujoco.mjv_initGeom(scene.geoms[0], mujoco.mjtGeom.mjGEOM_SPHERE, ball, place, np.eye(3).ravel(), colour)
+            scene.ngeom = 1
+            camera.place(scene, aspect)
+            rows, columns = np.nonzero(renderer.render().max(axis=2))
+            assert len(rows) == pytest.approx(np.pi * (0.03 * size[1]) ** 2, rel=0.1)
+            seen = np.array([columns.mean(), rows.mean()]) + 0.5
+            # Whole pixels of a ball 29 wide: its middle is known to a tenth of one.
+            np.testing.assert_allclose(seen, camera.project(place, size), rtol=0, atol=0.1)
+            tenth = 0.1 * camera.height / size[1]
+            np.testing.assert_allclose(camera.measure(seen, size), camera.axes @ place, rtol=0, atol=tenth)
+
+
+def test_measure_is_the_inverse_of_project() -> None:
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    pixels = TILTED.project(points, (640, 480))
+    np.testing.assert_allclose(TILTED.measure(pixels, (640, 480)), points @ TILTED.axes.T, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("aspect", [0.75, 4 / 3, 16 / 9])
+def test_fixed_cameras_see_the_whole_run(aspect: float, rollout: ls.Rollout) -> None:
+    size = (round(1000 * aspect), 1000)
+    position = list(rollout.state_coordinates.position)
+    for camera in (cameras.top(rollout, aspect), cameras.side(rollout, aspect)):
+        for states in (rollout.plan.states, *rollout.states):
+            places = np.zeros((len(states), 3))
+            places[:, : len(position)] = states[:, position]
+            margin = rollout.radius / camera.height * 1000
+            pixels = camera.project(places, size)
+            assert (pixels > margin).all()
+            assert (pixels < np.array(size) - margin).all()
+
+
+def test_a_diverged_trial_does_not_hide_the_others(rollout: ls.Rollout) -> None:
+    states = rollout.states.copy()
+    states[0, 40:] = np.nan
+    assert np.isfinite(cameras.top(dataclasses.replace(rollout, states=states)).position).all()
+
+
+def footage(rollout: ls.Rollout) -> Footage:
+    panes = (
+        Pane(0, 0, 320, 240, camera=cameras.top(rollout)),
+        Pane(320, 0, 320, 240, trial=1, camera=cameras.side(rollout)),
+        Pane(0, 240, 640, 240),
+    )
+    return Footage((digest(rollout),), (marker.radius(rollout),), Fraction(30000, 1001), 0.5, 3, panes)
+
+
+def test_footage_survives_its_file(rollout: ls.Rollout, tmp_path: Path) -> None:
+    written = footage(rollout)
+    path = tmp_path / "run.mp4"
+    with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+        written.embed(container)
+        stream = container.add_stream("libx264", rate=written.rate)
+        stream.width, stream.height, stream.pix_fmt = 640, 480, "yuv420p"
+        for _ in range(written.frames):
+            frame = av.VideoFrame.from_ndarray(np.zeros((480, 640, 3), dtype=np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    assert read(path) == written
+    np.testing.assert_allclose(written.times(), np.arange(3) * 0.5 * 1001 / 30000)
+
+
+def test_other_files_are_refused(rollout: ls.Rollout, tmp_path: Path) -> None:
+    with pytest.raises(ls.InputError, match="want a file that exists"):
+        read(tmp_path / "none.mp4")
+    (tmp_path / "text.mp4").write_text("no video")
+    with pytest.raises(ls.InputError, match="want one that can be read"):
+        read(tmp_path / "text.mp4")
+    with encoder(tmp_path / "other.mp4", (64, 64), Fraction(10), crf=20, preset="ultrafast") as encode:
+        encode(np.zeros((64, 64, 3), dtype=np.uint8))
+    with pytest.raises(ls.InputError, match="want a video that `lqrsim render` wrote"):
+        read(tmp_path / "other.mp4")
+    good = json.loads(footage(rollout).as_json())
+    for change, message in [
+        ({"version": 99}, "got version 99"),
+        ({"frames": 0}, "footage.frames: got 0"),
+        ({"rate": "30/0"}, "damaged"),
+        ({"markers": []}, "contradicts itself"),
+        ({"panes": [{"left": 0}]}, "damaged"),
+    ]:
+        with pytest.raises(ls.InputError, match=message):
+            Footage.from_json(json.dumps(good | change))
+    good["panes"][0]["camera"]["up"] = [0, 0, 1]
+    with pytest.raises(ls.InputError, match="want unit vectors at right angles"):
+        Footage.from_json(json.dumps(good))
+
+
+def test_digest_tells_runs_apart(rollout: ls.Rollout) -> None:
+    plan = dataclasses.replace(rollout.plan, states=rollout.plan.states + 1e-9)
+    others = [
+        dataclasses.replace(rollout, plan=plan),
+        dataclasses.replace(rollout, states=rollout.states[::-1]),
+        dataclasses.replace(rollout, applied=rollout.applied * (1 + 1e-12)),
+        dataclasses.replace(rollout, seed=rollout.seed + 1),
+    ]
+    assert len({digest(rollout), *map(digest, others)}) == 5
+    assert digest(dataclasses.replace(rollout, states=rollout.states.copy())) == digest(rollout)
+
+
+@draws
+@pytest.mark.parametrize("kind", ["top", "side"])
+def test_mark_is_seen_where_the_robot_is_whatever_hides_it(kind: str, rollout: ls.Rollout) -> None:
+    """In its colour to the last bit, in light and shade, before the sky and behind beams."""
+    gl.bind()
+    camera, size = getattr(cameras, kind)(rollout), (640, 480)
+    model = mujoco.MjModel.from_xml_string(rollout.model)
+    model.vis.quality.offsamples = 0
+    data = mujoco.MjData(model)
+    with mujoco.Renderer(model, size[1], size[0]) as renderer:
+        for frame in rollout.frames[0, ::30]:
+            data.qpos = frame
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data)
+            centre = data.xpos[marker.robot_body(model)]
+            marker.draw(renderer.scene, camera, centre, marker.radius(rollout))
+            camera.place(renderer.scene, size[0] / size[1])
+            rows, columns = np.nonzero((renderer.render() == 255 * np.array(marker.COLOUR)).all(axis=2))
+            assert len(rows) == pytest.approx(np.pi * (marker.radius(rollout) * size[1] / camera.height) ** 2, rel=0.15)
+            seen = np.array([columns.mean(), rows.mean()]) + 0.5
+            np.testing.assert_allclose(seen, camera.project(centre, size), rtol=0, atol=0.3)

@@ -1,0 +1,367 @@
+"""Verification from pixels: honest runs and videos pass with room to spare, and every fault is told."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim.cli import main
+from lqrsim.verify import pixels
+from lqrsim.view import cameras, footage, gl
+from lqrsim.view.cameras import Camera
+from lqrsim.view.footage import Footage
+from lqrsim.view.video import encoder
+
+pytestmark = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
+
+ROBOTS = ("quadrotor", "differential_drive")
+# Metres; the first as the packaged robots are verified, rms and at worst, the second of videos.
+BOUNDS = {"quadrotor": (0.005, 0.010), "differential_drive": (0.003, 0.005)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A disturbed run, the same with another seed, and the video of the first, small, in its file and decoded."""
+
+    name: str
+    solution: ls.Solution
+    run: ls.Rollout
+    other: ls.Rollout
+    video: Path
+    frames: list[np.ndarray]
+    told: Footage
+
+
+def decode(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+@pytest.fixture(scope="module", params=ROBOTS)
+def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Case:
+    """Overlays and shadows are on, and the robot's mark is five pixels wide or so."""
+    name = request.param
+    scenario: ls.Scenario = request.getfixturevalue(name)
+    solution = request.getfixturevalue({"quadrotor": "quadrotor_solution"}.get(name, "drive_solution"))
+    run, other = (
+        ls.simulate(scenario.plant(), solution, disturbances=scenario.disturbances, seed=seed) for seed in (0, 1)
+    )
+    path = tmp_path_factory.mktemp("video") / "run.mp4"
+    if name == "quadrotor":
+        ls.render(run, path, camera="top", insets=("side",), size=(800, 360), speed=2)
+    else:
+        ls.render(run, path, camera="top", size=(560, 360), speed=5)
+    return Case(name, solution, run, other, path, decode(path), footage.read(path))
+
+
+def failed(found: ls.Verification) -> set[str]:
+    return {test.name for test in found.tests if test.passed is False}
+
+
+# -- Runs
+
+
+def test_an_honest_run_is_verified(case: Case) -> None:
+    found = ls.verify_run(case.run, solution=case.solution)
+    assert found.passed, found.summary()
+    assert found.likely == ""
+    assert found.worst < BOUNDS[case.name][0] / 2
+    assert abs(found.scale - 1) < 5e-4
+    assert "X-ray" in found.method
+    np.testing.assert_allclose(found.tracking_error, case.run.tracking_error[0], rtol=0, atol=found.worst + 1e-9)
+
+
+Fault = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def late(frames: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.concatenate([frames[:1], frames[:-1]])
+
+
+def dropped(frames: np.ndarray, other: np.ndarray) -> np.ndarray:
+    middle = len(frames) // 2
+    return np.concatenate([frames[:middle], frames[middle + 1 :], frames[-1:]])
+
+
+def swapped(frames: np.ndarray, other: np.ndarray) -> np.ndarray:
+    changed = frames.copy()
+    step = 1 if len(frames) < 400 else 5  # recorded frames in a control period
+    first, second = step * 70, step * 71
+    changed[[first, second]] = frames[[second, first]]
+    return changed
+
+
+def mirrored(frames: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return frames * np.where(np.arange(frames.shape[1]) == 0, -1, 1)  # x is the first number in both models
+
+
+def another(frames: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return other
+
+
+FAULTS = {
+    "late": "1.0 frames late",
+    "dropped": "left out",
+    "swapped": "swapped",
+    "mirrored": "mirrored",
+    "another": "another run",
+}
+
+
+@pytest.mark.parametrize("fault", [late, dropped, swapped, mirrored, another])
+def test_a_fault_in_what_a_run_recorded_is_told(fault: Fault, case: Case) -> None:
+    frames = fault(case.run.frames[0], case.other.frames[0])[None]
+    found = ls.verify_run(dataclasses.replace(case.run, frames=frames), solution=case.solution)
+    assert "position" in failed(found)
+    assert FAULTS[fault.__name__] in found.likely
+    assert "NOT VERIFIED" in found.summary()
+
+
+def test_a_record_that_contradicts_itself_verifies_no_video(case: Case) -> None:
+    frames = late(case.run.frames[0], case.other.frames[0])[None]
+    assert "record" in failed(ls.verify_video(case.video, dataclasses.replace(case.run, frames=frames)))
+
+
+def test_a_plan_that_is_not_the_runs_is_told(case: Case) -> None:
+    plan = case.solution.candidates[1].trajectory
+    position = list(case.run.state_coordinates.position)
+    begins = np.linalg.norm((plan.states[0] - case.run.plan.states[0])[position])
+    assert begins < 0.05  # that does not tell
+    changed = dataclasses.replace(case.run, plan=plan)
+    found = ls.verify_run(changed, solution=case.solution)
+    assert failed(found) == {"plan"}
+    assert "plan" in found.likely
+    # With the solution that the plan is of, too: it was not that solution's policy that was run.
+    policy = dataclasses.replace(case.solution.policy, nominal=plan.states[:-1])
+    its_own = dataclasses.replace(case.solution, trajectory=plan, policy=policy)
+    assert failed(ls.verify_run(changed, solution=its_own)) == {"plan"}
+    assert failed(ls.verify_video(case.video, changed)) == {"run"}
+    untold = ls.verify_run(case.run)
+    assert untold.passed
+    assert "untold  plan" in untold.summary()
+
+
+def off(view: str, axis: int) -> Callable[[Camera, object, float], None]:
+    """`Camera.place` of a camera that stands 2 cm from where it is said to."""
+    place = Camera.place
+
+    def elsewhere(self: Camera, scene: object, aspect: float) -> None:
+        position = np.array(self.position) + (0.02 * np.eye(3)[axis] if self.name == view else 0)
+        place(dataclasses.replace(self, position=tuple(position.tolist())), scene, aspect)  # pyright: ignore
+
+    return elsewhere
+
+
+@pytest.mark.parametrize(("view", "axis"), [("top", 0), ("top", 1), ("side", 2)])
+def test_a_camera_that_is_off_by_2_cm_is_told(
+    view: str, axis: int, case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if view == "side" and case.name != "quadrotor":
+        pytest.skip("a robot in the plane is seen from above alone")
+    monkeypatch.setattr(Camera, "place", off(view, axis))
+    found = ls.verify_run(case.run)
+    assert "position" in failed(found)
+    assert "camera is off" in found.likely
+
+
+def test_a_camera_may_be_anywhere_along_its_line_of_sight(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = ls.verify_run(case.run).seen
+    monkeypatch.setattr(Camera, "place", off("top", 2))
+    np.testing.assert_array_equal(ls.verify_run(case.run).seen, seen)
+
+
+# -- Videos
+
+
+def test_an_honest_video_is_verified(case: Case) -> None:
+    found = ls.verify_video(case.video, case.run, solution=case.solution)
+    assert found.passed, found.summary()
+    # The bounds are for full-size panes; these have a third of the pixels or less.
+    assert found.rms < 0.3 * BOUNDS[case.name][1]
+    assert found.worst < BOUNDS[case.name][1]
+    assert len(found.times) == len(case.frames)
+
+
+def rewritten(case: Case, path: Path, frames: list[np.ndarray], told: Footage | None = None) -> Path:
+    """The video once more, with other frames or another account of itself."""
+    told = told or dataclasses.replace(case.told, frames=len(frames))
+    height, width, _ = frames[0].shape
+    with encoder(path, (width, height), told.rate, crf=18, preset="ultrafast", footage=told) as encode:
+        for frame in frames:
+            encode(frame)
+    return path
+
+
+def flipped(case: Case) -> list[np.ndarray]:
+    """Its first pane from left to right."""
+    pane = case.told.panes[0]
+    left, right, rows = pane.left, pane.left + pane.width, slice(pane.top, pane.top + pane.height)
+    frames = [frame.copy() for frame in case.frames]
+    for frame in frames:
+        frame[rows, left:right] = frame[rows, left:right][:, ::-1].copy()
+    return frames
+
+
+@pytest.mark.parametrize(
+    ("fault", "likely"),
+    [("late", "1.0 frames late"), ("dropped", "left out"), ("swapped", "swapped"), ("mirrored", "mirrored")],
+)
+def test_a_fault_in_a_videos_frames_is_told(fault: str, likely: str, case: Case, tmp_path: Path) -> None:
+    """Also where the file gives the right number of frames."""
+    frames, middle = list(case.frames), len(case.frames) // 2
+    if fault == "late":
+        frames = [frames[0], *frames[:-1]]
+    elif fault == "dropped":
+        del frames[middle]
+    elif fault == "swapped":
+        frames[middle : middle + 2] = frames[middle : middle + 2][::-1]
+    else:
+        frames = flipped(case)
+    found = ls.verify_video(rewritten(case, tmp_path / "changed.mp4", frames), case.run)
+    assert "position" in failed(found)
+    assert likely in found.likely
+
+
+def test_a_frame_that_is_missing_from_the_file_is_counted(case: Case, tmp_path: Path) -> None:
+    path = rewritten(case, tmp_path / "short.mp4", case.frames[:-1], case.told)
+    found = ls.verify_video(path, case.run)
+    assert failed(found) == {"frames"}
+    assert "cut" in found.likely
+
+
+def test_a_video_that_plays_at_another_speed_is_told(case: Case, tmp_path: Path) -> None:
+    faster = dataclasses.replace(case.told, rate=case.told.rate * 2)
+    with encoder(
+        tmp_path / "fast.mp4", case.frames[0].shape[1::-1], faster.rate, crf=18, preset="ultrafast", footage=case.told
+    ) as encode:
+        for frame in case.frames:
+            encode(frame)
+    assert failed(ls.verify_video(tmp_path / "fast.mp4", case.run)) == {"frames"}
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_calibration_that_is_off_by_2_cm_is_told(axis: int, case: Case, tmp_path: Path) -> None:
+    pane = case.told.panes[-1]  # the side of the quadrotor's video, the top of the other's
+    assert pane.camera is not None
+    moved = np.array(pane.camera.position) + 0.02 * np.eye(3)[axis]
+    camera = dataclasses.replace(pane.camera, position=tuple(moved.tolist()))
+    told = dataclasses.replace(case.told, panes=(*case.told.panes[:-1], dataclasses.replace(pane, camera=camera)))
+    found = ls.verify_video(rewritten(case, tmp_path / "changed.mp4", case.frames, told), case.run)
+    if abs(camera.forward[axis]) == 1:  # along the line of sight it is the same camera
+        assert found.passed
+    else:
+        assert "position" in failed(found)
+        assert "camera is off" in found.likely
+
+
+def test_another_seeds_run_is_told_by_the_pixels_alone(case: Case, tmp_path: Path) -> None:
+    assert {"run", "position"} <= failed(ls.verify_video(case.video, case.other))
+    told = dataclasses.replace(case.told, runs=(footage.digest(case.other),))
+    found = ls.verify_video(rewritten(case, tmp_path / "changed.mp4", case.frames, told), case.other)
+    assert "position" in failed(found)
+    assert "run" not in failed(found)
+    assert "another run" in found.likely
+
+
+def test_a_covered_robot_is_counted_not_guessed(case: Case, tmp_path: Path) -> None:
+    """A few frames without it are said; more than one in twenty are too many."""
+    frames = [frame.copy() for frame in case.frames]
+    for hidden, verdict in [(3, set()), (12, {"seen"})]:
+        for frame in frames[30 : 30 + hidden]:
+            frame[:] = 200
+        found = ls.verify_video(rewritten(case, tmp_path / "covered.mp4", frames), case.run)
+        assert failed(found) == verdict
+        assert f"in {len(frames) - hidden} of {len(frames)} frames" in found.summary()
+        assert np.isnan(found.seen).all(axis=1).sum() == hidden
+    for frame in frames:
+        frame[:] = 200
+    found = ls.verify_video(rewritten(case, tmp_path / "covered.mp4", frames), case.run)
+    assert "seen" in failed(found)
+    assert "not in the pictures" in found.likely
+
+
+def test_what_can_not_be_verified_is_refused(case: Case, tmp_path: Path) -> None:
+    bare = dataclasses.replace(case.told, panes=(dataclasses.replace(case.told.panes[0], camera=None),))
+    with pytest.raises(ls.InputError, match="views: got none, want"):
+        ls.verify_video(rewritten(case, tmp_path / "bare.mp4", case.frames[:3], bare), case.run)
+    if case.name == "quadrotor":
+        half = dataclasses.replace(case.told, panes=case.told.panes[:1])
+        with pytest.raises(ls.InputError, match="views: got top, want top and side"):
+            ls.verify_video(rewritten(case, tmp_path / "half.mp4", case.frames[:3], half), case.run)
+    small = [np.ascontiguousarray(frame[::2, ::2]) for frame in case.frames[:3]]
+    with pytest.raises(ls.InputError, match="want them as lqrsim wrote them"):
+        ls.verify_video(rewritten(case, tmp_path / "small.mp4", small, case.told), case.run)
+    with pytest.raises(ls.InputError, match="trial: got 1, want one of 0 to 0"):
+        ls.verify_run(case.run, 1)
+    without = dataclasses.replace(case.run, frames=case.run.frames[:, :0], frame_times=case.run.frame_times[:0])
+    with pytest.raises(ls.InputError, match="want what simulate"):
+        ls.verify_run(without)
+
+
+# -- The command, and its parts
+
+
+def test_the_command_says_it_with_its_exit_code(case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ls.save(case.run, tmp_path / "run.npz")
+    ls.save(case.other, tmp_path / "other.npz")
+    ls.save(case.solution, tmp_path / "solution.npz")
+    (tmp_path / "run.mp4").write_bytes(case.video.read_bytes())
+    assert main(["verify", str(tmp_path / "run.npz")]) == 0
+    assert main(["verify", str(tmp_path / "run.mp4")]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("\nverified: ") + printed.startswith("verified: ") == 2
+    assert printed.count("passed  plan") == 2
+    assert main(["verify", str(tmp_path / "run.mp4"), "--run", str(tmp_path / "other.npz")]) == 1
+    assert "FAILED  position" in capsys.readouterr().out
+    assert main(["verify", str(tmp_path / "none.mp4"), "--run", str(tmp_path / "run.npz")]) == 2
+
+
+def test_a_trial_that_diverged_is_verified_up_to_there(case: Case) -> None:
+    states, frames = case.run.states.copy(), case.run.frames.copy()
+    gone = case.run.times[60]
+    states[:, 61:], frames[:, case.run.frame_times > gone + 1e-9] = np.nan, np.nan
+    found = ls.verify_run(dataclasses.replace(case.run, states=states, frames=frames, diverged=np.array([True])))
+    assert found.passed
+    assert found.times[-1] == pytest.approx(gone)
+
+
+def test_views_that_disagree_are_told_apart() -> None:
+    top = Camera("top", (0.0, 0.0, 10.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 5.0)
+    side = Camera("side", (0.0, -10.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), 5.0)
+    point = np.array([0.3, -0.2, 0.5])
+    measured = np.array([[view.axes @ point for view in (top, side)]])
+    place, apart = pixels.place((top, side), measured, 3)
+    np.testing.assert_allclose(place, [point], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(apart, 0, rtol=0, atol=1e-12)
+    measured[0, 0, 0] += 0.01
+    place, apart = pixels.place((top, side), measured, 3)
+    np.testing.assert_allclose(place, [point + np.array([0.005, 0, 0])], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(apart, 0.01, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("centre", [(50.0, 40.0), (33.3, 61.7), (4.0, 40.0)])
+def test_the_marks_middle_is_found_between_pixels(centre: tuple[float, float]) -> None:
+    """Drawn by its exact share of each pixel, with stray green elsewhere, as a video leaves it."""
+    fine = (np.arange(800) + 0.5) / 8
+    radius = 5.0
+    inside = ((fine - centre[0]) ** 2 + (fine[:, None] - centre[1]) ** 2 < radius**2).astype(float)
+    share = inside.reshape(100, 8, 100, 8).mean(axis=(1, 3))
+    image = np.zeros((100, 100, 3), dtype=np.uint8)
+    image[..., 1] = np.round(255 * share)
+    image[90:92, 90] = (20, 220, 10)
+    # Where a fifth of it is outside of the picture, its middle is not the ball's, by less than that.
+    near = 0.03 if centre[0] > radius else 0.5
+    np.testing.assert_allclose(pixels.mark(image, radius), centre, rtol=0, atol=near)
+    image[:, 50:] = 0
+    image[:, :50] = 0
+    assert np.isnan(pixels.mark(image, radius)).all()
+
+
+def test_cameras_of_a_robot_in_the_plane_see_it_from_above(case: Case) -> None:
+    views = [cameras.side(case.run)]
+    with pytest.raises(ls.InputError, match="views: got side, want"):
+        pixels.place(views, np.zeros((0, 1, 2)), len(case.run.state_coordinates.position))
