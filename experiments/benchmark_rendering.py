@@ -25,7 +25,7 @@ from solver_benchmark.common import median
 from tqdm import tqdm
 
 import lqrsim as ls
-from lqrsim.machine import description, processors
+from lqrsim.machine import description
 from lqrsim.versions import versions
 from lqrsim.view import gl
 from lqrsim.view.picture import QUALITIES
@@ -109,7 +109,7 @@ def main(config: Config) -> dict[str, Any]:
     return {
         "config": asdict(config),
         "versions": versions(),
-        "machine": f"{processors()} x {description()}",
+        "machine": description(),
         "frames": {name: contest.frames for name, contest in contests.items()},
         "seconds": seconds,
         "ratios": ratios,
