@@ -17,13 +17,13 @@ class Verify:
     `side`. Positions from pixels are compared with the simulator's and with the plan. See docs/verifying.md.
 
       lqrsim verify runs/quadrotor/rollout.npz
-      lqrsim verify runs/quadrotor/rollout.mp4 --run runs/quadrotor/rollout.npz
+      lqrsim verify videos/quadrotor/video.mp4
     """
 
     file: Annotated[Positional[Path], arg(metavar="RUN.npz|VIDEO.mp4")]
     """What `lqrsim simulate` wrote, or what `lqrsim render` made of it with the cameras or insets top and side."""
     run_file: Annotated[Path | None, optional("RUN.npz"), arg(name="run")] = None
-    """The run that the video shows. By default the video's path with .npz."""
+    """The run that the video shows. By default the one in its folder that it says it shows."""
     trial: Annotated[int | None, optional("N")] = None
     """Which row of the rollout, from 0. By default 0, or the first that the video shows."""
     solution: Annotated[Path | None, optional("SOLUTION.npz")] = None
@@ -33,11 +33,11 @@ class Verify:
         """Carry the command out; its exit code: 1 if a test failed."""
         from lqrsim import console, files
         from lqrsim.verify.drawn import verify_run
-        from lqrsim.verify.filmed import verify_video
+        from lqrsim.verify.filmed import run_beside, verify_video
         from lqrsim.verify.record import follows
 
         is_run = self.file.suffix.lower() == ".npz"
-        path = self.file if is_run else self.run_file or self.file.with_suffix(".npz")
+        path = self.file if is_run else self.run_file or run_beside(self.file)
         rollout, beside = files.load_rollout(path), path.with_name("solution.npz")
         solution = None
         if self.solution or beside.is_file():

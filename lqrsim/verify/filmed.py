@@ -1,5 +1,6 @@
 """Verifying the video of a run, from its file."""
 
+import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from av.error import FFmpegError
 
+from lqrsim import files
 from lqrsim.errors import Array, InputError
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
@@ -21,6 +23,16 @@ from lqrsim.view.footage import Pane
 
 BOUND = 1 / 35  # the worst error that is allowed, in radii of the robot: 8.6 and 4.9 mm for the packaged ones
 SAME = 1 / 350  # between what was recorded for drawing and the states
+
+
+def run_beside(path: str | os.PathLike[str]) -> Path:
+    """The rollout's file in the video's folder that the video says it shows. Raises InputError if there is none."""
+    told, folder = footage.read(path), Path(path).parent
+    for found in sorted(folder.glob("*.npz")):
+        with contextlib.suppress(InputError):  # a solution, or what is damaged
+            if footage.digest(files.load_rollout(found)) in told.runs:
+                return found
+    raise InputError(f"run: got none, and none in {folder} is what the video says it shows, want the run's file")
 
 
 def verify_video(
