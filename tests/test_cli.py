@@ -111,6 +111,20 @@ def test_simulate_is_the_library_call_that_its_options_say(solved: Path, tmp_pat
     assert rollout.disturbances == again.disturbances
 
 
+def test_simulate_with_disturbances_by_name_and_without_feedback(solved: Path, tmp_path: Path) -> None:
+    scenario, solution = ls.scenarios.differential_drive(), ls.load_solution(solved)
+    options = "--disturbances light scenario:ControlNoise --strength 2 --push 1 0 0 2.5 --open-loop --seed 4"
+    rollout = simulate(solved, tmp_path, *options.split())
+    noise, push = ls.ControlNoise(0.1), ls.Push((1.0, 0.0, 0.0), at=2.5)
+    disturbances = [*ls.preset("moderate", scenario.plant()), noise, push]
+    again = ls.simulate(scenario.plant(), solution.open_loop(), disturbances=disturbances, seed=4)
+    np.testing.assert_array_equal(rollout.states, again.states)
+    assert rollout.disturbances == again.disturbances
+    # Without feedback the plan's controls are sent, whatever happens.
+    np.testing.assert_array_equal(rollout.commanded[0], solution.trajectory.controls)
+    assert main(["simulate", str(solved), "--disturbances", "gale"]) == 2
+
+
 def test_simulate_with_another_seed_is_another_run(solved: Path, tmp_path: Path) -> None:
     runs = [simulate(solved, tmp_path / seed, "--control-noise", "0.05", "--seed", seed) for seed in ("1", "1", "2")]
     np.testing.assert_array_equal(runs[0].states, runs[1].states)

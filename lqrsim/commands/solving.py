@@ -99,6 +99,10 @@ class Simulate:
     """Execute a policy closed-loop in MuJoCo and write the runs to rollout.npz.
 
     Prints a line for each trial. Without a disturbance it is the plain closed loop. The same seed gives the same bits.
+
+      lqrsim simulate SOLUTION.npz --force-noise 0.1 --push 0.2 0 0 3.0 --trials 10
+      lqrsim simulate SOLUTION.npz --disturbances severe --out runs/severe
+      lqrsim simulate SOLUTION.npz --disturbances severe --open-loop --out runs/open_loop   # meets the same numbers
     """
 
     solution: Annotated[Positional[Path], arg(metavar="SOLUTION")]
@@ -108,6 +112,13 @@ class Simulate:
     A file is data and never chooses code to run: name a function of yours here."""
     out: Folder = None
     """Folder for rollout.npz. By default that of the solution."""
+    open_loop: bool = False
+    """Execute the plan without feedback: its controls, whatever the state."""
+    disturbances: Annotated[tuple[str, ...], optional("NAME ...")] = ()
+    """Sets by name, as in `lqrsim stress --sweep`: a preset (calm, light, moderate, strong, severe), or scenario for
+    those of the scenario's demo; NAME:KIND for one kind of them alone. What the options below say comes on top."""
+    strength: Annotated[float, arg(metavar="FACTOR")] = 1.0
+    """What those sets are multiplied by."""
     control_noise: Annotated[float, arg(metavar="STD")] = 0.0
     """Standard deviation of white noise on each control, in the control's unit (m/s wheel speed, N rotor force)."""
     force_noise: Annotated[float, arg(metavar="STD")] = 0.0
@@ -129,6 +140,7 @@ class Simulate:
         from lqrsim.errors import InputError
         from lqrsim.references import resolve
         from lqrsim.simulation.closed_loop import simulate
+        from lqrsim.stress.sweeps import sweep
 
         folder = self.out or self.solution.parent
         console.check_output("--out", folder)
@@ -138,11 +150,12 @@ class Simulate:
                 "--scenario: got none, and the solution names none, want the one whose robot and scene to use"
             )
         scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario)
+        named = [one.scaled(self.strength) for name in self.disturbances for one in sweep(name, scenario)]
         with console.progress("simulating", "step") as progress:
             rollout = simulate(
                 scenario.plant(),
-                solution,
-                disturbances=self._disturbances(),
+                solution.open_loop() if self.open_loop else solution,
+                disturbances=[*named, *self._own()],
                 seed=self.seed,
                 trials=self.trials,
                 first_trial=self.first_trial,
@@ -152,7 +165,7 @@ class Simulate:
         console.say(f"wrote {files.save(rollout, folder / 'rollout.npz')}")
         return 0
 
-    def _disturbances(self) -> "list[Disturbance]":
+    def _own(self) -> "list[Disturbance]":
         from lqrsim.simulation.disturbances import ControlNoise, ForceNoise, MeasurementNoise, Push
 
         found: list[Disturbance] = []
