@@ -117,6 +117,7 @@ if TYPE_CHECKING:
     from lqrsim.verify.filmed import verify_video as verify_video
     from lqrsim.verify.verdict import Verification as Verification
     from lqrsim.view.plots import plot_run as plot_run
+    from lqrsim.view.policy_plot import plot_policy as plot_policy
     from lqrsim.view.render import render as render
     from lqrsim.view.render import still as still
     from lqrsim.view.report import report as report
@@ -191,6 +192,7 @@ _HOME = {
     "verify.filmed": ["verify_video"],
     "verify.verdict": ["Verification"],
     "view.plots": ["plot_run"],
+    "view.policy_plot": ["plot_policy"],
     "view.render": ["render", "still"],
     "view.report": ["report"],
     "world": ["Obstacle", "World"],

@@ -15,6 +15,7 @@ from lqrsim.scenarios import Scenario
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.view import gl
 from lqrsim.view.plots import plot_run
+from lqrsim.view.policy_plot import plot_policy
 
 TABLE = (
     f"{'scenario':<20} {'run':<12} {'iterations':>10} {'cost':>10} {'gap':>9} {'clearance m':>12}"
@@ -47,6 +48,11 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
         console.say(f"\n== {reference}: {scenario.summary}")
         solution = replace(console.solve(scenario.problem, "smooth"), scenario=reference)
         console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
+        if solution.cost_to_go is not None:
+            drawn = plot_policy(
+                solution, folder / "policy.png", world=scenario.scene.world, radius=scenario.robot.radius
+            )
+            console.say(f"wrote {drawn}")
         if not solution.success:
             failures.append(f"{reference}: the plan did not converge ({solution.status.name})")
         runs = {

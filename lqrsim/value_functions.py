@@ -98,6 +98,15 @@ class TotalCost:
         slope = np.einsum("...ij,...j->...i", go.hessian, mean) + go.gradient
         return np.linalg.solve(np.eye(mean.shape[-1]) + go.hessian @ covariance, slope[..., None])[..., 0]
 
+    def covariance(self) -> Array:
+        """The inverses (T+1, n, n) of the Hessians: zero in a direction in which no state can be reached.
+
+        As of a normal distribution, at k standard deviations the total cost is `k^2/2` above its least.
+        """
+        come, curvature = self.cost_to_come, self.cost_to_go.hessian
+        covariance = come.covariance if isinstance(come, Moments) else np.linalg.inv(come.hessian)
+        return covariance @ np.linalg.inv(np.eye(covariance.shape[-1]) + curvature @ covariance)
+
     def minimum(self) -> Array:
         """The least total cost at each knot, (T+1,): for a linear-quadratic problem the same number at all."""
         if isinstance(self.cost_to_come, Quadratic):

@@ -76,7 +76,9 @@ def test_list_names_every_scenario_with_units(capsys: pytest.CaptureFixture[str]
 
 
 def test_solve_prints_the_log_and_writes_the_solution(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["solve", "quadrotor,query=2,seed=0", "--out", str(tmp_path), "--stop", "cost"]) == 0
+    assert main(["solve", "quadrotor,query=2,seed=0", "--out", str(tmp_path), "--stop", "cost",
+                 "--figure", str(tmp_path / "policy.pdf")]) == 0  # fmt: skip
+    assert (tmp_path / "policy.pdf").read_bytes().startswith(b"%PDF")
     solution = ls.load_solution(tmp_path / "solution.npz")
     printed = capsys.readouterr().out
     assert solution.iteration_table() in printed

@@ -31,7 +31,8 @@ def test_demo_leaves_everything_it_promises(tmp_path: Path, capsys: pytest.Captu
         assert disturbed.tracking_error.max() > 0.05
         assert disturbed.outcome == ("reached",)
         assert disturbed.seed == 3
-        assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
+        for figure in ("figure.png", "policy.png"):
+            assert (folder / figure).read_bytes().startswith(b"\x89PNG")
         with av.open(str(folder / "video.mp4")) as video:
             stream = video.streams.video[0]
             assert stream.codec_context.name == "h264"

@@ -145,9 +145,7 @@ def _level_sets(axes: Axes, scenario: ls.Scenario, solution: ls.Solution) -> Non
     assert go is not None
     assert isinstance(come, Moments)
     steps = np.arange(0, solution.trajectory.steps + 1, round(EVERY / solution.trajectory.dt))
-    covariance, size = come.covariance, come.mean.shape[1]
     of_go = np.linalg.pinv(go.hessian, hermitian=True)
-    of_total = covariance @ np.linalg.inv(np.eye(size) + go.hessian @ covariance)
     least_to_go = -np.einsum("tij,tj->ti", of_go, go.gradient)
     (cost,) = scenario.problem.obstacle_costs
     world, plan = cost.world, solution.trajectory.states[:, :2]
@@ -156,8 +154,8 @@ def _level_sets(axes: Axes, scenario: ls.Scenario, solution: ls.Solution) -> Non
     axes.plot(*plan.T, color=LIMIT, linewidth=1, label="rollout")
     for name, colour, marker, centres, shapes in (
         ("cost-to-go", RUNS[0], "s", least_to_go, of_go),
-        ("cost-to-come", RUNS[1], "^", come.mean, covariance),
-        ("total cost", PLAN, "o", total.minimizer(), of_total),
+        ("cost-to-come", RUNS[1], "^", come.mean, come.covariance),
+        ("total cost", PLAN, "o", total.minimizer(), total.covariance()),
     ):
         for step in steps:
             axes.add_patch(_shadow(centres[step, :2], shapes[step, :2, :2], colour, filled=name == "total cost"))

@@ -13,7 +13,7 @@ class Demo:
     """Solve, execute and film: the main job, for both robots.
 
     Each is solved from a cold start with smooth(); its policy is run undisturbed and then disturbed; the solution, both
-    rollouts, a figure and a video are written.
+    rollouts, figures of the policy and of the runs, and a video are written.
 
     Exits with 1 if a plan did not converge or an undisturbed run leaves its plan by more than the scenario's bound.
     """

@@ -61,6 +61,8 @@ class Solve:
     """Keep at least this much between the robot and all obstacles, at the steps. By default they only cost."""
     control_limits: Annotated[tuple[float, float] | None, optional("LOWEST HIGHEST")] = None
     """Plan with these limits of every control, in its unit. By default those of the actuators."""
+    figure: Annotated[Path | None, optional("FILE")] = None
+    """Draw the policy, too, in FILE.png, .pdf or .svg: tube, cost-to-go along the plan, gains over time."""
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
@@ -91,6 +93,11 @@ class Solve:
             options["start"] = scenario.paper_start
         solution = replace(console.solve(problem, self.solver, **options), scenario=self.scenario)
         console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
+        if self.figure is not None:
+            from lqrsim.view.policy_plot import plot_policy
+
+            world, radius = scenario.scene.world, scenario.robot.radius
+            console.say(f"wrote {plot_policy(solution, self.figure, world=world, radius=radius)}")
         return 0 if solution.success else 1
 
 

@@ -10,11 +10,11 @@ from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError
 from lqrsim.results import Solution
-from lqrsim.value_functions import Moments, TotalCost
 from lqrsim.view import caption
 from lqrsim.view.caption import Colour
 from lqrsim.view.choices import Overlay
 from lqrsim.view.track import Track
+from lqrsim.view.tube import ABOVE, SIGMAS, ellipsoids
 
 # No colour of the error map, and none of the robots.
 PLAN = (0.78, 0.08, 0.42)
@@ -24,7 +24,6 @@ TUBE = (0.47, 0.30, 0.78)
 SEGMENTS = 120  # a line is drawn with no more than this many
 DOTS = 30  # measured states that are shown, the last ones
 ELLIPSOIDS = 24
-SIGMAS = 2.0  # of the ellipsoids; the total cost on them is this squared and halved above its least
 END_ON = 0.9  # cosine of the angle to the line of sight
 LIFT = 0.006  # metres between the floor and the lines on it
 
@@ -83,7 +82,7 @@ class Overlays:
         }
         found = [entry for overlay, entry in entries.items() if overlay in self.show]
         if self.tube is not None:
-            found.append((f"{SIGMAS:g} sigma: total cost ≤ least + {SIGMAS**2 / 2:g}", TUBE))
+            found.append((f"{SIGMAS:g} sigma: total cost ≤ least + {ABOVE:g}", TUBE))
         return found
 
     def draw(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
@@ -173,28 +172,15 @@ class _Pen:
 
 
 def _tube(track: Track, solution: Solution) -> tuple[Array, Array, Array]:
-    """Centres (k, 3), half axes (k, 3) and rotations (k, 3, 3) of the ellipsoids along the plan.
-
-    Of all states whose total cost is at most so much above its least, these are the positions: what is an ellipsoid of
-    the state casts one on the position, with that block of the covariance.
-    """
+    """Centres (k, 3), half axes (k, 3) and rotations (k, 3, 3) of the ellipsoids along the plan."""
     if not np.array_equal(solution.trajectory.states, track.rollout.plan.states):
         raise InputError("solution: got one with another plan than that of the run, want the one that was executed")
-    go, come = solution.cost_to_go, solution.cost_to_come
-    if go is None or come is None:
-        raise InputError(f"solution: got one of {solution.solver}, which has no total cost, want one of smooth")
-    covariance = come.covariance if isinstance(come, Moments) else np.linalg.inv(come.hessian)
-    of_total = covariance @ np.linalg.inv(np.eye(covariance.shape[-1]) + go.hessian @ covariance)
-    chosen = np.unique(np.linspace(0, len(of_total) - 1, ELLIPSOIDS).astype(int))
-    position = list(track.rollout.state_coordinates.position)
-    centres = np.full((len(chosen), 3), track.floor)
-    centres[:, : len(position)] = TotalCost(go, come).minimizer()[chosen][:, position]
-    block = of_total[chosen][:, position][:, :, position]
-    variances, axes = np.linalg.eigh(0.5 * (block + np.swapaxes(block, 1, 2)))
-    size = len(position)
-    half_axes, rotations = np.full((len(chosen), 3), 0.1 * LIFT), np.tile(np.eye(3), (len(chosen), 1, 1))
-    half_axes[:, :size], rotations[:, :size, :size] = SIGMAS * np.sqrt(np.maximum(variances, 0.0)), axes
-    rotations[:, :, 0] *= np.linalg.det(rotations)[:, None]
+    knots = np.unique(np.linspace(0, track.rollout.plan.steps, ELLIPSOIDS).astype(np.int64))
+    position = track.rollout.state_coordinates.position
+    size, count = len(position), len(knots)
+    centres, rotations = np.full((count, 3), track.floor), np.tile(np.eye(3), (count, 1, 1))
+    half_axes = np.full((count, 3), 0.1 * LIFT)
+    centres[:, :size], half_axes[:, :size], rotations[:, :size, :size] = ellipsoids(solution, position, knots)
     return centres, half_axes, rotations
 
 

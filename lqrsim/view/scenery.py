@@ -3,11 +3,14 @@
 import numpy as np
 from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d import Axes3D
+from scipy.spatial import ConvexHull
 
 from lqrsim import compiled
 from lqrsim.errors import Array
 from lqrsim.view.style import MARGIN, SOLID
 from lqrsim.world import Obstacle, World
+
+EDGE = "#5b6470"
 
 
 def bounds(places: Array, world: World, margin: float = 0.0) -> tuple[Array, Array]:
@@ -32,7 +35,7 @@ def draw_in_plane(axes: Axes, world: World, low: Array, high: Array, radius: flo
     )
     distance = compiled.signed_distance(flat, np.stack(np.meshgrid(x, y), axis=-1))
     axes.contourf(x, y, distance, levels=[-np.inf, 0, radius], colors=[SOLID, MARGIN])
-    axes.contour(x, y, distance, levels=[0], colors=["#5b6470"], linewidths=0.8)
+    axes.contour(x, y, distance, levels=[0], colors=[EDGE], linewidths=0.8)
 
 
 def draw_in_space(axes: Axes3D, world: World, low: Array, high: Array) -> None:
@@ -47,6 +50,18 @@ def draw_in_space(axes: Axes3D, world: World, low: Array, high: Array) -> None:
     axes.set_zlabel("z (m)", rotation=90)
     axes.set_box_aspect(tuple(high - low), zoom=1.0)  # pyright: ignore[reportArgumentType] a float, as its documentation says
     axes.view_init(elev=27, azim=-110)
+
+
+def draw_projected(axes: Axes, world: World, low: Array, high: Array, across: int, up: int) -> None:
+    """The shadows of obstacles between two corners (3,) on the plane of two of the axes x, y, z, seen through."""
+    for obstacle in world.obstacles:
+        if obstacle.kind != "plane":
+            points = surface(obstacle, low, high).reshape(3, -1)[[across, up]].T
+            outline = points[ConvexHull(points).vertices]  # obstacles have no hollows
+            axes.fill(*outline.T, facecolor=(SOLID, 0.35), edgecolor=EDGE, linewidth=0.6)
+    names = "xyz"
+    axes.set(xlabel=f"{names[across]} (m)", ylabel=f"{names[up]} (m)", aspect="equal")
+    axes.set(xlim=(low[across], high[across]), ylim=(low[up], high[up]))
 
 
 def surface(obstacle: Obstacle, low: Array, high: Array) -> Array:

@@ -1,0 +1,141 @@
+"""The figure of a policy: the tube in which it expects the robot, cost-to-go along the plan, gains over time."""
+
+import os
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+from lqrsim.errors import Array, InputError
+from lqrsim.policy import AffinePolicy
+from lqrsim.results import Solution
+from lqrsim.view import scenery, style
+from lqrsim.view.style import PLAN, RUNS
+from lqrsim.view.tube import ABOVE, SIGMAS, outlines
+from lqrsim.world import World
+
+TUBE, OUTLINE = "#d5c8ec", "#7a4dc7"
+OUTLINES = 24  # ellipses whose outlines are drawn
+LINES = ("-", "--", "-.", ":")
+
+
+def plot_policy(solution: Solution, path: str | os.PathLike[str], *, world: World, radius: float) -> Path:
+    """Writes a figure (png, pdf or svg, by the suffix) of a solution's policy; returns its path.
+
+    The tube is that of the positions whose total cost is near its least, for a robot in space from above and from the
+    side. Solutions of `ilqr` have none: there the plan is alone.
+
+    Args:
+      world: the obstacles, as the scene has them. radius: of the robot, in metres.
+
+    Raises:
+      InputError: the solution has no policy or no position, or the file can not be written.
+    """
+    if solution.cost_to_go is None:
+        raise InputError(
+            f"solution: got one without a cost-to-go ({solution.status.name}), want one of a solve that was"
+        )
+    if not solution.policy.state_coordinates.position:
+        raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
+    with style.figure(path, size=(11, 7.5)) as figure:
+        draw(figure, solution, world, radius)
+    return Path(path)
+
+
+def draw(figure: Figure, solution: Solution, world: World, radius: float) -> None:
+    """Draws it all."""
+    policy = solution.policy
+    grid = figure.add_gridspec(1, 2, left=0.07, right=0.97, bottom=0.12, top=0.95, wspace=0.2, width_ratios=(1, 1.1))
+    planes = [(0, 1)] if len(policy.state_coordinates.position) == 2 else [(0, 1), (0, 2)]
+    places = grid[0].subgridspec(len(planes), 1, hspace=0.25)
+    paths = [figure.add_subplot(place) for place in places]
+    for axes, plane in zip(paths, planes, strict=True):
+        _tube(axes, solution, world, radius, plane)
+    figure.legend(*paths[0].get_legend_handles_labels(), loc="lower center", ncols=4)
+    strips = list(
+        product(dict.fromkeys(policy.control_coordinates.units), dict.fromkeys(policy.state_coordinates.units))
+    )
+    rows = grid[1].subgridspec(2, 1, hspace=0.3, height_ratios=(1, 0.3 + 0.55 * len(strips)))
+    _cost(figure.add_subplot(rows[0]), solution)
+    of_gains = rows[1].subgridspec(len(strips), 1, hspace=0.18)
+    _gains([figure.add_subplot(row) for row in of_gains], strips, policy, solution.trajectory.times)
+
+
+def _tube(axes: Axes, solution: Solution, world: World, radius: float, plane: tuple[int, int]) -> None:
+    """The tube, the plan and the obstacles, as seen along the axis that is not of the plane."""
+    position = solution.policy.state_coordinates.position
+    states = [position[axis] for axis in plane]
+    plan = solution.trajectory.states[:, list(position)]
+    if len(position) == 2:
+        scenery.draw_in_plane(axes, world, *scenery.bounds(plan, world.seen_by(2), 1.5 * radius), radius)
+        axes.set_title("tube (pale: closer than the robot's radius)")
+    else:
+        scenery.draw_projected(axes, world, *scenery.bounds(plan, world, 1.5 * radius), *plane)
+        axes.set_title(f"tube, from {'above' if plane == (0, 1) else 'the side'}")
+    if solution.cost_to_come is not None:
+        steps = solution.trajectory.steps
+        every = outlines(solution, states, np.arange(steps + 1))
+        some = every[np.unique(np.linspace(0, steps, OUTLINES).astype(int))]
+        label = f"{SIGMAS:g} sigma: total cost at most {ABOVE:g} above its least"
+        axes.add_collection(PolyCollection(list(every), facecolors=TUBE, edgecolors="none", zorder=1.5, label=label))
+        axes.add_collection(
+            PolyCollection(list(some), facecolors="none", edgecolors=OUTLINE, linewidths=0.6, zorder=2.5)
+        )
+    path = plan[:, list(plane)]
+    axes.plot(*path.T, "--", color=PLAN, zorder=3, label="planned")
+    axes.plot(*path[0], "o", color=PLAN, markersize=6, zorder=3, label="start")
+    axes.plot(*path[-1], "*", color=PLAN, markersize=10, zorder=3, label="end of the plan")
+
+
+def _cost(axes: Axes, solution: Solution) -> None:
+    """The cost-to-go at the plan's states and, above it up to the total, what it cost to come there."""
+    times, states = solution.trajectory.times, solution.trajectory.states
+    assert solution.cost_to_go is not None
+    to_go = solution.cost_to_go(states)
+    axes.plot(times, to_go, color=RUNS[0], label="cost-to-go")
+    axes.fill_between(times, 0, to_go, color=RUNS[0], alpha=0.15, linewidth=0)
+    if solution.cost_to_come is not None:
+        axes.plot(times, solution.total_cost.minimum(), "--", color=PLAN, label="least total cost")
+    axes.set(xlabel="time (s)", ylabel="cost", title="cost-to-go along the plan")
+    axes.set_ylim(bottom=min(0.0, float(to_go.min())), top=1.12 * float(to_go.max()))
+    axes.margins(x=0.01)
+    axes.legend(loc="lower left")
+
+
+def _gains(strips: list[Axes], units: list[tuple[str, str]], policy: AffinePolicy, times: Array) -> None:
+    """For each unit of the states, how strongly each control answers to them."""
+    controls = policy.control_coordinates
+    for axes, (answer, deviation) in zip(strips, units, strict=True):
+        for number, (name, unit) in enumerate(zip(controls.names, controls.units, strict=True)):
+            if unit == answer:
+                norm = strength(policy, number, deviation)
+                line, colour = LINES[number % len(LINES)], RUNS[number % len(RUNS)]
+                axes.stairs(
+                    norm,
+                    times,
+                    baseline=None,
+                    color=colour,
+                    linestyle=line,
+                    linewidth=1.2,
+                    label=name.replace("_", " "),
+                )
+        axes.set_ylabel(f"{answer or '1'}\nper {deviation or '1'}")
+        axes.set_ylim(bottom=0)
+        axes.margins(x=0.01)
+        axes.tick_params(labelbottom=axes is strips[-1])
+    strips[0].set_title("feedback gains")
+    handles = {label: one for axes in strips for one, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    strips[0].legend(
+        handles.values(), handles.keys(), loc="lower right", bbox_to_anchor=(1, 1), ncols=4, borderaxespad=0.2,
+        columnspacing=1.0, handlelength=1.8, handletextpad=0.5,
+    )  # fmt: skip
+    strips[-1].set_xlabel("time (s)")
+
+
+def strength(policy: AffinePolicy, control: int, unit: str) -> Array:
+    """Norm (T,) of one control's gains on the states of a unit: its answer to 1 in the worst direction."""
+    chosen = [number for number, one in enumerate(policy.state_coordinates.units) if one == unit]
+    return np.linalg.norm(policy.gain[:, control, chosen], axis=-1)

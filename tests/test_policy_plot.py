@@ -1,0 +1,157 @@
+"""The figure of a policy: what is drawn is what the costs themselves say."""
+
+import re
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+import lqrsim as ls
+from lqrsim.view.policy_plot import draw, strength
+from lqrsim.view.scenery import draw_projected
+from lqrsim.view.tube import outlines
+
+
+def drawn(solution: ls.Solution, scenario: ls.Scenario) -> Figure:
+    figure = Figure()
+    draw(figure, solution, scenario.scene.world, scenario.robot.radius)
+    return figure
+
+
+def cost_from(scenario: ls.Scenario, solution: ls.Solution, knot: int) -> float:
+    """What is paid from a knot on, summed up by the definition of the costs: obstacles cost from the first step on."""
+    states, controls = solution.trajectory.states, solution.trajectory.controls
+    world, radius = scenario.scene.world.seen_by(2), scenario.robot.radius
+    goal, weight = np.array([0.0, 2.5, np.pi]), np.array([5000.0, 5000.0, 50.0])
+    obstacles = np.exp(-10.0 * (np.array([world.distances(state[:2]) for state in states[max(knot, 1) : -1]]) - radius))
+    steering = 0.5 * 60.0 * ((controls[knot:] - 0.25) ** 2).sum()
+    return float(steering + obstacles.sum() + 0.5 * (weight * (states[-1] - goal) ** 2).sum())
+
+
+def test_cost_to_go_is_what_the_plan_still_pays(drive_solution: ls.Solution, differential_drive: ls.Scenario) -> None:
+    """At the optimum the quadratic's value on the plan is the plan's own cost."""
+    finer = ls.smooth(differential_drive.problem, tolerance=1e-9)
+    (curve,) = [line for axes in drawn(finer, differential_drive).axes for line in axes.lines
+                if line.get_label() == "cost-to-go"]  # fmt: skip
+    times, values = np.asarray(curve.get_xdata()), np.asarray(curve.get_ydata())
+    np.testing.assert_array_equal(times, finer.trajectory.times)
+    paid = [cost_from(differential_drive, finer, knot) for knot in range(len(times))]
+    # The gap is 2e-6 by then, and the difference of second order in it.
+    np.testing.assert_allclose(values, paid, atol=1e-7)
+    assert values[0] - values[-1] > 20
+
+
+@pytest.mark.parametrize("states", [(0, 1), (0, 2)])
+def test_outlines_lie_where_the_total_cost_is_two_above_its_least(
+    quadrotor_solution: ls.Solution, states: tuple[int, int]
+) -> None:
+    """Of all states with that place on the outline, the best has a total cost of two above the least of all."""
+    solution = quadrotor_solution
+    assert solution.cost_to_go is not None
+    assert isinstance(solution.cost_to_come, ls.Moments)
+    knots = np.array([20, 75, 130])
+    go, come = solution.cost_to_go, solution.cost_to_come
+    least = solution.total_cost.minimum()
+    hidden = [i for i in range(12) if i not in states]
+    for knot, outline in zip(knots, outlines(solution, states, knots), strict=True):
+        hessian, gradient = go.hessian[knot], go.gradient[knot]
+        precise = np.linalg.inv(come.covariance[knot])
+        both, slope = hessian + precise, gradient - precise @ come.mean[knot]
+        for place in outline[::7]:
+            state = np.zeros(12)
+            state[list(states)] = place
+            state[hidden] = -np.linalg.solve(both[np.ix_(hidden, hidden)], (slope + both @ state)[hidden])
+            off = state - come.mean[knot]
+            cost = (
+                0.5 * state @ hessian @ state + state @ gradient + np.asarray(go.constant)[knot]
+                + 0.5 * off @ precise @ off + come.constant[knot]
+            )  # fmt: skip
+            # Inverting the covariance costs some of the digits, and the terms are far larger than their sum.
+            assert cost - least[knot] == pytest.approx(2.0, rel=1e-3)
+
+
+def test_the_tube_that_is_drawn_is_that_of_every_knot(
+    drive_solution: ls.Solution, differential_drive: ls.Scenario
+) -> None:
+    axes = drawn(drive_solution, differential_drive).axes[0]
+    tube, _ = [one for one in axes.collections if isinstance(one, PolyCollection)]
+    expected = outlines(drive_solution, (0, 1), np.arange(151))
+    assert len(tube.get_paths()) == 151
+    for path, outline in zip(tube.get_paths(), expected, strict=True):
+        np.testing.assert_array_equal(np.asarray(path.vertices)[: len(outline)], outline)
+
+
+def test_strength_is_the_answer_in_the_worst_direction(quadrotor_solution: ls.Solution) -> None:
+    """Against the policy itself: of many directions of a unit's states, none moves the control more, and one does."""
+    policy, plan = quadrotor_solution.policy, quadrotor_solution.trajectory
+    rng = np.random.default_rng(0)
+    for unit, chosen in {"m": slice(0, 3), "rad/s": slice(9, 12)}.items():
+        directions = rng.normal(size=(4000, 3))
+        states = np.tile(plan.states[40], (4000, 1))
+        states[:, chosen] += directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        answers = policy.control(states, 40) - policy.control(plan.states[40], 40)
+        for control in range(4):
+            most, said = np.abs(answers[:, control]).max(), strength(policy, control, unit)[40]
+            # The nearest of 4000 directions is within 0.1 rad, whose cosine is 0.995.
+            assert 0.995 * said <= most <= said * (1 + 1e-12)
+
+
+def test_axes_have_units(
+    drive_solution: ls.Solution,
+    quadrotor_solution: ls.Solution,
+    differential_drive: ls.Scenario,
+    quadrotor: ls.Scenario,
+    tmp_path: Path,
+) -> None:
+    def texts(solution: ls.Solution, scenario: ls.Scenario) -> list[str]:
+        options = {"world": scenario.scene.world, "radius": scenario.robot.radius}
+        path = ls.plot_policy(solution, tmp_path / "policy.svg", **options)
+        return [re.sub(r"<[^>]+>", "", text) for text in re.findall(r"<text.*?</text>", path.read_text(), re.DOTALL)]
+
+    drive = texts(drive_solution, differential_drive)
+    assert {"x (m)", "y (m)", "time (s)", "cost", "m/s", "per m", "per rad", "left", "right"} <= set(drive)
+    flight = texts(quadrotor_solution, quadrotor)
+    assert {"x (m)", "y (m)", "z (m)", "N", "per m", "per m/s", "per rad", "per rad/s", "rotor 4"} <= set(flight)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".pdf"])
+def test_same_policy_gives_the_same_bytes(
+    suffix: str, drive_solution: ls.Solution, differential_drive: ls.Scenario, tmp_path: Path
+) -> None:
+    options = {"world": differential_drive.scene.world, "radius": differential_drive.robot.radius}
+    first, second = (ls.plot_policy(drive_solution, tmp_path / f"{n}{suffix}", **options).read_bytes() for n in "ab")
+    assert first == second
+
+
+def test_solutions_without_a_cost_to_come_have_no_tube(differential_drive: ls.Scenario, tmp_path: Path) -> None:
+    solution = ls.ilqr(differential_drive.problem)
+    axes = drawn(solution, differential_drive).axes[0]
+    assert not [one for one in axes.collections if isinstance(one, PolyCollection)]
+    with pytest.raises(ls.InputError, match="solution: got one without a cost-to-go"):
+        ls.plot_policy(replace(solution, cost_to_go=None), tmp_path / "policy.png", world=ls.World([]), radius=0.1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_obstacles_cast_the_shadow_of_their_shape() -> None:
+    """A box that is turned about the line of sight is seen as it is, and one turned about another axis is wider."""
+    angle = 0.6
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    box = ls.Obstacle("box", "box", np.array([0.5, 0.2, 0.1]), turn, np.array([0.4, 0.3, 0.2]))
+    low, high = np.full(3, -2.0), np.full(3, 2.0)
+
+    def shadow(across: int, up: int) -> np.ndarray:
+        axes = Figure().add_subplot()
+        draw_projected(axes, ls.World([box]), low, high, across, up)
+        (patch,) = axes.patches
+        return np.asarray(patch.get_path().vertices)
+
+    above = shadow(0, 1)
+    sides = sorted(np.hypot(*(b - a)) for a, b in pairwise(above))
+    np.testing.assert_allclose(sides[-4:], [0.6, 0.6, 0.8, 0.8])
+    side = shadow(0, 2)
+    assert np.ptp(side[:, 0]) == pytest.approx(0.8 * np.cos(angle) + 0.6 * np.sin(angle))
+    assert np.ptp(side[:, 1]) == pytest.approx(0.4)
