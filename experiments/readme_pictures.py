@@ -1,40 +1,89 @@
-"""The pictures of the README: each robot on its way, drawn every two seconds or every half.
+"""The pictures of README.md and docs/gallery.md, by the command lines that the pages show beside them.
 
-    python experiments/readme_pictures.py            # writes videos/readme_<scenario>.png
+    python experiments/readme_pictures.py            # writes videos/readme_* and docs/figures/policy_*
 
-The runs are the demo's disturbed ones, seed 0.
+Each line is run once, in the order of the list.
 """
 
+import contextlib
+import re
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 from tqdm import tqdm
 
-import lqrsim as ls
+from lqrsim import cli
 
-EVERY = {"differential_drive": 2.0, "quadrotor": 0.5}  # seconds between two robots
+DRIVE, QUADROTOR = "runs/differential_drive", "runs/quadrotor"
+SOLVE_DRIVE, SOLVE_QUADROTOR = "lqrsim solve differential_drive", "lqrsim solve quadrotor"
+RUN_DRIVE = f"lqrsim simulate {DRIVE}/solution.npz --disturbances scenario"
+RUN_QUADROTOR = f"lqrsim simulate {QUADROTOR}/solution.npz --disturbances scenario"
+STILL = "--quality publication --size 1280 720"
+
+# What each picture takes: the one truth for this script, the pages and the tests.
+PICTURES = {
+    "videos/readme_quadrotor.gif": (
+        SOLVE_QUADROTOR,
+        RUN_QUADROTOR,
+        f"lqrsim render {QUADROTOR}/rollout.npz --solution {QUADROTOR}/solution.npz --camera chase --inset top side"
+        " --overlays plan ghost trace forces tube caption --size 680 382 --fps 12 --out videos/readme_quadrotor.gif",
+    ),
+    "videos/readme_feedback.gif": (
+        SOLVE_DRIVE,
+        RUN_DRIVE,
+        f"{RUN_DRIVE} --open-loop --out runs/open_loop",
+        f"lqrsim render {DRIVE}/rollout.npz runs/open_loop/rollout.npz --title 'with feedback' 'open loop'"
+        " --speed 4 --size 800 340 --fps 12 --out videos/readme_feedback.gif",
+    ),
+    "videos/readme_wind.gif": (
+        SOLVE_QUADROTOR,
+        f"lqrsim simulate {QUADROTOR}/solution.npz --disturbances calm:Dryden --out runs/calm",
+        f"lqrsim simulate {QUADROTOR}/solution.npz --disturbances severe:Dryden --out runs/severe",
+        "lqrsim render runs/calm/rollout.npz runs/severe/rollout.npz --title calm severe --camera chase"
+        " --size 640 360 --fps 12 --out videos/readme_wind.gif",
+    ),
+    "videos/readme_differential_drive.png": (
+        SOLVE_DRIVE,
+        RUN_DRIVE,
+        f"lqrsim render {DRIVE}/rollout.npz --every 2 {STILL} --out videos/readme_differential_drive.png",
+    ),
+    "videos/readme_quadrotor.png": (
+        SOLVE_QUADROTOR,
+        RUN_QUADROTOR,
+        f"lqrsim render {QUADROTOR}/rollout.npz --every 0.5 {STILL} --out videos/readme_quadrotor.png",
+    ),
+    "docs/figures/policy_differential_drive.png": (
+        f"{SOLVE_DRIVE} --figure docs/figures/policy_differential_drive.png",
+    ),
+    "docs/figures/policy_quadrotor.png": (f"{SOLVE_QUADROTOR} --figure docs/figures/policy_quadrotor.png",),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    out: Path = Path("videos")
-    """Folder for the pictures."""
+    out: Path = Path()
+    """Folder that the lines are run in."""
     quick: bool = False
-    """Small ones."""
+    """Small pictures of few frames."""
 
 
-def main(config: Config) -> dict[str, Path]:
-    pictures: dict[str, Path] = {}
-    for name, every in tqdm(EVERY.items(), unit="picture", leave=False, delay=2.0, disable=None):
-        scenario = ls.scenarios.get(name)
-        solution = ls.smooth(scenario.problem)
-        rollout = ls.simulate(scenario.plant(), solution, disturbances=scenario.disturbances, seed=0)
-        size = (320, 180) if config.quick else (1280, 720)
-        pictures[name] = ls.still(rollout, config.out / f"readme_{name}.png", every=every, size=size)
-    return pictures
+def main(config: Config) -> list[Path]:
+    """Runs the lines; what they made."""
+    lines = dict.fromkeys(line for of_picture in PICTURES.values() for line in of_picture)
+    config.out.mkdir(parents=True, exist_ok=True)
+    with contextlib.chdir(config.out):
+        for line in tqdm(lines, unit="line", leave=False, delay=2.0, disable=None):
+            if code := cli.main(shlex.split(_small(line) if config.quick else line)[1:]):
+                raise SystemExit(code)
+    return [config.out / picture for picture in PICTURES]
+
+
+def _small(line: str) -> str:
+    return re.sub(r"--fps \d+", "--fps 1", re.sub(r"--size \d+ \d+", "--size 320 240", line))
 
 
 if __name__ == "__main__":
-    for picture in main(tyro.cli(Config, description=__doc__)).values():
-        print(f"wrote {picture}")
+    for made in main(tyro.cli(Config, description=__doc__)):
+        print(f"wrote {made}: {made.stat().st_size / 1e6:.2f} MB")

@@ -137,11 +137,11 @@ def test_render_films_a_rollout(solved: Path, tmp_path: Path) -> None:
     if not gl.available():
         pytest.skip("no OpenGL here")
     rollout = simulate(solved, tmp_path)
-    size = ["--size", "128", "96", "--fps", "2"]
+    size = ["--size", "320", "180", "--fps", "2"]
     assert main(["render", str(tmp_path / "rollout.npz"), "--out", str(tmp_path / "run.mp4"), *size]) == 0
     with av.open(str(tmp_path / "run.mp4")) as video:
         stream = video.streams.video[0]
-        assert (stream.codec_context.name, stream.width, stream.height) == ("h264", 128, 96)
+        assert (stream.codec_context.name, stream.width, stream.height) == ("h264", 320, 180)
         assert stream.frames == int(2 * rollout.times[-1]) + 1
 
 

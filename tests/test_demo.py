@@ -59,4 +59,4 @@ def test_demo_without_opengl_does_the_rest(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("No videos, everything else works") == 1
     files = {path.name for path in (tmp_path / "differential_drive").iterdir()}
-    assert files == {"solution.npz", "undisturbed.npz", "disturbed.npz", "figure.png"}
+    assert files == {"solution.npz", "undisturbed.npz", "disturbed.npz", "figure.png", "policy.png"}

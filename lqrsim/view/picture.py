@@ -24,6 +24,7 @@ from lqrsim.view.track import Track
 RUNS = 6  # more can not be told apart side by side
 INSETS = 3
 READABLE = 300  # height of a picture in pixels from which on captions take a small part of it
+LEAST = 16  # height of what is shown below a caption, in pixels
 SHARE = 0.4  # of a run's part of the picture, for its insets
 LINE, BLANK = (120, 128, 140), (255, 255, 255)  # between panes, and behind captions
 
@@ -95,6 +96,8 @@ def picture(
     if legend is not None:
         captions = [Caption(*each, speed, over=over) for each in zip(tracks, drawn, boxes, names, strict=True)]
     strip = max(0 if one is None or over else one.height for one in captions)
+    if min(box.height for box in boxes) - strip < LEAST:
+        raise InputError(f"size: got {size[0]} x {size[1]}, which captions fill, want more, or overlays without them")
     with contextlib.ExitStack() as stack:
         parts: list[Part] = []
         for track, box, overlay, told in zip(tracks, boxes, drawn, captions, strict=True):
