@@ -9,7 +9,7 @@ import tyro
 from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
 from lqrsim.commands.solving import List, Simulate, Solve
 from lqrsim.commands.stressing import Replay, Report, Stress
-from lqrsim.commands.viewing import Render
+from lqrsim.commands.viewing import Render, View
 
 DESCRIPTION = """Feedback policies by iterated LQR smoothing, executed in MuJoCo under disturbances and shown on video.
 
@@ -17,12 +17,13 @@ The whole chain, for both robots, is `lqrsim demo`. Step by step, each command r
   lqrsim solve quadrotor --out runs/quadrotor
   lqrsim simulate runs/quadrotor/solution.npz --force-noise 0.1 --seed 1
   lqrsim render runs/quadrotor/rollout.npz
+Push the robot and watch the policy recover: `lqrsim view quadrotor`.
 How often policies fail, under what, and how sure that is: `lqrsim stress quadrotor`.
 The paper's results, beside what came out here: `lqrsim reproduce`.
 
 Exit codes: 0 done, 1 not converged or out of bounds, 2 bad input. The version is printed by `lqrsim --version`."""
 
-Command = List | Solve | Simulate | Render | Demo | Stress | Replay | Report | Reproduce | Cache
+Command = List | Solve | Simulate | Render | View | Demo | Stress | Replay | Report | Reproduce | Cache
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

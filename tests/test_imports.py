@@ -59,7 +59,7 @@ ROOMS = (
 
 # Who may import a heavy package, inside a function too. Type checkers' imports do not count.
 ALLOWED = {
-    "mujoco": ("scenes", "simulation", "view.render", "view.gl"),
+    "mujoco": ("scenes", "simulation", "view.render", "view.gl", "view.screen", "view.viewer", "view.browser"),
     "matplotlib": ("view",),
     "av": ("view",),
     "numba": ("core", "pointers"),
