@@ -54,7 +54,7 @@ class View:
 
     lqrsim view RUN.npz plays what `lqrsim simulate` wrote. lqrsim view SCENARIO solves the scenario and runs its policy
     live, again and again, and you interfere: the arrow keys and Page Up and Down push the robot, seen from the camera;
-    drag it after a double click on it, with Ctrl and the right mouse button. Space pauses, Backspace starts again.
+    Ctrl and the right mouse button drag it. Space pauses, Backspace starts again.
 
     The browser's server can be reached from this machine only. Ctrl-C ends it.
     """

@@ -47,19 +47,26 @@ class _Push(messages.Event):
 class _Drawing(plugin.ViewerPlugin):
     """The viewer's side."""
 
-    def __init__(self, title: str) -> None:
-        self.title, self.app, self.started = title, None, threading.Event()
+    studio: app.App
+
+    def __init__(self, screen: Screen, title: str) -> None:
+        self.screen, self.title, self.started = screen, title, threading.Event()
 
     @messages.handler
     def on_app(self, event: app.InitEvent) -> None:
-        self.app = event.app
+        self.studio = event.app
         self.started.set()
 
     @messages.handler
     def on_situation(self, event: _Situation) -> None:
         self.viewer.extra_geoms[:] = event.geoms
-        if self.app is not None:
-            self.app.status = f"{self.title}: {event.caption}"
+        self.studio.status = f"{self.title}: {event.caption}"
+
+    @messages.handler(priority=0)  # after the viewer has set up its own
+    def on_model(self, event: messages.PostModelEvent) -> None:
+        self.screen.aim(self.viewer.camera)
+        self.viewer.perturb.select = self.screen.robot
+        self.studio.step_control_state.set_speed(100 * self.screen.speed)
 
     @messages.handler
     def on_update(self, event: messages.UpdateEvent) -> None:
@@ -128,7 +135,7 @@ class Browser(Screen):
         if not mujoco.__version__.startswith(TESTED):
             known = f"{TESTED}x, whose server is known to keep to this machine"
             raise InputError(f"browser: got MuJoCo {mujoco.__version__}, want {known}; or a display, for a window")
-        drawing = _Drawing(title)
+        drawing = _Drawing(self, title)
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
         layout = app.Config(show_inspector=False)
         sockets: list[socket.socket] = []
@@ -141,7 +148,6 @@ class Browser(Screen):
             self.port = sockets[0].getsockname()[1] if sockets else port or web_server._DEFAULT_HTTP_PORT
             _check_private(self.port)
             self._handle.set_model(self.model, data=self.data)
-            self._handle.send_to_viewer(messages.StepControlSnapshot(speed=100 * self.speed))
         except BaseException:
             self._handle.close()
             raise

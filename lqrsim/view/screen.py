@@ -16,7 +16,7 @@ from lqrsim.results import Trajectory
 PLAN = (0.78, 0.08, 0.42, 1.0)
 WANTED = (*PLAN[:3], 0.25)
 TRACE = (0.05, 0.35, 0.62, 1.0)
-SEGMENTS = 100  # of the plan, and of the trace
+SEGMENTS = 60  # of the plan, and of the trace
 LIFT = 0.008  # metres between the floor and the lines on it
 TOO_LATE = 0.2  # s; what a slow machine is behind by more than that is not made up for
 # What a key adds to the velocity of the robot, seen from the camera: right, away, up.
@@ -142,6 +142,17 @@ class Screen(abc.ABC):
         flat = self._places.shape[1] == 2
         shape = (Geom.mjGEOM_CYLINDER, [self.radius, LIFT, 0.0]) if flat else (Geom.mjGEOM_SPHERE, [self.radius] * 3)
         _decor(new(), *shape, self.wanted(), WANTED)
+
+    def aim(self, camera: mujoco.MjvCamera) -> None:
+        """Let a camera that a person can turn see what the scene's own `overview` sees, if it has one."""
+        mujoco.mjv_defaultFreeCamera(self.model, camera)
+        number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, "overview")
+        if number >= 0:
+            away = np.array(self.model.stat.center) - self.model.cam_pos[number]
+            lenses = np.radians([self.model.cam_fovy[number], self.model.vis.global_.fovy])
+            camera.distance = np.linalg.norm(away) * np.divide(*np.tan(lenses / 2))
+            camera.azimuth = np.degrees(np.arctan2(away[1], away[0]))
+            camera.elevation = np.degrees(np.arctan2(away[2], np.hypot(away[0], away[1])))
 
     def _on_floor(self, place: Array | list[float]) -> Array:
         return np.append(place, self._floor + LIFT)[:3]

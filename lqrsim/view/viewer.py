@@ -3,6 +3,7 @@
 import contextlib
 import os
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,8 +20,8 @@ from lqrsim.simulation.plant import Plant
 from lqrsim.view.browser import Browser
 from lqrsim.view.screen import PUSHES, Again, Closed, Screen
 
-KEYS = """Arrow keys and Page Up/Down push the robot, seen from the camera. To drag it: double click on it, then hold
-Ctrl and move it with the right mouse button. Space pauses, Backspace starts again."""
+KEYS = """Arrow keys and Page Up/Down push the robot, seen from the camera. Ctrl and the right mouse button drag it.
+Space pauses, Backspace starts again."""
 PAUSE = 1.0  # s, between the end of a run and the next
 GLFW = {"RightArrow": 262, "LeftArrow": 263, "DownArrow": 264, "UpArrow": 265, "PageUp": 266, "PageDown": 267}
 
@@ -45,16 +46,23 @@ class Window(Screen):
                 self.restart()
 
         _check_window()
+        others = set(threading.enumerate())
         try:
             self._viewer = viewer.launch_passive(self.model, self.data, key_callback=pressed, show_right_ui=False)
         except RuntimeError as error:  # on macOS it wants to be run by mjpython
             raise InputError(f"window: {' '.join(str(error).split())}; or use --viewer browser") from None
+        self._threads = set(threading.enumerate()) - others
+        with self._viewer.lock():
+            self.aim(self._viewer.cam)
+            self._viewer.perturb.select = self.robot
 
     def __enter__(self) -> "Window":
         return self
 
     def __exit__(self, *_: object) -> None:
         self._viewer.close()
+        for thread in self._threads:  # the process would crash if it ended before them
+            thread.join(timeout=5.0)
 
     def refresh(self) -> bool:
         if not self._viewer.is_running():
