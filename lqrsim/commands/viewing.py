@@ -77,7 +77,7 @@ class View:
     """What else goes wrong in a live run: the scenario's disturbances, so many times as strong."""
     seed: int = 0
     """Of their random draws."""
-    push: Annotated[float, arg(metavar="M/S")] = 0.5
+    push: Annotated[float, arg(metavar="M/S")] = 0.3
     """By how much a key changes the robot's velocity."""
 
     def run(self) -> int:

@@ -27,6 +27,7 @@ from lqrsim.view.screen import PUSHES, Screen
 TESTED = "4.0."  # MuJoCo's versions whose server is known
 LOOPBACK = "127.0.0.1"
 OURS = re.compile(r"http://(localhost|127\.0\.0\.1)(:\d+)?")  # pages that may connect
+STARTING = 10.0  # s, that the server may take to start
 FORGOTTEN = 0.5  # s; a hand that is not heard of for so long has let go
 
 
@@ -118,7 +119,8 @@ class _Hand(plugin.SimPlugin):
 
 
 class Browser(Screen):
-    """A viewer in a browser. Use it with `with`: its server runs as long as the block.
+    """A viewer in a browser. Use it with `with`: its server runs as long as the block. One in a process: MuJoCo's user
+    interface is global, and a second one may crash.
 
     Args:
       port: 0 takes the first free one from 8080 on. title: of the page. The others are those of a Screen.
@@ -225,8 +227,11 @@ def _refusing() -> Iterator[None]:
 
 def _check_private(port: int) -> None:
     """Raises InputError unless the server answers on loopback, and at no other address of this machine."""
-    if not _answers(LOOPBACK, port):
-        raise InputError(f"browser: got a server that does not answer at {LOOPBACK}:{port}, want one that does")
+    until = time.monotonic() + STARTING
+    while not _answers(LOOPBACK, port):  # it is started on a thread of its own
+        if time.monotonic() > until:
+            raise InputError(f"browser: got a server that does not answer at {LOOPBACK}:{port}, want one that does")
+        time.sleep(0.02)
     for address in _other_addresses():
         if _answers(address, port):
             raise InputError(f"browser: got a server that others can reach at {address}, port {port}; it was closed")

@@ -57,7 +57,7 @@ class Screen(abc.ABC):
         position: tuple[int, ...],
         *,
         radius: float,
-        push: float = 0.5,
+        push: float = 0.3,
         speed: float = 1.0,
         seconds: float | None = None,
     ) -> None:

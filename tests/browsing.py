@@ -47,9 +47,33 @@ class Page:
         time.sleep(0.3)
         self.call("Input.dispatchKeyEvent", type="keyUp", **names)
 
-    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
-        """Move, press or release the mouse at x, y pixels."""
-        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Move the mouse from one pixel to another with Ctrl and its right button held."""
+        control = {"key": "Control", "code": "ControlLeft", "windowsVirtualKeyCode": 17, "nativeVirtualKeyCode": 17}
+        self.call("Input.dispatchKeyEvent", type="rawKeyDown", modifiers=2, **control)
+        held = {"button": "right", "buttons": 2}
+        self._mouse("mouseMoved", start, buttons=0)
+        self._mouse("mousePressed", start, clickCount=1, **held)
+        for part in np.linspace(0, 1, 9):
+            self._mouse("mouseMoved", tuple((1 - part) * np.array(start) + part * np.array(end)), **held)
+        self._mouse("mouseReleased", end, clickCount=1, **held)
+        self.call("Input.dispatchKeyEvent", type="keyUp", **control)
+
+    def pictures(self) -> Iterator[np.ndarray]:
+        """What the page shows, once it draws a scene, and from then on each picture that differs."""
+        last, until = self.picture(), time.monotonic() + 90
+        while time.monotonic() < until:
+            picture = self.picture()
+            # Before the scene is there the page is dark; colours are what the scene has.
+            if np.ptp(picture.reshape(-1, 3), axis=0).min() > 150 and (picture != last).any():
+                yield picture
+            last = picture
+            time.sleep(0.3)
+
+    def _mouse(self, kind: str, place: tuple[float, ...], **more: Any) -> None:
+        where = {"x": float(place[0]), "y": float(place[1]), "modifiers": 2}
+        self.call("Input.dispatchMouseEvent", type=kind, **where, **more)
+        time.sleep(0.25)  # for as long as a frame may take to draw
 
 
 @contextlib.contextmanager
@@ -66,8 +90,9 @@ def browser(url: str, profile: Path, *, size: tuple[int, int] = (800, 560)) -> I
                 assert process.poll() is None, "the browser ended"
                 time.sleep(0.1)
             port, endpoint = told.read_text().split()
-            whole = Page(connect(f"ws://127.0.0.1:{port}{endpoint}", max_size=None))
-            page = next(one for one in whole.call("Target.getTargets")["targetInfos"] if one["type"] == "page")
+            with connect(f"ws://127.0.0.1:{port}{endpoint}", max_size=None) as connection:
+                targets = Page(connection).call("Target.getTargets")["targetInfos"]
+            page = next(target for target in targets if target["type"] == "page")
             with connect(f"ws://127.0.0.1:{port}/devtools/page/{page['targetId']}", max_size=None) as connection:
                 yield Page(connection)
         finally:
