@@ -8,6 +8,7 @@ is closed again and nothing is shown.
 
 import contextlib
 import http
+import http.client
 import re
 import socket
 import threading
@@ -17,7 +18,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from mujoco.studio import app, launch_web, messages, plugin, sim, viewer_protocol, web_viewer
+from mujoco.studio import app, launch_web, messages, plugin, viewer_protocol, web_viewer
+from mujoco.studio import sim  # pyright: ignore[reportAttributeAccessIssue] it is made as the package is imported
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.web import web_server
 
@@ -143,16 +145,17 @@ class Browser(Screen):
         sockets: list[socket.socket] = []
         with _on_loopback(sockets):
             self._handle = launch_web.launch(config, plugins=[app.App(layout), drawing, _Hand(self)])
-            while not drawing.started.wait(0.02):
-                with _refusing():
+            try:
+                while not drawing.started.wait(0.02):
                     self._handle.is_running()  # raises what the viewer's thread did
-        try:
-            self.port = sockets[0].getsockname()[1] if sockets else port or web_server._DEFAULT_HTTP_PORT
-            _check_private(self.port)
-            self._handle.set_model(self.model, data=self.data)
-        except BaseException:
-            self._handle.close()
-            raise
+                self.port = sockets[0].getsockname()[1] if sockets else port
+                _check_private(self.port)
+            except RuntimeError as error:
+                raise InputError(f"--port: {error}") from None
+            except BaseException:
+                self._handle.close()
+                raise
+        self._handle.set_model(self.model, data=self.data)
 
     def __enter__(self) -> "Browser":
         return self
@@ -217,14 +220,6 @@ def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
         web_viewer._print_url_banner = banner
 
 
-@contextlib.contextmanager
-def _refusing() -> Iterator[None]:
-    try:
-        yield
-    except RuntimeError as error:
-        raise InputError(f"--port: {error}") from None
-
-
 def _check_private(port: int) -> None:
     """Raises InputError unless the server answers on loopback, and at no other address of this machine."""
     until = time.monotonic() + STARTING
@@ -235,6 +230,9 @@ def _check_private(port: int) -> None:
     for address in _other_addresses():
         if _answers(address, port):
             raise InputError(f"browser: got a server that others can reach at {address}, port {port}; it was closed")
+    for path, origin in (("/drop", f"http://localhost:{port}"), ("/state", "http://example.org")):
+        if _admits(path, origin, port):
+            raise InputError(f"browser: got a server that lets {origin} in to {path}, port {port}; it was closed")
 
 
 def _other_addresses() -> list[str]:
@@ -247,6 +245,16 @@ def _other_addresses() -> list[str]:
             probe.connect((elsewhere, 9))  # sends nothing; says which address would be used
             found.add(probe.getsockname()[0])
     return sorted(found - {LOOPBACK})
+
+
+def _admits(path: str, origin: str, port: int) -> bool:
+    """Whether a page of that origin may open a WebSocket there."""
+    key = {"Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="}
+    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=STARTING)
+    with contextlib.closing(connection):
+        headers = {"Connection": "Upgrade", "Upgrade": "websocket", "Origin": origin, **key}
+        connection.request("GET", path, headers=headers)
+        return connection.getresponse().status != http.HTTPStatus.FORBIDDEN
 
 
 def _answers(address: str, port: int) -> bool:

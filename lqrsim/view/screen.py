@@ -16,8 +16,9 @@ from lqrsim.results import Trajectory
 PLAN = (0.78, 0.08, 0.42, 1.0)
 WANTED = (*PLAN[:3], 0.25)
 TRACE = (0.05, 0.35, 0.62, 1.0)
-SEGMENTS = 60  # of the plan, and of the trace
+SEGMENTS = 60  # of the plan; the trace has twice as many
 LIFT = 0.008  # metres between the floor and the lines on it
+HAND = 2.0  # times the robot's weight that someone drags it with at most
 TOO_LATE = 0.2  # s; what a slow machine is behind by more than that is not made up for
 # What a key adds to the velocity of the robot, seen from the camera: right, away, up.
 PUSHES = {
@@ -69,7 +70,8 @@ class Screen(abc.ABC):
         self.robot = int(np.argmax(model.body_weldid != 0))  # the first body that moves
         self.radius, self.speed, self.paused, self.caption = radius, speed, False, ""
         self.wrench = np.zeros(6)
-        self._push, self._impulse = push * float(model.body_subtreemass[self.robot]), np.zeros(3)
+        self._mass = float(model.body_subtreemass[self.robot])
+        self._push, self._impulse = push * self._mass, np.zeros(3)
         self._times, self._places = plan.times, plan.states[:, list(position)]
         self._time, self._ahead, self._restart = 0.0, 0.0, False
         self._until = np.inf if seconds is None else clock.monotonic() + seconds
@@ -98,7 +100,7 @@ class Screen(abc.ABC):
         apart = float(np.linalg.norm(np.ptp(self._places, axis=0))) / SEGMENTS
         on_floor = self._on_floor(place[: self._places.shape[1]])
         if not self._trace or np.linalg.norm(on_floor - self._trace[-1]) > apart:
-            self._trace = [*self._trace, on_floor][-SEGMENTS:]
+            self._trace = [*self._trace, on_floor][-2 * SEGMENTS :]
         self.caption = f"{time:.1f} s, {1e3 * np.linalg.norm(on_floor - self.wanted()):.0f} mm from the plan"
         return place
 
@@ -114,8 +116,11 @@ class Screen(abc.ABC):
         self._impulse += self._push * np.array([x, y, up])
 
     def pull(self, wrenches: Array) -> None:
-        """Someone drags bodies with forces and torques (nbody, 6)."""
-        self.wrench = np.asarray(wrenches).reshape(-1, 6).sum(axis=0)
+        """Someone drags bodies with forces and torques (nbody, 6); a hand is only so strong."""
+        wrench, strength = np.asarray(wrenches).reshape(-1, 6).sum(axis=0), HAND * 9.81 * self._mass
+        for part, most in ((slice(0, 3), strength), (slice(3, 6), strength * self.radius)):
+            wrench[part] *= most / max(float(np.linalg.norm(wrench[part])), most)
+        self.wrench = wrench
 
     def restart(self) -> None:
         """Someone wants to see it from the start."""
