@@ -18,8 +18,15 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from mujoco.studio import app, launch_web, messages, plugin, viewer_protocol, web_viewer
-from mujoco.studio import sim  # pyright: ignore[reportAttributeAccessIssue] it is made as the package is imported
+from mujoco.studio import (
+    app,
+    launch_web,
+    messages,
+    plugin,
+    sim,  # pyright: ignore[reportAttributeAccessIssue] it is made as the package is imported
+    viewer_protocol,
+    web_viewer,
+)
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.web import web_server
 
