@@ -297,7 +297,7 @@ needs_browser = pytest.mark.skipif(not browsing.CHROMIUM, reason="there is no br
 @needs_browser
 def test_a_browser_draws_the_run(served: int, rollout: ls.Rollout, tmp_path: Path) -> None:
     """What the page gets is the run to the last bit, and what it draws moves."""
-    with browsing.browser(f"http://127.0.0.1:{served}/", tmp_path / "profile", size=(720, 540)) as page:
+    with browsing.browser(f"http://127.0.0.1:{served}/", tmp_path / "profile", size=(500, 400)) as page:
         pictures = list(itertools.islice(page.pictures(), 3))
         frames = {frame.tobytes() for frame in rollout.frames[0]}
         seen = set()
@@ -334,9 +334,9 @@ def pulled(self, wrenches):
 screen.Screen.push, screen.Screen.pull = pushed, pulled"""
     with viewing(tmp_path, "quadrotor", "--port", str(PORT + 3), "--speed", "0.3", before=before) as process:
         said(process, "Ctrl-C ends it")
-        with browsing.browser(f"http://127.0.0.1:{PORT + 3}/", tmp_path / "profile", size=(640, 480)) as page:
+        with browsing.browser(f"http://127.0.0.1:{PORT + 3}/", tmp_path / "profile", size=(500, 400)) as page:
             next(page.pictures())
             page.press("ArrowRight", 39)
             said(process, "pushed 1.0 0.0 0.0")
-            page.drag((420, 200), (420, 120))
+            page.drag((350, 140), (350, 80))
             said(process, "pulled")
