@@ -21,6 +21,7 @@ VENV = ROOT / ".venv"
 PYTHON = VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 STAMP = VENV / "installed-for"  # says what is installed; UNFINISHED while that is being changed
 UNFINISHED = "an installation that was interrupted"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 GL_PACKAGES = ("libegl1", "libgl1-mesa-dri", "libopengl0")
 
 COMMANDS = {
@@ -51,6 +52,8 @@ def main() -> int:
     set_up_python()
     if options.command != "check":
         set_up_graphics()
+    if options.command == "test":
+        set_up_browser()
     if options.command == "demo":
         return run([PYTHON, "-m", "lqrsim.cli", "demo", *rest])
     if options.command == "test":
@@ -119,6 +122,12 @@ def set_up_graphics() -> None:
     found = ctypes.util.find_library
     if not (found("EGL") and (found("OpenGL") or found("GL"))):
         install_system_packages(GL_PACKAGES, "No GL library, so no pictures; everything else works")
+
+
+def set_up_browser() -> None:
+    """Install a browser for the tests that look at a page, if it may; otherwise say how: they are skipped."""
+    if sys.platform == "linux" and not any(map(shutil.which, BROWSERS)):
+        install_system_packages(BROWSERS[:1], "No browser, so what the viewer's page shows is not tested")
 
 
 def install_system_packages(packages: Sequence[str], problem: str) -> None:

@@ -11,7 +11,7 @@ from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
 from lqrsim.commands.solving import List, Simulate, Solve
 from lqrsim.commands.stressing import Replay, Report, Stress
 from lqrsim.commands.verifying import Verify
-from lqrsim.commands.viewing import Render
+from lqrsim.commands.viewing import Render, View
 
 DESCRIPTION = """Feedback policies by iterated LQR smoothing, executed in MuJoCo under disturbances and shown on video.
 
@@ -20,13 +20,29 @@ The whole chain, for both robots, is `lqrsim demo`. Step by step, each command r
   lqrsim simulate runs/quadrotor/solution.npz --force-noise 0.1 --seed 1
   lqrsim render runs/quadrotor/rollout.npz
   lqrsim verify runs/quadrotor/rollout.npz
+Push the robot and watch the policy recover: `lqrsim view quadrotor`.
 How often policies fail, under what, and how sure that is: `lqrsim stress quadrotor`; where that is too seldom to be
 seen, `lqrsim rare quadrotor`; and how little it takes, `lqrsim break quadrotor`.
 The paper's results, beside what came out here: `lqrsim reproduce`.
 
 Exit codes: 0 done, 1 not converged or out of bounds, 2 bad input. The version is printed by `lqrsim --version`."""
 
-Command = List | Solve | Simulate | Render | Verify | Demo | Stress | Replay | Report | Rare | Break | Reproduce | Cache
+Command = (
+    List
+    | Solve
+    | Simulate
+    | Render
+    | Verify
+    | View
+    | Demo
+    | Stress
+    | Replay
+    | Report
+    | Rare
+    | Break
+    | Reproduce
+    | Cache
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

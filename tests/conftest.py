@@ -1,6 +1,11 @@
+import hypothesis
 import pytest
 
 import lqrsim as ls
+
+# How long an example takes is no business of the tests: machines are busy.
+hypothesis.settings.register_profile("untimed", deadline=None)
+hypothesis.settings.load_profile("untimed")
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ SPACE = ls.Coordinates(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_nearest_is_the_same_pose_and_the_nearest_of_all(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -32,6 +32,7 @@ def simulate(
     threads: int | None = None,
     generators: Callable[[int, int], np.random.Generator] | None = None,
     progress: Callable[[int, int], object] | None = None,
+    watch: Callable[[float, Array, npt.NDArray[np.bool_]], object] | None = None,
 ) -> Rollout:
     """Execute the solution's policy closed-loop in MuJoCo, from the first state of its plan.
 
@@ -49,6 +50,7 @@ def simulate(
       threads: of MuJoCo's; by default as many as there are processors.
       generators: (trial, number of the disturbance) -> where its numbers come from, in place of the seed.
       progress: called after each control period with the number of periods done and of all.
+      watch: called with each frame as it comes: its time, MuJoCo's qpos (K, nq), and who has become unstable (K,).
 
     Raises:
       InputError: the policy is for another robot, or its plan is not finite; the control period is no multiple of the
@@ -73,7 +75,7 @@ def simulate(
     for effect in effects:
         displaced += 0.0 if effect.displaced is None else effect.displaced
 
-    physics = Physics(plant, trials, substeps, frames=frames, contacts=contacts, threads=threads)
+    physics = Physics(plant, trials, substeps, frames=frames, contacts=contacts, threads=threads, watch=watch)
     begun = np.tile(plan.states[0], (trials, 1))
     for effect in effects:
         begun = begun if effect.begin is None else effect.begin(begun)

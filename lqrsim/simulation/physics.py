@@ -1,7 +1,7 @@
 """MuJoCo's side of the loop: all trials' states, and how to advance them by a control period."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import mujoco
 import numpy as np
@@ -25,6 +25,7 @@ class Physics:
       frames: whether to record positions for drawing, within the control periods too.
       contacts: whether the robot collides with obstacles; through them, a quarter of the time is saved.
       threads: by default as many as there are processors.
+      watch: called with each frame as it comes: its time, what `frame` returns, and `unstable`.
 
     Attributes:
       simulations: MuJoCo's. parts: frames of a control period.
@@ -32,9 +33,17 @@ class Physics:
     """
 
     def __init__(
-        self, plant: Plant, trials: int, substeps: int, *, frames: bool, contacts: bool, threads: int | None
+        self,
+        plant: Plant,
+        trials: int,
+        substeps: int,
+        *,
+        frames: bool,
+        contacts: bool,
+        threads: int | None,
+        watch: Callable[[float, Array, np.ndarray], object] | None = None,
     ) -> None:
-        self.plant = plant
+        self.plant, self._watch, self._watched = plant, watch, 0
         model = plant.model if contacts else plant.without_contacts
         self.simulations = batch.Batch(model, trials, min(trials, threads or processors()))
         self._sensors = self.simulations.bind("sensordata") if contacts else None
@@ -80,6 +89,9 @@ class Physics:
                 touched |= (self._sensors[:, self.plant.contact] > 0).any(axis=1)
             if self.parts:
                 frames.append(self.frame())
+                if self._watch is not None:
+                    self._watched += 1
+                    self._watch(self._watched * self._part * self.plant.timestep, frames[-1], self.unstable)
         # MuJoCo resets an unstable simulation and goes on; only its warnings tell.
         warned = self.simulations.warning[..., 1]
         if warned.any():

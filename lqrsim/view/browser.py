@@ -1,0 +1,272 @@
+"""MuJoCo's viewer in a browser, on loopback only.
+
+MuJoCo 4.0's server listens to the whole network, without a password, takes files from whoever asks, and lets pages of
+any site in. It has no options about that. So what makes its socket and its server is replaced while it starts, and then
+it is tried out: if anything but loopback answers, or the server is another than the one that this was written for, it
+is closed again and nothing is shown.
+"""
+
+import contextlib
+import http
+import http.client
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.studio import (
+    app,
+    launch_web,
+    messages,
+    plugin,
+    sim,  # pyright: ignore[reportAttributeAccessIssue] it is made as the package is imported
+    viewer_protocol,
+    web_viewer,
+)
+from mujoco.studio.dear_imgui import dear_imgui as imgui
+from mujoco.studio.web import web_server
+
+from lqrsim.errors import InputError
+from lqrsim.view.screen import PUSHES, Screen
+
+TESTED = "4.0."  # MuJoCo's versions whose server is known
+LOOPBACK = "127.0.0.1"
+OURS = re.compile(r"http://(localhost|127\.0\.0\.1)(:\d+)?")  # pages that may connect
+STARTING = 10.0  # s, that the server may take to start
+FORGOTTEN = 0.5  # s; a hand that is not heard of for so long has let go
+
+
+class _Situation(messages.Snapshot):
+    """From the simulation to the viewer: what to draw beside the model, and what to say."""
+
+    def __init__(self, geoms: list[mujoco.MjvGeom], caption: str) -> None:
+        self.geoms, self.caption = geoms, caption
+
+
+class _Push(messages.Event):
+    """From the viewer to the simulation: a key was pressed."""
+
+    def __init__(self, key: str, azimuth: float) -> None:
+        self.key, self.azimuth = key, azimuth
+
+
+class _Drawing(plugin.ViewerPlugin):
+    """The viewer's side."""
+
+    studio: app.App
+
+    def __init__(self, screen: Screen, title: str) -> None:
+        self.screen, self.title, self.started = screen, title, threading.Event()
+
+    @messages.handler
+    def on_app(self, event: app.InitEvent) -> None:
+        self.studio = event.app
+        self.started.set()
+
+    @messages.handler
+    def on_situation(self, event: _Situation) -> None:
+        self.viewer.extra_geoms[:] = event.geoms
+        self.studio.status = f"{self.title}: {event.caption}"
+
+    @messages.handler(priority=0)  # after the viewer has set up its own
+    def on_model(self, event: messages.PostModelEvent) -> None:
+        self.screen.aim(self.viewer.camera)
+        self.viewer.perturb.select = self.screen.robot
+        self.studio.step_control_state.set_speed(100 * self.screen.speed)
+
+    @messages.handler
+    def on_update(self, event: messages.UpdateEvent) -> None:
+        if not imgui.GetIO().WantCaptureKeyboard:
+            for key in PUSHES:
+                if imgui.IsKeyChordPressed(getattr(imgui.Key, key)):
+                    self.viewer.send_to_sim(_Push(key, self.viewer.camera.azimuth))
+
+
+class _Hand(plugin.SimPlugin):
+    """The simulation's side: what the person does reaches the screen, and nothing reaches anything else."""
+
+    def __init__(self, screen: Screen) -> None:
+        self.screen, self.heard = screen, 0.0
+
+    @messages.handler(priority=messages.Priority.CRITICAL)
+    def on_push(self, event: _Push) -> None:
+        self.screen.push(PUSHES[event.key], event.azimuth)
+
+    @messages.handler(priority=messages.Priority.CRITICAL)
+    def on_perturb(self, event: messages.PerturbSnapshot) -> bool:
+        self.heard = time.monotonic()
+        self.screen.pull(event.state)
+        return True
+
+    @messages.handler(priority=messages.Priority.CRITICAL)
+    def on_reset(self, event: messages.ResetEvent) -> bool:
+        self.screen.restart()
+        return True
+
+    @messages.handler(priority=messages.Priority.CRITICAL)
+    def on_control(self, event: messages.StepControlSnapshot) -> bool:
+        self.screen.paused = event.pause_state != sim.PauseState.UNPAUSED
+        self.screen.speed = max(event.speed / 100, 0.001)
+        return True
+
+    @messages.handler(priority=messages.Priority.CRITICAL)
+    def on_edit(self, event: messages.StateEvent) -> bool:
+        return True  # the state is the simulation's
+
+    @messages.handler(priority=messages.Priority.CRITICAL)
+    def on_load(self, event: messages.LoadModelEvent) -> bool:
+        return True  # and so is the model
+
+    @messages.handler
+    def on_step(self, event: messages.StepEvent) -> None:
+        if time.monotonic() - self.heard > FORGOTTEN:
+            self.screen.pull(np.zeros(6))
+
+
+class Browser(Screen):
+    """A viewer in a browser. Use it with `with`: its server runs as long as the block. One in a process: MuJoCo's user
+    interface is global, and a second one may crash.
+
+    Args:
+      port: 0 takes the first free one from 8080 on. title: of the page. The others are those of a Screen.
+
+    Attributes:
+      port: that it listens on.
+
+    Raises:
+      InputError: the port is taken, MuJoCo is not one of the versions whose server is known, or others can reach it.
+    """
+
+    def __init__(self, *arguments: Any, port: int = 0, title: str = "", **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        if not mujoco.__version__.startswith(TESTED):
+            known = f"{TESTED}x, whose server is known to keep to this machine"
+            raise InputError(f"browser: got MuJoCo {mujoco.__version__}, want {known}; or a display, for a window")
+        drawing = _Drawing(self, title)
+        config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
+        layout = app.Config(show_inspector=False)
+        sockets: list[socket.socket] = []
+        with _on_loopback(sockets):
+            self._handle = launch_web.launch(config, plugins=[app.App(layout), drawing, _Hand(self)])
+            try:
+                while not drawing.started.wait(0.02):
+                    self._handle.is_running()  # raises what the viewer's thread did
+                self.port = sockets[0].getsockname()[1] if sockets else port
+                _check_private(self.port)
+            except RuntimeError as error:
+                raise InputError(f"--port: {error}") from None
+            except BaseException:
+                self._handle.close()
+                raise
+        self._handle.set_model(self.model, data=self.data)
+
+    def __enter__(self) -> "Browser":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._handle.close()
+
+    @property
+    def where(self) -> str:
+        """How to get there."""
+        tunnel = f"ssh -L {self.port}:{LOOPBACK}:{self.port} THIS-MACHINE"
+        return (
+            f"Open http://localhost:{self.port}/ in a browser on this machine. From another one, run there first:\n"
+            f"  {tunnel}\nNo other machine reaches it; other users of this one do. Ctrl-C ends it."
+        )
+
+    def refresh(self) -> bool:
+        if self._handle.is_running():
+            self._handle.sync()
+        return self._handle.is_running()
+
+    def show(self, time: float, qpos: np.ndarray) -> np.ndarray:
+        place = super().show(time, qpos)
+        geoms: list[mujoco.MjvGeom] = []
+
+        def new() -> mujoco.MjvGeom:
+            geoms.append(mujoco.MjvGeom())
+            return geoms[-1]
+
+        self.draw(new)
+        self._handle.send_to_viewer(_Situation(geoms, self.caption))
+        return place
+
+
+@contextlib.contextmanager
+def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
+    """While it lasts, MuJoCo's server is made to listen on loopback only, to take no files, and to admit few pages.
+
+    Args:
+      sockets: gets what it listens on.
+    """
+    bind, serve, banner = web_server.bind_public_socket, web_server.serve, web_viewer._print_url_banner
+
+    def bind_private(host: str, port: int = 0) -> socket.socket:
+        sockets.append(bind(LOOPBACK, port))
+        return sockets[-1]
+
+    def serve_few(handler: Callable[..., Any], *, process_request: Callable[..., Any], **options: Any) -> Any:
+        def admit(connection: Any, request: Any) -> Any:
+            if request.path.split("?")[0] == "/drop":
+                return connection.respond(http.HTTPStatus.FORBIDDEN, "no files are taken\n")
+            return process_request(connection, request)
+
+        return serve(handler, process_request=admit, origins=[OURS], **options)
+
+    web_server.bind_public_socket, web_server.serve = bind_private, serve_few
+    web_viewer._print_url_banner = lambda host, port: None
+    try:
+        yield
+    finally:
+        web_server.bind_public_socket, web_server.serve = bind, serve
+        web_viewer._print_url_banner = banner
+
+
+def _check_private(port: int) -> None:
+    """Raises InputError unless the server answers on loopback, and at no other address of this machine."""
+    until = time.monotonic() + STARTING
+    while not _answers(LOOPBACK, port):  # it is started on a thread of its own
+        if time.monotonic() > until:
+            raise InputError(f"browser: got a server that does not answer at {LOOPBACK}:{port}, want one that does")
+        time.sleep(0.02)
+    for address in _other_addresses():
+        if _answers(address, port):
+            raise InputError(f"browser: got a server that others can reach at {address}, port {port}; it was closed")
+    for path, origin in (("/drop", f"http://localhost:{port}"), ("/state", "http://example.org")):
+        if _admits(path, origin, port):
+            raise InputError(f"browser: got a server that lets {origin} in to {path}, port {port}; it was closed")
+
+
+def _other_addresses() -> list[str]:
+    """Addresses of this machine at which a server that listens to the network answers, and ours must not."""
+    found = {"127.0.0.2", "::1"}  # a server on all interfaces answers there, one on 127.0.0.1 does not
+    with contextlib.suppress(OSError):
+        found |= {str(one[4][0]) for one in socket.getaddrinfo(socket.gethostname(), None)}
+    for family, elsewhere in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
+        with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((elsewhere, 9))  # sends nothing; says which address would be used
+            found.add(probe.getsockname()[0])
+    return sorted(found - {LOOPBACK})
+
+
+def _admits(path: str, origin: str, port: int) -> bool:
+    """Whether a page of that origin may open a WebSocket there."""
+    key = {"Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="}
+    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=STARTING)
+    with contextlib.closing(connection):
+        headers = {"Connection": "Upgrade", "Upgrade": "websocket", "Origin": origin, **key}
+        connection.request("GET", path, headers=headers)
+        return connection.getresponse().status != http.HTTPStatus.FORBIDDEN
+
+
+def _answers(address: str, port: int) -> bool:
+    try:
+        socket.create_connection((address, port), timeout=1.0).close()
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,194 @@
+"""Runs in MuJoCo's own viewer: executed ones, and live ones in which a person interferes."""
+
+import contextlib
+import os
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lqrsim.errors import Array, InputError
+from lqrsim.results import Solution
+from lqrsim.rollout import Rollout
+from lqrsim.simulation.closed_loop import simulate
+from lqrsim.simulation.disturbances import Disturbance, Effect
+from lqrsim.simulation.plant import Plant
+from lqrsim.view.browser import Browser
+from lqrsim.view.screen import PUSHES, Again, Closed, Screen
+
+KEYS = """Arrow keys and Page Up/Down push the robot, seen from the camera. Ctrl and the right mouse button drag it.
+Space pauses, Backspace starts again."""
+PAUSE = 1.0  # s, between the end of a run and the next
+GLFW = {"RightArrow": 262, "LeftArrow": 263, "DownArrow": 264, "UpArrow": 265, "PageUp": 266, "PageDown": 267}
+
+
+class Window(Screen):
+    """A viewer in a window. Use it with `with`: it is open as long as the block. The arguments are a Screen's."""
+
+    where = "A window has opened; closing it, or Ctrl-C here, ends it."
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        from mujoco import viewer
+
+        keys = {GLFW[name]: direction for name, direction in PUSHES.items()}
+
+        def pressed(code: int) -> None:
+            if code in keys:
+                self.push(keys[code], self._viewer.cam.azimuth)
+            elif code == 32:  # the space bar
+                self.paused = not self.paused
+            elif code == 259:  # backspace
+                self.restart()
+
+        _check_window()
+        others = set(threading.enumerate())
+        try:
+            self._viewer = viewer.launch_passive(self.model, self.data, key_callback=pressed, show_right_ui=False)
+        except RuntimeError as error:  # on macOS it wants to be run by mjpython
+            raise InputError(f"window: {' '.join(str(error).split())}; or use --viewer browser") from None
+        self._threads = set(threading.enumerate()) - others
+        with self._viewer.lock():
+            self.aim(self._viewer.cam)
+            self._viewer.perturb.select = self.robot
+
+    def __enter__(self) -> "Window":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._viewer.close()
+        for thread in self._threads:  # the process would crash if it ended before them
+            thread.join(timeout=5.0)
+
+    def refresh(self) -> bool:
+        if not self._viewer.is_running():
+            return False
+        self._viewer.sync()
+        self.pull(self.data.xfrc_applied)
+        return True
+
+    def show(self, time: float, qpos: Array) -> Array:
+        place, scene = super().show(time, qpos), self._viewer.user_scn
+
+        def new() -> mujoco.MjvGeom:
+            scene.ngeom += 1
+            return scene.geoms[scene.ngeom - 1]
+
+        with self._viewer.lock():
+            scene.ngeom = 0
+            self.draw(new)
+        self._viewer.set_texts((None, None, self.caption, None))
+        return place
+
+
+def open_viewer(kind: str, port: int, *, title: str, **options: Any) -> Window | Browser:
+    """A viewer that is a `window` or a `browser`; the options are a Screen's. To be used with `with`."""
+    return Window(**options) if kind == "window" else Browser(port=port, title=title, **options)
+
+
+def of_rollout(rollout: Rollout, trial: int) -> dict[str, Any]:
+    """What a Screen needs to show one trial."""
+    if not 0 <= trial < rollout.trials:
+        raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
+    if not np.isfinite(rollout.frames[trial]).all(axis=1).any():
+        raise InputError(f"rollout: got trial {trial} without one finite state, want something to show")
+    try:
+        model = mujoco.MjModel.from_xml_string(rollout.model)
+    except (ValueError, mujoco.FatalError) as error:
+        raise InputError(f"rollout.model: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
+    position = rollout.state_coordinates.position
+    return {"model": model, "plan": rollout.plan, "position": position, "radius": rollout.radius}
+
+
+def of_plant(plant: Plant, solution: Solution) -> dict[str, Any]:
+    """What a Screen needs to show a live run."""
+    position = plant.robot.dynamics.state_coordinates.position
+    return {"model": plant.model, "plan": solution.trajectory, "position": position, "radius": plant.robot.radius}
+
+
+class _Person(Disturbance):
+    """Whoever sits before a screen."""
+
+    def __init__(self, screen: Screen) -> None:
+        self.screen = screen
+
+    def start(self, plant: Plant, plan: Any, generators: Sequence[np.random.Generator]) -> Effect:
+        wrench = np.zeros(6)
+
+        def force(step: int, states: Array) -> Array:
+            wrench[:] = self.screen.take(plan.dt)
+            return wrench[None, :3]
+
+        return Effect(force=force, torque=lambda step, states: wrench[None, 3:])
+
+
+def play(rollout: Rollout, screen: Screen, *, trial: int = 0, loop: bool = True) -> None:
+    """Show the frames of one trial, each at its time, until the viewer is closed; once, or again and again."""
+    whole = np.isfinite(rollout.frames[trial]).all(axis=1)
+    frames = list(zip(rollout.frame_times[whole].tolist(), rollout.frames[trial][whole], strict=True))
+    with contextlib.suppress(Closed):
+        while True:
+            with contextlib.suppress(Again):
+                for time, qpos in frames:
+                    screen.show(time, qpos)
+                screen.hold(PAUSE if loop else np.inf)
+
+
+def live(
+    plant: Plant,
+    solution: Solution,
+    screen: Screen,
+    *,
+    disturbances: Sequence[Disturbance] = (),
+    seed: int = 0,
+    ended: Callable[[str], object] = lambda line: None,
+) -> None:
+    """Run a policy, as `simulate` does, as fast as it is shown, under what the person does, until the viewer is closed.
+
+    It starts again at the end of the horizon, and when the robot is lost: further from its plan than the scene is
+    large, or when the simulation becomes unstable. Run k has the random numbers of trial k of that seed.
+
+    Args:
+      ended: called with a line on each run that has ended.
+    """
+    dimension = len(plant.robot.dynamics.state_coordinates.position)
+
+    def watch(time: float, qpos: Array, unstable: np.ndarray) -> None:
+        apart = np.linalg.norm((screen.show(time, qpos[0]) - screen.wanted())[:dimension])
+        if unstable.any() or not apart < plant.model.stat.extent:
+            ended(f"run {run}: lost after {time:.1f} s")
+            raise Again
+
+    run, everything = 0, [*disturbances, _Person(screen)]
+    with contextlib.suppress(Closed):
+        while True:
+            with contextlib.suppress(Again):
+                rollout = simulate(plant, solution, disturbances=everything, seed=seed, first_trial=run, watch=watch)
+                ended(rollout.summary().splitlines()[-1].strip().replace("trial", "run"))
+                screen.hold(PAUSE)
+            run += 1
+
+
+def has_display() -> bool:
+    """Whether there is a screen to open a window on."""
+    return sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+
+
+def _check_window() -> None:
+    """Raises InputError if no window can be opened, for which MuJoCo's viewer would wait for ever."""
+    import glfw
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        usable = glfw.init()
+        if usable:
+            glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
+            window = glfw.create_window(64, 64, "lqrsim", None, None)
+            usable = bool(window)
+            glfw.terminate()
+    if not usable:
+        raise InputError("window: got a display that opens none, want one with OpenGL; or --viewer browser")

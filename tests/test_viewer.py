@@ -1,0 +1,342 @@
+"""Viewers: nobody but this machine reaches them, they show what was run, and whoever sits before them can interfere."""
+
+import contextlib
+import itertools
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import browsing
+import mujoco
+import numpy as np
+import pytest
+from websockets import Origin
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+import lqrsim as ls
+from lqrsim import cache, files
+from lqrsim.cli import main
+from lqrsim.errors import Array, InputError
+from lqrsim.simulation.disturbances import ForceNoise
+from lqrsim.view import viewer
+from lqrsim.view.browser import Browser
+from lqrsim.view.screen import PUSHES, Screen
+
+PORT = 18650 + os.getpid() % 1000  # of our own, also where tests run side by side
+
+
+@pytest.fixture(scope="module")
+def rollout(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> ls.Rollout:
+    return ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[ForceNoise(0.1)], seed=1)
+
+
+class Recorder(Screen):
+    """A viewer that no one looks at; it keeps what it showed, and closes after so many frames."""
+
+    def __init__(self, frames: int, **options: object) -> None:
+        super().__init__(speed=100.0, **options)  # pyright: ignore[reportArgumentType] what `of_plant` returns
+        self.count, self.shown, self.errors, self.act = frames, [], [], lambda time: None
+        self.shown: list[Array]
+        self.errors: list[float]
+        self.act: Callable[[float], object]
+
+    def refresh(self) -> bool:
+        return len(self.shown) < self.count
+
+    def show(self, time: float, qpos: Array) -> Array:
+        place = super().show(time, qpos)
+        self.shown.append(self.data.qpos.copy())
+        self.errors.append(float(np.linalg.norm(place - self.wanted())))
+        self.act(time)
+        return place
+
+
+@contextlib.contextmanager
+def viewing(folder: Path, *arguments: str, before: str = "") -> Iterator[subprocess.Popen[str]]:
+    """`lqrsim view` in a process of its own, for a minute at most, and as it ends with Ctrl-C.
+
+    Args:
+      before: what that process does first.
+    """
+    code = f"{before}\nimport sys; from lqrsim.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "view", *arguments, "--viewer", "browser", "--seconds", "100"]
+    # MuJoCo keeps the layout of its panels in the home; what is compiled stays where it is.
+    environment = {**os.environ, "HOME": str(folder), "LQRSIM_CACHE_DIR": str(cache.folder())}
+    outside = {"cwd": folder, "env": environment}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **outside) as process:
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                raise
+
+
+def said(process: subprocess.Popen[str], text: str) -> str:
+    """What the process has written, once it has written that."""
+    assert process.stdout is not None
+    found = ""
+    for line in process.stdout:
+        found += line
+        if text in line:
+            return found
+    raise AssertionError(f"{text!r} is not in {found}")
+
+
+@pytest.fixture(scope="module")
+def served(rollout: ls.Rollout, tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """A run is played; the port."""
+    folder, port = tmp_path_factory.mktemp("served"), PORT
+    files.save(rollout, folder / "run.npz")
+    with viewing(folder, "run.npz", "--port", str(port)) as process:
+        text = said(process, "Ctrl-C ends it")
+        assert f"http://localhost:{port}/" in text
+        assert f"ssh -L {port}:127.0.0.1:{port}" in text
+        assert refused("::1", port)
+        yield port
+    assert process.returncode == 0
+    assert refused("127.0.0.1", port)
+    assert sorted(path.name for path in folder.iterdir() if path.name != ".mujoco.ini") == ["run.npz"]
+
+
+def refused(address: str, port: int) -> bool:
+    try:
+        socket.create_connection((address, port), timeout=5).close()
+    except OSError:
+        return True
+    return False
+
+
+def listening(port: int) -> list[str]:
+    """Addresses, in the kernel's own words, at which this machine listens to a port."""
+    rows = [line.split() for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()[1:]]
+    places = [row[1].split(":") for row in rows if row[3] == "0A"]
+    return [address for address, number in places if int(number, 16) == port]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux")
+def test_only_loopback_is_listened_to(served: int) -> None:
+    assert listening(served) == ["0100007F"]
+    assert not refused("127.0.0.1", served)
+    assert refused("127.0.0.2", served)
+    assert refused("::1", served)
+
+
+def test_files_and_pages_of_other_sites_are_refused(served: int) -> None:
+    ours = f"http://localhost:{served}"
+    for path, origin in (("drop", None), ("drop", ours), ("state", "http://example.org"), ("ui", "null")):
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(f"ws://127.0.0.1:{served}/{path}", origin=Origin(origin) if origin else None)
+    with connect(f"ws://127.0.0.1:{served}/state", origin=Origin(ours)):
+        pass
+
+
+BIND = """from mujoco.studio.web import web_server
+bind = web_server.bind_public_socket
+web_server.bind_public_socket = lambda host, port=0: bind({}, port)"""
+SERVE = """from mujoco.studio.web import web_server
+serve = web_server.serve
+web_server.serve = lambda handler, **options: serve(handler, **{{**options, {}}})"""
+
+
+@pytest.mark.parametrize(
+    ("before", "reason"),
+    [
+        (BIND.format("'0.0.0.0'"), r"others can reach at \S+, port \d+"),
+        (BIND.format("'::'"), r"others can reach at \S+, port \d+"),
+        (SERVE.format("'origins': None"), r"lets http://example\.org in to /state, port \d+"),
+        (SERVE.format("'process_request': None"), r"lets http://localhost:\d+ in to /drop, port \d+"),
+    ],
+)
+def test_a_server_that_is_not_private_is_refused(rollout: ls.Rollout, before: str, reason: str, tmp_path: Path) -> None:
+    """MuJoCo's server is not what it is expected to be: what listens then is found out, and closed."""
+    files.save(rollout, tmp_path / "run.npz")
+    with viewing(tmp_path, "run.npz", "--port", str(PORT + 1), before=before) as process:
+        assert re.search(f"{reason}; it was closed", said(process, "lqrsim: error"))
+        assert process.wait(20) == 2
+    assert refused("127.0.0.1", PORT + 1)
+
+
+def test_a_server_that_is_not_known_is_refused(rollout: ls.Rollout, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mujoco, "__version__", "4.1.0")
+    with pytest.raises(InputError, match=r"got MuJoCo 4\.1\.0, want 4\.0\.x"):
+        Browser(port=PORT, **viewer.of_rollout(rollout, 0))
+
+
+def test_what_can_not_be_shown(rollout: ls.Rollout, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(files.save(rollout, tmp_path / "run.npz"))
+    asked = (
+        ([path, "--trial", "1"], "trial"),
+        ([path, "--speed", "0"], "--speed"),
+        (["nowhere.npz"], "nowhere.npz"),
+        (["hexapod"], "hexapod"),
+    )
+    for arguments, reason in asked:
+        assert main(["view", *arguments]) == 2
+        assert reason in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="where windows are opened is said by DISPLAY")
+def test_a_display_that_is_gone(
+    rollout: ls.Rollout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """MuJoCo's window would be waited for without end."""
+    monkeypatch.setenv("DISPLAY", ":64321")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert main(["view", str(files.save(rollout, tmp_path / "run.npz"))]) == 2
+    assert "--viewer browser" in capsys.readouterr().err
+
+
+def test_a_port_that_is_taken(rollout: ls.Rollout, tmp_path: Path) -> None:
+    files.save(rollout, tmp_path / "run.npz")
+    taken = socket.create_server(("127.0.0.1", PORT + 2))
+    with taken, viewing(tmp_path, "run.npz", "--port", str(PORT + 2)) as process:
+        assert "--port" in said(process, "already in use")
+        assert process.wait(20) == 2
+
+
+def test_a_run_is_shown_as_it_was(rollout: ls.Rollout) -> None:
+    count = rollout.frames.shape[1]
+    screen = Recorder(2 * count + 5, **viewer.of_rollout(rollout, 0))
+    viewer.play(rollout, screen)
+    np.testing.assert_array_equal(screen.shown, [*rollout.frames[0], *rollout.frames[0], *rollout.frames[0][:5]])
+
+
+def test_a_run_takes_its_time(rollout: ls.Rollout) -> None:
+    """At 5 times the real speed, 5 seconds take one; a machine that is busy may be late, none may be early."""
+    screen = Recorder(rollout.frames.shape[1], **viewer.of_rollout(rollout, 0))
+    screen.speed = 5.0
+    begun = time.perf_counter()
+    viewer.play(rollout, screen)
+    assert 0.99 < time.perf_counter() - begun < 3.0
+
+
+def live(scenario: ls.Scenario, solution: ls.Solution, screen: Recorder, **options: object) -> list[str]:
+    lines: list[str] = []
+    viewer.live(scenario.plant(), solution, screen, ended=lines.append, **options)  # pyright: ignore[reportArgumentType]
+    return lines
+
+
+def test_a_live_run_is_what_simulate_does(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    """Run k has the numbers of trial k, to the last bit."""
+    noise = [ForceNoise(0.1)]
+    wanted = ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=noise, seed=3, trials=2)
+    screen = Recorder(300, **viewer.of_plant(quadrotor.plant(), quadrotor_solution))
+    lines = live(quadrotor, quadrotor_solution, screen, disturbances=noise, seed=3)
+    np.testing.assert_array_equal(screen.shown, [*wanted.frames[0][1:], *wanted.frames[1][1:]])
+    assert [line.split(",")[0] for line in lines] == ["run 0: reached", "run 1: reached"]
+
+
+@pytest.mark.parametrize("key", PUSHES)
+def test_a_push_is_felt_and_overcome(key: str, quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    """0.3 m/s at 3 s: a decimetre off, in the direction of the key, and back within 3 cm at the end, at 5 s."""
+    screen = Recorder(150, push=0.3, **viewer.of_plant(quadrotor.plant(), quadrotor_solution))
+    azimuth = 0.0
+    screen.act = lambda time: screen.push(PUSHES[key], azimuth) if abs(time - 3.0) < 0.01 else None
+    live(quadrotor, quadrotor_solution, screen)
+    still = ls.simulate(quadrotor.plant(), quadrotor_solution).frames[0][1:]
+    moved = np.array(screen.shown)[:, :3] - still[:, :3]
+    right, away, up = PUSHES[key]  # a camera that looks along x has y to its left
+    velocity = 30 * (moved[90] - moved[89])
+    np.testing.assert_array_equal(moved[:90], 0)
+    # A force that is constant over a period takes the robot half as far as its last velocity would; drag is 1 % of it.
+    assert velocity @ [away, -right, up] == pytest.approx(0.15, rel=0.01)
+    assert 0.05 < max(screen.errors) < 0.4
+    assert screen.errors[-1] < 0.03
+
+
+def test_a_hand_is_felt_and_overcome(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    """Half a newton upwards for half a second, a tenth of the weight."""
+    screen = Recorder(150, **viewer.of_plant(quadrotor.plant(), quadrotor_solution))
+    wrenches = np.zeros((screen.model.nbody, 6))
+    wrenches[screen.robot, 2] = 0.5
+    screen.act = lambda time: screen.pull(wrenches * (2.5 < time < 3.0))
+    live(quadrotor, quadrotor_solution, screen)
+    assert max(screen.errors[:75]) < 1e-6
+    assert 0.1 < max(screen.errors) < 1.0
+    assert screen.errors[-1] < 0.05
+
+
+def test_a_hand_is_only_so_strong(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    screen = Recorder(1, **viewer.of_plant(quadrotor.plant(), quadrotor_solution))
+    screen.pull(np.full((screen.model.nbody, 6), 1e4))
+    weight = 0.5 * 9.81
+    assert np.linalg.norm(screen.take(0.1)[:3]) == pytest.approx(2 * weight)
+    assert np.linalg.norm(screen.take(0.1)[3:]) == pytest.approx(2 * weight * quadrotor.robot.radius)
+
+
+def test_who_is_lost_starts_again(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    """A push to 1 km/s."""
+    screen = Recorder(90, push=1000.0, **viewer.of_plant(quadrotor.plant(), quadrotor_solution))
+    screen.act = lambda time: screen.push((1.0, 0.0, 0.0), 0.0) if time < 0.05 else None
+    lines = live(quadrotor, quadrotor_solution, screen)
+    assert len(lines) > 3
+    assert all(re.fullmatch(r"run \d+: lost after \d\.\d s", line) for line in lines)
+
+
+def test_backspace_starts_again(rollout: ls.Rollout) -> None:
+    screen = Recorder(20, **viewer.of_rollout(rollout, 0))
+    screen.act = lambda time: screen.restart() if len(screen.shown) == 8 else None
+    viewer.play(rollout, screen)
+    np.testing.assert_array_equal(screen.shown, [*rollout.frames[0][:8], *rollout.frames[0][:12]])
+
+
+needs_browser = pytest.mark.skipif(not browsing.CHROMIUM, reason="there is no browser: sudo apt-get install chromium")
+
+
+@needs_browser
+def test_a_browser_draws_the_run(served: int, rollout: ls.Rollout, tmp_path: Path) -> None:
+    """What the page gets is the run to the last bit, and what it draws moves."""
+    with browsing.browser(f"http://127.0.0.1:{served}/", tmp_path / "profile", size=(500, 400)) as page:
+        pictures = list(itertools.islice(page.pictures(), 3))
+        frames = {frame.tobytes() for frame in rollout.frames[0]}
+        seen = set()
+        ours = Origin(f"http://localhost:{served}")
+        with connect(f"ws://127.0.0.1:{served}/state", origin=ours, max_size=None) as spectator:
+            until = time.monotonic() + 60
+            while len(seen) < 10 and time.monotonic() < until:
+                payload = spectator.recv(timeout=60)
+                spectator.send("state_ack")
+                if isinstance(payload, bytes):
+                    found = [frame for frame in frames if frame in payload]
+                    assert len(found) == 1
+                    seen.update(found)
+    assert len(seen) >= 10
+    for picture in pictures:
+        assert picture.std() > 20
+    for before, after in itertools.pairwise(pictures):
+        changed = np.abs(after.astype(int) - before).max(axis=2) > 40
+        assert 20 < changed.sum() < 0.2 * changed.size  # the robot, its trace and the words, and not all of it
+
+
+@needs_browser
+def test_keys_and_the_mouse_reach_the_robot(tmp_path: Path) -> None:
+    """In the browser: an arrow key pushes the robot, and Ctrl with the right mouse button drags it."""
+    before = """import lqrsim.view.viewer as viewer, lqrsim.view.screen as screen
+push, pull = screen.Screen.push, screen.Screen.pull
+def pushed(self, direction, azimuth):
+    push(self, direction, azimuth)
+    print("pushed", *direction, flush=True)
+def pulled(self, wrenches):
+    pull(self, wrenches)
+    if self.wrench.any():
+        print("pulled", *self.wrench, flush=True)
+screen.Screen.push, screen.Screen.pull = pushed, pulled"""
+    with viewing(tmp_path, "quadrotor", "--port", str(PORT + 3), "--speed", "0.3", before=before) as process:
+        said(process, "Ctrl-C ends it")
+        with browsing.browser(f"http://127.0.0.1:{PORT + 3}/", tmp_path / "profile", size=(500, 400)) as page:
+            next(page.pictures())
+            page.press("ArrowRight", 39)
+            said(process, "pushed 1.0 0.0 0.0")
+            page.drag((350, 140), (350, 80))
+            said(process, "pulled")
