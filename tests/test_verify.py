@@ -1,10 +1,11 @@
 """Verification from pixels: honest runs and videos pass with room to spare, and every fault is told."""
 
 import dataclasses
+import importlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import av
 import numpy as np
 import pytest
 
@@ -14,13 +15,15 @@ from lqrsim.verify import pixels
 from lqrsim.view import cameras, footage, gl
 from lqrsim.view.cameras import Camera
 from lqrsim.view.footage import Footage
-from lqrsim.view.video import encoder
+
+faults: Any = importlib.import_module("injected_faults")  # of experiments/, whose benchmark makes them at full size
 
 pytestmark = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
 
 ROBOTS = ("quadrotor", "differential_drive")
 # Metres; the first as the packaged robots are verified, rms and at worst, the second of videos.
 BOUNDS = {"quadrotor": (0.005, 0.010), "differential_drive": (0.003, 0.005)}
+HALF = 75  # control periods
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,10 +38,12 @@ class Case:
     frames: list[np.ndarray]
     told: Footage
 
-
-def decode(path: Path) -> list[np.ndarray]:
-    with av.open(str(path)) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    def beginning(self, frames: np.ndarray | None = None) -> ls.Rollout:
+        """The first half of the run, as if it had diverged then, which is as good for faults; or with other frames."""
+        frames = (self.run.frames if frames is None else frames[None]).copy()
+        states = self.run.states.copy()
+        frames[:, self.run.frame_times > self.run.times[HALF] + 1e-9], states[:, HALF + 1 :] = np.nan, np.nan
+        return dataclasses.replace(self.run, states=states, frames=frames, diverged=np.array([True]))
 
 
 @pytest.fixture(scope="module", params=ROBOTS)
@@ -52,10 +57,10 @@ def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     )
     path = tmp_path_factory.mktemp("video") / "run.mp4"
     if name == "quadrotor":
-        ls.render(run, path, camera="top", insets=("side",), size=(800, 360), speed=2)
+        ls.render(run, path, camera="top", insets=("side",), size=(800, 360), speed=3)
     else:
-        ls.render(run, path, camera="top", size=(560, 360), speed=5)
-    return Case(name, solution, run, other, path, decode(path), footage.read(path))
+        ls.render(run, path, camera="top", size=(560, 360), speed=10)
+    return Case(name, solution, run, other, path, list(faults.decoded(path)), footage.read(path))
 
 
 def failed(found: ls.Verification) -> set[str]:
@@ -83,14 +88,14 @@ def late(frames: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def dropped(frames: np.ndarray, other: np.ndarray) -> np.ndarray:
-    middle = len(frames) // 2
-    return np.concatenate([frames[:middle], frames[middle + 1 :], frames[-1:]])
+    gone = len(frames) // 4
+    return np.concatenate([frames[:gone], frames[gone + 1 :], frames[-1:]])
 
 
 def swapped(frames: np.ndarray, other: np.ndarray) -> np.ndarray:
     changed = frames.copy()
     step = 1 if len(frames) < 400 else 5  # recorded frames in a control period
-    first, second = step * 70, step * 71
+    first, second = step * 40, step * 41
     changed[[first, second]] = frames[[second, first]]
     return changed
 
@@ -114,8 +119,8 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", [late, dropped, swapped, mirrored, another])
 def test_a_fault_in_what_a_run_recorded_is_told(fault: Fault, case: Case) -> None:
-    frames = fault(case.run.frames[0], case.other.frames[0])[None]
-    found = ls.verify_run(dataclasses.replace(case.run, frames=frames), solution=case.solution)
+    frames = fault(case.run.frames[0], case.other.frames[0])
+    found = ls.verify_run(case.beginning(frames), solution=case.solution)
     assert "position" in failed(found)
     assert FAULTS[fault.__name__] in found.likely
     assert "NOT VERIFIED" in found.summary()
@@ -131,7 +136,7 @@ def test_a_plan_that_is_not_the_runs_is_told(case: Case) -> None:
     position = list(case.run.state_coordinates.position)
     begins = np.linalg.norm((plan.states[0] - case.run.plan.states[0])[position])
     assert begins < 0.05  # that does not tell
-    changed = dataclasses.replace(case.run, plan=plan)
+    changed = dataclasses.replace(case.beginning(), plan=plan)
     found = ls.verify_run(changed, solution=case.solution)
     assert failed(found) == {"plan"}
     assert "plan" in found.likely
@@ -139,8 +144,8 @@ def test_a_plan_that_is_not_the_runs_is_told(case: Case) -> None:
     policy = dataclasses.replace(case.solution.policy, nominal=plan.states[:-1])
     its_own = dataclasses.replace(case.solution, trajectory=plan, policy=policy)
     assert failed(ls.verify_run(changed, solution=its_own)) == {"plan"}
-    assert failed(ls.verify_video(case.video, changed)) == {"run"}
-    untold = ls.verify_run(case.run)
+    assert failed(ls.verify_video(case.video, dataclasses.replace(case.run, plan=plan))) == {"run"}
+    untold = ls.verify_run(case.beginning())
     assert untold.passed
     assert "untold  plan" in untold.summary()
 
@@ -163,15 +168,15 @@ def test_a_camera_that_is_off_by_2_cm_is_told(
     if view == "side" and case.name != "quadrotor":
         pytest.skip("a robot in the plane is seen from above alone")
     monkeypatch.setattr(Camera, "place", off(view, axis))
-    found = ls.verify_run(case.run)
+    found = ls.verify_run(case.beginning())
     assert "position" in failed(found)
     assert "camera is off" in found.likely
 
 
 def test_a_camera_may_be_anywhere_along_its_line_of_sight(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = ls.verify_run(case.run).seen
+    seen = ls.verify_run(case.beginning()).seen
     monkeypatch.setattr(Camera, "place", off("top", 2))
-    np.testing.assert_array_equal(ls.verify_run(case.run).seen, seen)
+    np.testing.assert_array_equal(ls.verify_run(case.beginning()).seen, seen)
 
 
 # -- Videos
@@ -186,82 +191,47 @@ def test_an_honest_video_is_verified(case: Case) -> None:
     assert len(found.times) == len(case.frames)
 
 
-def rewritten(case: Case, path: Path, frames: list[np.ndarray], told: Footage | None = None) -> Path:
-    """The video once more, with other frames or another account of itself."""
-    told = told or dataclasses.replace(case.told, frames=len(frames))
-    height, width, _ = frames[0].shape
-    with encoder(path, (width, height), told.rate, crf=18, preset="ultrafast", footage=told) as encode:
-        for frame in frames:
-            encode(frame)
-    return path
-
-
-def flipped(case: Case) -> list[np.ndarray]:
-    """Its first pane from left to right."""
-    pane = case.told.panes[0]
-    left, right, rows = pane.left, pane.left + pane.width, slice(pane.top, pane.top + pane.height)
-    frames = [frame.copy() for frame in case.frames]
-    for frame in frames:
-        frame[rows, left:right] = frame[rows, left:right][:, ::-1].copy()
-    return frames
-
-
 @pytest.mark.parametrize(
     ("fault", "likely"),
     [("late", "1.0 frames late"), ("dropped", "left out"), ("swapped", "swapped"), ("mirrored", "mirrored")],
 )
 def test_a_fault_in_a_videos_frames_is_told(fault: str, likely: str, case: Case, tmp_path: Path) -> None:
     """Also where the file gives the right number of frames."""
-    frames, middle = list(case.frames), len(case.frames) // 2
-    if fault == "late":
-        frames = [frames[0], *frames[:-1]]
-    elif fault == "dropped":
-        del frames[middle]
-    elif fault == "swapped":
-        frames[middle : middle + 2] = frames[middle : middle + 2][::-1]
-    else:
-        frames = flipped(case)
-    found = ls.verify_video(rewritten(case, tmp_path / "changed.mp4", frames), case.run)
+    getattr(faults, fault)(case.video, tmp_path / "changed.mp4")
+    found = ls.verify_video(tmp_path / "changed.mp4", case.run)
     assert "position" in failed(found)
+    assert "frames" not in failed(found)
     assert likely in found.likely
 
 
 def test_a_frame_that_is_missing_from_the_file_is_counted(case: Case, tmp_path: Path) -> None:
-    path = rewritten(case, tmp_path / "short.mp4", case.frames[:-1], case.told)
-    found = ls.verify_video(path, case.run)
+    faults.write(tmp_path / "short.mp4", case.frames[:-1], case.told)
+    found = ls.verify_video(tmp_path / "short.mp4", case.run)
     assert failed(found) == {"frames"}
     assert "cut" in found.likely
 
 
 def test_a_video_that_plays_at_another_speed_is_told(case: Case, tmp_path: Path) -> None:
-    faster = dataclasses.replace(case.told, rate=case.told.rate * 2)
-    with encoder(
-        tmp_path / "fast.mp4", case.frames[0].shape[1::-1], faster.rate, crf=18, preset="ultrafast", footage=case.told
-    ) as encode:
-        for frame in case.frames:
-            encode(frame)
+    faults.write(tmp_path / "fast.mp4", case.frames, case.told, rate=case.told.rate * 2)
     assert failed(ls.verify_video(tmp_path / "fast.mp4", case.run)) == {"frames"}
 
 
-@pytest.mark.parametrize("axis", range(3))
-def test_calibration_that_is_off_by_2_cm_is_told(axis: int, case: Case, tmp_path: Path) -> None:
-    pane = case.told.panes[-1]  # the side of the quadrotor's video, the top of the other's
-    assert pane.camera is not None
-    moved = np.array(pane.camera.position) + 0.02 * np.eye(3)[axis]
-    camera = dataclasses.replace(pane.camera, position=tuple(moved.tolist()))
-    told = dataclasses.replace(case.told, panes=(*case.told.panes[:-1], dataclasses.replace(pane, camera=camera)))
-    found = ls.verify_video(rewritten(case, tmp_path / "changed.mp4", case.frames, told), case.run)
-    if abs(camera.forward[axis]) == 1:  # along the line of sight it is the same camera
-        assert found.passed
-    else:
-        assert "position" in failed(found)
-        assert "camera is off" in found.likely
+def test_calibration_that_is_off_by_2_cm_is_told(case: Case, tmp_path: Path) -> None:
+    _, camera = faults.calibrated(case.told)[-1]  # the side of the quadrotor's video, the top of the other's
+    for axis in range(3):
+        faults.off(camera.name, axis)(case.video, tmp_path / "changed.mp4")
+        found = ls.verify_video(tmp_path / "changed.mp4", case.run)
+        if abs(camera.forward[axis]) == 1:  # along the line of sight it is the same camera
+            assert found.passed
+        else:
+            assert "position" in failed(found)
+            assert "camera is off" in found.likely
 
 
 def test_another_seeds_run_is_told_by_the_pixels_alone(case: Case, tmp_path: Path) -> None:
     assert {"run", "position"} <= failed(ls.verify_video(case.video, case.other))
-    told = dataclasses.replace(case.told, runs=(footage.digest(case.other),))
-    found = ls.verify_video(rewritten(case, tmp_path / "changed.mp4", case.frames, told), case.other)
+    faults.forged(footage.digest(case.other))(case.video, tmp_path / "changed.mp4")
+    found = ls.verify_video(tmp_path / "changed.mp4", case.other)
     assert "position" in failed(found)
     assert "run" not in failed(found)
     assert "another run" in found.likely
@@ -269,32 +239,34 @@ def test_another_seeds_run_is_told_by_the_pixels_alone(case: Case, tmp_path: Pat
 
 def test_a_covered_robot_is_counted_not_guessed(case: Case, tmp_path: Path) -> None:
     """A few frames without it are said; more than one in twenty are too many."""
-    frames = [frame.copy() for frame in case.frames]
-    for hidden, verdict in [(3, set()), (12, {"seen"})]:
+    frames, path = [frame.copy() for frame in case.frames], tmp_path / "covered.mp4"
+    for hidden, verdict in [(2, set()), (len(frames) // 10, {"seen"})]:
         for frame in frames[30 : 30 + hidden]:
             frame[:] = 200
-        found = ls.verify_video(rewritten(case, tmp_path / "covered.mp4", frames), case.run)
+        faults.write(path, frames, case.told, preset="ultrafast")  # as sharp as possible: encoded twice, it is small
+        found = ls.verify_video(path, case.run)
         assert failed(found) == verdict
         assert f"in {len(frames) - hidden} of {len(frames)} frames" in found.summary()
         assert np.isnan(found.seen).all(axis=1).sum() == hidden
-    for frame in frames:
-        frame[:] = 200
-    found = ls.verify_video(rewritten(case, tmp_path / "covered.mp4", frames), case.run)
+    faults.write(path, [np.full_like(frame, 200) for frame in frames], case.told)
+    found = ls.verify_video(path, case.run)
     assert "seen" in failed(found)
     assert "not in the pictures" in found.likely
 
 
 def test_what_can_not_be_verified_is_refused(case: Case, tmp_path: Path) -> None:
     bare = dataclasses.replace(case.told, panes=(dataclasses.replace(case.told.panes[0], camera=None),))
+    path = tmp_path / "changed.mp4"
+    faults.retold(case.video, path, bare)
     with pytest.raises(ls.InputError, match="views: got none, want"):
-        ls.verify_video(rewritten(case, tmp_path / "bare.mp4", case.frames[:3], bare), case.run)
+        ls.verify_video(path, case.run)
     if case.name == "quadrotor":
-        half = dataclasses.replace(case.told, panes=case.told.panes[:1])
+        faults.retold(case.video, path, dataclasses.replace(case.told, panes=case.told.panes[:1]))
         with pytest.raises(ls.InputError, match="views: got top, want top and side"):
-            ls.verify_video(rewritten(case, tmp_path / "half.mp4", case.frames[:3], half), case.run)
-    small = [np.ascontiguousarray(frame[::2, ::2]) for frame in case.frames[:3]]
+            ls.verify_video(path, case.run)
+    faults.write(path, [np.ascontiguousarray(frame[::2, ::2]) for frame in case.frames[:3]], case.told)
     with pytest.raises(ls.InputError, match="want them as lqrsim wrote them"):
-        ls.verify_video(rewritten(case, tmp_path / "small.mp4", small, case.told), case.run)
+        ls.verify_video(path, case.run)
     with pytest.raises(ls.InputError, match="trial: got 1, want one of 0 to 0"):
         ls.verify_run(case.run, 1)
     without = dataclasses.replace(case.run, frames=case.run.frames[:, :0], frame_times=case.run.frame_times[:0])
@@ -321,12 +293,9 @@ def test_the_command_says_it_with_its_exit_code(case: Case, tmp_path: Path, caps
 
 
 def test_a_trial_that_diverged_is_verified_up_to_there(case: Case) -> None:
-    states, frames = case.run.states.copy(), case.run.frames.copy()
-    gone = case.run.times[60]
-    states[:, 61:], frames[:, case.run.frame_times > gone + 1e-9] = np.nan, np.nan
-    found = ls.verify_run(dataclasses.replace(case.run, states=states, frames=frames, diverged=np.array([True])))
+    found = ls.verify_run(case.beginning())
     assert found.passed
-    assert found.times[-1] == pytest.approx(gone)
+    assert found.times[-1] == pytest.approx(case.run.times[HALF])
 
 
 def test_views_that_disagree_are_told_apart() -> None:

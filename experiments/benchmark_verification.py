@@ -1,0 +1,152 @@
+"""How well positions are told from pixels, and whether faults are found: both robots' disturbed runs, and their videos.
+
+    python experiments/benchmark_verification.py            # some minutes; the table of docs/verifying.md
+    python experiments/benchmark_verification.py --quick    # small videos of fewer frames
+    python experiments/benchmark_verification.py --json     # all that is measured, for other programs
+
+The runs are the demo's. Each is drawn and measured; its video is rendered at standard quality with all overlays, and
+measured as its file has it. Then each fault is made in the decoded frames, which are encoded again, or in what the file
+says of itself.
+"""
+
+import json
+import tempfile
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import injected_faults as faults
+import tyro
+from quality.common import judge
+from tqdm import tqdm
+
+import lqrsim as ls
+from lqrsim.machine import description
+from lqrsim.versions import versions
+from lqrsim.view import footage, gl
+
+VIEWS = {"quadrotor": ("top", "side"), "differential_drive": ("top",)}  # a camera, and insets
+RUN, VIDEO = "the run, drawn", "the video"
+# Millimetres, and of what.
+MOST = {
+    ("quadrotor", RUN): ("worst", 5.0),
+    ("quadrotor", VIDEO): ("rms", 10.0),
+    ("differential_drive", RUN): ("worst", 3.0),
+    ("differential_drive", VIDEO): ("worst", 5.0),
+}
+SAID = {"rms": "rms", "worst": "at worst"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    seed: int = 0
+    """Of the disturbances; the other run's is the next."""
+    quick: bool = False
+    """Draft quality, 10 frames a second."""
+    json: bool = False
+    """Print all that is measured as JSON."""
+
+
+def main(config: Config) -> dict[str, Any]:
+    gl.bind()
+    with tempfile.TemporaryDirectory() as folder:
+        robots = {name: measure(name, config, Path(folder)) for name in VIEWS}
+    return {"config": asdict(config), "versions": versions(), "machine": description(), "robots": robots}
+
+
+def measure(name: str, config: Config, folder: Path) -> dict[str, dict[str, Any]]:
+    """What verification finds, by what is verified."""
+    scenario = ls.scenarios.get(name)
+    solution, plant = ls.smooth(scenario.problem), scenario.plant()
+    run, other = (
+        ls.simulate(plant, solution, disturbances=scenario.disturbances, seed=seed)
+        for seed in (config.seed, config.seed + 1)
+    )
+    video, changed = folder / f"{name}.mp4", folder / f"{name}_changed.mp4"
+    camera, *insets = VIEWS[name]
+    quality, fps = ("draft", 10) if config.quick else ("standard", 30)
+    with tqdm(desc=f"{name}, rendering", unit="frame", leave=False, delay=2.0, disable=None) as bar:
+
+        def progress(done: int, count: int) -> None:
+            bar.total = count
+            bar.update(done - bar.n)
+
+        options = {"camera": camera, "insets": insets, "quality": quality, "fps": fps}
+        ls.render(run, video, solution=solution, progress=progress, **options)
+    found = {
+        RUN: verdict(ls.verify_run(run, solution=solution)),
+        VIDEO: verdict(ls.verify_video(video, run, solution=solution)),
+    }
+    made = all_faults(video, footage.digest(other))
+    for label, (make, is_other) in tqdm(made.items(), desc=f"{name}, faults", leave=False, delay=2.0, disable=None):
+        make(video, changed)
+        found[label] = verdict(ls.verify_video(changed, other if is_other else run, solution=solution))
+    return found
+
+
+def all_faults(video: Path, digest: str) -> dict[str, tuple[faults.Fault, bool]]:
+    """What makes each of the video, and whether it is then said to be of the other run, of that digest."""
+    views = [camera for _, camera in faults.calibrated(footage.read(video))]
+    made: dict[str, tuple[faults.Fault, bool]] = {
+        "one frame late": (faults.late, False),
+        "one frame dropped": (faults.dropped, False),
+        "two frames swapped": (faults.swapped, False),
+        f"`{views[0].name}` mirrored": (faults.mirrored, False),
+    }
+    for view in views:
+        for axis in (
+            axis for axis in range(3) if view.forward[axis] == 0
+        ):  # along its line of sight it may be anywhere
+            made[f"`{view.name}` off by {100 * faults.OFF:g} cm in {'xyz'[axis]}"] = (
+                faults.off(view.name, axis),
+                False,
+            )
+    return made | {"another seed's run, its digest forged": (faults.forged(digest), True)}
+
+
+def verdict(found: ls.Verification) -> dict[str, Any]:
+    return {
+        "rms": 1e3 * found.rms, "worst": 1e3 * found.worst, "shift": found.shift, "scale": found.scale,
+        "frames": len(found.times), "passed": found.passed, "likely": found.likely,
+        "failed": [test.name for test in found.tests if test.passed is False],
+    }  # fmt: skip
+
+
+def report(result: dict[str, Any]) -> str:
+    robots = result["robots"]
+    heads = [head for name in robots for head in (f"{name.replace('_', ' ')} rms", "worst")]
+    rows = [f"| | {' | '.join(heads)} | verdict | said to be likely |", "|---" * (3 + len(heads)) + "|"]
+    labels = list(dict.fromkeys(label for found in robots.values() for label in found))
+    for label in labels:
+        found = [one[label] for one in robots.values() if label in one]
+        numbers = [
+            f"{one[label][of]:.1f}" if label in one else "" for one in robots.values() for of in ("rms", "worst")
+        ]
+        verdicts = joined("passed" if one["passed"] else "refused" for one in found)
+        likely = joined(one["likely"].split(":")[0].split(";")[0] for one in found)
+        rows.append(f"| {label} | {' | '.join(numbers)} | {verdicts} | {likely} |")
+    rows.append("")
+    for (name, label), (of, most) in MOST.items():
+        value, want = robots[name][label][of], f"{most:g} mm or less {SAID[of]}"
+        rows.append(f"{name}, {label}: {value:.1f} mm {SAID[of]}  {judge(value <= most, want)}")
+    honest, faulty = (
+        [one["passed"] for found in robots.values() for label, one in found.items() if (label in (RUN, VIDEO)) is kind]
+        for kind in (True, False)
+    )
+    rows += [
+        f"without a fault: {sum(honest)} of {len(honest)} pass  {judge(all(honest), 'all')}",
+        f"with one: {faulty.count(False)} of {len(faulty)} are refused  {judge(not any(faulty), 'all')}",
+    ]
+    return "\n".join(rows)
+
+
+def joined(said: Iterable[str]) -> str:
+    """Once what is said of all robots, otherwise in their order."""
+    return " / ".join(dict.fromkeys(said))
+
+
+if __name__ == "__main__":
+    settings = tyro.cli(Config, description=__doc__)
+    outcome = main(settings)
+    print(json.dumps(outcome) if settings.json else report(outcome))
