@@ -1,6 +1,7 @@
 """The command line. Each command reads what the one before wrote; `lqrsim COMMAND --help` documents each."""
 
 import logging
+import os
 import sys
 from collections.abc import Sequence
 
@@ -52,7 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
       arguments: what follows `lqrsim` on the command line; those of this process by default.
 
     Returns:
-      The exit code: 0 done; 1 not converged or out of bounds; 2 bad input; 130 stopped with Ctrl-C.
+      The exit code: 0 done; 1 not converged or out of bounds; 2 bad input; 130 stopped with Ctrl-C;
+      141 nobody reads what it prints.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if arguments == ["--version"]:
@@ -69,13 +71,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logger.addHandler(notices)
     logger.setLevel(logging.INFO)
     try:
-        return command.run()
+        code = command.run()
+        sys.stdout.flush()  # while a broken pipe can still be handled
+        return code
     except InputError as error:
         print(f"lqrsim: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("lqrsim: stopped", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # whoever reads what is printed, such as `head`, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at the end
+        return 141
     finally:
         logger.removeHandler(notices)
 

@@ -266,6 +266,16 @@ def test_ctrl_c_is_one_line_and_leaves_nothing(own: Path, tmp_path: Path) -> Non
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGPIPE, nor an exit code for it")
+def test_whoever_reads_the_output_may_stop() -> None:
+    with start("list") as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        error = process.stderr.read()
+    assert (process.returncode, error) == (141, "")
+
+
 def test_cache_shows_and_clears(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
