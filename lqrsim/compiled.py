@@ -195,13 +195,11 @@ def _plain(array: Array) -> Array:
     return np.require(array, np.float64, ["C", "W"])
 
 
-def nearest(space: Coordinates, states: Array, nominal: Array) -> Array:
-    """As `space.nearest`, compiled: states (K, T+1, n), nominal (T+1, n)."""
-    out = np.array(states, dtype=np.float64, order="C")
+def turn_to_nearest(space: Coordinates, states: Array, nominal: Array) -> None:
+    """As `space.nearest`, compiled and in place: states (T+1, K, n), C-ordered, become those nearest to (T+1, n)."""
     with compiling:
         core_of_laws = _policy_core(len(space), 1, space.angles, space.rotation_vectors)
-    core_of_laws.turn_all(len(out), len(nominal), out.reshape(-1, len(space)), _plain(nominal))
-    return out
+    core_of_laws.turn_all(len(states), states.shape[1], states.reshape(-1, len(space)), _plain(nominal))
 
 
 @cache

@@ -33,11 +33,11 @@ def apply_law(count, near, gain, offset, nominal, low, high, out) -> None:
             out[k, j] = total
 
 
-def turn_all(count, steps, states, nominal) -> None:
-    """Takes each of the states (count steps, N) to its representative nearest to its step's nominal (steps, N)."""
-    for k in range(count):
-        for t in range(steps):
-            turn(states[k * steps + t], nominal[t])
+def turn_all(steps, count, states, nominal) -> None:
+    """Takes each of the states (steps count, N) to its representative nearest to its step's nominal (steps, N)."""
+    for t in range(steps):
+        for k in range(count):
+            turn(states[t * count + k], nominal[t])
 
 
 def nearest_angle(x, nominal, i: int) -> None:

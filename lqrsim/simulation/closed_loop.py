@@ -131,7 +131,8 @@ def simulate(
                 progress(step + 1, steps)
 
     drawn = np.stack(seen, axis=1)
-    states, measured = (compiled.nearest(controller.spaces[0], array, plan.states) for array in (states, measured))
+    for array in (states, measured):
+        compiled.turn_to_nearest(controller.spaces[0], array.transpose(1, 0, 2), plan.states)
     if lost.any():
         # A frame belongs to the knot that ends its period: the trial was lost somewhere before that.
         knot_of_frame = -(np.arange(len(seen)) // -max(physics.parts, 1))
