@@ -15,7 +15,7 @@ from lqrsim.verify.record import Progress
 from lqrsim.verify.verdict import Verification, judge
 from lqrsim.view import cameras, gl
 from lqrsim.view.cameras import Camera
-from lqrsim.view.marker import robot_body
+from lqrsim.view.recorded import robot_body
 
 SIZE = (640, 480)
 BOUND = 1 / 60  # the worst error that is allowed, in radii of the robot: 5 and 2.8 mm for the packaged ones

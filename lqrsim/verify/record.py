@@ -6,27 +6,20 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_count
+from lqrsim.errors import Array, InputError
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.controllers import Feedback
 from lqrsim.verify.verdict import Test
-from lqrsim.view.marker import robot_body
+from lqrsim.view.recorded import model_of, robot_body
 
 Progress = Callable[[int, int], object]
 
 
 def model(rollout: Rollout, trial: int) -> mujoco.MjModel:
     """The model that was run. Raises InputError unless there is such a trial of it, recorded for drawing."""
-    if not 0 <= check_count("trial", trial, at_least=0) < rollout.trials:
-        raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
-    if len(rollout.state_coordinates.position) not in (2, 3):
-        raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
-    try:
-        found = mujoco.MjModel.from_xml_string(rollout.model)
-    except (ValueError, mujoco.FatalError) as error:
-        raise InputError(f"rollout.model: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
-    if found.nq != rollout.frames.shape[-1] or len(rollout.frame_times) < 2:
+    found = model_of(rollout, trial)
+    if len(rollout.frame_times) < 2:
         raise InputError(f"rollout.frames: got shape {rollout.frames.shape}, want what simulate(frames=True) records")
     return found
 

@@ -6,6 +6,7 @@ import numpy as np
 from lqrsim.errors import Array
 from lqrsim.rollout import Rollout
 from lqrsim.view.cameras import Camera
+from lqrsim.view.decor import decorate
 
 # Pure green: the error map, the plan, forces, robots and scenes do not use it. All of its light is its own and its
 # channels are at their ends, so that it looks the same in the sun and in the shade.
@@ -26,13 +27,7 @@ def draw(scene: mujoco.MjvScene, camera: Camera, centre: Array, radius: float) -
     forward = np.array(camera.forward)
     centre = centre - (forward @ (centre - camera.position)) * forward
     for distance, size, colour in ((1, radius, COLOUR), (2, RIM * radius, (0.0, 0.0, 0.0))):
-        ball = scene.geoms[scene.ngeom]
-        place, rgba = centre + (distance + size) * forward, np.array([*colour, 1.0], dtype=np.float32)
-        mujoco.mjv_initGeom(ball, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, size), place, np.eye(3).ravel(), rgba)
-        ball.category, ball.castshadow, ball.specular, ball.emission = mujoco.mjtCatBit.mjCAT_DECOR, 0, 0, 1
+        place = centre + (distance + size) * forward
+        ball = decorate(scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_SPHERE, [size] * 3, place, (*colour, 1.0))
+        ball.specular, ball.emission = 0, 1
         scene.ngeom += 1
-
-
-def robot_body(model: mujoco.MjModel) -> int:
-    """The number of the robot's body: the first that moves."""
-    return int(np.argmax(model.body_weldid != 0))

@@ -13,11 +13,11 @@ from lqrsim.results import Solution
 from lqrsim.view import caption
 from lqrsim.view.caption import Colour
 from lqrsim.view.choices import Overlay
+from lqrsim.view.decor import PLAN, decorate
 from lqrsim.view.track import Track
 from lqrsim.view.tube import ABOVE, SIGMAS, ellipsoids
 
-# No colour of the error map, and none of the robots.
-PLAN = (0.78, 0.08, 0.42)
+# As PLAN, no colours of the error map, and none of the robots.
 FORCE = (0.0, 0.50, 0.36)
 MEASURED = (0.10, 0.10, 0.12)
 TUBE = (0.47, 0.30, 0.78)
@@ -142,17 +142,7 @@ class _Pen:
     def add(
         self, kind: Geom, position: Array, size: npt.ArrayLike, rgba: npt.ArrayLike, rotation: Array | None = None
     ) -> mujoco.MjvGeom:
-        geom = self.scene.geoms[self.scene.ngeom]
-        matrix = np.eye(3) if rotation is None else rotation
-        mujoco.mjv_initGeom(
-            geom,
-            kind,
-            np.asarray(size, dtype=np.float64),
-            np.asarray(position, dtype=np.float64),
-            matrix.ravel(),
-            np.asarray(rgba, dtype=np.float32),
-        )
-        geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, 0
+        geom = decorate(self.scene.geoms[self.scene.ngeom], kind, size, position, rgba, rotation)
         geom.specular, geom.emission = 0, 0 if self.flat else 0.3
         self.scene.ngeom += 1
         return geom

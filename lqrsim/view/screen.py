@@ -12,9 +12,10 @@ from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError
 from lqrsim.results import Trajectory
+from lqrsim.view.decor import PLAN, decorate
+from lqrsim.view.recorded import floor_below, robot_body
 
-PLAN = (0.78, 0.08, 0.42, 1.0)
-WANTED = (*PLAN[:3], 0.25)
+WANTED = (*PLAN, 0.25)
 TRACE = (0.05, 0.35, 0.62, 1.0)
 SEGMENTS = 60  # of the plan; the trace has twice as many
 LIFT = 0.008  # metres between the floor and the lines on it
@@ -67,7 +68,7 @@ class Screen(abc.ABC):
         # A copy: a viewer has sliders for gravity and the like.
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
-        self.robot = int(np.argmax(model.body_weldid != 0))  # the first body that moves
+        self.robot = robot_body(model)
         self.radius, self.speed, self.paused, self.caption = radius, speed, False, ""
         self.wrench = np.zeros(6)
         self._mass = float(model.body_subtreemass[self.robot])
@@ -96,7 +97,7 @@ class Screen(abc.ABC):
         place = self.data.xpos[self.robot].copy()
         if begins:
             self._trace.clear()
-            self._floor = self._below(place)
+            self._floor = floor_below(self.model, self.data)
         apart = float(np.linalg.norm(np.ptp(self._places, axis=0))) / SEGMENTS
         on_floor = self._on_floor(place[: self._places.shape[1]])
         if not self._trace or np.linalg.norm(on_floor - self._trace[-1]) > apart:
@@ -140,13 +141,13 @@ class Screen(abc.ABC):
         knots = np.unique(np.linspace(0, len(self._times) - 1, SEGMENTS + 1).astype(int))
         plan = [self._on_floor(self._places[knot]) for knot in knots]
         width = 0.002 * float(self.model.stat.extent)
-        for points, thick, colour in ((plan, 0.6 * width, PLAN), (self._trace, width, TRACE)):
+        for points, thick, colour in ((plan, 0.6 * width, (*PLAN, 1.0)), (self._trace, width, TRACE)):
             for ends in itertools.pairwise(points):
-                geom = _decor(new(), Geom.mjGEOM_CAPSULE, [thick] * 3, ends[0], colour)
+                geom = decorate(new(), Geom.mjGEOM_CAPSULE, [thick] * 3, ends[0], colour)
                 mujoco.mjv_connector(geom, Geom.mjGEOM_CAPSULE, thick, *ends)
         flat = self._places.shape[1] == 2
         shape = (Geom.mjGEOM_CYLINDER, [self.radius, LIFT, 0.0]) if flat else (Geom.mjGEOM_SPHERE, [self.radius] * 3)
-        _decor(new(), *shape, self.wanted(), WANTED)
+        decorate(new(), *shape, self.wanted(), WANTED)
 
     def aim(self, camera: mujoco.MjvCamera) -> None:
         """Let a camera that a person can turn see what the scene's own `overview` sees, if it has one."""
@@ -161,11 +162,6 @@ class Screen(abc.ABC):
 
     def _on_floor(self, place: Array | list[float]) -> Array:
         return np.append(place, self._floor + LIFT)[:3]
-
-    def _below(self, place: Array) -> float:
-        down = np.array([0.0, 0.0, -1.0])
-        hit = mujoco.mj_ray(self.model, self.data, place, down, None, True, self.robot, np.zeros(1, np.int32))
-        return float(place[2] - max(hit, 0.0))
 
     def _wait(self, left: float) -> None:
         """Until `left` seconds of the time shown have gone by."""
@@ -184,12 +180,3 @@ class Screen(abc.ABC):
                 break
             clock.sleep(float(np.clip(left / self.speed, 0.001, 0.01)))
         self._ahead = -left
-
-
-def _decor(
-    geom: mujoco.MjvGeom, kind: Geom, size: list[float], place: Array, rgba: tuple[float, ...]
-) -> mujoco.MjvGeom:
-    colour = np.array(rgba, dtype=np.float32)
-    mujoco.mjv_initGeom(geom, kind, np.array(size), np.asarray(place), np.eye(3).ravel(), colour)
-    geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, 0
-    return geom

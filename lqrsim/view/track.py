@@ -3,9 +3,9 @@
 import mujoco
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_count
+from lqrsim.errors import Array, InputError
 from lqrsim.rollout import Rollout
-from lqrsim.view.marker import robot_body
+from lqrsim.view.recorded import floor_below, model_of, robot_body
 
 SEEN = 0.2  # seconds for which a push is shown: one control period would be gone before it is seen, and noise flickers
 
@@ -23,12 +23,8 @@ class Track:
 
     def __init__(self, rollout: Rollout, trial: int) -> None:
         """Raises InputError: there is no such trial, or nothing of it that could be drawn."""
-        if not 0 <= check_count("trial", trial, at_least=0) < rollout.trials:
-            raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
-        if len(rollout.state_coordinates.position) not in (2, 3):
-            raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
         self.rollout, self.trial = rollout, trial
-        self.model = _model(rollout)
+        self.model = model_of(rollout, trial)
         whole = np.isfinite(rollout.frames[trial]).all(axis=1)
         alive = np.isfinite(rollout.states[trial]).all(axis=1)
         if not (whole.any() and alive.any()):
@@ -41,7 +37,9 @@ class Track:
         self.end = float(rollout.times[-1])
         self.planar = len(rollout.state_coordinates.position) == 2
         self.robot = robot_body(self.model)
-        self.floor = self._floor()
+        data = mujoco.MjData(self.model)
+        self.pose(data, 0.0)
+        self.floor = floor_below(self.model, data)
 
     def pose(self, data: mujoco.MjData, time: float) -> None:
         """Puts the model where it was at `time`, between two recorded frames if need be."""
@@ -80,23 +78,6 @@ class Track:
     def lost(self, time: float) -> bool:
         """Whether the trial had diverged by then."""
         return bool(self.rollout.diverged[self.trial]) and time > self.times[-1]
-
-    def _floor(self) -> float:
-        data = mujoco.MjData(self.model)
-        self.pose(data, 0.0)
-        centre, drop = data.xpos[self.robot], np.array([0.0, 0.0, -1.0])
-        hit = mujoco.mj_ray(self.model, data, centre, drop, None, True, self.robot, np.zeros(1, np.int32))
-        return float(centre[2] - max(hit, 0.0))
-
-
-def _model(rollout: Rollout) -> mujoco.MjModel:
-    try:
-        model = mujoco.MjModel.from_xml_string(rollout.model)
-    except (ValueError, mujoco.FatalError) as error:
-        raise InputError(f"rollout.model: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
-    if model.nq != rollout.frames.shape[-1]:
-        raise InputError(f"rollout.frames: got {rollout.frames.shape[-1]} numbers each, want the model's {model.nq}")
-    return model
 
 
 def _recent(forces: Array, dt: float) -> Array:

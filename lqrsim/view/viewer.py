@@ -18,6 +18,7 @@ from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
 from lqrsim.view.browser import Browser
+from lqrsim.view.recorded import model_of
 from lqrsim.view.screen import PUSHES, Again, Closed, Screen
 
 KEYS = """Arrow keys and Page Up/Down push the robot, seen from the camera. Ctrl and the right mouse button drag it.
@@ -92,14 +93,9 @@ def open_viewer(kind: str, port: int, *, title: str, **options: Any) -> Window |
 
 def of_rollout(rollout: Rollout, trial: int) -> dict[str, Any]:
     """What a Screen needs to show one trial."""
-    if not 0 <= trial < rollout.trials:
-        raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
+    model = model_of(rollout, trial)
     if not np.isfinite(rollout.frames[trial]).all(axis=1).any():
         raise InputError(f"rollout: got trial {trial} without one finite state, want something to show")
-    try:
-        model = mujoco.MjModel.from_xml_string(rollout.model)
-    except (ValueError, mujoco.FatalError) as error:
-        raise InputError(f"rollout.model: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
     position = rollout.state_coordinates.position
     return {"model": model, "plan": rollout.plan, "position": position, "radius": rollout.radius}
 

@@ -1,0 +1,35 @@
+"""What a rollout recorded for drawing: its model, the robot in it, and what that stands on."""
+
+import mujoco
+import numpy as np
+
+from lqrsim.errors import InputError, check_count
+from lqrsim.rollout import Rollout
+
+
+def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
+    """The model that was run, anew. Raises InputError unless there is such a trial of it, of a robot with a place."""
+    if not 0 <= check_count("trial", trial, at_least=0) < rollout.trials:
+        raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
+    if len(rollout.state_coordinates.position) not in (2, 3):
+        raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
+    try:
+        model = mujoco.MjModel.from_xml_string(rollout.model)
+    except (ValueError, mujoco.FatalError) as error:
+        raise InputError(f"rollout.model: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
+    if model.nq != rollout.frames.shape[-1]:
+        raise InputError(f"rollout.frames: got {rollout.frames.shape[-1]} numbers each, want the model's {model.nq}")
+    return model
+
+
+def robot_body(model: mujoco.MjModel) -> int:
+    """The number of the robot's body: the first that moves."""
+    return int(np.argmax(model.body_weldid != 0))
+
+
+def floor_below(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+    """The height of what is below the robot, in metres; its own where there is nothing."""
+    robot = robot_body(model)
+    centre, drop = data.xpos[robot], np.array([0.0, 0.0, -1.0])
+    hit = mujoco.mj_ray(model, data, centre, drop, None, True, robot, np.zeros(1, np.int32))
+    return float(centre[2] - max(hit, 0.0))
