@@ -27,7 +27,9 @@ from lqrsim.errors import Array
 from lqrsim.problem import FixedState, Problem
 from lqrsim.solvers import (
     augmented,
+    certificate,
     dual,
+    entries,
     interface,
     kernels,
     limits,
@@ -84,7 +86,7 @@ def _core(
     return Core("\n\n".join(parts), {**_NAMES, **sizes}, what)
 
 
-_SHARED = limits, passes, rollouts, loops, safeguard
+_SHARED = limits, passes, rollouts, loops, safeguard, certificate, entries
 
 
 @cache

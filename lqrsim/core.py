@@ -30,7 +30,7 @@ logger = logging.getLogger("lqrsim")
 _FAST = ("contract", "reassoc", "nsz", "arcp")
 
 # The functions that take long to compile, which is worth a message.
-LONG = ("smoother_iterations", "damped_iterations", "ilqr_iterations")
+LONG = ("smoother", "ilqr")
 
 # Compilations in this process; what was loaded from disk does not count.
 compilations: list[str] = []

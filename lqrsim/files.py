@@ -20,7 +20,7 @@ import numpy.typing as npt
 from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array
 from lqrsim.policy import AffinePolicy
-from lqrsim.results import Candidate, Iteration, Multipliers, Solution, Status, Trajectory
+from lqrsim.results import Candidate, Certificate, Iteration, Multipliers, Solution, Status, Trajectory
 from lqrsim.rollout import Rollout
 from lqrsim.value_functions import Moments, Quadratic
 
@@ -120,6 +120,8 @@ def load_solution(path: str | os.PathLike[str]) -> Solution:
             trajectory=_trajectory(arrays, steps, n, m, dt),
             iterations=tuple(Iteration(*numbers, method=str(method)) for numbers, method in rows),
             clearance=_array(arrays, "clearance", (steps + 1,)) if "clearance" in arrays else None,
+            certificate=Certificate(**meta["certificate"]),
+            gap=float(meta["gap"]),
             solver=meta["solver"],
             options=meta["options"],
             problem_digest=meta["problem_digest"],
@@ -189,6 +191,7 @@ def _solution_parts(solution: Solution) -> tuple[str, dict[str, npt.NDArray[Any]
     texts = {
         "status": solution.status.value, "detail": solution.detail, "dt": solution.trajectory.dt,
         "states": asdict(solution.policy.state_coordinates), "controls": asdict(solution.policy.control_coordinates),
+        "certificate": asdict(solution.certificate), "gap": solution.gap,
         "solver": solution.solver, "options": dict(solution.options), "problem_digest": solution.problem_digest,
         "versions": dict(solution.versions), "scenario": solution.scenario,
         "methods": [iteration.method for iteration in solution.iterations],

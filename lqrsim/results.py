@@ -45,10 +45,13 @@ class Status(enum.StrEnum):
     CONVERGED = "converged"
     COST_CONVERGED = "cost converged"
     MAX_ITERATIONS = "max iterations"
+    TIME_LIMIT = "time limit"
+    INTERRUPTED = "interrupted"
     INFEASIBLE = "infeasible"
     DIVERGED = "diverged"
     NOT_FINITE = "not finite"
     NOT_POSITIVE_DEFINITE = "not positive definite"
+    NOT_CERTIFIED = "not certified"
 
     @property
     def success(self) -> bool:
@@ -75,6 +78,14 @@ _STATUS_TEXT = {
         "the iteration limit came first, or no step lowered the cost any more",
         "raise max_iterations if the improvements still shrink; if they do not, try another start",
     ),
+    Status.TIME_LIMIT: (
+        "the time limit came first; the plan is the best so far",
+        "raise time_limit, or begin nearer: start=solution of a similar problem",
+    ),
+    Status.INTERRUPTED: (
+        "the callback raised, or Ctrl-C; the plan is the best so far",
+        "solve again, from start=solution",
+    ),
     Status.INFEASIBLE: (
         "the constraints can not be met, at least not near the plan that misses them least",
         "relax the constraint that is named, give more time, or try another start",
@@ -90,6 +101,10 @@ _STATUS_TEXT = {
     Status.NOT_POSITIVE_DEFINITE: (
         "a matrix that must be inverted was not positive definite",
         "raise the control weight, start with an InitialPrior, shorten dt, or try the other solver",
+    ),
+    Status.NOT_CERTIFIED: (
+        "the method converged, but its plan, checked against the problem, is not what it claims",
+        "try another start or form; and please report it, for it is a fault of lqrsim",
     ),
 }
 
@@ -142,6 +157,33 @@ class Iteration:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class Certificate:
+    """What the plan is, recomputed from the problem after the solve, on a path that the solvers do not use.
+
+    A solution that says CONVERGED has passed: each of these is within rounding, and the optimality within tolerance.
+
+    Attributes:
+      cost: of the plan.
+      start: largest difference of its first state from a `FixedState`; 0 where the start is not fixed.
+      motion: largest difference of a state from a step of the dynamics out of the state before it; each state relative
+        to its largest size along the plan, at least 1 unit.
+      law: largest difference of a control from the policy's at that state, relative to the terms of `L x + l`.
+      limits: by how much a control is beyond its limits, in its unit.
+      violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all are kept.
+      optimality: the decrease of cost that the slopes of the cost in the policy's offsets (and in a start that is not
+        fixed) still promise, relative to the cost; infinite where there is no cost-to-go to weigh them with.
+    """
+
+    cost: float
+    start: float
+    motion: float
+    law: float
+    limits: float
+    violation: float
+    optimality: float
+
+
 @dataclass(frozen=True)
 class Multipliers:
     """What a constraint presses with, at each step: zero where it is kept with room to spare.
@@ -192,6 +234,8 @@ class Solution:
       clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,);
         None where the problem has no obstacles.
       solver, options: what was called, with which settings.
+      certificate: what the plan is, recomputed from the problem; cost, violation and optimality are read from it.
+      gap: of the plan; see `Iteration.gap`. NaN if there is none.
       problem_digest: hash of everything that defined the problem.
       versions: of lqrsim and the libraries that the numbers depend on.
       scenario: what the command line was asked for; empty where a program called the solver.
@@ -208,6 +252,8 @@ class Solution:
     trajectory: Trajectory
     iterations: tuple[Iteration, ...]
     clearance: Array | None
+    certificate: Certificate
+    gap: float
     solver: str
     options: Mapping[str, object]
     problem_digest: str
@@ -223,28 +269,23 @@ class Solution:
 
     @property
     def cost(self) -> float:
-        """True cost of the plan; NaN if not one iteration was completed, or it was only to keep the constraints."""
-        return self.iterations[-1].cost if self.iterations else float("nan")
-
-    @property
-    def gap(self) -> float:
-        """Gap of the last iteration; see `Iteration.gap`."""
-        return self.iterations[-1].gap if self.iterations else float("nan")
+        """True cost of the plan, start and end included."""
+        return self.certificate.cost
 
     @property
     def optimality(self) -> float:
-        """First-order optimality of the last iteration; see `Iteration.optimality`."""
-        return self.iterations[-1].optimality if self.iterations else float("nan")
+        """First-order optimality of the plan; see `Certificate`."""
+        return self.certificate.optimality
+
+    @property
+    def violation(self) -> float:
+        """By how much the worst constraint is missed at the steps; see `Certificate`."""
+        return self.certificate.violation
 
     @property
     def dynamics_residual(self) -> float:
         """Dynamics residual of the last iteration; see `Iteration.dynamics_residual`."""
         return self.iterations[-1].dynamics_residual if self.iterations else float("nan")
-
-    @property
-    def violation(self) -> float:
-        """By how much the worst constraint is missed at the steps; see `Iteration.violation`."""
-        return self.iterations[-1].violation if self.iterations else float("nan")
 
     @property
     def total_cost(self) -> TotalCost:

@@ -280,11 +280,11 @@ def test_cache_shows_and_clears(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
-    cache.save("kept", bytes(10_000), "smoother_iterations for pendulum (2 states, 1 controls)")
+    cache.save("kept", bytes(10_000), "smoother for pendulum (2 states, 1 controls)")
     assert main(["cache"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("    0.01 MB  last used 20")
-    assert lines[0].endswith("smoother_iterations for pendulum (2 states, 1 controls)")
+    assert lines[0].endswith("smoother for pendulum (2 states, 1 controls)")
     assert lines[1] == f"1 items, 0.0 of at most 268 MB, in {tmp_path}"
     assert main(["cache", "--clear"]) == 0
     assert capsys.readouterr().out == f"removed 1 items from {tmp_path}\n"

@@ -8,10 +8,10 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from types import ModuleType
 
-import kkt
 import numpy as np
 import pytest
 from linear_quadratic import LinearQuadratic, solve_dense
+from whole_problems import kkt
 
 import lqrsim as ls
 from lqrsim.costs import terms_of

@@ -4,10 +4,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import kkt
 import numpy as np
 import pytest
 from test_smoother import same
+from whole_problems import kkt
 
 import lqrsim as ls
 from lqrsim.errors import Array

@@ -244,7 +244,7 @@ class TestEndings:
         assert solution.status is Status.NOT_POSITIVE_DEFINITE
         assert solution.detail == "forward pass of iteration 1, step 0 of 20"
         assert solution.iterations == ()
-        assert np.isnan(solution.cost)
+        assert solution.cost == pytest.approx(0.5)  # of what the start leads to: at rest at 1, u = 0
         assert solution.cost_to_go is None
 
     @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
@@ -264,14 +264,11 @@ class TestEndings:
         assert solution.status is Status.NOT_FINITE
         assert solution.detail == "rollout of the initial controls"
 
-    @pytest.mark.parametrize(
-        ("solver", "options", "rows"), [(ls.smooth, {}, 4), (ls.smooth, {"safeguard": False}, 2), (ls.ilqr, {}, 2)]
-    )
-    def test_too_few_iterations(self, differential_drive: ls.Scenario, solver, options: dict, rows: int) -> None:
-        """The safeguard has as many again."""
+    @pytest.mark.parametrize(("solver", "options"), [(ls.smooth, {}), (ls.smooth, {"safeguard": False}), (ls.ilqr, {})])
+    def test_too_few_iterations(self, differential_drive: ls.Scenario, solver, options: dict) -> None:
         solution = solver(differential_drive.problem, max_iterations=2, **options)
         assert solution.status is Status.MAX_ITERATIONS
-        assert len(solution.iterations) == rows
+        assert len(solution.iterations) == 2
         assert np.isfinite(solution.optimality)
 
     def test_the_cost_test_alone_is_not_called_converged(self, differential_drive: ls.Scenario) -> None:

@@ -1,22 +1,26 @@
 """The method from one start, as far as it has got; and the safeguard, where it fails."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.problem import Problem
-from lqrsim.results import Candidate, Iteration, Multipliers, Status, Trajectory
+from lqrsim.results import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers import interface
-from lqrsim.solvers.common import LOG_COLUMNS, Callback, Ending, SmootherSettings, check_outcome, iterate
+from lqrsim.solvers.certify import REST, certificate_of, faults
+from lqrsim.solvers.common import LOG_COLUMNS, Callback, Ending, SmootherSettings, Stop, check_outcome, iterate
 from lqrsim.solvers.start import Start
 from lqrsim.solvers.workspace import Workspace
 
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """What there is to answer with; see `assemble`. With `final`, another start would not do better."""
+    """What there is to answer with; see `assemble`. With `final`, another start would not do better.
+
+    `cost` is that of the plan, as the iterations that led to it say: infinite where there is none.
+    """
 
     status: Status
     detail: str
@@ -24,21 +28,18 @@ class Found:
     states: Array
     controls: Array
     law: tuple[Array, Array]
+    cost: float
+    violation: float
+    gap: float
     values: dict[str, Any] = field(default_factory=dict)
     multipliers: tuple[Multipliers, ...] = ()
+    certificate: Certificate | None = None
     final: bool = False
-
-    @property
-    def cost(self) -> float:
-        """True cost of the plan; infinite where there is none, or it is not known."""
-        cost = self.iterations[-1].cost if self.iterations else np.inf
-        return cost if np.isfinite(cost) else np.inf
 
     @property
     def rank(self) -> tuple[bool, float, float]:
         """The smaller, the better: success first, then constraints, then the cost."""
-        violation = self.iterations[-1].violation if self.iterations else np.inf
-        return not self.success, 0.0 if self.success else violation, self.cost
+        return not self.success, 0.0 if self.success else self.violation, self.cost
 
     @property
     def success(self) -> bool:
@@ -54,16 +55,17 @@ class Attempt:
       ending: how it stands; its outcome is RUNNING until it has ended.
     """
 
-    def __init__(self, problem: Problem, settings: SmootherSettings, begin: Start, start: Array) -> None:
-        self.problem, self.settings = problem, settings
+    def __init__(self, problem: Problem, settings: SmootherSettings, begin: Start, start: Array, stop: Stop) -> None:
+        self.problem, self.settings, self.stop = problem, settings, stop
         if settings.first_pass == "backward" and begin.gain.any():
             begin = begin.rolled_out(problem, start)
         self.begin = begin
         self.work = Workspace(problem, settings, begin, start)
+        self.work.memory[interface.WATCHED] = float(settings.safeguard)
         self.ending = Ending((), interface.RUNNING, False, -1, "")
         self._log = np.zeros((settings.max_iterations, LOG_COLUMNS))
         self._shares = begin.prior.obstacles if begin.prior is not None else ()
-        self._loop = self.work.core.entry("smoother_iterations", *self._arguments(0, 0, self._log))
+        self._loop = self.work.core.entry("smoother", *self._arguments(0, 0, self._log))
 
     @property
     def cost(self) -> float:
@@ -82,16 +84,19 @@ class Attempt:
         self.ending = iterate(
             self.problem, lambda first, last: self._loop(*self._arguments(first, last, self._log)), self._log,
             min(last, self.settings.max_iterations), done=self.ending.iterations, look=self._violation,
-            each=self._looking(each), callback=callback,
+            each=self._looking(each), stop=self.stop, callback=callback,
         )  # fmt: skip
+        if self.ending.outcome == interface.TIMED_OUT and not self.ending.iterations:
+            self.roll_out()
 
     def run_on(
         self, log: Array, last: int, *, done: tuple[Iteration, ...], each: bool, callback: Callback | None
     ) -> Ending:
         """More iterations of the same kind, with a log of their own; the prior has had its time."""
+        self.work.memory[interface.WATCHED] = 0.0  # with constraints the least cost is no measure
         return iterate(
             self.problem, lambda first, last: self._loop(*self._arguments(first, last, log, again=True)), log, last,
-            done=done, look=self._violation, each=each, callback=callback,
+            done=done, look=self._violation, each=self._looking(each), stop=self.stop, callback=callback,
         )  # fmt: skip
 
     def roll_out(self) -> None:
@@ -105,76 +110,138 @@ class Attempt:
         ending = check_outcome(self.problem, self.ending, self.work.start, self.begin.offset[0], refuse=each)
         lost = ending is not self.ending  # a function that is not finite at the start: nothing can help
         found = self.found(ending)
-        if settings.safeguard and not lost and not found.success:
-            return self.rescue(found.detail or found.status.meaning, each=each, callback=callback)
-        return found
+        if lost or found.success:
+            return found
+        if ending.outcome == interface.TIMED_OUT or (settings.safeguard and self.left(found.iterations) == 0):
+            return self.best(found)
+        return self.rescue(found, each=each, callback=callback) if settings.safeguard else found
+
+    def left(self, iterations: tuple[Iteration, ...]) -> int:
+        """How many iterations may still follow these."""
+        return max(self.settings.max_iterations - len(iterations), 0)
 
     def found(self, ending: Ending) -> Found:
         """What the bare method found; `ending` is its own, or one that knows more of why it failed."""
-        work = self.work
+        work, last = self.work, ending.iterations[-1] if ending.iterations else None
         return Found(
             status=ending.status, detail=ending.detail(self.problem.steps), iterations=ending.iterations,
-            states=work.states, controls=work.controls, law=work.kept,
-            values={} if ending.pass_failed else work.value_functions(),
+            states=work.states, controls=work.controls, law=work.kept, cost=_cost_of(last),
+            violation=np.inf if last is None else last.violation, gap=np.nan if last is None else last.gap,
+            values={} if ending.pass_failed or last is None else work.value_functions(),
         )  # fmt: skip
 
-    def rescue(self, why: str, *, each: bool, callback: Callback | None = None) -> Found:
-        """The safeguard: iterations from the best plan so far."""
-        work, detail = self.work, f"the undamped method failed ({why})"
+    def best(self, found: Found) -> Found:
+        """The best plan so far in place of the last one, with a policy and value functions about it."""
+        cost = float(self.work.memory[interface.PLAN_COST])
+        if not np.isfinite(cost) or (not cost < found.cost and found.values):
+            return found
+        optimality = self.look_back()
+        detail = f"{found.detail}; the plan is the best so far" if found.detail else "the plan is the best so far"
+        return self._about_plan(found.iterations, optimality, found.status, detail)
+
+    def look_back(self) -> float:
+        """Make policy and value functions about the plan in the memory; its optimality, NaN if that fails."""
+        work, log = self.work, np.full((1, LOG_COLUMNS), np.nan)
+        trial = np.zeros_like(work.states), np.zeros_like(work.controls)
         work.memory[interface.MERIT] = work.memory[interface.PLAN_COST]
-        damped = self.damp(before=self.ending.iterations, each=each, callback=callback)
+        self._loop(*self._damped_arguments(0, 0, log, 1, trial))
+        return float(log[0, 3])
+
+    def rescue(self, found: Found, *, each: bool, callback: Callback | None = None) -> Found:
+        """The safeguard: iterations from the best plan so far."""
+        work, detail = self.work, f"the undamped method failed ({found.detail or found.status.meaning})"
+        work.memory[interface.MERIT] = work.memory[interface.PLAN_COST]
+        damped = self.damp(before=found.iterations, each=each, callback=callback)
         if not np.isfinite(work.memory[interface.PLAN_COST]):
             # Nothing that was tried leads anywhere. What is left is how it failed.
-            return Found(
-                status=self.ending.status, detail=detail, iterations=damped.iterations, states=work.states,
-                controls=work.controls, law=work.kept,
-            )  # fmt: skip
+            return replace(found, detail=detail, iterations=damped.iterations, values={})
         status = damped.status
         if damped.outcome == interface.STALLED:
             status, detail = self.ending.status, f"{detail}; from the best plan, no step lowers the cost any more"
         return self.found_damped(damped, status, detail)
 
-    def damp(self, *, before: tuple[Iteration, ...], each: bool, callback: Callback | None) -> Ending:
-        """Damped iterations from the plan, whose cost and merit are in the memory; see `solvers/safeguard.py`."""
-        settings, work = self.settings, self.work
-        log = np.zeros((settings.max_iterations, LOG_COLUMNS))
+    def damp(
+        self,
+        *,
+        before: tuple[Iteration, ...],
+        least: tuple[float, float] = (0.0, 0.0),
+        each: bool,
+        callback: Callback | None,
+    ) -> Ending:
+        """Damped iterations from the plan, whose cost and merit are in the memory; see `solvers/safeguard.py`.
+
+        Args:
+          before: the iterations that led there. least: what the tolerances of cost and gap are to be at least.
+        """
+        work, last = self.work, self.left(before)
+        log = np.zeros((max(last, 1), LOG_COLUMNS))
         memory = work.memory
         memory[interface.REACH], memory[interface.WEIGHT], memory[interface.SMALL] = 1.0, 0.0, 0.0
         memory[interface.ILQR_LEFT], memory[interface.ILQR_NEXT], memory[interface.SINCE_ILQR] = 0.0, 2.0, 0.0
         trial = np.zeros_like(work.states), np.zeros_like(work.controls)
 
-        def arguments(first: int, last: int) -> tuple[Any, ...]:
-            return (
-                self.problem.steps, first, last, settings.max_iterations, settings.tolerance, settings.gap_tolerance,
-                settings.stop == "optimal", work.fixed, *work.passes, *work.no_prior, *work.plan, *trial, memory, log,
-            )  # fmt: skip
+        def run(first: int, to: int) -> tuple[int, int, bool, int]:
+            return self._loop(*self._damped_arguments(first, to, log, last, trial, least))
 
-        loop = work.core.entry("damped_iterations", *arguments(0, 0))
         return iterate(
-            self.problem, lambda first, last: loop(*arguments(first, last)), log, settings.max_iterations,
-            before=before, look=lambda: self._violation_of(work.plan), each=self._looking(each), callback=callback,
+            self.problem, run, log, last, before=before, look=lambda: self._violation_of(work.plan),
+            each=self._looking(each), stop=self.stop, callback=callback,
         )  # fmt: skip
 
     def found_damped(self, damped: Ending, status: Status, detail: str) -> Found:
         """What damped iterations found: the plan, and what was modelled about it."""
+        optimality = damped.iterations[-1].optimality if damped.iterations else np.nan
+        if damped.outcome in (interface.RUNNING, interface.TIMED_OUT):  # they were stopped, and did not look back
+            return self.best(
+                Found(
+                    status=status, detail=detail, iterations=damped.iterations, states=self.work.states,
+                    controls=self.work.controls, law=self.work.kept, cost=np.inf, violation=np.inf, gap=np.nan,
+                )
+            )  # fmt: skip
+        return self._about_plan(damped.iterations, optimality, status, detail)
+
+    def _about_plan(self, iterations: tuple[Iteration, ...], optimality: float, status: Status, detail: str) -> Found:
+        """The plan in the memory, with the policy and the value functions that were made about it last."""
         work = self.work
         states, controls = work.plan
-        values, law = {}, work.law
-        if not np.isfinite(damped.iterations[-1].optimality):  # there is no model about the plan, nor a policy
-            law = np.zeros_like(work.law[0]), controls.copy()
+        values, law, gap = {}, work.law, float(work.memory[interface.FINAL_GAP])
+        if not np.isfinite(optimality):  # there is no model about the plan, nor a policy
+            law, gap = (np.zeros_like(work.law[0]), controls.copy()), np.nan
         else:
             values = work.value_functions()
-            gap = work.memory[interface.FINAL_GAP]
             if not gap < self.settings.gap_tolerance:
                 # As from iLQR, whose steps need neither of these.
                 values["cost_to_come"] = values["inverse_law"] = None
+                off, gap = gap, np.nan
                 detail += (
-                    f"; the states of least total cost are {gap:.1g} off the plan, so the cost-to-come is left out"
+                    f"; the states of least total cost are {off:.1g} off the plan, so the cost-to-come is left out"
                 )
         return Found(
-            status=status, detail=detail, iterations=damped.iterations, states=states, controls=controls, law=law,
+            status=status, detail=detail.removeprefix("; "), iterations=iterations, states=states, controls=controls,
+            law=law, cost=float(work.memory[interface.PLAN_COST]), violation=self._violation_of(work.plan), gap=gap,
             values=values,
         )  # fmt: skip
+
+    def certified(self, found: Found) -> Found:
+        """With its certificate; a success that fails it is none."""
+        log = np.zeros((1, LOG_COLUMNS))
+        self._loop(*self._certificate_arguments(found, log))
+        violation = self._violation_of((found.states, found.controls))
+        certificate = certificate_of(self.problem, log[0], found.states, violation=violation)
+        if "cost_to_go" not in found.values:
+            certificate = replace(certificate, optimality=np.inf)
+        found = replace(found, certificate=certificate, cost=certificate.cost, violation=violation)
+        if not np.isfinite(found.cost):
+            found = replace(found, cost=np.inf)
+        if not found.success:
+            return found
+        wrong = faults(
+            certificate, claimed=found.iterations[-1].cost, rest=REST * float(log[0, 1]),
+            tolerance=self.settings.tolerance if found.status is Status.CONVERGED else None,
+        )  # fmt: skip
+        if not wrong:
+            return found
+        return replace(found, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
 
     def candidate(self, name: str, found: Found | None) -> Candidate:
         """It, as one of several; `found` if it was run to its end."""
@@ -211,9 +278,35 @@ class Attempt:
         guided = self.begin.trajectory is not None and settings.first_pass == "forward" and not again
         prior = (*work.no_prior, 0) if again else work.prior
         return (
-            self.problem.steps, first, last, len(log), tolerance, settings.gap_tolerance,
+            interface.ITERATE, self.problem.steps, first, last, len(log), tolerance, settings.gap_tolerance,
             settings.stop == "optimal", work.fixed, guided, *work.passes, work.eased(share), *prior,
             *work.guess, *work.plan, work.states, work.controls, *work.kept, work.memory, log,
+        )  # fmt: skip
+
+    def _damped_arguments(
+        self,
+        first: int,
+        last: int,
+        log: Array,
+        most: int,
+        trial: tuple[Array, Array],
+        least: tuple[float, float] = (0.0, 0.0),
+    ) -> tuple[Any, ...]:
+        """What it takes for damped iterations, of which there are to be `most`; `trial` is written to on the way."""
+        settings, work = self.settings, self.work
+        return (
+            interface.DAMP, self.problem.steps, first, last, most, max(settings.tolerance, least[0]),
+            max(settings.gap_tolerance, least[1]),
+            settings.stop == "optimal", work.fixed, False, *work.passes, work.eased(1.0), *work.no_prior, 0,
+            *work.guess, *work.plan, *trial, *work.kept, work.memory, log,
+        )  # fmt: skip
+
+    def _certificate_arguments(self, found: Found, log: Array) -> tuple[Any, ...]:
+        settings, work = self.settings, self.work
+        return (
+            interface.CERTIFY, self.problem.steps, 0, 0, 0, settings.tolerance, settings.gap_tolerance, True,
+            work.fixed, False, *work.passes, work.eased(1.0), *work.no_prior, 0, *work.guess, *work.plan,
+            found.states, found.controls, *found.law, work.memory, log,
         )  # fmt: skip
 
     def _share(self, iteration: int) -> float:
@@ -229,3 +322,8 @@ class Attempt:
 
     def _violation_of(self, plan: tuple[Array, Array]) -> float:
         return self.work.violation(self.work.constraint_values(*plan)) if self.problem.constraints else 0.0
+
+
+def _cost_of(iteration: Iteration | None) -> float:
+    """Its cost; infinite where there is none, or it is not known."""
+    return iteration.cost if iteration is not None and np.isfinite(iteration.cost) else np.inf

@@ -17,7 +17,7 @@ from lqrsim.functions import External
 from lqrsim.machine import processors
 from lqrsim.policy import AffinePolicy
 from lqrsim.problem import Problem
-from lqrsim.results import Candidate, Iteration, Multipliers, Solution, Status, Trajectory
+from lqrsim.results import Candidate, Certificate, Iteration, Multipliers, Solution, Status, Trajectory
 from lqrsim.solvers import interface
 from lqrsim.solvers.start import Start, StartLike, resolve
 from lqrsim.value_functions import Moments, Quadratic
@@ -36,6 +36,8 @@ _STATUS = {
     interface.NO_START: Status.NOT_FINITE,
     interface.STALLED: Status.MAX_ITERATIONS,
     interface.CYCLING: Status.MAX_ITERATIONS,
+    interface.NO_PROGRESS: Status.MAX_ITERATIONS,
+    interface.TIMED_OUT: Status.TIME_LIMIT,
 }
 
 
@@ -55,6 +57,7 @@ class Settings:
     stop: str
     tolerance: float
     max_iterations: int
+    time_limit: float | None
     start: StartLike
 
     def __post_init__(self) -> None:
@@ -64,11 +67,17 @@ class Settings:
         object.__setattr__(self, "max_iterations", check_count("max_iterations", self.max_iterations))
         if self.max_iterations > 1_000_000:  # the log of so many takes 48 MB
             raise InputError(f"max_iterations: got {self.max_iterations}, want at most 1000000")
+        if self.time_limit is not None:
+            object.__setattr__(self, "time_limit", check_number("time_limit", self.time_limit, above=0.0))
 
     @property
     def core_form(self) -> str:
         """The form of the core that is used."""
         return "dual"
+
+    def stop_early(self) -> "Stop":
+        """For a solve that begins now."""
+        return Stop(np.inf if self.time_limit is None else time.perf_counter() + self.time_limit)
 
     def options(self, start: Start) -> dict[str, object]:
         """The settings as a solution keeps them."""
@@ -104,6 +113,31 @@ class SmootherSettings(Settings):
     @property
     def core_form(self) -> str:
         return self.form
+
+
+@dataclass
+class Stop:
+    """Why a solve is to end early, if it is: a deadline, on the clock of `time.perf_counter`, or what was raised.
+
+    What the callback raises, and Ctrl-C, end the solve as a deadline does: with the best plan so far. Then it is raised
+    again, and has that as its `solution`.
+    """
+
+    deadline: float = np.inf
+    error: BaseException | None = None
+
+    @property
+    def due(self) -> bool:
+        return self.error is not None or time.perf_counter() >= self.deadline
+
+    def settle(self, solution: Solution) -> Solution:
+        """The solution; or, where something was raised, raises it again."""
+        if self.error is None:
+            return solution
+        with contextlib.suppress(AttributeError, TypeError):  # an exception that takes no attributes
+            self.error.solution = replace(solution, status=Status.INTERRUPTED)  # pyright: ignore[reportAttributeAccessIssue]
+            self.error.add_note("lqrsim: the best plan so far is this exception's `solution`")
+        raise self.error
 
 
 @dataclass(frozen=True)
@@ -144,6 +178,8 @@ class Ending:
             return "rollout of the initial controls"
         if self.outcome == interface.CYCLING:
             return "the iterations repeat themselves"
+        if self.outcome == interface.NO_PROGRESS:
+            return "the least cost so far no longer falls"
         return "the line search found no lower cost" if self.outcome == interface.STALLED else ""
 
 
@@ -157,6 +193,7 @@ def iterate(
     before: tuple[Iteration, ...] = (),
     look: Callable[[], float] = lambda: 0.0,
     each: bool,
+    stop: Stop,
     callback: Callback | None = None,
 ) -> Ending:
     """Run a loop of `solvers/loops.py` until it ends, or there are so many iterations.
@@ -171,26 +208,33 @@ def iterate(
       look: how far the constraints are missed by what `run` found last.
       each: come back after each iteration, to time it, to tell `callback` and to heed Ctrl-C; otherwise nothing but
         compiled code runs, and the seconds of an iteration are the average.
+      stop: looked at before each iteration, where there is a deadline or a callback.
     """
+    each = each or stop.deadline < np.inf
     functions = functions_of(problem)
     for function in functions:
         function.forget()
     iterations = list(done)
     outcome, backward, failed = interface.RUNNING, False, -1
-    while outcome == interface.RUNNING and len(iterations) < last:
-        first = len(iterations)
-        clock = time.perf_counter()
-        count, outcome, backward, failed = run(first, first + 1 if each else last)
-        seconds = (time.perf_counter() - clock) / max(count - first, 1)
-        for i, (cost, improvement, gap, optimality, residual, method) in enumerate(log[first:count].tolist(), first):
-            missed = look() if i == count - 1 or not problem.constraints else float("nan")
-            name = _METHODS[int(method)]
-            iterations.append(Iteration(cost, improvement, gap, optimality, residual, missed, seconds, name))
-            if callback is not None:
-                callback(iterations[-1])
-        for function in functions:
-            if function.raised is not None and not isinstance(function.raised, Exception):
-                raise function.raised  # Ctrl-C
+    try:
+        while outcome == interface.RUNNING and len(iterations) < last:
+            if stop.due:
+                outcome = interface.TIMED_OUT
+                break
+            first = len(iterations)
+            clock = time.perf_counter()
+            count, outcome, backward, failed = run(first, first + 1 if each else last)
+            seconds = (time.perf_counter() - clock) / max(count - first, 1)
+            for i, (*numbers, method) in enumerate(log[first:count].tolist(), first):
+                missed = look() if i == count - 1 or not problem.constraints else float("nan")
+                iterations.append(Iteration(*numbers, missed, seconds, _METHODS[int(method)]))
+                if callback is not None:
+                    callback(iterations[-1])
+            for function in functions:
+                if function.raised is not None and not isinstance(function.raised, Exception):
+                    raise function.raised  # Ctrl-C
+    except BaseException as error:  # the callback's, or Ctrl-C: raised again when there is a solution
+        stop.error, outcome = error, interface.TIMED_OUT
     raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
     return Ending((*before, *iterations), outcome, backward, failed, "; ".join(raised))
 
@@ -288,6 +332,8 @@ def assemble(
     states: Array,
     controls: Array,
     law: tuple[Array, Array],
+    certificate: Certificate,
+    gap: float,
     inverse_law: tuple[Array, Array] | None = None,
     cost_to_go: Quadratic | None = None,
     cost_to_come: Quadratic | Moments | None = None,
@@ -312,7 +358,9 @@ def assemble(
         cost_to_come=cost_to_come,
         trajectory=Trajectory(states, controls, problem.dt),
         iterations=iterations,
-        clearance=_clearance(problem, states),
+        clearance=clearance_of(problem, states),
+        certificate=certificate,
+        gap=gap,
         solver=solver,
         options=options,
         multipliers=multipliers,
@@ -328,7 +376,8 @@ def model(problem: Problem, multipliers: Sequence[Array] = ()) -> tuple[Any, ...
     return data["p"], data["dt"], data["initial"], data["stage"], data["final"]
 
 
-def _clearance(problem: Problem, states: Array) -> Array | None:
+def clearance_of(problem: Problem, states: Array) -> Array | None:
+    """Signed distance to the nearest obstacle minus the robot's radius, (T+1,); None without obstacles."""
     position = list(problem.dynamics.state_coordinates.position)
     constraints = [constraint for constraint in problem.constraints if isinstance(constraint, Clearance)]
     worlds = {(id(one.world), one.radius): one.world for one in (*problem.obstacle_costs, *constraints)}

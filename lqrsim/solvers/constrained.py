@@ -13,10 +13,12 @@ import numpy as np
 
 from lqrsim.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.errors import Array
+from lqrsim.problem import Problem
 from lqrsim.results import Iteration, Multipliers, Status
 from lqrsim.solvers import interface
 from lqrsim.solvers.attempt import Attempt, Found
 from lqrsim.solvers.common import LOG_COLUMNS, Callback
+from lqrsim.solvers.start import Start
 from lqrsim.value_functions import Moments
 
 PENALTY = 8.0  # at first, relative to what it costs to change what is constrained
@@ -24,32 +26,51 @@ GROWTH = 5.0  # of the penalty
 LARGEST, STUCK = 1e4, 3  # how far it grows before that is given up, and how often to no avail at all
 ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
 ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to renew the multipliers, and when anyway
+ROUGHEST_GAP = 3e-2  # and of damped iterations, which come to their minimum slowly
 
 
 def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> Found:
-    """Run an attempt to its end: the method, its safeguard where that fails, and then the constraints."""
+    """Run an attempt to its end, the method, its safeguard where that fails, and then the constraints; certified."""
     tried: tuple[Iteration, ...] = ()
     if attempt.begin.multipliers and attempt.opened():
-        found = satisfy(attempt, None, each=each, callback=callback)
-        if found.success:
-            return found
+        found = _satisfy(attempt, None, each=each, callback=callback)
+        if found.success or attempt.stop.due or not attempt.left(found.iterations):
+            return attempt.certified(found)
         # What is known of another problem does not help here.
-        tried, begin = found.iterations, dataclasses.replace(attempt.begin, multipliers=())
-        attempt = Attempt(attempt.problem, attempt.settings, begin, attempt.work.start)
+        tried = found.iterations
+        attempt = _again(attempt, attempt.problem, dataclasses.replace(attempt.begin, multipliers=()), tried)
     found = attempt.finish(each=each, callback=callback)
     if attempt.problem.constraints:
-        found = satisfy(attempt, found, each=each, callback=callback)
-    return dataclasses.replace(found, iterations=(*tried, *found.iterations))
+        attempt, found = _with_constraints(attempt, found, each=each, callback=callback)
+    return attempt.certified(dataclasses.replace(found, iterations=(*tried, *found.iterations)))
 
 
-def satisfy(attempt: Attempt, found: Found | None, *, each: bool, callback: Callback | None = None) -> Found:
+def _again(attempt: Attempt, problem: Problem, begin: Start, done: tuple[Iteration, ...]) -> Attempt:
+    """Another attempt, with what is left of the iterations."""
+    settings = dataclasses.replace(attempt.settings, max_iterations=max(attempt.left(done), 1))
+    return Attempt(problem, settings, begin, attempt.work.start, attempt.stop)
+
+
+def _with_constraints(
+    attempt: Attempt, found: Found, *, each: bool, callback: Callback | None
+) -> tuple[Attempt, Found]:
+    """Go on from what was found without the constraints; also which attempt has the answer in its memory."""
+    if attempt.stop.due or not attempt.left(found.iterations):
+        if found.success and attempt.work.violation(attempt.work.constraint_values(found.states, found.controls)) > 0:
+            status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS
+            found = dataclasses.replace(found, status=status, detail="before the constraints could be met")
+        return attempt, found
+    if found.success:
+        return attempt, _satisfy(attempt, found, each=each, callback=callback)
+    return _first_feasible(attempt, found, each=each, callback=callback)
+
+
+def _satisfy(attempt: Attempt, found: Found | None, *, each: bool, callback: Callback | None = None) -> Found:
     """Go on from what was found without the constraints, or, without it, from the multipliers of another solution."""
     lagrangian = _Lagrangian(attempt)
     if found is None:
         attempt.roll_out()
         lagrangian.look(attempt.work.states, attempt.work.controls)
-    elif not found.success:
-        return _first_feasible(attempt, found, each=each, callback=callback)
     else:
         lagrangian.look(found.states, found.controls)
         if lagrangian.violation == 0:
@@ -59,19 +80,19 @@ def satisfy(attempt: Attempt, found: Found | None, *, each: bool, callback: Call
         found = dataclasses.replace(found, states=found.states.copy(), controls=found.controls.copy())
     before = found.iterations if found is not None else ()
     undamped = _undamped(attempt, lagrangian, before, each=each, callback=callback)
-    if undamped.success or not attempt.settings.safeguard:
+    if undamped.success or not attempt.settings.safeguard or attempt.stop.due or not attempt.left(undamped.iterations):
         return undamped
     return _damped(attempt, lagrangian, found, undamped, each=each, callback=callback)
 
 
-def _first_feasible(attempt: Attempt, found: Found, *, each: bool, callback: Callback | None) -> Found:
+def _first_feasible(attempt: Attempt, found: Found, *, each: bool, callback: Callback | None) -> tuple[Attempt, Found]:
     """Where not even the problem without the constraints is solved: deep within obstacles, they cost beyond numbers.
 
     Without these costs there is a plan that keeps the constraints, from where they can come in, or there is none.
     """
-    problem, settings, start = attempt.problem, attempt.settings, attempt.work.start
-    if not (settings.safeguard and any(cost.weight for cost in problem.obstacle_costs)):
-        return found
+    problem = attempt.problem
+    if not (attempt.settings.safeguard and any(cost.weight for cost in problem.obstacle_costs)):
+        return attempt, found
 
     def without_cost(iteration: Iteration) -> Iteration:
         return dataclasses.replace(iteration, cost=np.nan, improvement=np.nan)
@@ -87,19 +108,26 @@ def _first_feasible(attempt: Attempt, found: Found, *, each: bool, callback: Cal
         for cost in terms_of(problem.stage_cost)
     ]
     plain = dataclasses.replace(problem, stage_cost=CostSum(tuple(costs)))
-    without = Attempt(plain, settings, dataclasses.replace(attempt.begin, prior=None), start)
+    without = _again(attempt, plain, dataclasses.replace(attempt.begin, prior=None), found.iterations)
     kept = without.finish(each=each, callback=told)
-    if kept.success:
-        kept = satisfy(without, kept, each=each, callback=told)
+    if kept.success and not attempt.stop.due and without.left(kept.iterations):
+        kept = _satisfy(without, kept, each=each, callback=told)
     before = (*found.iterations, *(without_cost(iteration) for iteration in kept.iterations))
-    if not kept.success:
-        return dataclasses.replace(kept, iterations=before, final=True)
+    if not kept.success or attempt.stop.due or not attempt.left(before):
+        # Of the plan, only what the constraints say is known: its certificate tells the cost.
+        status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS if kept.success else kept.status
+        return attempt, dataclasses.replace(kept, status=status, iterations=before, final=not kept.success, values={})
     begin = dataclasses.replace(
         attempt.begin, gain=kept.law[0].copy(), offset=kept.law[1].copy(), trajectory=None, prior=None,
         cost_to_go=kept.values.get("cost_to_go"), multipliers=kept.multipliers,
     )  # fmt: skip
-    again = finish(Attempt(problem, settings, begin, start), each=each, callback=callback)
-    return dataclasses.replace(again, iterations=(*before, *again.iterations))
+    attempt = _again(attempt, problem, begin, before)
+    again = _satisfy(attempt, None, each=each, callback=callback) if kept.multipliers else None
+    if again is None:
+        again = attempt.finish(each=each, callback=callback)
+        if again.success and not attempt.stop.due and attempt.left(again.iterations):
+            again = _satisfy(attempt, again, each=each, callback=callback)
+    return attempt, dataclasses.replace(again, iterations=(*before, *again.iterations))
 
 
 def _undamped(
@@ -112,13 +140,14 @@ def _undamped(
 ) -> Found:
     work, settings = attempt.work, attempt.settings
     work.memory[interface.PLAN_COST] = -np.inf  # of lower cost is not better now
-    log = np.zeros((min(ITERATIONS, settings.max_iterations), LOG_COLUMNS))
+    log = np.zeros((min(ITERATIONS, max(attempt.left(before), 1)), LOG_COLUMNS))
     done: tuple[Iteration, ...] = ()
     since = 0
     while True:
         ending = attempt.run_on(log, len(done) + 1, done=done, each=each, callback=callback)
         done, since = ending.iterations, since + 1
-        if ending.pass_failed or ending.outcome == interface.CYCLING or not np.isfinite(done[-1].cost):
+        stopped = ending.pass_failed or ending.outcome in (interface.CYCLING, interface.TIMED_OUT)
+        if stopped or not np.isfinite(done[-1].cost):
             break
         lagrangian.look(work.states, work.controls)
         settled = ending.outcome in (interface.CONVERGED, interface.COST_CONVERGED)
@@ -146,9 +175,9 @@ def _damped(
     callback: Callback | None,
 ) -> Found:
     """The safeguard: from the plan without constraints or the last one with them, whichever is the better beginning."""
-    work, tolerance = attempt.work, attempt.settings.constraint_tolerance
-    plans = [(work.states, work.controls, undamped.iterations[-1].cost)] if undamped.iterations else []
-    plans += [(found.states, found.controls, found.iterations[-1].cost)] if found is not None else []
+    work = attempt.work
+    plans = [(work.states, work.controls, undamped.cost)]
+    plans += [(found.states, found.controls, found.cost)] if found is not None else []
     plans = [plan for plan in plans if np.isfinite(plan[2])]
     if not plans:
         return undamped
@@ -160,28 +189,75 @@ def _damped(
         merits.append(cost + lagrangian.added())
     states, controls, cost = plans[int(np.argmin(merits))]
     work.plan[0][:], work.plan[1][:] = states, controls
-    lagrangian.look(*work.plan)
-    iterations = undamped.iterations
+    work.memory[interface.PLAN_COST] = cost
     why = "the undamped method failed with the constraints"
-    rounds = 0
+    return _rounds(attempt, lagrangian, undamped.iterations, why, each=each, callback=callback)
+
+
+def refine(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> Found:
+    """Run an attempt to its end by steps that lower the cost alone, from where its first policy leads; certified.
+
+    So it stays on the way round that it begins with, which undamped iterations would leave.
+    """
+    attempt.roll_out()
+    cost = float(attempt.work.memory[interface.PLAN_COST])
+    optimality = attempt.look_back() if np.isfinite(cost) else np.nan
+    if not np.isfinite(optimality):
+        return attempt.certified(attempt.finish(each=each, callback=callback))
+    if not attempt.problem.constraints:
+        attempt.work.memory[interface.MERIT] = cost
+        damped = attempt.damp(before=(), each=each, callback=callback)
+        found = attempt.found_damped(damped, damped.status, damped.detail(attempt.problem.steps))
+        return attempt.certified(found)
+    lagrangian = _Lagrangian(attempt)
+    lagrangian.look(*attempt.work.plan)
+    lagrangian.begin()
+    return attempt.certified(_rounds(attempt, lagrangian, (), "", each=each, callback=callback))
+
+
+def _rounds(
+    attempt: Attempt,
+    lagrangian: "_Lagrangian",
+    iterations: tuple[Iteration, ...],
+    why: str,
+    *,
+    each: bool,
+    callback: Callback | None,
+) -> Found:
+    """Damped iterations from the plan in the memory, and renewed multipliers, until the constraints are met or can not
+    be.
+    """
+    work, tolerance = attempt.work, attempt.settings.constraint_tolerance
+    lagrangian.look(*work.plan)
+    rounds, rough = 0, True
     while True:
         rounds += 1
-        work.memory[interface.PLAN_COST] = cost
-        work.memory[interface.MERIT] = cost + lagrangian.added()
-        ending = attempt.damp(before=iterations, each=each, callback=callback)
-        iterations, cost = ending.iterations, float(work.memory[interface.PLAN_COST])
+        work.memory[interface.MERIT] = work.memory[interface.PLAN_COST] + lagrangian.added()
+        # Until the multipliers are about right, there is no point in a minimum to all its digits.
+        limits = (ROUGH, ROUGHEST_GAP) if rough else (0.0, 0.0)
+        ending = attempt.damp(before=iterations, least=limits, each=each, callback=callback)
+        iterations = ending.iterations
         lagrangian.look(*work.plan)
         if ending.success and lagrangian.missed <= tolerance:
-            found = attempt.found_damped(ending, ending.status, why)
-            return dataclasses.replace(found, multipliers=lagrangian.multipliers())
+            if not rough:
+                found = attempt.found_damped(ending, ending.status, why)
+                return dataclasses.replace(found, multipliers=lagrangian.multipliers())
+            if attempt.left(iterations) and not attempt.stop.due:
+                rough = False
+                continue
         if rounds == ROUNDS or lagrangian.grown > LARGEST or lagrangian.stuck == STUCK:
             break
+        if attempt.stop.due or not attempt.left(iterations):
+            break
         lagrangian.renew()
-    status, detail = Status.MAX_ITERATIONS, f"{why}, and {lagrangian.worst()}"
+        rough = rough and lagrangian.stuck == 0
+    status, detail = Status.MAX_ITERATIONS, f"{why}; {lagrangian.worst()}".removeprefix("; ")
     if lagrangian.violation == 0:
-        detail = f"{why}; the plan keeps them, but there are better ones"
+        detail = f"{why}; the plan keeps the constraints, but there are better ones".removeprefix("; ")
     elif lagrangian.stuck == STUCK or lagrangian.grown > LARGEST:
         status, detail = Status.INFEASIBLE, lagrangian.worst()
+    if attempt.stop.due:
+        status = Status.TIME_LIMIT
     found = attempt.found_damped(ending, status, detail)
     return dataclasses.replace(found, multipliers=lagrangian.multipliers())
 

@@ -8,7 +8,9 @@ from lqrsim import compiled
 from lqrsim.checks import check_functions
 from lqrsim.errors import InputError
 from lqrsim.problem import Problem
-from lqrsim.results import Solution
+from lqrsim.results import Solution, Status
+from lqrsim.solvers import interface
+from lqrsim.solvers.certify import REST, certificate_of, faults
 from lqrsim.solvers.common import (
     LOG_COLUMNS,
     Callback,
@@ -32,6 +34,7 @@ def ilqr(
     stop: str = "optimal",
     tolerance: float = 1e-4,
     max_iterations: int = 500,
+    time_limit: float | None = None,
     start: StartLike = None,
     callback: Callback | None = None,
 ) -> Solution:
@@ -42,7 +45,8 @@ def ilqr(
     the controls are kept; constraints are not for this solver.
 
     Args:
-      stop, tolerance, max_iterations, callback: as in `smooth`; the gap is zero here, for every iterate is feasible.
+      stop, tolerance, max_iterations, time_limit, callback: as in `smooth`; the gap is zero here, for every iterate is
+        feasible.
       start: what the first trajectory applies: controls (m,) or (T, m), by default the problem's nominal control; the
         controls of a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
 
@@ -52,7 +56,9 @@ def ilqr(
     Raises:
       InputError: an argument is not as described, or the problem names no start.
     """
-    settings = Settings(stop=stop, tolerance=tolerance, max_iterations=max_iterations, start=start)
+    settings = Settings(
+        stop=stop, tolerance=tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start
+    )
     check_callback(callback)
     _check(problem, settings)
     return _solve(problem, settings, each=True, callback=callback)
@@ -65,6 +71,7 @@ def ilqr_many(
     stop: str = "optimal",
     tolerance: float = 1e-4,
     max_iterations: int = 500,
+    time_limit: float | None = None,
     start: StartLike = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> list[Solution]:
@@ -73,7 +80,9 @@ def ilqr_many(
     Raises:
       InputError: an argument is not as described; a problem that is refused is named by its place in the list.
     """
-    settings = Settings(stop=stop, tolerance=tolerance, max_iterations=max_iterations, start=start)
+    settings = Settings(
+        stop=stop, tolerance=tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start
+    )
     return solve_all(list_of(problems), settings, _check, _solve, threads=threads, progress=progress)
 
 
@@ -113,19 +122,34 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
         start, L, l, *go, *model(problem),
         states, controls, states.copy(), controls.copy(), zeros(1), log,
     )  # fmt: skip
-    loop = core.entry("ilqr_iterations", steps, 0, 0, *options, *arrays)
+    stop = settings.stop_early()
+    loop = core.entry("ilqr", interface.ITERATE, steps, 0, 0, *options, *arrays)
     ending = iterate(
         problem,
-        lambda first, last: loop(steps, first, last, *options, *arrays),
-        log, settings.max_iterations, each=each, callback=callback,
+        lambda first, last: loop(interface.ITERATE, steps, first, last, *options, *arrays),
+        log, settings.max_iterations, each=each, stop=stop, callback=callback,
     )  # fmt: skip
     ending = check_outcome(problem, ending, start, control, refuse=each)
     whole = ending.iterations != () and ending.failed < 0
+    if ending.outcome == interface.TIMED_OUT:  # the last backward pass was about the trajectory before the last one
+        count = len(ending.iterations)
+        *_, failed = loop(interface.ITERATE, steps, count, count, *options, *arrays)
+        whole = failed < 0 and np.isfinite(states).all()
     if not whole:
         L[:] = 0  # without a pass about the trajectory there is no feedback; what is left is to play the controls
     offset = controls - np.einsum("tij,tj->ti", L, states[:-1]) if whole else controls.copy()
-    return assemble(
-        problem, solver="ilqr", options=settings.options(begin), status=ending.status,
-        detail=ending.detail(problem.steps), iterations=ending.iterations, states=states, controls=controls,
-        law=(L, offset), cost_to_go=Quadratic(*go) if whole else None,
+    numbers = np.zeros((1, LOG_COLUMNS))
+    loop(interface.CERTIFY, steps, 0, 0, *options, start, L, offset, *arrays[3:-1], numbers)
+    certificate = certificate_of(problem, numbers[0], states, violation=0.0)
+    status, detail = ending.status, ending.detail(problem.steps)
+    if status.success:
+        tolerance = settings.tolerance if status is Status.CONVERGED else None
+        rest = REST * numbers[0, 1]
+        if wrong := faults(certificate, claimed=ending.iterations[-1].cost, rest=rest, tolerance=tolerance):
+            status, detail = Status.NOT_CERTIFIED, f"of the plan that converged: {wrong}"
+    solution = assemble(
+        problem, solver="ilqr", options=settings.options(begin), status=status, detail=detail,
+        iterations=ending.iterations, states=states, controls=controls, law=(L, offset), certificate=certificate,
+        gap=0.0, cost_to_go=Quadratic(*go) if whole else None,
     )  # fmt: skip
+    return stop.settle(solution)

@@ -14,11 +14,20 @@ K = 0  # of these, how many entries a cost is not convex in
 LIMITS = 0  # which array of `stage` has the limits of the controls: lowest (M,), highest (M,)
 
 # How iterations end; see `Status`. Of those without a status of their own, NO_START is a first trajectory that is not
-# finite, STALLED a line search that found no lower cost, and CYCLING that the same costs come again and again.
+# finite, STALLED a line search that found no lower cost, CYCLING that the same costs come again and again, and
+# NO_PROGRESS that the least cost so far does not fall. TIMED_OUT is for the drivers: no kernel looks at a clock.
 RUNNING, CONVERGED, COST_CONVERGED, MAX_ITERATIONS, DIVERGED = 0, 1, 2, 3, 4
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED, CYCLING = 5, 6, 7, 8, 9
+NO_PROGRESS, TIMED_OUT = 10, 11
 LONGEST_CYCLE = 8
+# After how many iterations without a lower cost, and after how many in which it fell by less than a thousandth, there
+# is no progress. `python experiments/benchmark_reliability.py --sections overhead` shows that neither is met where the
+# method converges on the paper's queries.
+NO_FALL, SLOW_FALL = 12, 30
 HEADER = 4  # numbers that come before the multipliers; see `augmented.py`
+
+# What an entry is to do; see `entries.py`.
+ITERATE, DAMP, CERTIFY = 0, 1, 2
 
 # What an iteration was; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
@@ -27,9 +36,10 @@ SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
 # controls; how many small changes there were in a row; of iterations at reach 0, iLQR's, how many are left, how many
 # there will be the next time, and how many others there were since, of which PATIENCE are enough.
 # At the end, how far the states of least total cost are from the plan; at the beginning, whether that was made.
-# MERIT is the cost of the plan, and what the augmented Lagrangian adds to it: what is to be lowered.
-PLAN_COST, REACH, WEIGHT, SMALL, ILQR_LEFT, ILQR_NEXT, SINCE_ILQR, FINAL_GAP, STARTED, MERIT = range(10)
-MEMORY = 10
+# MERIT is the cost of the plan, and what the augmented Lagrangian adds to it: what is to be lowered. WATCHED is 1 where
+# the undamped iterations are to end when they make no progress, because there is a safeguard to go on.
+PLAN_COST, REACH, WEIGHT, SMALL, ILQR_LEFT, ILQR_NEXT, SINCE_ILQR, FINAL_GAP, STARTED, MERIT, WATCHED = range(11)
+MEMORY = 11
 PATIENCE = 50
 
 

@@ -11,7 +11,7 @@ from lqrsim.errors import Array, InputError, check_array, check_name, check_numb
 from lqrsim.linear_quadratic import Stage, check_end
 from lqrsim.policy import AffinePolicy
 from lqrsim.problem import FixedState
-from lqrsim.results import Iteration, Solution, Status, Trajectory
+from lqrsim.results import Certificate, Iteration, Solution, Status, Trajectory
 from lqrsim.value_functions import Moments, Quadratic
 from lqrsim.versions import versions
 
@@ -78,7 +78,7 @@ def smooth_lq(
             start = -np.linalg.solve(curve, initial.gradient + go[1][0])
     states, controls, value = _rollout(parts, law, start)
     value += float(final(states[-1])) + (float(initial(states[0])) if isinstance(initial, Quadratic) else 0.0)
-    iterations, gap, residual = (), np.inf, np.inf
+    iterations, gap, residual, optimality = (), np.inf, np.inf, np.inf
     if not detail:
         promised = float(Quadratic(go[0][0], go[1][0], go[2][0])(start))
         promised += float(initial(start)) if isinstance(initial, Quadratic) else 0.0
@@ -119,6 +119,11 @@ def smooth_lq(
         trajectory=Trajectory(states, controls, dt),
         iterations=iterations,
         clearance=None,
+        # The plan is the rollout just made.
+        certificate=Certificate(
+            cost=value, start=0.0, motion=0.0, law=0.0, limits=0.0, violation=0.0, optimality=optimality
+        ),
+        gap=gap,
         solver="smooth_lq",
         options={"form": form},
         problem_digest=_digest(parts, initial, final),

@@ -16,14 +16,18 @@ from lqrsim.solvers.interface import (
     ILQR,
     LONGEST_CYCLE,
     MAX_ITERATIONS,
+    NO_FALL,
+    NO_PROGRESS,
     NO_START,
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
     PLAN_COST,
     RUNNING,
+    SLOW_FALL,
     SMOOTH,
     STALLED,
     STARTED,
+    WATCHED,
     M,
     N,
     stack,
@@ -80,6 +84,9 @@ def smoother_iterations(
             copy(guess_x[0], N, x_hat)
     for done in range(first, last):
         weight = prior_weight if done < prior_iterations else no_weight
+        for i in range(N):
+            if fixed and x_hat[i] != start[i]:  # whatever ran before: each forward pass begins where the start is given
+                x_hat[i] = start[i]
         failed, good = forward_pass(
             steps, fixed, guided and done == 0, 0.0, guess_x, guess_u,
             x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, eased, final, weight, prior_about,
@@ -109,6 +116,8 @@ def smoother_iterations(
         outcome = ending(settled, optimal, left, tolerance, cost, full)
         if outcome == RUNNING and cycling(log, done):
             outcome = CYCLING
+        if outcome == RUNNING and memory[WATCHED] > 0 and no_progress(log, done):
+            outcome = NO_PROGRESS
         if outcome != RUNNING:
             return done + 1, outcome, False, -1
     return last, RUNNING, False, -1
@@ -135,6 +144,25 @@ def cycling(log, done):
         if same and abs(log[done, 0] - log[done - 1, 0]) > 1e-6 * abs(log[done, 0]):
             return True
     return False
+
+
+def no_progress(log, done):
+    """Whether the least cost so far has not fallen for NO_FALL iterations, or next to nothing for SLOW_FALL.
+
+    Costs that rise are no sign: the method passes through them on its way. Costs that swing about, or creep, are.
+    """
+    least, reference, since, slow = inf, inf, 0, 0
+    for i in range(done + 1):
+        cost = log[i, 0]
+        since, slow = since + 1, slow + 1
+        if abs(cost) < inf and cost < least:
+            least = cost
+            since = 0
+        if not least < inf:
+            since = 0
+        if least < reference - 1e-3 * abs(reference) or not reference < inf:
+            reference, slow = least, 0
+    return since >= NO_FALL or slow >= SLOW_FALL
 
 
 def optimality(steps, fixed, states, controls, cost, nothing, p, dt, initial, stage, final):
@@ -182,7 +210,8 @@ def ilqr_iterations(
 
     L, l are the policy that makes the first trajectory, from x0; afterwards `states` and `controls` are the best one,
     and L, l (relative to it), S, s, k are about it. `damping` (1,) is the weight on changes of the controls; `log` has,
-    in its last row, the cost that the first iteration improves on.
+    in its last row, the cost that the first iteration improves on. With `first` of `last`, there is no iteration: only
+    policy and cost-to-go are made, about the trajectory as it is.
     """
     no_shift = stack(N)
     for i in range(N):
@@ -193,6 +222,9 @@ def ilqr_iterations(
         if not abs(cost) < inf:
             return 0, NO_START, False, -1
     cost = log[first - 1 if first > 0 else max_iterations, 0]
+    if first == last:
+        failed, _, _ = differential_pass(steps, states, controls, p, dt, stage, final, 0.0, 1, L, l, S, s, k)
+        return last, RUNNING, failed >= 0, failed
     for done in range(first, last):
         damping[0] *= 0.1
         failed, good, _ = differential_pass(steps, states, controls, p, dt, stage, final, damping[0], 1, L, l, S, s, k)

@@ -1,8 +1,8 @@
 """The safeguard: LQR smoothing held near the best plan so far, for when it fails on its own. The numba subset.
 
-Rollouts on the way to an optimum can be worse than the first one by any factor, so there is no merit by which to tell
-early that the method will fail, and it is left alone until it does: in a pass, or by not ending. So it changes nothing
-where the method converges. What Levenberg-Marquardt is to Gauss-Newton, the damped iterations are to LQR smoothing.
+Rollouts on the way to an optimum can be worse than the first one by any factor, so a rising cost does not tell that the
+method will fail. It is left alone until a pass fails or the least cost so far no longer falls; see `no_progress`. What
+Levenberg-Marquardt is to Gauss-Newton, the damped iterations are to LQR smoothing.
 """
 
 from math import inf, isnan, nan
@@ -63,8 +63,16 @@ def damped_iterations(
 
     After many iterations without an end, too, reach 0 has its turn, each time for twice as long. `memory` (MEMORY,) is
     what one iteration leaves to the next; see `interface.py`.
+
+    With `first` of `last`, there is no iteration: only policy and value functions are made, about the plan as it is.
     """
     shift = stack(N)
+    if first == last:
+        relinearize(
+            steps, fixed, tolerance, optimal, False, 0.0,
+            start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
+            no_weight, no_about, plan_x, plan_u, memory, log, first,
+        )  # fmt: skip
     for done in range(first, last):
         reach, weight, nothing = memory[REACH], memory[WEIGHT], 0.0
         copy(start if fixed else plan_x[0], N, x_hat)
@@ -175,6 +183,8 @@ def relinearize(
     memory[FINAL_GAP] = inf
     if failed < 0 and minimizers(steps, S, s, C, b, x_hats):
         memory[FINAL_GAP] = largest_gap(steps, x_hats, plan_x)
+    # The forward pass has left it at the end; what comes next begins at the start.
+    copy(start if fixed else plan_x[0], N, x_hat)
     for t in range(steps):
         for i in range(M):  # the policy that makes the plan
             l[t, i] = plan_u[t, i]

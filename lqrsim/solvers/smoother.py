@@ -1,7 +1,6 @@
 """Iterated LQR smoothing: Sec. V of the paper, with a safeguard for where it would fail."""
 
 from collections.abc import Callable, Iterable
-from functools import partial
 
 import numpy as np
 
@@ -10,18 +9,18 @@ from lqrsim.errors import InputError, check_count
 from lqrsim.machine import processors
 from lqrsim.problem import FixedState, Problem
 from lqrsim.results import Solution
-from lqrsim.solvers.attempt import Attempt, Found
+from lqrsim.solvers.attempt import Attempt
 from lqrsim.solvers.common import (
     Callback,
     SmootherSettings,
+    Stop,
     assemble,
     check_callback,
     check_problem,
     list_of,
     solve_all,
 )
-from lqrsim.solvers.constrained import finish
-from lqrsim.solvers.search import check_starts, choose, guides
+from lqrsim.solvers.search import Search, check_starts, guides
 from lqrsim.solvers.start import StartLike, resolve
 
 
@@ -35,6 +34,7 @@ def smooth(
     tolerance: float = 1e-4,
     gap_tolerance: float = 1e-3,
     max_iterations: int = 500,
+    time_limit: float | None = None,
     start: StartLike = None,
     starts: int | None = None,
     constraint_tolerance: float = 1e-3,
@@ -60,8 +60,10 @@ def smooth(
         test, which looks at the change of cost alone and can pass early.
       tolerance: of the relative change of cost, and of the optimality (see `Iteration`).
       gap_tolerance: of the gap (see `Iteration`).
-      max_iterations: when to give up the method; the safeguard, if it steps in, has as many again, and with constraints
-        as many for each of up to 30 rounds of multipliers.
+      max_iterations: the most iterations that lead to the answer, the safeguard's and those with constraints included.
+        Of a search, each start has as many.
+      time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
+        comes first, does not count. It is looked at between iterations.
       start: what to begin with, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
         problem's nominal control, which the paper begins with; an InitialPrior, which adds to that what draws the first
         iterations; an AffinePolicy; a Trajectory, feasible or not, about which the first pass linearises; or a Solution
@@ -73,6 +75,7 @@ def smooth(
         metres. So much to spare is aimed at; a plan that has converged keeps the constraints themselves.
       threads: how many starts to run at once; by default as many as there are processors.
       callback: called with each `Iteration` as it ends; of a search, those of the starts that are run to their end.
+        What it raises ends the solve, as Ctrl-C does, and is raised again with the best plan so far as its `solution`.
 
     Returns:
       A Solution. A hard problem does not raise: the status says how it ended and what to try.
@@ -82,7 +85,7 @@ def smooth(
     """
     settings = SmootherSettings(
         form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
-        gap_tolerance=gap_tolerance, max_iterations=max_iterations, start=start, starts=starts,
+        gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start, starts=starts,
         constraint_tolerance=constraint_tolerance,
     )  # fmt: skip
     check_callback(callback)
@@ -102,6 +105,7 @@ def smooth_many(
     tolerance: float = 1e-4,
     gap_tolerance: float = 1e-3,
     max_iterations: int = 500,
+    time_limit: float | None = None,
     start: StartLike = None,
     starts: int | None = None,
     constraint_tolerance: float = 1e-3,
@@ -116,8 +120,8 @@ def smooth_many(
     Args:
       problems: of one structure or of many; each structure is compiled once.
       threads: how many to use; by default all processors that this process may run on.
-      form, first_pass, safeguard, stop, tolerance, gap_tolerance, max_iterations, start, starts, constraint_tolerance:
-        as in `smooth`, for all.
+      form, first_pass, safeguard, stop, tolerance, gap_tolerance, max_iterations, time_limit, start, starts,
+        constraint_tolerance: as in `smooth`, for all.
       progress: called with how many are done, of how many, as each one ends.
 
     Returns:
@@ -129,7 +133,7 @@ def smooth_many(
     """
     settings = SmootherSettings(
         form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
-        gap_tolerance=gap_tolerance, max_iterations=max_iterations, start=start, starts=starts,
+        gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start, starts=starts,
         constraint_tolerance=constraint_tolerance,
     )  # fmt: skip
     return solve_all(list_of(problems), settings, _check, _solve, threads=threads, progress=progress)
@@ -145,38 +149,28 @@ def _solve(
 ) -> Solution:
     """Solve; with `each`, a look after each iteration (see `iterate`)."""
     given = [("", settings.start)] if settings.start is not None else guides(problem, settings.starts)
-    names, begins = [name for name, _ in given], [resolve(start, problem) for _, start in given]
     start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
-    check_functions(problem, start, begins[0].offset[0].copy())
-    attempts = [Attempt(problem, settings, begin, start) for begin in begins]
-    chosen, *others = choose(attempts, partial(Attempt.run, each=each), threads)
-
-    def finished(attempt: Attempt) -> Found:
-        if callback is not None:
-            for iteration in attempt.ending.iterations:
-                callback(iteration)
-        return finish(attempt, each=each, callback=callback)
-
-    tried = [(chosen, finished(chosen))]
-    if problem.constraints:
-        # Constraints can make the best way round the worst, or close it. What the others cost without them is about the
-        # least that they can cost with them.
-        for attempt in sorted(others, key=lambda attempt: attempt.cost):
-            best = tried[0][1]
-            if best.final or (best.success and not attempt.cost < best.cost):
-                break
-            tried.append((attempt, finished(attempt)))
-            tried.sort(key=lambda pair: pair[1].rank)
-    chosen, found = tried[0]
-    results = {id(attempt): found for attempt, found in tried}
-    candidates = [
-        attempt.candidate(name, results.get(id(attempt))) for name, attempt in zip(names, attempts, strict=True)
-    ]
-    return assemble(
+    first = resolve(given[0][1], problem)
+    check_functions(problem, start, first.offset[0].copy())
+    begins = [first, *(resolve(one, problem) for _, one in given[1:])]
+    attempts = [Attempt(problem, settings, begin, start, Stop()) for begin in begins]
+    stop = settings.stop_early()  # from now on: compiling does not count
+    for attempt in attempts:
+        attempt.stop = stop
+    search = Search([name for name, _ in given], attempts, each=each, callback=callback)
+    search.run(threads)
+    default = settings.start is None and settings.starts is None and settings.safeguard
+    if default and not stop.due and search.poor(problem):
+        search.widen(problem, settings, start, stop, threads)
+    chosen, found = search.best
+    assert found.certificate is not None
+    solution = assemble(
         problem, solver="smooth", options=settings.options(chosen.begin), status=found.status, detail=found.detail,
         iterations=found.iterations, states=found.states, controls=found.controls, law=found.law,
-        candidates=tuple(candidates) if len(attempts) > 1 else (), multipliers=found.multipliers, **found.values,
+        certificate=found.certificate, gap=found.gap, candidates=search.candidates(), multipliers=found.multipliers,
+        **found.values,
     )  # fmt: skip
+    return stop.settle(solution)
 
 
 def _check(problem: Problem, settings: SmootherSettings) -> None:

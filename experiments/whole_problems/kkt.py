@@ -55,15 +55,19 @@ def check(problem: ls.Problem, solution: ls.Solution, rate: Rate | None = None) 
     """Look at a solution. `rate` is xdot in NumPy, for dynamics that are more than a formula of SymPy's."""
     plan, gain = solution.trajectory, solution.policy.gain
     n, z = plan.states.shape[1], np.hstack([plan.states[:-1], plan.controls])
-    arrived, jacobian = _step_jacobian(_rate_of(problem, rate), z, n, _numbers(problem), problem.dt)
+    arrived, jacobian = step_jacobian(rate_of(problem, rate), z, n, numbers_of(problem), problem.dt)
     A, B, defect = jacobian[..., :n], jacobian[..., n:], arrived - plan.states[1:]
-    stage, gradient, hessian = _model(problem, problem.stage_cost, z, n, first=0)
-    end, end_slope, end_curve = (part[0] for part in _model(problem, problem.final_cost, plan.states[-1:], n, first=-1))
+    stage, gradient, hessian = cost_model(problem, problem.stage_cost, z, n, first=0)
+    end, end_slope, end_curve = (
+        part[0] for part in cost_model(problem, problem.final_cost, plan.states[-1:], n, first=-1)
+    )
     if fixed := isinstance(problem.initial, ls.FixedState):
         start, start_slope, start_curve = 0.0, np.zeros(n), np.zeros((n, n))
     else:
         initial: Cost = problem.initial  # pyright: ignore[reportAssignmentType]
-        start, start_slope, start_curve = (part[0] for part in _model(problem, initial, plan.states[:1], n, first=0))
+        start, start_slope, start_curve = (
+            part[0] for part in cost_model(problem, initial, plan.states[:1], n, first=0)
+        )
     cost = stage.sum() + start + end
     hessian[0, :n, :n] += start_curve
     gradient[0, :n] += start_slope
@@ -88,11 +92,11 @@ def recompute(problem: ls.Problem, plan: ls.Trajectory, rate: Rate | None = None
     """Cost and residual alone, of plans that may be too far out for anything more."""
     n, z = plan.states.shape[1], np.hstack([plan.states[:-1], plan.controls])
     with np.errstate(all="ignore"):
-        cost = _value(problem, problem.stage_cost, z, n, first=0).sum()
-        cost += _value(problem, problem.final_cost, plan.states[-1:], n, first=-1)[0]
+        cost = cost_values(problem, problem.stage_cost, z, n, first=0).sum()
+        cost += cost_values(problem, problem.final_cost, plan.states[-1:], n, first=-1)[0]
         if not isinstance(problem.initial, ls.FixedState):
-            cost += _value(problem, problem.initial, plan.states[:1], n, first=0)[0]
-        arrived = _step(_rate_of(problem, rate), z[:, :n], z[:, n:], _numbers(problem), problem.dt)
+            cost += cost_values(problem, problem.initial, plan.states[:1], n, first=0)[0]
+        arrived = step(rate_of(problem, rate), z[:, :n], z[:, n:], numbers_of(problem), problem.dt)
         return float(cost), _residual(plan, arrived)
 
 
@@ -143,7 +147,7 @@ def _stationarity(
 # The model about a plan.
 
 
-def _step(rate: Rate, x: Values, u: Values, p: tuple[float, ...], dt: float) -> Values:
+def step(rate: Rate, x: Values, u: Values, p: tuple[float, ...], dt: float) -> Values:
     """One Runge-Kutta step of states (..., n) under controls (..., m)."""
     controls = list(np.moveaxis(u, -1, 0))
 
@@ -158,11 +162,11 @@ def _step(rate: Rate, x: Values, u: Values, p: tuple[float, ...], dt: float) -> 
     return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-def _step_jacobian(rate: Rate, z: Array, n: int, p: tuple[float, ...], dt: float) -> tuple[Array, Array]:
+def step_jacobian(rate: Rate, z: Array, n: int, p: tuple[float, ...], dt: float) -> tuple[Array, Array]:
     """The step from each of the points (T, n+m), and its Jacobian (T, n, n+m), by complex steps."""
     tiny = 1e-30
     moved = z + 1j * tiny * np.eye(z.shape[1])[:, None, :]  # (n+m, T, n+m): moved along each entry in turn
-    x = _step(rate, moved[..., :n], moved[..., n:], p, dt)
+    x = step(rate, moved[..., :n], moved[..., n:], p, dt)
     return x[0].real, np.moveaxis(x.imag, 0, -1) / tiny
 
 
@@ -183,15 +187,15 @@ def _functions(problem: ls.Problem, cost: Cost, n: int, size: int, first: int) -
             raise TypeError(f"no check for {term.name}")
 
 
-def _value(problem: ls.Problem, cost: Cost, z: Array, n: int, *, first: int) -> Array:
-    """Values (k,) of a sum of costs at points (k, size), as `_model`."""
+def cost_values(problem: ls.Problem, cost: Cost, z: Array, n: int, *, first: int) -> Array:
+    """Values (k,) of a sum of costs at points (k, size), as `cost_model`."""
     value = np.zeros(len(z))
     for function, place, skip, _ in _functions(problem, cost, n, z.shape[1], first):
         value[skip:] += function(z[skip:][:, place])
     return value
 
 
-def _model(problem: ls.Problem, cost: Cost, z: Array, n: int, *, first: int) -> tuple[Array, Array, Array]:
+def cost_model(problem: ls.Problem, cost: Cost, z: Array, n: int, *, first: int) -> tuple[Array, Array, Array]:
     """Value (k,), gradient (k, size) and convex Hessian (k, size, size) of a sum of costs at points (k, size).
 
     The points are of the states alone, or of states and controls; `first` is the step that the first of them is at.
@@ -205,7 +209,7 @@ def _model(problem: ls.Problem, cost: Cost, z: Array, n: int, *, first: int) -> 
         (hessian if convex else bent)[np.ix_(range(skip, count), place, place)] += curve
     values, vectors = np.linalg.eigh(bent)
     hessian += vectors * np.maximum(values, 0)[:, None, :] @ np.swapaxes(vectors, 1, 2)
-    return _value(problem, cost, z, n, first=first), gradient, hessian
+    return cost_values(problem, cost, z, n, first=first), gradient, hessian
 
 
 def _differentiate(function: Function, z: Array) -> tuple[Array, Array]:
@@ -237,7 +241,7 @@ def _numeric(function: Any, n: int, m: int, parameters: tuple[str, ...], several
     return sympy.lambdify([x, u, p], list(formula) if several else formula, modules="numpy", cse=True)
 
 
-def _rate_of(problem: ls.Problem, rate: Rate | None) -> Rate:
+def rate_of(problem: ls.Problem, rate: Rate | None) -> Rate:
     dynamics = problem.dynamics
     if rate is not None:
         return rate
@@ -245,7 +249,7 @@ def _rate_of(problem: ls.Problem, rate: Rate | None) -> Rate:
     return _numeric(dynamics.f, n, m, tuple(dynamics.parameters), True)
 
 
-def _numbers(problem: ls.Problem) -> tuple[float, ...]:
+def numbers_of(problem: ls.Problem) -> tuple[float, ...]:
     return tuple(problem.dynamics.parameters.values())
 
 
@@ -268,11 +272,11 @@ def _formula_cost(cost: ls.SymbolicCost, n: int, size: int, m: int) -> Function:
 def _obstacles(cost: ls.ObstacleCost, place: Values) -> Values:
     total = np.zeros(place.shape[:-1])
     for obstacle in cost.world.obstacles:
-        total = total + np.exp(-cost.sharpness * (_distance(obstacle, place) - cost.radius))
+        total = total + np.exp(-cost.sharpness * (distance(obstacle, place) - cost.radius))
     return cost.weight * total
 
 
-def _distance(obstacle: ls.Obstacle, place: Values) -> Values:
+def distance(obstacle: ls.Obstacle, place: Values) -> Values:
     """Signed distance of places (..., 2 or 3), which may be complex, to an obstacle. In the plane, seen from above."""
     if flat := place.shape[-1] == 2:
         place = np.concatenate([place, np.broadcast_to(obstacle.position[2], (*place.shape[:-1], 1))], axis=-1)
@@ -281,8 +285,9 @@ def _distance(obstacle: ls.Obstacle, place: Values) -> Values:
     first, second, third = obstacle.size
     if obstacle.kind == "plane":
         return c
-    if obstacle.kind == "box" and not flat:
-        beyond: Values = np.stack([_absolute(a) - first, _absolute(b) - second, _absolute(c) - third], axis=-1)
+    if obstacle.kind == "box" and (not flat or abs(obstacle.rotation[2, 2]) > 1 - 1e-9):
+        sides = [_absolute(a) - first, _absolute(b) - second, *([] if flat else [_absolute(c) - third])]
+        beyond: Values = np.stack(sides, axis=-1)
         deepest: Values = np.take_along_axis(beyond, beyond.real.argmax(axis=-1)[..., None], axis=-1)[..., 0]
         outside = np.where(beyond.real > 0, beyond, 0)
         return np.where(deepest.real > 0, _length(outside, deepest.real > 0), deepest)

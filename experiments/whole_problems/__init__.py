@@ -1,0 +1,1 @@
+"""Whole problems, drawn at random, and what is true of their solutions by the problem alone."""

@@ -1,0 +1,155 @@
+"""Whatever a solution claims, held against the problem alone, in plain NumPy; `kkt.py` evaluates problems.
+
+What must be so of any plan, whatever the status; what a success claims besides; and what the other statuses say.
+"""
+
+import numpy as np
+
+import lqrsim as ls
+from lqrsim.costs import terms_of
+from lqrsim.errors import Array
+from lqrsim.results import Status
+from whole_problems import kkt
+
+# Rounding, of sums of a few hundred terms, and of a step that may amplify it a thousandfold.
+COST, MOTION, LAW = 1e-7, 1e-7, 1e-9
+# The decrease that is still promised is worked out with other gains and Hessians than the method's, and a constraint's
+# multiplier is right to the tolerance to which it is solved.
+SLACK = 10.0
+
+
+def contradictions(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | None = None) -> list[str]:
+    """What a solution claims that is not so; empty where all of it is."""
+    with np.errstate(all="ignore"):
+        found = _of_any_plan(problem, solution, rate)
+        if solution.success:
+            found += _of_a_success(problem, solution, rate)
+    if solution.status is not Status.CONVERGED and not solution.status.success and not solution.status.remedy:
+        found.append(f"{solution.status.name} has no remedy")
+    limit = solution.options["max_iterations"]
+    assert isinstance(limit, int)
+    if len(solution.iterations) > limit:
+        found.append(f"{len(solution.iterations)} iterations, with max_iterations={limit}")
+    return found
+
+
+def _of_any_plan(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | None) -> list[str]:
+    """The plan is the rollout of its policy from where it must start, inside the limits, and costs what is said."""
+    plan, policy, found = solution.trajectory, solution.policy, []
+    if isinstance(problem.initial, ls.FixedState) and not np.array_equal(plan.states[0], problem.initial.state):
+        found.append(f"begins at {plan.states[0]}, not at {problem.initial.state}")
+    low, high = np.array(problem.control_coordinates.low), np.array(problem.control_coordinates.high)
+    if ((plan.controls < low) | (plan.controls > high)).any():
+        found.append("a control is beyond its limits")
+    if not np.isfinite(plan.states).all():
+        return found if not solution.success else [*found, "the plan is not finite"]
+    raw = np.einsum("tij,tj->ti", policy.gain, plan.states[:-1]) + policy.offset
+    terms = np.einsum("tij,tj->ti", np.abs(policy.gain), np.abs(plan.states[:-1])) + np.abs(policy.offset) + 1e-300
+    if not (np.abs(np.clip(raw, low, high) - plan.controls) <= LAW * (terms + np.abs(plan.controls))).all():
+        found.append("the controls are not the policy's")
+    cost, residual = kkt.recompute(problem, plan, rate)
+    if not residual < MOTION * max(1.0, float(np.abs(plan.states).max())):
+        found.append(f"a state is {residual:.2g} off the dynamics")
+    # Of a cost of zero, squares of rounding errors remain, each weighed by what the problem weighs it with.
+    if not abs(cost - solution.cost) <= COST * abs(cost) + 1e-20 * _size(problem, plan):
+        found.append(f"costs {cost:.9g}, not {solution.cost:.9g}")
+    violation = _violation(problem, plan)
+    if not abs(violation - solution.violation) <= 1e-9:
+        found.append(f"misses a constraint by {violation:.3g}, not {solution.violation:.3g}")
+    return found
+
+
+def _of_a_success(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | None) -> list[str]:
+    found = [f"misses a constraint by {solution.violation:.3g}"] if solution.violation > 0 else []
+    tolerance = solution.options["tolerance"]
+    assert isinstance(tolerance, float)
+    if solution.status is Status.CONVERGED:
+        decrease = _decrease(problem, solution, rate)
+        promised = decrease / (abs(solution.cost) + 1e-20 * _size(problem, solution.trajectory) + 1e-300)
+        if not promised < SLACK * tolerance:
+            found.append(f"{promised:.2g} of the cost could still be saved")
+    return found
+
+
+def _size(problem: ls.Problem, plan: ls.Trajectory) -> float:
+    """Squares of the states and controls, weighed as the problem's quadratic terms weigh them."""
+    total = 0.0
+    for cost, places in ((problem.stage_cost, plan.states[:-1]), (problem.final_cost, plan.states[-1:])):
+        for term in terms_of(cost):
+            if isinstance(term, ls.QuadraticCost):
+                total += float(np.einsum("ti,ij,tj->", np.abs(places), np.abs(term.weight), np.abs(places)))
+            elif isinstance(term, ls.ControlCost):
+                controls = np.abs(plan.controls)
+                total += float(np.einsum("ti,ij,tj->", controls, np.abs(term.weight), controls))
+            else:
+                total += len(places) * max(float(np.abs(places).max()) ** 2, 1.0)
+    return total
+
+
+def _clearances(problem: ls.Problem) -> list[ls.Clearance]:
+    for constraint in problem.constraints:
+        if not isinstance(constraint, ls.Clearance):
+            raise TypeError(f"no check for {type(constraint).__name__}")
+    return [constraint for constraint in problem.constraints if isinstance(constraint, ls.Clearance)]
+
+
+def _spare(problem: ls.Problem, clearance: ls.Clearance, states: Array) -> Array:
+    """What each obstacle's constraint has to spare (T+1, obstacles); complex states will do."""
+    place = states[..., list(problem.dynamics.state_coordinates.position)]
+    world = clearance.world.seen_by(len(problem.dynamics.state_coordinates.position))
+    if not world.obstacles:
+        return np.full((len(states), 1), np.inf)
+    away = [kkt.distance(obstacle, place) - clearance.radius - clearance.margin for obstacle in world.obstacles]
+    return np.stack(away, axis=-1)
+
+
+def _acting(problem: ls.Problem, spare: Array) -> Array:
+    if isinstance(problem.initial, ls.FixedState):  # about a start that is given nothing can be done
+        spare = np.concatenate([np.full((1, spare.shape[1]), np.inf), spare[1:]])
+    return spare
+
+
+def _violation(problem: ls.Problem, plan: ls.Trajectory) -> float:
+    spare = [_acting(problem, _spare(problem, one, plan.states).real) for one in _clearances(problem)]
+    return max(0.0, *(-float(one.min(initial=np.inf)) for one in spare)) if spare else 0.0
+
+
+def _decrease(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | None) -> float:
+    """`1/2 sum e' H^-1 e`: with the slopes e of the Lagrangian in the offsets of the policy, later controls responding.
+
+    H is the curvature of the cost in one offset, all others held. A control at a limit that would go beyond it does not
+    count, and does not respond. Multipliers are the solution's.
+    """
+    plan, gain = solution.trajectory, solution.policy.gain
+    n, m = plan.states.shape[1], plan.controls.shape[1]
+    z = np.hstack([plan.states[:-1], plan.controls])
+    _, jacobian = kkt.step_jacobian(kkt.rate_of(problem, rate), z, n, kkt.numbers_of(problem), problem.dt)
+    A, B = jacobian[..., :n], jacobian[..., n:]
+    _, gradient, hessian = kkt.cost_model(problem, problem.stage_cost, z, n, first=0)
+    _, end_slope, end_curve = kkt.cost_model(problem, problem.final_cost, plan.states[-1:], n, first=-1)
+    pull = np.zeros_like(plan.states)
+    for clearance, multipliers in zip(_clearances(problem), solution.multipliers, strict=False):
+        for i in range(n):
+            moved = plan.states + 1e-30j * np.eye(n)[i]
+            slope = _acting(problem, _spare(problem, clearance, moved).imag / 1e-30)
+            pull[:, i] -= np.where(np.isinf(slope), 0.0, multipliers.values * slope).sum(axis=1)
+    costate, curve, total = end_slope[0] + pull[-1], end_curve[0], 0.0
+    low, high = np.array(problem.control_coordinates.low), np.array(problem.control_coordinates.high)
+    for t in range(len(A) - 1, -1, -1):
+        slope = gradient[t, n:] + B[t].T @ costate
+        u, H = plan.controls[t], hessian[t, n:, n:] + B[t].T @ curve @ B[t]
+        counts = ~(((u == low) & (slope >= 0)) | ((u == high) & (slope <= 0)))
+        free = (u > low) & (u < high)
+        if counts.any():
+            e = slope[counts]
+            total += 0.5 * float(e @ np.linalg.pinv(H[np.ix_(counts, counts)], hermitian=True) @ e)
+        law = np.where(free[:, None], gain[t], 0.0)
+        closed, both = A[t] + B[t] @ law, np.vstack([np.eye(n), law])
+        costate = closed.T @ costate + both.T @ gradient[t] + pull[t]
+        curve = closed.T @ curve @ closed + both.T @ hessian[t] @ both
+    if not isinstance(problem.initial, ls.FixedState):
+        _, slope, own = kkt.cost_model(problem, problem.initial, plan.states[:1], n, first=0)
+        e = slope[0] + costate
+        total += 0.5 * float(e @ np.linalg.pinv(own[0] + curve, hermitian=True) @ e)
+    assert m == len(low)
+    return total

@@ -1,0 +1,59 @@
+"""The last look before a solver says that it converged: is the plan what the solution claims, by the problem itself?
+
+`certificate.py` works the numbers out, on a path of its own; here they are held against what is claimed.
+"""
+
+import numpy as np
+
+from lqrsim.errors import Array
+from lqrsim.problem import FixedState, Problem
+from lqrsim.results import Certificate
+
+# What rounding may do. A policy's control is a sum of a few terms, and a step of the dynamics some hundred operations,
+# of which one amplifies what another has rounded.
+LAW, MOTION, COST = 1e-11, 1e-8, 1e-8
+# Costs are sums, of which something remains where all cancels: a share of the parts.
+REST = 1e-13
+# The optimality is worked out otherwise than by the method, with gains and Hessians about states that are within the
+# gap's tolerance of the plan: it may come out a little larger.
+SLACK = 2.0
+
+
+def certificate_of(problem: Problem, found: Array, states: Array, *, violation: float) -> Certificate:
+    """The certificate of a plan with states (T+1, n), given what `certificate.certify` wrote, (6,)."""
+    cost, scale, motion, law, limits, decrease = (float(number) for number in found)
+    start = 0.0
+    if isinstance(problem.initial, FixedState):
+        start = float(np.abs(states[0] - np.asarray(problem.initial.state)).max())
+    if not np.isfinite(cost):
+        decrease = np.inf
+    optimality = decrease / max(abs(cost), 1e-26 * scale, 1e-300) if np.isfinite(decrease) else np.inf
+    return Certificate(
+        cost=cost, start=start, motion=motion, law=law, limits=max(limits, 0.0), violation=violation,
+        optimality=optimality,
+    )  # fmt: skip
+
+
+def faults(certificate: Certificate, *, claimed: float, rest: float, tolerance: float | None) -> str:
+    """What of it contradicts a solver that says it converged; empty where nothing does.
+
+    Args:
+      claimed: the cost that the log ends with. rest: what rounding may leave of a cost where all of it cancels.
+      tolerance: of the optimality; None where only the cost was asked for.
+    """
+    found = []
+    if certificate.start != 0:
+        found.append(f"it begins {certificate.start:.2g} off the fixed start")
+    if not certificate.motion <= MOTION:
+        found.append(f"it is {certificate.motion:.2g} off the dynamics")
+    if not certificate.law <= LAW:
+        found.append(f"its controls are {certificate.law:.2g} off the policy's")
+    if certificate.limits > 0:
+        found.append(f"a control is {certificate.limits:.2g} beyond its limit")
+    if certificate.violation > 0:
+        found.append(f"a constraint is missed by {certificate.violation:.2g}")
+    if not abs(certificate.cost - claimed) <= COST * abs(certificate.cost) + rest:
+        found.append(f"it costs {certificate.cost:.9g}, not {claimed:.9g}")
+    if tolerance is not None and not certificate.optimality < SLACK * tolerance:
+        found.append(f"its optimality is {certificate.optimality:.2g}, not below {tolerance:g}")
+    return ", ".join(found)
