@@ -272,6 +272,8 @@ def _formula_cost(cost: ls.SymbolicCost, n: int, size: int, m: int) -> Function:
 def _obstacles(cost: ls.ObstacleCost, place: Values) -> Values:
     total = np.zeros(place.shape[:-1])
     for obstacle in cost.world.obstacles:
+        if place.shape[-1] == 2 and obstacle.kind == "plane" and abs(obstacle.rotation[2, 2]) > 1 - 1e-9:
+            continue  # seen from above, a floor bounds nothing
         total = total + np.exp(-cost.sharpness * (distance(obstacle, place) - cost.radius))
     return cost.weight * total
 

@@ -1,0 +1,189 @@
+"""Whether what solutions claim is so, on whole problems drawn at random, and on one person's own robot.
+
+    python experiments/benchmark_claims.py                         # 10,000 problems, some 20 minutes on two cores
+    python experiments/benchmark_claims.py --sections planar       # some of it
+    python experiments/benchmark_claims.py --quick                 # bounded, and too few to trust
+
+Every claim is held against the problem alone, by whole_problems/claims.py, which shares nothing with the solvers.
+
+drawn        Random systems with fixed and soft starts, limits, constraints, warm starts, few and many iterations.
+planar       A planar quadrotor that has to get over a wall: 60 starts and goals, with a clearance and without.
+certificate  What the certificate costs of a solve, on the paper's queries and on warm starts.
+"""
+
+import dataclasses
+import json
+import statistics
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from typing import Any, Literal, get_args
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+from whole_problems import planar_quadrotor
+from whole_problems.claims import contradictions
+from whole_problems.draws import KINDS, draw, solve
+
+import lqrsim as ls
+from lqrsim.machine import processors
+from lqrsim.solvers.attempt import Attempt
+from lqrsim.versions import versions
+
+Section = Literal["drawn", "planar", "certificate"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    sections: tuple[Section, ...] = get_args(Section)
+    """What to measure."""
+    problems: int = 10_000
+    """How many random problems, of all kinds together."""
+    kinds: tuple[str, ...] = tuple(KINDS)
+    """Of random problems."""
+    seed: int = 0
+    """Of the random problems."""
+    queries: int = 100
+    """How many of the quadrotor's for what the certificate costs."""
+    quick: bool = False
+    """110 problems, 6 starts and goals, 10 queries."""
+    json: bool = False
+    """Print everything as JSON instead of the tables."""
+
+
+def main(config: Config) -> dict[str, Any]:
+    if config.quick:
+        config = dataclasses.replace(config, problems=min(config.problems, 110), queries=min(config.queries, 10))
+    result: dict[str, Any] = {"config": asdict(config), "versions": versions(), "processors": processors()}
+    for name in config.sections:
+        result[name] = {"drawn": _drawn, "planar": _planar, "certificate": _certificate}[name](config)
+    return result
+
+
+def look(kind: str, number: int, seed: int) -> tuple[list[str], list[str]]:
+    """The statuses of a draw's solutions, and what they claim that is not so."""
+    drawn = draw(kind, number, seed=seed)
+    solutions = solve(drawn)
+    false = [
+        f"{drawn} (seed {seed}), {solution.status.name}: {wrong}"
+        for solution in solutions
+        for wrong in contradictions(drawn.problem, solution, drawn.rate)
+    ]
+    return [solution.status.name for solution in solutions], false
+
+
+def _look_at(task: tuple[str, int, int]) -> tuple[str, list[str], list[str]]:
+    return task[0], *look(*task)
+
+
+def _drawn(config: Config) -> dict[str, Any]:
+    each = max(config.problems // len(config.kinds), 1)
+    tasks = [(kind, number, config.seed) for number in range(each) for kind in config.kinds]
+    statuses: dict[str, Counter[str]] = {kind: Counter() for kind in config.kinds}
+    false: list[str] = []
+    # One after the other, so that each kind is compiled once before all begin.
+    for kind in tqdm(config.kinds, desc="compiling", leave=False, disable=None):
+        draw(kind, 0, seed=config.seed)
+        look(kind, 0, config.seed)
+    with tqdm(total=len(tasks), desc="drawn", disable=None) as bar:
+        for kind, ended, wrong in _on_all_processors(tasks):
+            statuses[kind].update(ended)
+            false += wrong
+            bar.update()
+    return {"problems": len(tasks), "statuses": statuses, "false": false}
+
+
+def _on_all_processors(tasks: list[tuple[str, int, int]]) -> Iterator[tuple[str, list[str], list[str]]]:
+    with ProcessPoolExecutor(processors(), mp_context=get_context("spawn")) as pool:
+        yield from pool.map(_look_at, tasks, chunksize=20)
+
+
+def _planar(config: Config) -> dict[str, Any]:
+    count = 6 if config.quick else 60
+    result: dict[str, Any] = {}
+    for name, clearance in (("without", False), ("clearance", True)):
+        rng = np.random.default_rng(config.seed)
+        problems = [planar_quadrotor.draw(rng, clearance=clearance) for _ in range(count)]
+        clock = time.perf_counter()
+        solutions = ls.smooth_many(problems)
+        seconds = time.perf_counter() - clock
+        away = [
+            solution.trajectory.states[-1][:2] - problem.goal[:2]
+            for problem, solution in zip(problems, solutions, strict=True)
+        ]
+        iterations = [len(solution.iterations) for solution in solutions]
+        result[name] = {
+            "solved": sum(solution.status.name == "CONVERGED" for solution in solutions),
+            "problems": count,
+            "at_goal": sum(float(np.linalg.norm(one)) <= planar_quadrotor.RADIUS for one in away),
+            "false": [wrong for pair in zip(problems, solutions, strict=True) for wrong in contradictions(*pair)],
+            "median": statistics.median(iterations),
+            "most": max(iterations),
+            "cost": statistics.median(solution.cost for solution in solutions),
+            "seconds": seconds,
+        }
+    return result
+
+
+def _certificate(config: Config) -> dict[str, Any]:
+    """Each query solved with and without the certificate, in turns, on one thread."""
+    problems = [ls.scenarios.quadrotor(query=query).problem for query in range(config.queries)]
+    problems = [replace(problem, initial=ls.FixedState(problem.start)) for problem in problems]
+    certified, spent = Attempt.certified, 0.0
+
+    def timed(self: Attempt, found: Any) -> Any:
+        nonlocal spent
+        clock = time.perf_counter()
+        answer = certified(self, found)
+        spent += time.perf_counter() - clock
+        return answer
+
+    shares: dict[str, list[float]] = {"search": [], "hover": [], "warm": []}
+    Attempt.certified = timed  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        for problem in tqdm(problems, desc="certificate", leave=False, disable=None):
+            solution = ls.smooth(problem, threads=1)
+            starts = {"search": None, "hover": problem.nominal_control, "warm": solution.shifted(1)}
+            for name, start in starts.items():
+                spent, clock = 0.0, time.perf_counter()
+                ls.smooth(problem, start=start, threads=1)
+                shares[name].append(spent / (time.perf_counter() - clock))
+    finally:
+        Attempt.certified = certified  # pyright: ignore[reportAttributeAccessIssue]
+    return {name: statistics.median(values) for name, values in shares.items()}
+
+
+def report(result: dict[str, Any]) -> str:
+    lines = []
+    if drawn := result.get("drawn"):
+        lines.append(f"{drawn['problems']} problems drawn: {len(drawn['false'])} false claims")
+        for kind, counts in drawn["statuses"].items():
+            ended = ", ".join(f"{count} {status}" for status, count in Counter(counts).most_common())
+            lines.append(f"  {kind:<12} {ended}")
+        lines += [f"  FALSE: {wrong}" for wrong in drawn["false"]]
+    for name, row in result.get("planar", {}).items():
+        lines.append(
+            f"planar quadrotor, {name}: {row['solved']} of {row['problems']} converged, {row['at_goal']} at the goal,"
+            f" {len(row['false'])} false claims; iterations {row['median']:g} in the median, {row['most']} at most;"
+            f" median cost {row['cost']:.4g}; {row['seconds']:.1f} s"
+        )
+        lines += [f"  FALSE: {wrong}" for wrong in row["false"]]
+    if certificate := result.get("certificate"):
+        shares = ", ".join(f"{100 * share:.1f} % ({name})" for name, share in certificate.items())
+        lines.append(f"the certificate's share of a solve, in the median: {shares}")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    settings = tyro.cli(Config, description=__doc__)
+    outcome = main(settings)
+    print(json.dumps(outcome) if settings.json else report(outcome))
+    wrong = [
+        *outcome.get("drawn", {}).get("false", []),
+        *(w for row in outcome.get("planar", {}).values() for w in row["false"]),
+    ]
+    raise SystemExit(1 if wrong else 0)

@@ -1,0 +1,88 @@
+"""Whole problems drawn at random: nothing that a solution claims is false; and what once was is not any more."""
+
+import dataclasses
+from collections.abc import Callable
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from whole_problems import draws, planar_quadrotor
+from whole_problems.claims import contradictions
+
+import lqrsim as ls
+from lqrsim.results import Status
+
+# Ten kinds of problems are compiled where nothing is cached, some 10 seconds each.
+pytestmark = pytest.mark.timeout(900)
+
+
+@settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
+@given(kind=st.sampled_from(sorted(draws.KINDS)), number=st.integers(0, 2**32 - 1))
+def test_nothing_that_a_solution_claims_is_false(kind: str, number: int) -> None:
+    drawn = draws.draw(kind, number)
+    for solution in draws.solve(drawn):
+        assert contradictions(drawn.problem, solution, drawn.rate) == [], f"{drawn}: {solution.status.name}"
+
+
+def test_a_draw_does_not_depend_on_what_else_is_drawn() -> None:
+    assert draws.draw("car", 5).problem.digest == draws.draw("car", 5).problem.digest
+    digests = {draws.draw("car", number).problem.digest for number in range(20)}
+    assert len(digests) == 20
+
+
+Case = tuple[ls.Problem, ls.Solution]
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    problem = planar_quadrotor.problem((-1.2, 0.1), (1.6, 0.3), steps=150)
+    solution = ls.smooth(problem)
+    assert solution.status is Status.CONVERGED
+    assert contradictions(problem, solution) == []
+    return problem, solution
+
+
+class TestTheCheckCanFail:
+    """Each claim of a right solution, made false by a little."""
+
+    @pytest.mark.parametrize(
+        ("spoil", "says"),
+        [
+            (lambda s: _with_plan(s, states=s.trajectory.states + 1e-6), "begins at"),
+            (lambda s: _with_plan(s, controls=s.trajectory.controls + 7.0), "beyond its limits"),
+            (lambda s: _with_plan(s, controls=s.trajectory.controls * (1 - 1e-6)), "not the policy's"),
+            (lambda s: _with_plan(s, states=_bent(s.trajectory.states)), "off the dynamics"),
+            (lambda s: _certified(s, cost=s.cost * (1 + 1e-6)), "costs"),
+            (lambda s: _certified(s, violation=1e-6), "misses a constraint"),
+            (lambda s: _slack(s), "could still be saved"),
+            (lambda s: dataclasses.replace(s, options={**s.options, "max_iterations": 2}), "iterations, with"),
+        ],
+    )
+    def test_and_says_what_is_false(self, case: Case, spoil: Callable, says: str) -> None:
+        problem, solution = case
+        assert any(says in wrong for wrong in contradictions(problem, spoil(solution)))
+
+
+def _with_plan(solution: ls.Solution, **parts: np.ndarray) -> ls.Solution:
+    return dataclasses.replace(solution, trajectory=dataclasses.replace(solution.trajectory, **parts))
+
+
+def _bent(states: np.ndarray) -> np.ndarray:
+    bent = states.copy()
+    bent[7, 3] += 1e-4
+    return bent
+
+
+def _certified(solution: ls.Solution, **numbers: float) -> ls.Solution:
+    return dataclasses.replace(solution, certificate=dataclasses.replace(solution.certificate, **numbers))
+
+
+def _slack(solution: ls.Solution) -> ls.Solution:
+    """A plan that is run exactly, and not the best."""
+    controls = np.clip(solution.trajectory.controls + np.array([0.05, 0.05]), 0.0, 6.0)
+    states = [solution.trajectory.states[0]]
+    for control in controls:
+        states.append(planar_quadrotor.dynamics().step(states[-1], control, planar_quadrotor.DT))
+    policy = dataclasses.replace(solution.policy, gain=np.zeros_like(solution.policy.gain), offset=controls)
+    return dataclasses.replace(_with_plan(solution, states=np.array(states), controls=controls), policy=policy)
