@@ -102,5 +102,5 @@ def _rotation_vector(quaternion: Array) -> Array:
     angle = 2 * np.arctan2(sine, np.abs(scalar))
     # Without a turn the ratio is 2 / scalar, whatever the length; there the division is by zero.
     small = sine < 1e-12
-    ratio = np.divide(angle, sine, out=2.0 / np.abs(scalar), where=~small) if small.any() else angle / sine
+    ratio = np.divide(angle, sine, out=np.asarray(2.0 / np.abs(scalar)), where=~small) if small.any() else angle / sine
     return np.copysign(ratio, scalar)[..., None] * quaternion[..., 1:]
