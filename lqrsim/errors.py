@@ -5,8 +5,11 @@ list to choose from, the valid names). The command line prints that line and exi
 """
 
 import difflib
+import inspect
 import itertools
+import os
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -68,6 +71,27 @@ def check_shape(field: str, array: npt.NDArray[Any], shape: tuple[int | None, ..
         raise InputError(f"{field}: got shape {_shape(found)}, want {_shape(shape)}")
 
 
+def real(field: str, value: npt.ArrayLike, want: str = "numbers") -> Array:
+    """`value` as a float64 array of any shape and any numbers; not copied if it is that already. Raises InputError."""
+    done = type(value) is np.ndarray and value.dtype == np.float64
+    return value if done else numbers_of(field, value, want)  # pyright: ignore[reportReturnType]
+
+
+def shaped(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...]) -> Array:
+    """`value` as float64 of the given shape (None matches any length), NaN and all; not copied if it is that already."""
+    array = real(field, value, f"numbers of shape {_shape(shape)}")
+    check_shape(field, array, shape)
+    return array
+
+
+def vectors_of(field: str, value: npt.ArrayLike, size: int) -> Array:
+    """`value` as float64 of shape (..., size), NaN and all; not copied if it is that already. Raises InputError."""
+    array = real(field, value, f"numbers of shape (..., {size})")
+    if array.shape[-1:] != (size,):
+        raise InputError(f"{field}: got shape {_shape(array.shape)}, want (..., {size})")
+    return array
+
+
 def check_number(
     field: str,
     value: object,
@@ -111,6 +135,11 @@ def check_count(field: str, value: object, *, at_least: int = 1, at_most: int = 
     return int(value)  # pyright: ignore[reportArgumentType]
 
 
+def check_seed(field: str, value: object) -> int:
+    """`value` as an int that is not negative, as long as it has at most 128 bits. Raises InputError otherwise."""
+    return check_count(field, value, at_least=0, at_most=2**128 - 1)
+
+
 def check_memory(field: str, count: int, each: int, what: str = "whose arrays") -> None:
     """Raises InputError if `count` of what takes `each` bytes do not fit into this machine's memory."""
     if count * each > (there := memory()):
@@ -127,10 +156,25 @@ def check_kind(field: str, value: object, kind: type | tuple[type, ...], want: s
     return value
 
 
-def check_function(field: str, value: object, want: str, *, optional: bool = True) -> None:
-    """Raises InputError unless it can be called, or is None and may be."""
-    if not callable(value) and not (optional and value is None):
+def check_function(field: str, value: object, want: str, *, arguments: int | None = None, optional: bool = True) -> None:
+    """Raises InputError unless it can be called, with so many arguments, or is None and may be.
+
+    What it raises when it is called is its own, and is not turned into an InputError.
+    """
+    if optional and value is None:
+        return
+    if not callable(value):
         raise InputError(f"{field}: got {excerpt(value)}, want {want}")
+    if arguments is None:
+        return
+    try:
+        inspect.signature(value).bind(*[None] * arguments)
+    except ValueError:  # a built-in tells nothing about itself
+        return
+    except TypeError as error:
+        raise InputError(f"{field}: got {excerpt(value)}, which does not take {arguments} ({error}), want {want}") from None
+    except Exception:  # an object that raises whatever it likes when it is looked at
+        raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
 
 
 def check_flag(field: str, value: object) -> bool:
@@ -151,6 +195,21 @@ def check_text(field: str, value: object, want: str = "text", *, at_most: int = 
     if len(value) > at_most:
         raise InputError(f"{field}: got {len(value)} characters, {excerpt(value)}, want {want} of at most {at_most}")
     return value
+
+
+def check_path(field: str, value: object, want: str = "the path of a file") -> Path:
+    """`value` as a path that a file can have: each name of at most 255 bytes. Raises InputError otherwise."""
+    try:
+        if not isinstance(value, (str, os.PathLike)):
+            raise TypeError
+        name = os.fspath(value)
+        good = isinstance(name, str) and name and "\0" not in name
+        good = good and all(len(part.encode()) <= 255 for part in Path(name).parts) and len(name.encode()) < 4096
+    except Exception:  # no path, or what can not be written as bytes
+        good, name = False, value
+    if not good:
+        raise InputError(f"{field}: got {excerpt(name)}, want {want}, of names of at most 255 bytes")
+    return Path(name)  # pyright: ignore[reportArgumentType]
 
 
 def check_items(

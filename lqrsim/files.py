@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.coordinates import Coordinates
-from lqrsim.errors import Array, InputError, check_array
+from lqrsim.errors import Array, InputError, check_array, check_kind, check_path
 from lqrsim.policy import AffinePolicy
 from lqrsim.results import Candidate, Iteration, Multipliers, Solution, Status, Trajectory
 from lqrsim.rollout import Rollout
@@ -33,7 +33,8 @@ def save(result: Solution | Rollout, path: str | os.PathLike[str]) -> Path:
     Raises:
       InputError: the file cannot be written.
     """
-    path = Path(path)
+    path = check_path("output", path)
+    check_kind("result", result, (Solution, Rollout), "a Solution or a Rollout")
     kind, arrays, texts = _solution_parts(result) if isinstance(result, Solution) else _rollout_parts(result)
     meta = {"format": f"lqrsim {kind}", "version": VERSIONS[kind], **texts}
     with replacing(path) as unfinished, unfinished.open("wb") as file:
@@ -75,7 +76,8 @@ def load_solution(path: str | os.PathLike[str]) -> Solution:
     Raises:
       InputError: no such file, not a solution, damaged, or of another version.
     """
-    arrays, meta = _read(Path(path), "solution")
+    path = check_path("solution", path)
+    arrays, meta = _read(path, "solution")
     with _complete(path, "solution"):
         states, controls = _coordinates(meta["states"]), _coordinates(meta["controls"])
         n, m, steps, dt = len(states), len(controls), len(arrays["policy.gain"]), float(meta["dt"])
@@ -135,7 +137,8 @@ def load_solution(path: str | os.PathLike[str]) -> Solution:
 
 def load_rollout(path: str | os.PathLike[str]) -> Rollout:
     """Read what `save` wrote of a Rollout. Raises InputError as `load_solution` does."""
-    arrays, meta = _read(Path(path), "rollout")
+    path = check_path("rollout", path)
+    arrays, meta = _read(path, "rollout")
     with _complete(path, "rollout"):
         states, controls = _coordinates(meta["states"]), _coordinates(meta["controls"])
         n, m = len(states), len(controls)

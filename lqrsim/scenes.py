@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_name
+from lqrsim.errors import InputError, check_kind, check_name, check_path, check_text
 from lqrsim.world import KINDS, Obstacle, World
 
 try:
@@ -54,6 +54,12 @@ class Scene:
     model: mujoco.MjModel
     world: World
 
+    def __post_init__(self) -> None:
+        check_text("Scene: name", self.name, "a name", at_most=1000)
+        check_kind("Scene: xml", self.xml, str, "the MJCF as text")
+        check_kind("Scene: model", self.model, mujoco.MjModel, "a mujoco.MjModel")
+        check_kind("Scene: world", self.world, World, "a World")
+
 
 def names() -> list[str]:
     """The packaged scenes: the files in models/ that include a robot."""
@@ -66,7 +72,7 @@ def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
     Raises:
       InputError: no such scene or file; it does not parse or compile; an obstacle is of a type without a distance.
     """
-    path = Path(name_or_path)
+    path = check_path("scene", name_or_path, "the name of a packaged scene, or the path of an .xml file")
     if path.suffix.lower() != ".xml":
         packaged = names()
         try:

@@ -9,7 +9,7 @@ import numpy as np
 
 from lqrsim import compiled
 from lqrsim.coordinates import Coordinates
-from lqrsim.errors import Array, InputError, check_number
+from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.policy import AffinePolicy
 from lqrsim.problem import FixedState, Problem
 from lqrsim.results import Solution, Trajectory
@@ -43,7 +43,7 @@ class Feedback(Controller):
     """A policy, or an open-loop plan, whose gains are zero."""
 
     def __init__(self, policy: AffinePolicy) -> None:
-        self.policy = policy
+        self.policy = check_kind("Feedback: policy", policy, AffinePolicy, "an AffinePolicy, such as solution.policy")
 
     def start(self, trials: int) -> Control:
         policy = self.policy
@@ -83,7 +83,16 @@ class Replanning(Controller):
     """
 
     def __init__(self, problem: Problem, solution: Solution, *, every: float) -> None:
-        check_number("Replanning: every", every, at_least=0.999 * problem.dt)
+        check_kind("Replanning: problem", problem, Problem, "a Problem, such as scenario.problem")
+        check_kind("Replanning: solution", solution, Solution, "its Solution")
+        plan, dynamics = solution.trajectory, problem.dynamics
+        spaces = solution.policy.state_coordinates.names, solution.policy.control_coordinates.names
+        if spaces != (dynamics.state_coordinates.names, dynamics.control_coordinates.names):
+            raise InputError("Replanning: solution: got one of another system, want the problem's")
+        if (plan.steps, plan.dt) != (problem.steps, problem.dt):
+            got, want = f"{plan.steps} steps of {plan.dt:g} s", f"{problem.steps} steps of {problem.dt:g} s"
+            raise InputError(f"Replanning: solution: got {got}, want the problem's: {want}")
+        every = check_number("Replanning: every", every, at_least=0.999 * problem.dt)
         self.problem, self.solution, self.every = problem, solution, every
         self._periods = round(every / problem.dt)
 
@@ -114,11 +123,13 @@ class Replanning(Controller):
         here = law.state_coordinates.nearest(state, law.nominal[done])
         try:
             problem = replace(self.problem, initial=FixedState(here), steps=left)
-            # The law itself would not do: without its cost-to-go the first iteration may leave for a worse optimum.
-            ahead = Trajectory(*compiled.rollout(problem, law.gain[done:], law.offset[done:], here), problem.dt)
-            solution = smooth(problem, start=ahead, threads=1)
         except InputError:  # it begins within an obstacle
             return law, first
+        # The law itself would not do: without its cost-to-go the first iteration may leave for a worse optimum.
+        ahead = Trajectory(*compiled.rollout(problem, law.gain[done:], law.offset[done:], here), problem.dt)
+        if not np.isfinite(ahead.states).all():
+            return law, first
+        solution = smooth(problem, start=ahead, threads=1)
         return (solution.policy, step) if solution.success else (law, first)
 
     @property

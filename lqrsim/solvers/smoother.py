@@ -15,13 +15,15 @@ from lqrsim.solvers.common import (
     Callback,
     SmootherSettings,
     assemble,
+    check_attempts,
     check_callback,
     check_problem,
+    check_threads,
     list_of,
     solve_all,
 )
 from lqrsim.solvers.constrained import finish
-from lqrsim.solvers.search import check_starts, choose, guides
+from lqrsim.solvers.search import STARTS, check_starts, choose, guides
 from lqrsim.solvers.start import StartLike, resolve
 
 
@@ -87,7 +89,7 @@ def smooth(
     )  # fmt: skip
     check_callback(callback)
     _check(problem, settings)
-    threads = processors() if threads is None else check_count("threads", threads)
+    threads = check_threads(threads)
     return _solve(problem, settings, each=True, threads=threads, callback=callback)
 
 
@@ -181,6 +183,8 @@ def _solve(
 
 def _check(problem: Problem, settings: SmootherSettings) -> None:
     check_problem(problem)
+    several = settings.start is None and len(problem.obstacle_costs) > 0
+    check_attempts(problem, settings.starts or (STARTS if several else 1))
     if settings.form == "primal" and isinstance(problem.initial, FixedState):
         raise InputError(
             "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start):"

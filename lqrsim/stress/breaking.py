@@ -18,10 +18,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_function,
+    check_memory,
+    check_number,
+    check_seed,
+)
 from lqrsim.rollout import Rollout
 from lqrsim.stress.given import normal_tail
-from lqrsim.stress.splitting import Score, split
+from lqrsim.stress.splitting import MOST, Score, scores_of, split
 
 MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # how much of the best failure is in the rays that are tried; none, 98 %
 FORGETTING = 0.95  # of what earlier rounds said of the slope, each round
@@ -71,17 +80,21 @@ def smallest_failure(
       InputError: an option is out of range, or none of the failures is one.
       NoFailure: none was given, and none was found.
     """
+    check_function("score", score, "a function of vectors (K, size)", arguments=1, optional=False)
+    check_function("progress", progress, "a function of how many rounds are done, of how many", arguments=2)
     check_count("size", size)
-    check_count("rounds", rounds, at_least=0)
+    check_count("rounds", rounds, at_least=0, at_most=MOST)
     pairs = max(250, size // 2) if pairs is None else check_count("pairs", pairs)
-    check_number("spread", spread, above=0.0)
-    check_number("tolerance", tolerance, above=0.0)
-    rng, asked = np.random.default_rng(seed), 0
+    check_memory("pairs", pairs, 8 * 5 * size, "whose vectors")
+    check_memory("size", size, 8 * 16 * 12, "whose vectors")  # of the rays
+    spread = check_number("spread", spread, above=0.0, at_most=1e6)
+    tolerance = check_number("tolerance", tolerance, above=0.0)
+    rng, asked = np.random.default_rng(check_seed("seed", seed)), 0
 
     def counted(vectors: Array) -> Array:
         nonlocal asked
         asked += len(vectors)
-        return score(vectors)
+        return scores_of(score, vectors)
 
     if failures is None:
         failures = split(counted, size, particles=200, keep=0.2, repetitions=2, seed=seed).failures

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim import files
-from lqrsim.errors import InputError, check_count, excerpt
+from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path, check_text, excerpt
 from lqrsim.machine import description, processors
 from lqrsim.references import resolve
 from lqrsim.results import Trajectory
@@ -37,6 +37,7 @@ from lqrsim.versions import versions
 
 _log = logging.getLogger("lqrsim")
 
+MOST_WORKERS = 1024
 _OWN = {"manifest.json", "campaign.lock", "policies", "shards", "damaged"}
 
 
@@ -62,9 +63,13 @@ def run_campaign(
       InputError: something that is asked can not be run; the folder is another campaign's, no campaign's, being
         written, or on a full disk; or the cluster can not be reached.
     """
-    folder = Path(folder)
-    workers = processors() if workers is None else check_count("workers", workers, at_least=0)
-    check_count("batch", batch)
+    check_kind("campaign", campaign, Campaign, "a Campaign")
+    folder = check_path("folder", folder, "the path of a folder")
+    workers = processors() if workers is None else check_count("workers", workers, at_least=0, at_most=MOST_WORKERS)
+    batch = check_count("batch", batch)
+    if scheduler is not None:
+        check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
+    check_function("progress", progress, "a function of how many trials are done, of how many", arguments=2)
     scenario = resolve(campaign.scenario)
     _rehearse(campaign, scenario)
     _look_at(folder)

@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 
 from lqrsim import files
-from lqrsim.errors import InputError, check_count, check_name
+from lqrsim.errors import (
+    InputError,
+    check_count,
+    check_flag,
+    check_kind,
+    check_name,
+    check_path,
+    excerpt,
+)
 from lqrsim.references import resolve
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
@@ -41,13 +49,13 @@ class Results:
     """
 
     def __init__(self, folder: str | os.PathLike[str], *, scenario: str | None = None) -> None:
-        self.folder = Path(folder)
+        self.folder = check_path("folder", folder, "the path of a campaign's folder")
         self.manifest = read_manifest(self.folder)
         self.cells = [Cell(*cell) for cell in self.manifest["cells"]]
         self._scenario = scenario
         asked = self.manifest["campaign"]["scenario"]
         if scenario is not None and scenario != asked:
-            raise InputError(f"scenario: got {scenario}, want {asked}, which {self.folder} was run on")
+            raise InputError(f"scenario: got {excerpt(scenario)}, want {asked}, which {self.folder} was run on")
 
     @cached_property
     def campaign(self) -> Campaign:
@@ -140,6 +148,7 @@ class Results:
 
     def number(self, cell: Cell) -> int:
         """The place of a cell among `cells`. Raises InputError if it is none of them."""
+        check_kind("cell", cell, Cell, "a Cell of the campaign")
         if cell not in self.cells:
             first, last = self.cells[0], self.cells[-1]
             raise InputError(f"cell: got {cell}, want one of the {len(self.cells)}, from {first} to {last}")
@@ -147,6 +156,7 @@ class Results:
 
     def path(self, shard: Shard) -> Path:
         """Its file."""
+        check_kind("shard", shard, Shard, "a Shard of the campaign")
         return self.folder / "shards" / shard.file
 
     def read(self, shard: Shard) -> Table:
@@ -155,6 +165,7 @@ class Results:
 
     def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[tuple[Shard, Table]]:
         """The shards of a cell one by one. Raises InputError for what is damaged, or missing unless `partial`."""
+        check_flag("partial", partial)
         for shard in self.shards(cell):
             if self.path(shard).is_file() or not partial:
                 yield shard, self.table(shard)
@@ -193,6 +204,7 @@ def replay(
     """
     results = results if isinstance(results, Results) else Results(results)
     results.number(cell)
+    frames, contacts = check_flag("frames", frames), check_flag("contacts", contacts)
     if check_count("trial", trial, at_least=0) >= results.manifest["campaign"]["trials"]:
         raise InputError(f"trial: got {trial}, want less than {results.manifest['campaign']['trials']}")
     return results.trials.run(cell, trial, frames=frames, contacts=contacts)

@@ -16,10 +16,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from lqrsim.errors import Array, InputError, check_count, check_number
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_count,
+    check_function,
+    check_memory,
+    check_number,
+    check_seed,
+    shaped,
+)
 from lqrsim.stress.statistics import CONFIDENCE, Estimate
 
 Score = Callable[[Array], Array]
+MOST = 10_000  # repetitions, moves, levels and rounds
 ACCEPTED = 0.4  # the share of moves for which a first run aims
 
 
@@ -84,13 +94,20 @@ def split(
       InputError: an option is out of range, or a score is NaN.
       NoFailure: none was found.
     """
+    check_function("score", score, "a function of vectors (K, size)", arguments=1, optional=False)
     check_count("size", size)
     check_count("particles", particles, at_least=10)
-    check_number("keep", keep, at_least=2 / particles, at_most=0.5)
-    check_count("moves", moves)
-    check_count("repetitions", repetitions, at_least=2)
+    check_memory("particles", particles, 8 * 5 * size, "whose vectors")  # vectors, moved ones, and copies of them
+    keep = check_number("keep", keep, at_least=2 / particles, at_most=0.5)
+    check_count("moves", moves, at_most=MOST)
+    check_count("repetitions", repetitions, at_least=2, at_most=MOST)
+    check_memory("repetitions", repetitions, 8 * particles * (size + 1), "whose failures")
+    check_count("most_levels", most_levels, at_most=MOST)
+    confidence = check_number("confidence", confidence, above=0.0, below=1.0)
+    check_function("level", level, "a function of a level", arguments=1)
+    check_function("progress", progress, "a function of how many repetitions are done, of how many", arguments=2)
     count = _Count(score)
-    first, *rest = np.random.SeedSequence(seed).spawn(repetitions + 1)
+    first, *rest = np.random.SeedSequence(check_seed("seed", seed)).spawn(repetitions + 1)
     levels, sizes = _levels(count, size, particles, keep, moves, most_levels, np.random.default_rng(first), level)
     shares, failures, scores = [], [], []
     for number, key in enumerate(rest):
@@ -120,6 +137,15 @@ def split(
     )
 
 
+def scores_of(score: Score, vectors: Array) -> Array:
+    """The scores (K,) of vectors (K, size). Raises InputError for what is no number for each of them."""
+    # With vectors of its own, for a user's function may write to them.
+    found = shaped("score: returned", score(vectors.copy()), (len(vectors),))
+    if np.isnan(found).any():
+        raise InputError(f"score: got NaN returned, want a number for each of {len(vectors)} vectors")
+    return found
+
+
 class _Count:
     """A score that counts how often it is asked."""
 
@@ -127,11 +153,8 @@ class _Count:
         self.score, self.asked = score, 0
 
     def __call__(self, vectors: Array) -> Array:
-        found = np.asarray(self.score(vectors), dtype=np.float64)
         self.asked += len(vectors)
-        if found.shape != (len(vectors),) or np.isnan(found).any():
-            raise InputError(f"score: got shape {found.shape} or NaN, want a number for each of {len(vectors)} vectors")
-        return found
+        return scores_of(self.score, vectors)
 
 
 def _levels(

@@ -54,6 +54,7 @@ def verify_video(
     Raises:
       InputError: the file is not lqrsim's, or has not the panes that it takes.
     """
+    record.check_asked(solution, progress)
     told = footage.read(path)
     digest, size = footage.digest(rollout), len(rollout.state_coordinates.position)
     run = told.runs.index(digest) if digest in told.runs else 0

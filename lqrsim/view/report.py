@@ -17,7 +17,7 @@ import jinja2
 import numpy as np
 from PIL import Image
 
-from lqrsim.errors import InputError, check_count
+from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path
 from lqrsim.files import replacing
 from lqrsim.scenarios import Scenario
 from lqrsim.simulation.disturbances import Disturbance
@@ -33,6 +33,7 @@ BELOW = 0.95  # success below which a policy counts as broken
 LARGEST = 1_500_000  # bytes of a video
 SIZES = (640, 360), (480, 270), (320, 180)  # the first with which a video is small enough
 FPS = 15
+MOST_VIDEOS = 100  # a page with more is too large for a browser
 EACH = 3  # worst trials that are listed of each policy and sweep
 
 
@@ -62,7 +63,10 @@ def report(
       InputError: nothing has been run yet; something is damaged; the scenario is one of yours, and `results` was not
         given it; or the page cannot be written.
     """
-    check_count("videos", videos, at_least=0)
+    check_kind("results", results, Results, "Results, such as run_campaign(...) returns")
+    check_count("videos", videos, at_least=0, at_most=MOST_VIDEOS)
+    check_function("progress", progress, "a function of how many parts are done, of how many", arguments=2)
+    path = check_path("out", out, "the path of a page")
     scenario, missing = results.trials.scenario, Counter[Cell]()
     for cell, _, count in results.missing:
         missing[cell] += count
@@ -88,10 +92,10 @@ def report(
             tell(3 + number, parts)
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string(packaged("lqrsim.view").joinpath("report.html.j2").read_text(encoding="utf-8"))
-    with replacing(Path(out)) as unfinished:
+    with replacing(path) as unfinished:
         unfinished.write_text(template.render(page), encoding="utf-8")
     tell(parts, parts)
-    return Path(out)
+    return path
 
 
 def _page(results: Results, table: analysis.Table, scenario: Scenario) -> dict[str, Any]:
