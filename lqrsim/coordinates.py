@@ -68,7 +68,7 @@ class Coordinates:
             if any(not 0 <= index <= size - width for index in indices):
                 raise InputError(f"{field}: got indices {indices}, want them between 0 and {size - width}")
         for field, endless in (("low", -np.inf), ("high", np.inf)):
-            if getattr(self, field) == ():
+            if isinstance(getattr(self, field), tuple) and not getattr(self, field):
                 object.__setattr__(self, field, (endless,) * size)
         low = check_array("low", self.low, (size,), infinite=True)
         high = check_array("high", self.high, (size,), infinite=True)

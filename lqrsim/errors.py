@@ -53,11 +53,15 @@ def numbers_of(field: str, value: object, want: str = "numbers") -> Array:
     """`value` as a new C-ordered float64 array of any shape and any numbers. Raises InputError for what has none."""
     try:
         given = np.asarray(value)
+        if given.size > 10**7:
+            check_memory(field, given.size, 32, "what is made of which")
         if given.dtype.kind not in "biufO":  # text, complex numbers, dates, records
             raise TypeError
         if given.dtype.kind == "O" and any(isinstance(entry, (str, bytes)) for entry in given.flat):
             raise TypeError
         return np.array(given, dtype=np.float64, order="C")
+    except InputError:
+        raise
     except MemoryError:
         raise InputError(f"{field}: got {excerpt(value)}, which does not fit into memory, want {want}") from None
     except Exception:  # whatever the object raises when it is asked for its numbers
@@ -74,6 +78,9 @@ def check_shape(field: str, array: npt.NDArray[Any], shape: tuple[int | None, ..
 def real(field: str, value: npt.ArrayLike, want: str = "numbers") -> Array:
     """`value` as a float64 array of any shape and any numbers; not copied if it is that already. Raises InputError."""
     done = type(value) is np.ndarray and value.dtype == np.float64
+    if done and value.size > 10**7:  # pyright: ignore[reportAttributeAccessIssue]
+        # It may be there once for many places, as NumPy broadcasts, and what is made of it will not be.
+        check_memory(field, value.size, 32, "what is made of which")  # pyright: ignore[reportAttributeAccessIssue]
     return value if done else numbers_of(field, value, want)  # pyright: ignore[reportReturnType]
 
 

@@ -12,7 +12,7 @@ from math import inf, sqrt
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_items, check_name, check_text, excerpt, real
+from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, check_text, real
 from lqrsim.solvers.interface import stack
 
 KINDS = ("plane", "sphere", "capsule", "cylinder", "box")
@@ -87,10 +87,8 @@ class World:
         Raises:
           InputError: an obstacle is tilted, so that it has no outline from above among the primitives.
         """
-        if dimension == 3:
+        if check_count("dimension", dimension, at_least=2, at_most=3) == 3:
             return self
-        if type(dimension) is not int or dimension != 2:
-            raise InputError(f"dimension: got {excerpt(dimension)}, want 2 or 3")
         return World([flat for obstacle in self.obstacles if (flat := _from_above(obstacle)) is not None])
 
     def distances(self, point: npt.ArrayLike) -> Array:

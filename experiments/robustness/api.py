@@ -33,6 +33,7 @@ from lqrsim.errors import LONGEST, InputError
 MEMORY = 6 << 30  # bytes that a call may come to use beyond what is used before
 PATIENCE = 30.0  # seconds of the processor that a call may take
 WALL = 400.0  # seconds after which a call that takes none of the processor counts as hung, too
+HERE = Path(__file__).parent
 FAILURES = ("raw", "hang", "death")
 
 
@@ -86,10 +87,9 @@ class Caller:
             return Verdict(number, name, "deliberate", what)
         except Hang as error:
             return Verdict(number, name, "hang", what, where(error))
-        except BaseException as error:
-            if "as it was told" in repr(error.__cause__) or "as it was told" in repr(error.__context__):
-                pass
-            return Verdict(number, name, "raw", what, where(error))
+        except Exception as error:
+            own = isinstance(error, subject.raises) or Path(traceback.extract_tb(error.__traceback__)[-1].filename).parent == HERE
+            return Verdict(number, name, "deliberate" if own else "raw", what, where(error))
         return Verdict(number, name, "accepted", what)
 
     def _arguments(self, rng: np.random.Generator, subject: Subject) -> dict[str, Any]:

@@ -11,13 +11,17 @@ class Deliberate(Exception):
     """What a user's own function raises, which may come through as it is."""
 
 
+class DeliberateValue(Deliberate, ValueError):
+    """The same, as an exception of a usual kind."""
+
+
 class Biting:
     """An object that raises whatever it is asked."""
 
     def __init__(self, where: str) -> None:
         self.where = where
 
-    def _bite(self, *_: object) -> Any:
+    def bite(self, *_: object) -> Any:
         raise RuntimeError("no")
 
     def __getattr__(self, name: str) -> Any:
@@ -28,7 +32,7 @@ class Biting:
 
 def biting(where: str) -> Any:
     """An object whose method of that name raises."""
-    return type("Biting", (Biting,), {where: Biting._bite})(where)
+    return type("Biting", (Biting,), {where: raising if where == "__call__" else Biting.bite})(where)
 
 
 class Text(str):
@@ -42,6 +46,10 @@ class Unequal:
         raise RuntimeError("no")
 
     __hash__ = None  # type: ignore[assignment]
+
+
+class Kind:
+    """A class, and no object of it."""
 
 
 def endless() -> Any:
@@ -62,7 +70,7 @@ def raising(*_: object, **__: object) -> Any:
 
 
 def failing(*_: object, **__: object) -> Any:
-    raise ValueError("two\nlines")
+    raise DeliberateValue("two\nlines")
 
 
 def answering(answer: Any) -> Callable[..., Any]:
@@ -91,8 +99,8 @@ PLAIN: list[Callable[[], Any]] = [
     lambda: np.full(3, np.nan), lambda: np.full((2, 3), np.inf), lambda: np.zeros(2, dtype="datetime64[s]"),
     lambda: np.zeros((), dtype=[("a", "f8")]), lambda: np.ma.masked_array([1.0, 2.0, 3.0], mask=[1, 0, 0]),
     lambda: np.broadcast_to(0.0, (10**7, 10**4)), lambda: memoryview(b"abc"), lambda: np.full(3, 1e300), lambda: np.matrix("1 2"),
-    lambda: object(), lambda: object, lambda: int, lambda: Ellipsis, lambda: NotImplemented, lambda: np,
-    lambda: print, lambda: len, lambda: raising, lambda: failing, lambda: (lambda: 1), lambda: (lambda a: a),
+    lambda: object(), lambda: Kind, lambda: Ellipsis, lambda: NotImplemented, lambda: np,
+    lambda: print, lambda: raising, lambda: failing, lambda: (lambda: 1), lambda: (lambda a: a),
     lambda: (lambda *a: a[0]), lambda: (lambda x, u, p: x[5]),
     *(lambda answer=answer: answering(answer) for answer in (
         None, 1.0, "text", [], [1.0, 2.0], np.zeros(3), np.full((1, 3), np.nan), np.zeros((7, 7)), 1j, object(), True,
@@ -107,9 +115,9 @@ PLAIN: list[Callable[[], Any]] = [
 
 def spoilt(rng: np.random.Generator, value: Any, others: list[Any], depth: int = 0) -> Any:
     """Something hostile in the place of a valid value: what it is not, or itself with something wrong."""
-    if rng.random() < 0.45 or depth > 3:
+    if rng.random() < 0.3 or depth > 3:
         return PLAIN[rng.integers(len(PLAIN))]()
-    if rng.random() < 0.2:
+    if rng.random() < 0.12:
         return others[rng.integers(len(others))]
     if isinstance(value, np.ndarray):
         return _array(rng, value)
@@ -130,7 +138,7 @@ def spoilt(rng: np.random.Generator, value: Any, others: list[Any], depth: int =
         name = fields[rng.integers(len(fields))]
         # What refuses it refuses it here: an InputError is an answer, too.
         return dataclasses.replace(value, **{name: spoilt(rng, getattr(value, name), others, depth + 1)})
-    return [lambda: [value], lambda: (value, value), lambda: {"a": value}, lambda: type(value), lambda: answering(value)][
+    return [lambda: [value], lambda: (value, value), lambda: {"a": value}, lambda: Kind, lambda: answering(value)][
         rng.integers(5)
     ]()
 

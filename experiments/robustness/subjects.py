@@ -17,12 +17,15 @@ from typing import Any
 import numpy as np
 
 import lqrsim as ls
+from lqrsim.stress.shards import Damaged
 
 # Called by lqrsim itself, with what it has checked: what one overrides to add a cost, a disturbance or a controller.
 HOOKS = {"bind", "start", "check", "describe", "blow", "fitting", "actuation", "multiply", "parts", "draw", "limits"}
 HOOKS |= {"displace"}
 # Text that compiled cores contain: numbers in, numbers out.
 KERNELS = {f"{ratio}{order}" for ratio in ls.rotations.RATIOS for order in ("", "_d1", "_d2")}
+
+RAISES = {"Results.read": (Damaged,)}
 
 TINY = """
 import dataclasses
@@ -42,11 +45,13 @@ class Subject:
 
     Attributes:
       weight: how often it is called beside the others, 1 being often: what takes longer is called less.
+      raises: what it may raise besides InputError, as its docstring says.
     """
 
     call: Callable[..., Any]
     arguments: Mapping[str, Any]
     weight: float = 1.0
+    raises: tuple[type[Exception], ...] = ()
 
 
 def public() -> Iterator[tuple[str, Any]]:
@@ -94,7 +99,7 @@ def subjects(folder: Path) -> dict[str, Subject]:
                 call = getattr(arguments.pop("self", getattr(ls, owner)), method)
             else:
                 call = getattr(getattr(ls, owner), method) if method else getattr(ls, owner)
-            found[name] = Subject(call, arguments, *weight)
+            found[name] = Subject(call, arguments, *weight, raises=RAISES.get(name, ()))
     return found
 
 
@@ -346,6 +351,11 @@ def simulate_effect(plant: ls.Plant, solution: ls.Solution, **effects: Any) -> l
     return ls.simulate(plant, solution, disturbances=[Hooked(ls.Effect(**effects))])
 
 
+def simulate_kind(kind: Any, plant: ls.Plant, solution: ls.Solution, **settings: Any) -> ls.Rollout:
+    """Two trials of a packaged disturbance with those settings."""
+    return ls.simulate(plant, solution, disturbances=[kind(**settings)], trials=2)
+
+
 class Steering(ls.Controller):
     """A user's own controller, whose answers are spoilt."""
 
@@ -395,6 +405,11 @@ def _running(place: _Place) -> dict[str, tuple[Any, ...]]:
         **{f"{name}.scaled": ({"self": one, "strength": 2.0}, 0.5) for name, one in disturbances.items()},
         "Disturbance.scaled": ({"self": noise, "strength": 2.0}, 0.5),
         "GilbertElliott": (dataclasses.asdict(ls.GilbertElliott(0.1, 0.5)), 0.5),
+        **{
+            f"simulate {name}": ({"call": simulate_kind, "kind": getattr(ls, name), "plant": plant, "solution": solution,
+                                  **DISTURBANCES[name]}, 0.3)
+            for name in DISTURBANCES
+        },
         "preset": ({"name": "light", "plant": plant},),
         "Effect": (effect,),
         "Plant": ({"robot": robot, "scene": place.scenario.scene}, 0.3),

@@ -65,6 +65,10 @@ class Shard:
     first: int
     count: int
 
+    def __post_init__(self) -> None:
+        for name, least in (("cell", 0), ("first", 0), ("count", 1)):
+            check_count(f"Shard: {name}", getattr(self, name), at_least=least)
+
     @property
     def file(self) -> str:
         """The name of its file: the number of the cell and that of the first trial."""
