@@ -4,6 +4,7 @@ Every message is one line that names the field, what it got and what it wanted (
 list to choose from, the valid names). The command line prints that line and exits with 2.
 """
 
+import dataclasses
 import difflib
 import inspect
 import itertools
@@ -301,6 +302,8 @@ def excerpt(value: object) -> str:
             return f"{type(value).__name__} of {len(value)}"  # pyright: ignore[reportArgumentType]
         elif isinstance(value, int) and value.bit_length() > 1000:
             return f"an int of {value.bit_length()} bits"
+        elif dataclasses.is_dataclass(value):  # some hold megabytes
+            return value.__name__ if isinstance(value, type) else f"{type(value).__name__}(...)"
         text = " ".join(repr(value).split())
     except Exception:  # a __repr__ that fails, or that is nested without end
         return f"a {type(value).__name__}"

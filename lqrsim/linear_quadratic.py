@@ -97,6 +97,6 @@ def check_end(field: str, cost: Quadratic, n: int) -> tuple[Array, Array, float]
 def _shape(value: npt.ArrayLike) -> tuple[int, ...]:
     """() for what is ragged and has none."""
     try:
-        return np.shape(value)
+        return np.asarray(value).shape
     except Exception:  # or raises whatever it likes when it is asked
         return ()

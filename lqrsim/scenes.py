@@ -59,6 +59,8 @@ class Scene:
         check_kind("Scene: xml", self.xml, str, "the MJCF as text")
         check_kind("Scene: model", self.model, mujoco.MjModel, "a mujoco.MjModel")
         check_kind("Scene: world", self.world, World, "a World")
+        if len(self.world) != (count := len(obstacle_geoms(self.model))):
+            raise InputError(f"Scene: world: got {len(self.world)} obstacles, want {count}, those of the model")
 
 
 def names() -> list[str]:

@@ -109,7 +109,7 @@ def exercise(made: Any) -> None:
         return
     str(made), repr(made)
     for name, item in inspect.getmembers_static(type(made)):
-        if name[0] == "_" and name != "__len__":
+        if (name[0] == "_" and name != "__len__") or name in getattr(type(made), "__dataclass_fields__", ()):
             continue
         if inspect.isfunction(item) and len(inspect.signature(item).parameters) == 1:
             getattr(made, name)()

@@ -6,6 +6,7 @@ its classes that take arguments. `subjects()` has arguments for each; a test fai
 
 import dataclasses
 import enum
+import functools
 import inspect
 import logging
 from collections.abc import Callable, Iterator, Mapping
@@ -359,24 +360,24 @@ def simulate_kind(kind: Any, plant: ls.Plant, solution: ls.Solution, **settings:
 class Steering(ls.Controller):
     """A user's own controller, whose answers are spoilt."""
 
-    def __init__(self, feedback: ls.Feedback, control: Any, digest: Any, spaces: Any) -> None:
-        self._parts = feedback, control, digest, spaces
+    def __init__(self, control: Any, digest: Any, spaces: Any) -> None:
+        self._parts = control, digest, spaces
 
     def start(self, trials: int) -> Any:
-        return self._parts[1]
+        return self._parts[0]
 
     @property
     def digest(self) -> Any:
-        return self._parts[2]
+        return self._parts[1]
 
     @property
     def spaces(self) -> Any:
-        return self._parts[3]
+        return self._parts[2]
 
 
 def simulate_controller(plant: ls.Plant, solution: ls.Solution, control: Any, digest: Any, spaces: Any) -> ls.Rollout:
     """One trial of a user's own controller."""
-    return ls.simulate(plant, solution, controller=Steering(ls.Feedback(solution.policy), control, digest, spaces))
+    return ls.simulate(plant, solution, controller=Steering(control, digest, spaces))
 
 
 def steering(step: int, shown: Any) -> Any:
@@ -406,7 +407,7 @@ def _running(place: _Place) -> dict[str, tuple[Any, ...]]:
         "Disturbance.scaled": ({"self": noise, "strength": 2.0}, 0.5),
         "GilbertElliott": (dataclasses.asdict(ls.GilbertElliott(0.1, 0.5)), 0.5),
         **{
-            f"simulate {name}": ({"call": simulate_kind, "kind": getattr(ls, name), "plant": plant, "solution": solution,
+            f"simulate {name}": ({"call": functools.partial(simulate_kind, getattr(ls, name)), "plant": plant, "solution": solution,
                                   **DISTURBANCES[name]}, 0.3)
             for name in DISTURBANCES
         },

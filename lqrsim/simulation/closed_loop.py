@@ -88,7 +88,7 @@ def simulate(
     goal_radius = plant.robot.radius if goal_radius is None else check_number("goal_radius", goal_radius, above=0.0)
     controller = Feedback(solution.policy) if controller is None else controller
     plan, space = solution.trajectory, plant.robot.dynamics.control_coordinates
-    _check_solution(solution, controller, plant)
+    states_space, controls_space = _check_solution(solution, controller, plant)
     substeps = plant.substeps(plan.dt)
     _check_size(plant, plan, substeps, trials, frames=frames)
 
@@ -171,7 +171,7 @@ def simulate(
 
     drawn = np.stack(seen, axis=1)
     for array in (states, measured):
-        compiled.turn_to_nearest(controller.spaces[0], array.transpose(1, 0, 2), plan.states)
+        compiled.turn_to_nearest(states_space, array.transpose(1, 0, 2), plan.states)
     if lost.any():
         # A frame belongs to the knot that ends its period: the trial was lost somewhere before that.
         knot_of_frame = -(np.arange(len(seen)) // -max(physics.parts, 1))
@@ -187,8 +187,8 @@ def simulate(
         model=plant.scene.xml,
         plan=plan,
         policy_digest=controller.digest,
-        state_coordinates=controller.spaces[0],
-        control_coordinates=controller.spaces[1],
+        state_coordinates=states_space,
+        control_coordinates=controls_space,
         radius=plant.robot.radius,
         goal_radius=goal_radius,
         states=states,
@@ -273,7 +273,8 @@ class _Streams(Sequence[np.random.Generator]):
         return self._made[trial]
 
 
-def _check_solution(solution: Solution, controller: Controller, plant: Plant) -> None:
+def _check_solution(solution: Solution, controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:
+    """What the controller's states and controls are. Raises InputError unless they, and the plan, are the plant's."""
     dynamics = plant.robot.dynamics
     wanted = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     kind = type(controller).__name__
@@ -293,3 +294,4 @@ def _check_solution(solution: Solution, controller: Controller, plant: Plant) ->
         raise InputError(f"solution: got a plan of {shapes}, want {len(wanted[0])} and {len(wanted[1])}")
     if not (np.isfinite(plan.states).all() and np.isfinite(plan.controls).all()):
         raise InputError(f"solution: got a plan that is not finite ({solution.status.name}), want one that can be run")
+    return spaces[0], spaces[1]

@@ -28,6 +28,7 @@ from lqrsim.scenes import Scene, obstacle_geoms
 from lqrsim.world import World
 
 MOST_STEPS = 100_000_000  # of the physics in a run: minutes or hours
+MOST_CHECKED = 1_000_000  # of `check_plant`, which makes them one by one
 Indices = npt.NDArray[np.intp]
 
 
@@ -125,9 +126,15 @@ class Plant:
             places[:, geom.id] += displaced[:, number] @ drawn.xmat[geom.bodyid[0]].reshape(3, 3)
 
     def _compile(self, *, contacts: bool = True) -> mujoco.MjModel:
-        spec = mujoco.MjSpec.from_string(self.scene.xml)
-        # The sensors need names; geoms without one get the obstacle's. A geom's id is its place in the compiled model.
-        spec.compile()
+        try:
+            spec = mujoco.MjSpec.from_string(self.scene.xml)
+            # The sensors need names; geoms without one get the obstacle's. A geom's id is its place in the compiled model.
+            again = spec.compile()
+        except (ValueError, mujoco.FatalError) as error:
+            raise InputError(f"scene {self.scene.name}: xml: got one that MuJoCo refuses: {error}") from None
+        had, has = self.scene.model, again
+        if (had.ngeom, had.nbody, had.nq, had.nv, had.nu) != (has.ngeom, has.nbody, has.nq, has.nv, has.nu):
+            raise InputError(f"scene {self.scene.name}: got a model that is not of its xml, want one of load_scene")
         geoms = {geom.id: geom for geom in spec.geoms}
         for geom, obstacle in zip(obstacle_geoms(self.scene.model), self.scene.world.obstacles, strict=True):
             geoms[geom].name = obstacle.name
@@ -270,10 +277,10 @@ def check_plant(
         settle = 0.5 if 2 * len(plant.qvel) > n else 0.0
     waiting = check_number("settle", settle, at_least=0.0) / plant.timestep
     samples = check_count("samples", samples, at_most=100_000)
-    if not samples * (waiting + substeps) <= MOST_STEPS:
+    if not samples * (waiting + substeps) <= MOST_CHECKED:
         raise InputError(
             f"samples: got {samples}, which are {samples * (waiting + substeps):.3g} physics steps in all, want at most"
-            f" {MOST_STEPS}: fewer samples, or a shorter period and time to settle"
+            f" {MOST_CHECKED}: fewer samples, or a shorter period and time to settle"
         )
     waiting, found = round(waiting), []
     tolerance = check_number("tolerance", tolerance, above=0.0)

@@ -71,6 +71,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_name("stop", self.stop, ("optimal", "cost"))
+        if callable(self.start) and not isinstance(self.start, AffinePolicy):
+            check_function("start", self.start, "a function of a Problem, or what it returns", arguments=1)
         # What is kept is plain Python's: NumPy's numbers would be other types for the compiler, and not for JSON.
         object.__setattr__(self, "tolerance", check_number("tolerance", self.tolerance, above=0.0))
         # The log of so many takes 48 MB.

@@ -54,7 +54,7 @@ class Results:
         self.cells = [Cell(*cell) for cell in self.manifest["cells"]]
         self._scenario = scenario
         asked = self.manifest["campaign"]["scenario"]
-        if scenario is not None and scenario != asked:
+        if scenario is not None and check_kind("scenario", scenario, str, "the campaign's reference") != asked:
             raise InputError(f"scenario: got {excerpt(scenario)}, want {asked}, which {self.folder} was run on")
 
     @cached_property
