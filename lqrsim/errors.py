@@ -224,15 +224,14 @@ def check_items(
     field: str, value: object, kind: type | tuple[type, ...], want: str, *, at_most: int = 1_000_000
 ) -> tuple[Any, ...]:
     """What `value` has in it, as a tuple of instances of `kind`. Raises InputError for text, mappings and other kinds."""
-    wanted = f"{field}: got {excerpt(value)}, want {want}"
-    if isinstance(value, (str, bytes, dict)):
-        raise InputError(wanted)
     try:
+        if isinstance(value, (str, bytes, dict)):
+            raise TypeError
         found = tuple(itertools.islice(iter(value), at_most + 1))  # pyright: ignore[reportCallIssue, reportArgumentType]
     except InputError:
         raise
     except Exception:  # it is no collection, or raises whatever it likes as one
-        raise InputError(wanted) from None
+        raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
     if len(found) > at_most:
         raise InputError(f"{field}: got more than {at_most} of them, want {want}")
     for place, one in enumerate(found):

@@ -37,9 +37,13 @@ def save(result: Solution | Rollout, path: str | os.PathLike[str]) -> Path:
     check_kind("result", result, (Solution, Rollout), "a Solution or a Rollout")
     kind, arrays, texts = _solution_parts(result) if isinstance(result, Solution) else _rollout_parts(result)
     meta = {"format": f"lqrsim {kind}", "version": VERSIONS[kind], **texts}
+    try:
+        text = json.dumps(meta)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"result: got options or texts that JSON does not have ({error}), want plain data") from None
     with replacing(path) as unfinished, unfinished.open("wb") as file:
         # Through a file object: given a name, NumPy appends .npz to it.
-        np.savez_compressed(file, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
+        np.savez_compressed(file, allow_pickle=False, meta=np.array(text), **arrays)
     return path
 
 

@@ -124,14 +124,15 @@ class View:
     def run(self) -> int:
         """Carry the command out; its exit code."""
         from lqrsim import console, files
-        from lqrsim.errors import check_count, check_number
+        from lqrsim.errors import check_count, check_number, check_seed
         from lqrsim.references import resolve
         from lqrsim.view import viewer
 
         check_number("--speed", self.speed, at_least=0.01, at_most=100)
         check_number("--push", self.push, at_least=0)
         check_number("--disturbances", self.disturbances, at_least=0)
-        check_count("--seed", self.seed, at_least=0)
+        check_seed("--seed", self.seed)
+        check_count("--port", self.port, at_least=0, at_most=65535)
         if self.seconds is not None:
             check_number("--seconds", self.seconds, above=0)
         kind = self.viewer if self.viewer != "auto" else "window" if viewer.has_display() else "browser"

@@ -66,7 +66,7 @@ def run_campaign(
     check_kind("campaign", campaign, Campaign, "a Campaign")
     folder = check_path("folder", folder, "the path of a folder")
     workers = processors() if workers is None else check_count("workers", workers, at_least=0, at_most=MOST_WORKERS)
-    batch = check_count("batch", batch)
+    batch = check_count("batch", batch, at_most=100_000)
     if scheduler is not None:
         check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
     check_function("progress", progress, "a function of how many trials are done, of how many", arguments=2)

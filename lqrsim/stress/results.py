@@ -157,6 +157,7 @@ class Results:
     def path(self, shard: Shard) -> Path:
         """Its file."""
         check_kind("shard", shard, Shard, "a Shard of the campaign")
+        check_count("shard: cell", shard.cell, at_least=0, at_most=len(self.cells) - 1)
         return self.folder / "shards" / shard.file
 
     def read(self, shard: Shard) -> Table:

@@ -111,6 +111,7 @@ def bootstrap(
     if not arrays or any(array.shape != arrays[0].shape or array.ndim != 1 for array in arrays) or len(arrays[0]) < 2:
         raise InputError(f"samples: got shapes {[array.shape for array in arrays]}, want one length of at least 2")
     check_number("confidence", confidence, above=0, below=1)
+    check_count("resamples", resamples, at_most=1_000_000)
     found = stats.bootstrap(
         arrays,
         statistic,
