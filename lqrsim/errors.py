@@ -58,6 +58,8 @@ def numbers_of(field: str, value: object, want: str = "numbers") -> Array:
             check_memory(field, given.size, 32, "what is made of which")
         if given.dtype.kind not in "biufO":  # text, complex numbers, dates, records
             raise TypeError
+        if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):  # a number that is not there
+            raise TypeError
         if given.dtype.kind == "O" and any(isinstance(entry, (str, bytes)) for entry in given.flat):
             raise TypeError
         return np.array(given, dtype=np.float64, order="C")
@@ -86,7 +88,7 @@ def real(field: str, value: npt.ArrayLike, want: str = "numbers") -> Array:
 
 
 def shaped(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...]) -> Array:
-    """`value` as float64 of the given shape (None matches any length), NaN and all; not copied if it is that already."""
+    """`value` as float64 of the given shape (None: any length), NaN and all; not copied if it is that already."""
     array = real(field, value, f"numbers of shape {_shape(shape)}")
     check_shape(field, array, shape)
     return array
@@ -158,13 +160,15 @@ def check_memory(field: str, count: int, each: int, what: str = "whose arrays") 
 
 
 def check_kind(field: str, value: object, kind: type | tuple[type, ...], want: str) -> Any:
-    """`value` if it is an instance of `kind`; otherwise an InputError that says what is wanted: "a Problem, such as"."""
+    """`value` if it is an instance of `kind`; otherwise an InputError with what is wanted: "a Problem, such as ..."."""
     if not isinstance(value, kind):
         raise InputError(f"{field}: got {excerpt(value)}, want {want}")
     return value
 
 
-def check_function(field: str, value: object, want: str, *, arguments: int | None = None, optional: bool = True) -> None:
+def check_function(
+    field: str, value: object, want: str, *, arguments: int | None = None, optional: bool = True
+) -> None:
     """Raises InputError unless it can be called, with so many arguments, or is None and may be.
 
     What it raises when it is called is its own, and is not turned into an InputError.
@@ -180,7 +184,9 @@ def check_function(field: str, value: object, want: str, *, arguments: int | Non
     except ValueError:  # a built-in tells nothing about itself
         return
     except TypeError as error:
-        raise InputError(f"{field}: got {excerpt(value)}, which does not take {arguments} ({error}), want {want}") from None
+        raise InputError(
+            f"{field}: got {excerpt(value)}, which does not take {arguments} ({error}), want {want}"
+        ) from None
     except Exception:  # an object that raises whatever it likes when it is looked at
         raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
 
@@ -223,7 +229,7 @@ def check_path(field: str, value: object, want: str = "the path of a file") -> P
 def check_items(
     field: str, value: object, kind: type | tuple[type, ...], want: str, *, at_most: int = 1_000_000
 ) -> tuple[Any, ...]:
-    """What `value` has in it, as a tuple of instances of `kind`. Raises InputError for text, mappings and other kinds."""
+    """What `value` has in it, as a tuple of instances of `kind`. Raises InputError for text, mappings, other kinds."""
     try:
         if isinstance(value, (str, bytes, dict)):
             raise TypeError

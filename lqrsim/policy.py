@@ -6,7 +6,17 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.coordinates import Coordinates
-from lqrsim.errors import Array, InputError, check_count, check_flag, check_kind, check_number, excerpt, shaped, vectors_of
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_count,
+    check_flag,
+    check_kind,
+    check_number,
+    excerpt,
+    shaped,
+    vectors_of,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +45,9 @@ class AffinePolicy:
             check_kind(f"AffinePolicy: {name}", getattr(self, name), Coordinates, "Coordinates")
         n, m = len(self.state_coordinates), len(self.control_coordinates)
         for name, shape in (("gain", (m, n)), ("offset", (m,)), ("nominal", (n,))):
-            array = shaped(f"AffinePolicy: {name}", getattr(self, name), (self.steps if name != "gain" else None, *shape))
+            array = shaped(
+                f"AffinePolicy: {name}", getattr(self, name), (self.steps if name != "gain" else None, *shape)
+            )
             if not len(array):
                 raise InputError(f"AffinePolicy: {name}: got none, want one a step, at least one")
             object.__setattr__(self, name, array)

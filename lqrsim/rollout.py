@@ -116,7 +116,9 @@ class Rollout:
             # A period of contact is counted, and a trial has diverged or not.
             most = steps if name == "contacts" else 1
             if not ((numbers >= 0) & (numbers <= most) & (numbers == np.floor(numbers))).all():
-                raise InputError(f"Rollout: {name}: got {excerpt(numbers.tolist())}, want whole numbers from 0 to {most}")
+                raise InputError(
+                    f"Rollout: {name}: got {excerpt(numbers.tolist())}, want whole numbers from 0 to {most}"
+                )
             object.__setattr__(self, name, numbers.astype(kind))
 
     @property

@@ -55,7 +55,7 @@ def _three(field: str, vector: Sequence[Any]) -> tuple[Any, ...]:
         expressions = [None]
     if not all(isinstance(one, sympy.Expr) for one in expressions):
         raise InputError(f"{field}: got {excerpt(vector)}, want three expressions or numbers")
-    return found
+    return tuple(expressions)
 
 
 def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:

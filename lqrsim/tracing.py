@@ -15,7 +15,6 @@ from lqrsim.errors import InputError, check_kind, check_number, excerpt
 from lqrsim.fingerprint import fingerprint
 from lqrsim.rotations import RATIOS
 
-
 MOST = 1000  # parameters of a function
 
 

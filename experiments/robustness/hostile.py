@@ -1,6 +1,8 @@
 """What arguments are replaced by: other kinds, other shapes, extremes, what is nested, and objects that bite."""
 
+import contextlib
 import dataclasses
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -82,23 +84,45 @@ def answering(answer: Any) -> Callable[..., Any]:
     return function
 
 
+def twisted(function: Callable[..., Any], seed: int) -> Callable[..., Any]:
+    """The function, but that something is wrong with what it returns, or with when it does."""
+    rng, calls = np.random.default_rng(seed), [0]
+    late = int(rng.integers(3))  # as often, it is right
+
+    def twisting(*arguments: Any) -> Any:
+        calls[0] += 1
+        returned = function(*arguments)
+        if calls[0] <= late or returned is None:
+            return returned
+        if callable(returned):
+            return twisted(returned, seed + 1)
+        return spoilt(rng, returned, [None])
+
+    with contextlib.suppress(Exception):  # what tells nothing about itself
+        twisting.__signature__ = inspect.signature(function)  # type: ignore[attr-defined]
+    return twisting
+
+
 PLAIN: list[Callable[[], Any]] = [
     lambda: None, lambda: True, lambda: 0, lambda: -1, lambda: 1, lambda: 3, lambda: 2.5, lambda: -0.0,
     lambda: 2**31, lambda: 10**20, lambda: 10**400, lambda: 1e20, lambda: 1e300, lambda: -1e300, lambda: 5e-324,
     lambda: 1e9, lambda: 10**6, lambda: 10**9,
     lambda: float("nan"), lambda: float("inf"), lambda: -float("inf"), lambda: 1j,
-    lambda: "", lambda: "a", lambda: "1", lambda: "x" * 5000, lambda: "a\nb", lambda: "\0", lambda: "ünï☃", lambda: "\ud800",
+    lambda: "", lambda: "a", lambda: "1", lambda: "x" * 5000, lambda: "a\nb", lambda: "\0", lambda: "ünï☃",
+    lambda: "\ud800",
     lambda: b"bytes", lambda: Text("smooth"), lambda: "../..", lambda: ".", lambda: "nan", lambda: "%s{}$x^",
-    lambda: [], lambda: (), lambda: {}, lambda: set(), lambda: [[]], lambda: [None], lambda: ["a", "b"], lambda: {"a": 1},
+    list, lambda: (), dict, lambda: set(), lambda: [[]], lambda: [None], lambda: ["a", "b"], lambda: {"a": 1},
     lambda: [1.0], lambda: [1.0, 2.0], lambda: [1.0, 2.0, 3.0], lambda: [[1.0, 2.0], [3.0]], lambda: range(3),
     lambda: {1: 2}, lambda: {"x": "m", "v": "m"}, lambda: {0.5}, lambda: nested(50), lambda: nested(5000),
     lambda: (i for i in range(3)), endless, lambda: iter([1.0]), lambda: [1.0] * 1000,
-    lambda: np.zeros(0), lambda: np.zeros((0, 3)), lambda: np.zeros((3, 0)), lambda: np.array(1.0), lambda: np.float32(2),
+    lambda: np.zeros(0), lambda: np.zeros((0, 3)), lambda: np.zeros((3, 0)), lambda: np.array(1.0),
+    lambda: np.float32(2),
     lambda: np.int64(3), lambda: np.zeros(3), lambda: np.zeros((3, 3)), lambda: np.ones((2, 2, 2)), lambda: -np.eye(3),
     lambda: np.zeros(3, dtype=complex), lambda: np.array(["a", "b"]), lambda: np.array([1, None], dtype=object),
     lambda: np.full(3, np.nan), lambda: np.full((2, 3), np.inf), lambda: np.zeros(2, dtype="datetime64[s]"),
     lambda: np.zeros((), dtype=[("a", "f8")]), lambda: np.ma.masked_array([1.0, 2.0, 3.0], mask=[1, 0, 0]),
-    lambda: np.broadcast_to(0.0, (10**7, 10**4)), lambda: memoryview(b"abc"), lambda: np.full(3, 1e300), lambda: np.matrix("1 2"),
+    lambda: np.broadcast_to(0.0, (10**7, 10**4)), lambda: memoryview(b"abc"), lambda: np.full(3, 1e300),
+    lambda: np.matrix("1 2"),
     lambda: object(), lambda: Kind, lambda: Ellipsis, lambda: NotImplemented, lambda: np,
     lambda: print, lambda: raising, lambda: failing, lambda: (lambda: 1), lambda: (lambda a: a),
     lambda: (lambda *a: a[0]), lambda: (lambda x, u, p: x[5]),
@@ -130,14 +154,23 @@ def spoilt(rng: np.random.Generator, value: Any, others: list[Any], depth: int =
     if isinstance(value, Mapping) and value:
         return _mapping(rng, dict(value), others, depth)
     if isinstance(value, str):
-        return [value.upper(), value + " ", value[:-1], value * 500, [value], value.encode(), value + "\n", value + ",a"][
-            rng.integers(8)
-        ]
+        return [
+            value.upper(),
+            value + " ",
+            value[:-1],
+            value * 500,
+            [value],
+            value.encode(),
+            value + "\n",
+            value + ",a",
+        ][rng.integers(8)]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = [field.name for field in dataclasses.fields(value) if field.init]
         name = fields[rng.integers(len(fields))]
         # What refuses it refuses it here: an InputError is an answer, too.
         return dataclasses.replace(value, **{name: spoilt(rng, getattr(value, name), others, depth + 1)})
+    if callable(value) and not isinstance(value, type) and rng.random() < 0.8:
+        return twisted(value, int(rng.integers(2**31)))
     return [lambda: [value], lambda: (value, value), lambda: {"a": value}, lambda: Kind, lambda: answering(value)][
         rng.integers(5)
     ]()
@@ -145,7 +178,8 @@ def spoilt(rng: np.random.Generator, value: Any, others: list[Any], depth: int =
 
 def _number(rng: np.random.Generator, value: float) -> Any:
     spoil: list[Callable[[], Any]] = [
-        lambda: -value, lambda: 0 * value, lambda: str(value), lambda: [value], lambda: 1e6 * value, lambda: complex(value),
+        lambda: -value, lambda: 0 * value, lambda: str(value), lambda: [value], lambda: 1e6 * value,
+        lambda: complex(value),
         lambda: np.array([value]), lambda: np.array([[value]] * 2), lambda: float(value), lambda: int(value),
         lambda: value + 1, lambda: value - 1, lambda: 1e-9 * value, lambda: value + 0.5, lambda: np.float32(value),
         lambda: 1e9 * value, lambda: 1000 * value,
@@ -164,10 +198,14 @@ def _array(rng: np.random.Generator, value: np.ndarray) -> Any:
         lambda: value.T, lambda: value[..., :-1] if value.ndim else value, lambda: value[:0] if value.ndim else value,
         lambda: value[None], lambda: np.concatenate([value, value]) if value.ndim else value, lambda: value.ravel(),
         lambda: value.tolist(), lambda: value.astype(object), lambda: value.astype(str), lambda: changed(np.nan),
-        lambda: changed(np.inf), lambda: changed(1e300), lambda: -changed(1.0) if value.dtype.kind in "iuf" else value,
-        lambda: value[:-1] if value.ndim else value, lambda: dict(enumerate(value.ravel()[:5])), lambda: value[::-1] if value.ndim else value,
-        lambda: value.reshape(-1, 1), lambda: value.astype(complex) if value.dtype.kind in "biuf" else value, lambda: changed(0.0),
-        lambda: value.astype(np.float16) if value.dtype.kind in "biuf" else value, lambda: (row for row in value.ravel()), lambda: changed(2.0),
+        lambda: changed(np.inf), lambda: changed(1e300),
+        lambda: -changed(1.0) if value.dtype.kind in "iuf" else value,
+        lambda: value[:-1] if value.ndim else value, lambda: dict(enumerate(value.ravel()[:5])),
+        lambda: value[::-1] if value.ndim else value,
+        lambda: value.reshape(-1, 1), lambda: value.astype(complex) if value.dtype.kind in "biuf" else value,
+        lambda: changed(0.0),
+        lambda: value.astype(np.float16) if value.dtype.kind in "biuf" else value,
+        lambda: (row for row in value.ravel()), lambda: changed(2.0),
     ]  # fmt: skip
     return spoil[rng.integers(len(spoil))]()
 
@@ -199,5 +237,8 @@ def _mapping(rng: np.random.Generator, value: dict[Any, Any], others: list[Any],
     if which == 2:
         return list(value)
     if which == 3:
-        return {(name if name != key else ["a\nb", 5, "", "x" * 3000, None][rng.integers(5)]): one for name, one in value.items()}
+        return {
+            (name if name != key else ["a\nb", 5, "", "x" * 3000, None][rng.integers(5)]): one
+            for name, one in value.items()
+        }
     return value | {key: spoilt(rng, value[key], others, depth + 1)}

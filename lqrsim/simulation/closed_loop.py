@@ -131,7 +131,9 @@ def simulate(
     wrenches = [(slice(0, 3), *one) for one in hooks("force")] + [(slice(3, 6), *one) for one in hooks("torque")]
     asked = f"{type(controller).__name__}: control: returned"
     control = controller.start(trials)
-    check_function(f"{type(controller).__name__}.start", control, "a function of step and states", arguments=2, optional=False)
+    check_function(
+        f"{type(controller).__name__}.start", control, "a function of step and states", arguments=2, optional=False
+    )
     low, high = (np.array(limits) for limits in (space.low, space.high))
 
     steps = plan.steps

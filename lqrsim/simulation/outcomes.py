@@ -83,7 +83,9 @@ def outcomes(rollout: Rollout, plant: Plant, problem: Problem | None = None) -> 
         got = f"{problem.steps} steps of {problem.dt:g} s"
         raise InputError(f"problem: got {got}, want {rollout.plan.steps} of {rollout.plan.dt:g} s, as in the rollout")
     if problem is not None and problem.dynamics.state_coordinates.names != rollout.state_coordinates.names:
-        raise InputError(f"problem: got one of another system, want states {', '.join(rollout.state_coordinates.names)}")
+        raise InputError(
+            f"problem: got one of another system, want states {', '.join(rollout.state_coordinates.names)}"
+        )
     plan, dt, steps = rollout.plan, rollout.plan.dt, rollout.plan.steps
     hit = np.less(rollout.clearance, 0)
     lost = np.any(~np.isfinite(rollout.states), axis=2)

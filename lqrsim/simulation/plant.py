@@ -128,7 +128,7 @@ class Plant:
     def _compile(self, *, contacts: bool = True) -> mujoco.MjModel:
         try:
             spec = mujoco.MjSpec.from_string(self.scene.xml)
-            # The sensors need names; geoms without one get the obstacle's. A geom's id is its place in the compiled model.
+            # The sensors need names; geoms without one get the obstacle's. A geom's id is its place once compiled.
             again = spec.compile()
         except (ValueError, mujoco.FatalError) as error:
             raise InputError(f"scene {self.scene.name}: xml: got one that MuJoCo refuses: {error}") from None

@@ -6,8 +6,7 @@ from functools import partial
 import numpy as np
 
 from lqrsim.checks import check_functions
-from lqrsim.errors import InputError, check_count
-from lqrsim.machine import processors
+from lqrsim.errors import InputError
 from lqrsim.problem import FixedState, Problem
 from lqrsim.results import Solution
 from lqrsim.solvers.attempt import Attempt, Found

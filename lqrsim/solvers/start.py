@@ -47,11 +47,15 @@ class InitialPrior:
     ) -> None:
         self.weight = check_array("InitialPrior: weight", weight, (None,))
         if not len(self.weight) or (self.weight < 0).any():
-            raise InputError(f"InitialPrior: weight: got {excerpt(self.weight.tolist())}, want numbers >= 0, one a state")
+            raise InputError(
+                f"InitialPrior: weight: got {excerpt(self.weight.tolist())}, want numbers >= 0, one a state"
+            )
         given = numbers_of("InitialPrior: about", about, f"numbers ({len(self.weight)},) or (T+1, {len(self.weight)})")
         self.about = check_array("InitialPrior: about", given, (*[None] * (given.ndim == 2), len(self.weight)))
         if len(self.about) < 2 and self.about.ndim == 2:
-            raise InputError(f"InitialPrior: about: got {len(self.about)} rows, want one for each of at least two times")
+            raise InputError(
+                f"InitialPrior: about: got {len(self.about)} rows, want one for each of at least two times"
+            )
         self.iterations = check_count("InitialPrior: iterations", iterations)
         shares = check_array("InitialPrior: obstacles", obstacles, (None,))
         if ((shares < 0) | (shares > 1)).any():

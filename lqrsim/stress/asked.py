@@ -170,7 +170,9 @@ class Campaign:
         try:
             sweeps = {name: tuple(_made(one) for one in sweep) for name, sweep in fields["sweeps"].items()}
             return cls(**{**fields, "sweeps": sweeps})
-        except (KeyError, TypeError, AttributeError) as error:
+        except InputError:
+            raise
+        except Exception as error:  # whatever a disturbance raises of settings that are not its own
             raise InputError(f"campaign: got {excerpt(fields)}, want what lqrsim wrote ({error})") from None
 
 

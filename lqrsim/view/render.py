@@ -70,9 +70,9 @@ def render(
     path = _named(path, ".mp4", ".gif")
     check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)
     animated = path.suffix.lower() == ".gif"
-    fps = check_number("fps", (15 if animated else 30) if fps is None else fps, above=0, at_most=240)
+    fps = check_number("fps", (15 if animated else 30) if fps is None else fps, at_least=0.1, at_most=240)
     rate = Fraction(fps).limit_denominator(1001)
-    speed = check_number("speed", speed, above=0, at_most=1000)
+    speed = check_number("speed", speed, at_least=1e-3, at_most=1000)
     size = size if size is not None or not animated else _half(quality)
     options = (trial, camera, insets, titles, overlays, solution, quality, size, speed)
     with replacing(path) as unfinished, picture(runs, *options) as drawn:

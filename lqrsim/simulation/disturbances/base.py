@@ -71,7 +71,9 @@ class Disturbance(abc.ABC):
         Raises:
           InputError: nothing says what this is, or that much of it means nothing.
         """
-        raise InputError(f"{type(self).__name__}: got strength {excerpt(strength)}, want a disturbance that overrides `scaled`")
+        raise InputError(
+            f"{type(self).__name__}: got strength {excerpt(strength)}, want a disturbance that overrides `scaled`"
+        )
 
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
         """Raise InputError if the plant can not have this disturbance."""
