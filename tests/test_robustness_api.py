@@ -32,6 +32,9 @@ from lqrsim.errors import (
 from lqrsim.machine import memory
 
 
+anything: Any = ls  # whose types nobody checks
+
+
 def refusal(call: Callable[[], object]) -> str:
     """The one line with which a call is refused."""
     with pytest.raises(InputError) as caught:
@@ -265,28 +268,28 @@ class TestDataThatUsersBuild:
     def test_objects_of_the_wrong_kind(self, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
         plant, problem = differential_drive.plant(), differential_drive.problem
         for call in (
-            lambda: ls.smooth("problem"), lambda: ls.ilqr([problem]), lambda: ls.simulate(plant, [drive_solution]),
-            lambda: ls.simulate("plant", drive_solution), lambda: ls.simulate(plant, drive_solution, controller="none"),
-            lambda: ls.Feedback(drive_solution), lambda: ls.Replanning("problem", drive_solution, every=1.0),
-            lambda: ls.plot_run("solution", {}, "a.png", world=differential_drive.scene.world),
-            lambda: ls.report("results", "a.html"), lambda: ls.verify_run("run"), lambda: ls.outcomes("run", plant),
-            lambda: ls.render("run", "a.mp4"), lambda: ls.Plant("robot", differential_drive.scene),
-            lambda: ls.save("solution", "a.npz"), lambda: ls.World(["box"]), lambda: ls.preset("light", "plant"),
-            lambda: ls.smooth(problem, start=lambda: 0), lambda: ls.smooth_many(itertools.repeat(3)),
+            lambda: anything.smooth("problem"), lambda: anything.ilqr([problem]), lambda: anything.simulate(plant, [drive_solution]),
+            lambda: anything.simulate("plant", drive_solution), lambda: anything.simulate(plant, drive_solution, controller="none"),
+            lambda: anything.Feedback(drive_solution), lambda: anything.Replanning("problem", drive_solution, every=1.0),
+            lambda: anything.plot_run("solution", {}, "a.png", world=differential_drive.scene.world),
+            lambda: anything.report("results", "a.html"), lambda: anything.verify_run("run"), lambda: anything.outcomes("run", plant),
+            lambda: anything.render("run", "a.mp4"), lambda: anything.Plant("robot", differential_drive.scene),
+            lambda: anything.save("solution", "a.npz"), lambda: anything.World(["box"]), lambda: anything.preset("light", "plant"),
+            lambda: anything.smooth(problem, start=lambda: 0), lambda: anything.smooth_many(itertooanything.repeat(3)),
         ):  # fmt: skip
             assert ": got " in refusal(call)
 
     def test_names_are_one_short_line(
         self, differential_drive: ls.Scenario, drive_solution: ls.Solution, tmp_path: Path
     ) -> None:
-        rollout, world = ls.simulate(differential_drive.plant(), drive_solution), differential_drive.scene.world
+        rollout, world = anything.simulate(differential_drive.plant(), drive_solution), differential_drive.scene.world
         path = tmp_path / "run.png"
         for label in ("x" * 5000, "two\nlines", "", 3):
-            call = lambda name=label: ls.plot_run(drive_solution, {name: rollout}, path, world=world)  # noqa: E731
+            call = lambda name=label: anything.plot_run(drive_solution, {name: rollout}, path, world=world)  # noqa: E731
             assert refusal(call).startswith("rollouts: label: got ")
-        assert "titles" in refusal(lambda: ls.render(rollout, tmp_path / "a.mp4", titles=["two\nlines"]))
-        assert "sweeps: name" in refusal(lambda: ls.Campaign(scenario="quadrotor", sweeps={"a\nb": ()}))
-        ls.plot_run(drive_solution, {"a run for $5, or $x^": rollout}, path, world=world)
+        assert "titles" in refusal(lambda: anything.render(rollout, tmp_path / "a.mp4", titles=["two\nlines"]))
+        assert "sweeps: name" in refusal(lambda: anything.Campaign(scenario="quadrotor", sweeps={"a\nb": ()}))
+        anything.plot_run(drive_solution, {"a run for $5, or $x^": rollout}, path, world=world)
         assert path.is_file()
 
 
