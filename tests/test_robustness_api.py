@@ -31,8 +31,7 @@ from lqrsim.errors import (
 )
 from lqrsim.machine import memory
 
-
-anything: Any = ls  # whose types nobody checks
+lq: Any = ls  # whose types nobody checks
 
 
 def refusal(call: Callable[[], object]) -> str:
@@ -268,28 +267,28 @@ class TestDataThatUsersBuild:
     def test_objects_of_the_wrong_kind(self, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
         plant, problem = differential_drive.plant(), differential_drive.problem
         for call in (
-            lambda: anything.smooth("problem"), lambda: anything.ilqr([problem]), lambda: anything.simulate(plant, [drive_solution]),
-            lambda: anything.simulate("plant", drive_solution), lambda: anything.simulate(plant, drive_solution, controller="none"),
-            lambda: anything.Feedback(drive_solution), lambda: anything.Replanning("problem", drive_solution, every=1.0),
-            lambda: anything.plot_run("solution", {}, "a.png", world=differential_drive.scene.world),
-            lambda: anything.report("results", "a.html"), lambda: anything.verify_run("run"), lambda: anything.outcomes("run", plant),
-            lambda: anything.render("run", "a.mp4"), lambda: anything.Plant("robot", differential_drive.scene),
-            lambda: anything.save("solution", "a.npz"), lambda: anything.World(["box"]), lambda: anything.preset("light", "plant"),
-            lambda: anything.smooth(problem, start=lambda: 0), lambda: anything.smooth_many(itertooanything.repeat(3)),
+            lambda: lq.smooth("problem"), lambda: lq.ilqr([problem]), lambda: lq.simulate(plant, [drive_solution]),
+            lambda: lq.simulate("plant", drive_solution), lambda: lq.simulate(plant, drive_solution, controller="none"),
+            lambda: lq.Feedback(drive_solution), lambda: lq.Replanning("problem", drive_solution, every=1.0),
+            lambda: lq.plot_run("solution", {}, "a.png", world=differential_drive.scene.world),
+            lambda: lq.report("results", "a.html"), lambda: lq.verify_run("run"), lambda: lq.outcomes("run", plant),
+            lambda: lq.render("run", "a.mp4"), lambda: lq.Plant("robot", differential_drive.scene),
+            lambda: lq.save("solution", "a.npz"), lambda: lq.World(["box"]), lambda: lq.preset("light", "plant"),
+            lambda: lq.smooth(problem, start=lambda: 0), lambda: lq.smooth_many(itertools.repeat(3)),
         ):  # fmt: skip
             assert ": got " in refusal(call)
 
     def test_names_are_one_short_line(
         self, differential_drive: ls.Scenario, drive_solution: ls.Solution, tmp_path: Path
     ) -> None:
-        rollout, world = anything.simulate(differential_drive.plant(), drive_solution), differential_drive.scene.world
+        rollout, world = lq.simulate(differential_drive.plant(), drive_solution), differential_drive.scene.world
         path = tmp_path / "run.png"
         for label in ("x" * 5000, "two\nlines", "", 3):
-            call = lambda name=label: anything.plot_run(drive_solution, {name: rollout}, path, world=world)  # noqa: E731
+            call = lambda name=label: lq.plot_run(drive_solution, {name: rollout}, path, world=world)  # noqa: E731
             assert refusal(call).startswith("rollouts: label: got ")
-        assert "titles" in refusal(lambda: anything.render(rollout, tmp_path / "a.mp4", titles=["two\nlines"]))
-        assert "sweeps: name" in refusal(lambda: anything.Campaign(scenario="quadrotor", sweeps={"a\nb": ()}))
-        anything.plot_run(drive_solution, {"a run for $5, or $x^": rollout}, path, world=world)
+        assert "titles" in refusal(lambda: lq.render(rollout, tmp_path / "a.mp4", titles=["two\nlines"]))
+        assert "sweeps: name" in refusal(lambda: lq.Campaign(scenario="quadrotor", sweeps={"a\nb": ()}))
+        lq.plot_run(drive_solution, {"a run for $5, or $x^": rollout}, path, world=world)
         assert path.is_file()
 
 
