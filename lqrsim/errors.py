@@ -8,6 +8,7 @@ import dataclasses
 import difflib
 import inspect
 import itertools
+import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -20,6 +21,8 @@ from lqrsim.machine import memory
 
 Array = npt.NDArray[np.floating]
 
+_FLOAT64 = np.dtype(np.float64)
+_LARGE = 10**7  # entries of an array from which on it is looked at whether there is memory for others of its size
 LONGEST = 1010  # characters of a message
 LARGEST_COUNT = 10**9  # of what has no limit of its own: a loop over more does not end in a working day
 
@@ -54,7 +57,7 @@ def numbers_of(field: str, value: object, want: str = "numbers") -> Array:
     """`value` as a new C-ordered float64 array of any shape and any numbers. Raises InputError for what has none."""
     try:
         given = np.asarray(value)
-        if given.size > 10**7:
+        if given.size > _LARGE:
             check_memory(field, given.size, 32, "what is made of which")
         if given.dtype.kind not in "biufO":  # text, complex numbers, dates, records
             raise TypeError
@@ -81,7 +84,7 @@ def check_shape(field: str, array: npt.NDArray[Any], shape: tuple[int | None, ..
 def real(field: str, value: npt.ArrayLike, want: str = "numbers") -> Array:
     """`value` as a float64 array of any shape and any numbers; not copied if it is that already. Raises InputError."""
     done = type(value) is np.ndarray and value.dtype == np.float64
-    if done and value.size > 10**7:  # pyright: ignore[reportAttributeAccessIssue]
+    if done and value.size > _LARGE:  # pyright: ignore[reportAttributeAccessIssue]
         # It may be there once for many places, as NumPy broadcasts, and what is made of it will not be.
         check_memory(field, value.size, 32, "what is made of which")  # pyright: ignore[reportAttributeAccessIssue]
     return value if done else numbers_of(field, value, want)  # pyright: ignore[reportReturnType]
@@ -89,6 +92,8 @@ def real(field: str, value: npt.ArrayLike, want: str = "numbers") -> Array:
 
 def shaped(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...]) -> Array:
     """`value` as float64 of the given shape (None: any length), NaN and all; not copied if it is that already."""
+    if type(value) is np.ndarray and value.dtype is _FLOAT64 and value.shape == shape and value.size <= _LARGE:
+        return value  # without making a message: what a solver returns goes this way
     array = real(field, value, f"numbers of shape {_shape(shape)}")
     check_shape(field, array, shape)
     return array
@@ -112,11 +117,6 @@ def check_number(
     below: float | None = None,
 ) -> float:
     """`value` as a finite float within the stated bounds. Raises InputError otherwise; text and True are no numbers."""
-    wants = ["a finite number"]
-    wants += [f"> {above:g}"] if above is not None else []
-    wants += [f">= {at_least:g}"] if at_least is not None else []
-    wants += [f"<= {at_most:g}"] if at_most is not None else []
-    wants += [f"< {below:g}"] if below is not None else []
     number = float("nan")
     try:
         if not isinstance(value, (str, bytes, bytearray, bool, np.bool_)) and np.ndim(value) == 0:  # pyright: ignore
@@ -124,13 +124,18 @@ def check_number(
     except Exception:  # whatever the object raises when it is asked for its value
         number = float("nan")
     good = (
-        np.isfinite(number)
+        math.isfinite(number)
         and (above is None or number > above)
         and (at_least is None or number >= at_least)
         and (at_most is None or number <= at_most)
         and (below is None or number < below)
     )
     if not good:
+        wants = ["a finite number"]
+        wants += [f"> {above:g}"] if above is not None else []
+        wants += [f">= {at_least:g}"] if at_least is not None else []
+        wants += [f"<= {at_most:g}"] if at_most is not None else []
+        wants += [f"< {below:g}"] if below is not None else []
         raise InputError(f"{field}: got {excerpt(value)}, want {' '.join(wants)}")
     return number
 
