@@ -110,7 +110,7 @@ def exercise(made: Any) -> None:
         if inspect.isgenerator(made):
             list(made)
         return
-    str(made), repr(made)
+    _ = str(made), repr(made)
     for name, item in inspect.getmembers_static(type(made)):
         if (name[0] == "_" and name != "__len__") or name in getattr(type(made), "__dataclass_fields__", ()):
             continue

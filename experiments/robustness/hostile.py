@@ -120,7 +120,7 @@ PLAIN: list[Callable[[], Any]] = [
     lambda: np.int64(3), lambda: np.zeros(3), lambda: np.zeros((3, 3)), lambda: np.ones((2, 2, 2)), lambda: -np.eye(3),
     lambda: np.zeros(3, dtype=complex), lambda: np.array(["a", "b"]), lambda: np.array([1, None], dtype=object),
     lambda: np.full(3, np.nan), lambda: np.full((2, 3), np.inf), lambda: np.zeros(2, dtype="datetime64[s]"),
-    lambda: np.zeros((), dtype=[("a", "f8")]), lambda: np.ma.masked_array([1.0, 2.0, 3.0], mask=[1, 0, 0]),
+    lambda: np.zeros((), dtype=[("a", "f8")]), lambda: np.ma.masked_array([1.0, 2.0, 3.0], mask=[True, False, False]),
     lambda: np.broadcast_to(0.0, (10**7, 10**4)), lambda: memoryview(b"abc"), lambda: np.full(3, 1e300),
     lambda: np.matrix("1 2"),
     lambda: object(), lambda: Kind, lambda: Ellipsis, lambda: NotImplemented, lambda: np,

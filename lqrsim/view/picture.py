@@ -86,7 +86,7 @@ def picture(
     look = QUALITIES[quality]
     size = _checked_size(look.size if size is None else size)
     check_text("camera", camera, "the name of a camera")
-    insets = check_items("insets", insets, str, f"a tuple of the names of cameras, {INSETS} at most", at_most=INSETS)
+    insets = check_items("insets", insets, str, f"a tuple of the names of cameras, {INSETS} at most", at_most=100)
     overlays = check_items("overlays", overlays, object, f"a tuple of: {', '.join(OVERLAYS)}", at_most=100)
     for overlay in overlays:
         check_name("overlays", overlay, OVERLAYS)
@@ -196,8 +196,9 @@ def _shown(
 ) -> tuple[list[Rollout], list[tuple[int, int]]]:
     """The rollouts, each once, and which run and trial each part of the picture shows."""
     if isinstance(runs, Rollout):
-        several = isinstance(trial, Sequence) and not isinstance(trial, str)
-        rows = check_items("trial", trial, object, f"1 to {RUNS} of them", at_most=RUNS) if several else (trial,)
+        rows: tuple[Any, ...] = (trial,)
+        if isinstance(trial, Sequence) and not isinstance(trial, str):
+            rows = check_items("trial", trial, object, f"1 to {RUNS} of them", at_most=RUNS)
         distinct, shown = [runs], [(0, row) for row in rows]
     else:
         distinct = list(check_items("runs", runs, Rollout, f"a Rollout, or 1 to {RUNS} of them", at_most=RUNS))

@@ -138,5 +138,5 @@ def _half(quality: Quality) -> tuple[int, int]:
 def _named(path: str | os.PathLike[str], *suffixes: str) -> Path:
     path = check_path("path", path)
     if path.suffix.lower() not in suffixes:
-        raise InputError(f"path: got {excerpt(str(path))}, want a name that ends in {' or '.join(suffixes)}")
+        raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in {' or '.join(suffixes)}")
     return path

@@ -47,7 +47,7 @@ def figure(*paths: str | os.PathLike[str], size: tuple[float, float]) -> Iterato
     places = [check_path("path", path) for path in paths]
     for place in places:
         if place.suffix.lower() not in METADATA:
-            raise InputError(f"path: got {excerpt(str(place))}, want a name that ends in one of: {', '.join(METADATA)}")
+            raise InputError(f"path: got {excerpt(place.name)}, want a name that ends in one of: {', '.join(METADATA)}")
     with contextlib.ExitStack() as stack:
         unfinished = [(place.suffix.lower(), stack.enter_context(replacing(place))) for place in places]
         stack.enter_context(matplotlib.style.context(["default", STYLE]))
