@@ -1,6 +1,7 @@
 """Files: what goes in comes out to the bit, needs only NumPy to read, and a bad one gets one line."""
 
 import dataclasses
+import hashlib
 import json
 import pickle
 import zipfile
@@ -50,7 +51,7 @@ def test_a_policy_is_read_with_numpy_alone(saved: Path, drive_solution: ls.Solut
     with np.load(saved) as archive:
         gain, offset, nominal = (archive[f"policy.{name}"] for name in ("gain", "offset", "nominal"))
         meta = json.loads(str(archive["meta"]))
-    assert (meta["format"], meta["version"]) == ("lqrsim solution", 3)
+    assert (meta["format"], meta["version"]) == ("lqrsim solution", 4)
     state, t = drive_solution.trajectory.states[7] + [0.01, 0.02, 2 * np.pi], 7 / 6
     step = min(int(t / meta["dt"] + 1e-9), len(gain) - 1)
     for i in meta["states"]["angles"]:
@@ -59,13 +60,40 @@ def test_a_policy_is_read_with_numpy_alone(saved: Path, drive_solution: ls.Solut
     np.testing.assert_allclose(control, drive_solution.policy(state, t), rtol=0, atol=1e-12)
 
 
-def rewrite(path: Path, **changes: object) -> None:
-    """Change what a solution file says of itself."""
+def content_hash(arrays: dict[str, np.ndarray], meta: dict[str, object]) -> str:
+    """The hash in a file, as docs/file_format.md describes it, and not as the package computes it."""
+    text = json.dumps({k: v for k, v in meta.items() if k != "sha256"}, sort_keys=True, separators=(",", ":"))
+    found = hashlib.sha256(text.encode())
+    for name, array in sorted(arrays.items()):
+        found.update(f"\n{name} {array.dtype.str} {array.shape}\n".encode() + array.tobytes())
+    return found.hexdigest()
+
+
+def contents(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
     with np.load(path) as archive:
         arrays = dict(archive)
-    meta = json.loads(str(arrays.pop("meta"))) | {k: v for k, v in changes.items() if not isinstance(v, np.ndarray)}
-    arrays |= {key: value for key, value in changes.items() if isinstance(value, np.ndarray)}
-    np.savez(path, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
+    return arrays, json.loads(str(arrays.pop("meta")))
+
+
+def rewrite(path: Path, *, sealed: bool = True, **changes: object) -> None:
+    """Change what a file says, as another program could: with the hash that belongs to it, or the old one.
+
+    An array replaces one, None takes one out, and a function changes it; anything else is metadata.
+    """
+    arrays, meta = contents(path)
+    for name, change in changes.items():
+        if name in arrays:
+            array = arrays.pop(name)
+            if change is not None:
+                arrays[name] = change(array) if callable(change) else np.asarray(change)
+        elif isinstance(change, np.ndarray):
+            arrays[name] = change
+        else:
+            meta[name] = change(meta[name]) if callable(change) else change
+    if sealed:
+        meta["sha256"] = content_hash(arrays, meta)
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
 
 
 def _save_bare_array(path: Path) -> None:
@@ -77,16 +105,16 @@ def _save_bare_array(path: Path) -> None:
     ("spoil", "message"),
     [
         (lambda path: path.unlink(), "want a file that exists"),
-        (lambda path: path.write_bytes(path.read_bytes()[:-4000]), "which is damaged, want a file that lqrsim wrote"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-4000]), "which is damaged .*want a file that lqrsim wrote"),
         (lambda path: path.write_bytes(b""), "which is damaged"),
         (lambda path: path.write_text("gain: 3"), "which is damaged"),
         (lambda path: np.savez(path, a=np.zeros(3)), "which is damaged"),
         (lambda path: _save_bare_array(path), "which is damaged"),
         (lambda path: path.write_bytes(pickle.dumps({"gain": 1})), "which is damaged"),
         (lambda path: np.savez(path, meta=np.array([{}], dtype=object)), "which is damaged"),
-        (lambda path: rewrite(path, version=1), "of version 1, want version 3"),
+        (lambda path: rewrite(path, version=1), "of version 1, want version 4"),
         (lambda path: rewrite(path, format="lqrsim rollout"), "holds a 'lqrsim rollout', want a 'lqrsim solution'"),
-        (lambda path: rewrite(path, status="great"), "which is damaged .*'great' is not a valid Status"),
+        (lambda path: rewrite(path, status="great"), r"meta\.status: got 'great', want one of: converged"),
         (lambda path: rewrite(path, **{"policy.offset": np.zeros((150, 3))}), r"policy.offset: got shape \(150, 3\)"),
         (lambda path: rewrite(path, **{"policy.gain": np.full((150, 2, 3), np.nan)}), "policy.gain: got nan at index"),
         (lambda path: rewrite(path, dt=None), "which is damaged"),
