@@ -41,7 +41,7 @@ class Header(NamedTuple):
     shape: tuple[int, ...]
 
 
-class _Other(InputError):
+class Other(InputError):
     """A file that is whole, but not what was asked for."""
 
 
@@ -146,12 +146,12 @@ def opened(path: Path, kind: str, version: int) -> Iterator[Archive]:
     with blamed(path, kind), path.open("rb") as file, zipfile.ZipFile(file) as archive:
         found = Archive(archive, os.fstat(file.fileno()).st_size)
         if found.meta.get("format") != f"lqrsim {kind}":
-            raise _Other(
+            raise Other(
                 f"{kind}: got {path}, which holds a {excerpt(found.meta.get('format'))}, want a {f'lqrsim {kind}'!r}"
             )
         if found.meta.get("version") != version:
             was = excerpt(found.meta.get("version"))
-            raise _Other(f"{kind}: got {path} of version {was}, want version {version}: write it again")
+            raise Other(f"{kind}: got {path} of version {was}, want version {version}: write it again")
         yield found
 
 
@@ -165,7 +165,7 @@ def blamed(path: Path, kind: str) -> Iterator[None]:
         raise InputError(f"{kind}: got {excerpt_of(path)}, want a file that exists")
     try:
         yield
-    except _Other:
+    except Other:
         raise
     except OSError as error:
         raise InputError(f"{kind}: got {path}, want a file that can be read ({error.strerror or error})") from None

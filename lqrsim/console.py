@@ -1,6 +1,7 @@
 """What the commands share: progress on the terminal, and an early look at whether the outputs can be written."""
 
 import contextlib
+import os
 import sys
 import tempfile
 import time
@@ -8,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lqrsim.archive import excerpt_of
 from lqrsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,12 +30,15 @@ def say(text: str = "") -> None:
 def check_output(field: str, folder: Path) -> None:
     """Find out before the work starts whether `folder` can be written. Raises InputError if not."""
     existing = folder.absolute()
-    while not existing.exists() and existing != existing.parent:
+    while not os.path.exists(existing) and existing != existing.parent:
         existing = existing.parent
     try:
         tempfile.TemporaryFile(dir=existing).close()
-    except OSError as error:
-        raise InputError(f"{field}: got {folder}, want a folder that can be written ({error.strerror})") from None
+        with contextlib.suppress(FileNotFoundError):
+            os.lstat(folder)  # a name that no folder can have
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{field}: got {excerpt_of(folder)}, want a folder that can be written ({reason})") from None
 
 
 def solve(problem: "Problem", solver: str, **options: object) -> "Solution":

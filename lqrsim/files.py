@@ -1,6 +1,6 @@
 """Solutions and rollouts on disk: arrays by name, and everything that is not an array in one JSON text.
 
-`docs/file_format.md` says what is in them and loads a policy elsewhere, with NumPy alone; `archive.py` is the container.
+`docs/file_format.md` says what is in them and loads a policy elsewhere, with NumPy alone; `archive.py` has the rest.
 The tables here say what belongs into a file. What is saved and what is loaded are both held to them.
 """
 
@@ -275,4 +275,4 @@ _MAKERS = {"solution": _solution, "rollout": _rollout}
 
 
 def _coordinates(texts: Mapping[str, Any]) -> Coordinates:
-    return Coordinates(**{name: tuple(value) for name, value in texts.items()})
+    return Coordinates(**{name: tuple(value) if isinstance(value, list) else value for name, value in texts.items()})

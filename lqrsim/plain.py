@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from lqrsim.errors import InputError, check_count, check_name, check_number, excerpt
+from lqrsim.errors import InputError, check_name, check_number, excerpt
 
 Check = Callable[[str, Any], Any]
 LINE = 1000  # characters of a name or another line; more is no name
@@ -77,7 +77,9 @@ def _real(field: str, value: Any) -> float:
 
 def count(field: str, value: Any) -> int:
     """A whole number, not negative."""
-    return check_count(field, value, at_least=0)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise InputError(f"{field}: got {excerpt(value)}, want a whole number >= 0")
+    return value
 
 
 def one_of(names: Iterable[str]) -> Check:

@@ -105,10 +105,13 @@ class Replay:
         from lqrsim import console, files
         from lqrsim.stress.asked import Cell
         from lqrsim.stress.results import Results, agrees, replay
+        from lqrsim.versions import changed
 
         console.check_output("--out", self.out.parent)
         results = Results(self.folder, scenario=self.scenario)
         cell = Cell.named(self.cell, results.cells)
+        if others := changed(results.manifest["versions"]):
+            console.say(f"bits can differ from the table's: got {others}")
         same = agrees(results, cell, self.trial)
         rollout = replay(results, cell, self.trial)
         console.say(rollout.summary())

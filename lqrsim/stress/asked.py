@@ -13,6 +13,7 @@ import numpy as np
 from lqrsim.errors import InputError, check_count, check_name, check_number, excerpt
 from lqrsim.simulation.disturbances import Disturbance
 
+_FILES = 1_000_000  # of shards in a folder
 POLICIES = ("smooth", "ilqr", "open_loop", "replan")
 
 
@@ -106,6 +107,12 @@ class Campaign:
         object.__setattr__(self, "sweeps", {name: tuple(sweep) for name, sweep in self.sweeps.items()})
         for field, least in (("trials", 1), ("seed", 0), ("shard", 1)):
             object.__setattr__(self, field, check_count(field, getattr(self, field), at_least=least))
+        files = -(-self.trials // self.shard) * len(self.cells)
+        if files > _FILES:
+            raise InputError(
+                f"trials: got {self.trials} in shards of {self.shard} for {len(self.cells)} cells, which are {files}"
+                f" files, want at most {_FILES}: fewer, or a larger shard"
+            )
         if self.replan_every is not None:
             object.__setattr__(self, "replan_every", check_number("replan_every", self.replan_every, above=0.0))
         object.__setattr__(self, "time_limit", check_number("time_limit", self.time_limit, above=0.0))
@@ -141,7 +148,9 @@ class Campaign:
         try:
             sweeps = {name: tuple(_made(one) for one in sweep) for name, sweep in fields["sweeps"].items()}
             return cls(**{**fields, "sweeps": sweeps})
-        except (KeyError, TypeError, AttributeError) as error:
+        except InputError:
+            raise
+        except Exception as error:  # whatever a disturbance raises of settings that are not its own
             raise InputError(f"campaign: got {excerpt(fields)}, want what lqrsim wrote ({error})") from None
 
 

@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import av
@@ -105,7 +104,7 @@ class Footage:
 
 def read(path: str | os.PathLike[str]) -> Footage:
     """What the video says of itself. Raises InputError if it is none that lqrsim wrote."""
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         raise InputError(f"video: got {path}, want a file that exists")
     try:
         with av.open(str(path)) as container:
