@@ -85,7 +85,7 @@ def count(field: str, value: Any) -> int:
 def one_of(names: Iterable[str]) -> Check:
     """One of these texts."""
     valid = list(names)
-    return lambda field, value: check_name(field, value, valid)
+    return lambda field, value: check_name(field, value[:100] if isinstance(value, str) else value, valid)
 
 
 def optional(check: Check) -> Check:

@@ -5,6 +5,7 @@ import io
 import json
 import pickle
 import struct
+import warnings
 import zipfile
 from collections.abc import Callable
 from typing import Any
@@ -78,22 +79,12 @@ def member(array: npt.NDArray[Any]) -> bytes:
 def archive(members: list[tuple[str, bytes]], packing: int = zipfile.ZIP_DEFLATED, comment: bytes = b"") -> bytes:
     """A zip file of these, in this order; names may come twice."""
     file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", packing) as written:
+    with warnings.catch_warnings(), zipfile.ZipFile(file, "w") as written:
+        warnings.simplefilter("ignore")  # of names that come twice
         for name, contents in members:
-            with _quiet(), written.open(zipfile.ZipInfo(name), "w", force_zip64=True) as one:
-                one.write(contents)
-        for info in written.infolist():
-            info.compress_type = packing
+            written.writestr(zipfile.ZipInfo(name), contents, packing)
         written.comment = comment
     return file.getvalue()
-
-
-def _quiet() -> Any:
-    import warnings
-
-    caught = warnings.catch_warnings()
-    warnings.simplefilter("ignore")
-    return caught
 
 
 def seal(arrays: Arrays, meta: Any) -> str:
@@ -291,6 +282,8 @@ def _values(rng: Rng, was: Any) -> list[Any]:
     if isinstance(was, bool | int | float):
         values += [was + 1, was * 2, -was, str(was), [was], was * 1e9]
     if isinstance(was, str):
+        low, high = sorted(rng.integers(len(was) + 1, size=2).tolist())
+        values += [was[:low] + was[high:]] * 6 + [was[:high] + was[low:], was[:low] + "9" + was[low + 1 :]]
         values += [was.upper(), was + "x", was[:-1], was[::-1], [was], was * 3, f"{was}\n", {was: was}]
     if isinstance(was, list):
         values += [was[::-1], was + was, was[:-1], tuple(was), dict(enumerate(was)), [*was, None]]

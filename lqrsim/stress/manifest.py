@@ -49,7 +49,7 @@ _MANIFEST = plain.record(
 def write_manifest(folder: Path, contents: dict[str, Any]) -> None:
     """Seal and write it: `contents` is all but its format, its cells and its hashes. Raises InputError."""
     manifest = {"format": FORMAT, "version": VERSION, **contents, "cells": _cells(contents["campaign"])}
-    manifest["digest"] = _digest(manifest)
+    manifest["digest"] = digest_of_rows(manifest)
     manifest["sha256"] = _seal(manifest)
     _check(plain.parse(plain.canonical(manifest)))
     write(json.dumps(manifest, indent=1).encode(), folder / NAME)
@@ -83,7 +83,7 @@ def _check(manifest: dict[str, Any]) -> None:
         raise InputError("cells: got others than those of the campaign, want each sweep, strength and policy")
     if set(manifest["policies"]) != set(asked["policies"]):
         raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(asked['policies'])}")
-    if manifest["digest"] != _digest(manifest):
+    if manifest["digest"] != digest_of_rows(manifest):
         raise InputError("digest: got another than that of the campaign, want a file that has not been changed")
 
 
@@ -103,7 +103,7 @@ def _seal(manifest: Mapping[str, Any]) -> str:
     return digest_of(plain.canonical({name: one for name, one in manifest.items() if name != "sha256"}).encode())
 
 
-def _digest(manifest: Mapping[str, Any]) -> str:
+def digest_of_rows(manifest: Mapping[str, Any]) -> str:
     """Hash of all that rows depend on, and of nothing that differs where the same is begun again."""
     lasting = {name: manifest[name] for name in ("cells", "model", "problem", "code", "versions")} | {
         "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},
