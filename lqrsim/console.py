@@ -27,18 +27,23 @@ def say(text: str = "") -> None:
         sys.stdout.flush()
 
 
-def check_output(field: str, folder: Path) -> None:
-    """Find out before the work starts whether `folder` can be written. Raises InputError if not."""
+def check_output(field: str, folder: Path, name: str = "") -> None:
+    """Find out before the work starts whether `folder`, or a file of that name in it, can be written.
+
+    Raises:
+      InputError: it cannot.
+    """
     existing = folder.absolute()
     while not os.path.exists(existing) and existing != existing.parent:
         existing = existing.parent
     try:
         tempfile.TemporaryFile(dir=existing).close()
         with contextlib.suppress(FileNotFoundError):
-            os.lstat(folder)  # a name that no folder can have
+            os.lstat(folder / name)  # fails otherwise for what no file can be called
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{field}: got {excerpt_of(folder)}, want a folder that can be written ({reason})") from None
+        reason, what = getattr(error, "strerror", None) or error, "file" if name else "folder"
+        place = excerpt_of(folder / name)
+        raise InputError(f"{field}: got {place}, want a {what} that can be written ({reason})") from None
 
 
 def solve(problem: "Problem", solver: str, **options: object) -> "Solution":

@@ -3,8 +3,8 @@
     campaign = Campaign(scenario="quadrotor", sweeps={"gusts": (ls.ForceNoise(0.2),)})
     results = run_campaign(campaign, "runs/stress/quadrotor")
 
-A trial's rows depend on the campaign alone: not on how many workers there are, on what they do at once, or on how often
-the campaign was interrupted.
+On equal processors a trial's rows depend on the campaign alone: not on how many workers there are, on what they do at
+once, or on how often the campaign was interrupted.
 """
 
 import contextlib
@@ -134,7 +134,7 @@ def _rehearse(campaign: Campaign, scenario: Scenario) -> None:
 
 def _look_at(folder: Path) -> None:
     """Raise InputError for a folder that is not empty, and no campaign's."""
-    if folder.is_dir() and not (folder / NAME).exists():
+    if os.path.isdir(folder) and not os.path.exists(folder / NAME):
         others = sorted(name for name in os.listdir(folder) if name not in _OWN and not name.startswith(".unfinished-"))
         if others:
             raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty one or a campaign's")
@@ -148,7 +148,7 @@ def _begin(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
         "problem": scenario.problem.digest,
         "code": _code(campaign),
     }
-    if (folder / NAME).exists():
+    if os.path.exists(folder / NAME):
         _compare(asked, read_manifest(folder), folder)
         return
     policies = {}

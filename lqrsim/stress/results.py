@@ -133,7 +133,7 @@ class Results:
     def there(self) -> set[Shard]:
         """The shards that have a file."""
         folder = self.folder / "shards"
-        names = set(os.listdir(folder)) if folder.is_dir() else set()
+        names = set(os.listdir(folder)) if os.path.isdir(folder) else set()
         return {shard for shard in self.shards() if shard.file in names}
 
     def number(self, cell: Cell) -> int:
@@ -185,6 +185,8 @@ def replay(
     contacts: bool = True,
 ) -> Rollout:
     """The very trial of a campaign again, to the bit until its first collision; and to its end without contacts.
+
+    That is so on the kind of processor and with the versions that `results.manifest["versions"]` has.
 
     Raises:
       InputError: no such cell or trial, or the scenario is one of yours and `Results` was not given it.
