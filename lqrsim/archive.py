@@ -51,7 +51,7 @@ def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> s
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
         hasher.update(f"\n{name} {array.dtype.str} {array.shape}\n".encode())
-        hasher.update(array.reshape(-1).view(np.uint8))
+        hasher.update(array.reshape(-1).view(np.uint8).data)
     return hasher.hexdigest()
 
 

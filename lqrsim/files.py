@@ -262,12 +262,14 @@ def _rollout(arrays: Arrays, meta: dict[str, Any]) -> Rollout:
         raise InputError("frame_times: got times that are not in order, want each after the one before")
     if (arrays["contacts"] < 0).any():
         raise InputError("contacts: got less than none, want numbers of control periods")
+    texts: dict[str, Any] = {name: meta[name] for name in _ROLLOUT_TEXTS}
+    texts["disturbances"] = tuple(texts["disturbances"])
     return Rollout(
         **{name: arrays[name] for name in _ROLLOUT_ARRAYS},
         plan=Trajectory(arrays["trajectory.states"], arrays["trajectory.controls"], float(meta["dt"])),
         state_coordinates=_coordinates(meta["states"]),
         control_coordinates=_coordinates(meta["controls"]),
-        **{name: meta[name] for name in _ROLLOUT_TEXTS} | {"disturbances": tuple(meta["disturbances"])},
+        **texts,
     )
 
 

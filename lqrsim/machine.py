@@ -37,5 +37,5 @@ def processor() -> str:
 
     target: Any = registry.cpu_target
     triple, name, features = target.target_context.codegen().magic_tuple()
-    here = llvm.get_host_cpu_name(), codegen.get_host_cpu_features(), config.USING_SVML
+    here = llvm.get_host_cpu_name(), codegen.get_host_cpu_features(), getattr(config, "USING_SVML", None)
     return f"{name} {hashlib.sha256(repr((triple, name, features, *here)).encode()).hexdigest()[:8]}"

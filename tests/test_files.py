@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import hashlib
+import importlib
 import io
 import json
 import pickle
@@ -11,14 +12,18 @@ import warnings
 import zipfile
 from collections import Counter
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
-from robustness.files import FAILURES, same, verdicts
 
 import lqrsim as ls
 from lqrsim import files
 from lqrsim.cli import main
+
+fuzzer: ModuleType = importlib.import_module("robustness.files")
+same = fuzzer.same
 
 
 @pytest.fixture
@@ -54,7 +59,7 @@ def test_a_policy_is_read_with_numpy_alone(saved: Path, drive_solution: ls.Solut
     np.testing.assert_allclose(control, drive_solution.policy(state, t), rtol=0, atol=1e-12)
 
 
-def content_hash(arrays: dict[str, np.ndarray], meta: dict[str, object]) -> str:
+def content_hash(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> str:
     """The hash in a file, as docs/file_format.md describes it, and not as the package computes it."""
     text = json.dumps({k: v for k, v in meta.items() if k != "sha256"}, sort_keys=True, separators=(",", ":"))
     found = hashlib.sha256(text.encode())
@@ -63,13 +68,13 @@ def content_hash(arrays: dict[str, np.ndarray], meta: dict[str, object]) -> str:
     return found.hexdigest()
 
 
-def contents(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
+def contents(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     with np.load(path) as archive:
         arrays = dict(archive)
     return arrays, json.loads(str(arrays.pop("meta")))
 
 
-def rewrite(path: Path, *, sealed: bool = True, **changes: object) -> None:
+def rewrite(path: Path, *, sealed: Any = True, **changes: Any) -> None:
     """Change what a file says, as another program could: with the hash that belongs to it, or the old one.
 
     An array replaces one, None takes one out, and a function changes it; anything else is metadata.
@@ -79,7 +84,8 @@ def rewrite(path: Path, *, sealed: bool = True, **changes: object) -> None:
         if name in arrays:
             array = arrays.pop(name)
             if change is not None:
-                arrays[name] = change(array) if callable(change) else np.asarray(change)
+                changed: Any = change(array) if callable(change) else change
+                arrays[name] = np.asarray(changed)
         elif isinstance(change, np.ndarray):
             arrays[name] = change
         else:
@@ -169,8 +175,8 @@ def test_every_flipped_bit_is_harmless(saved: Path, drive_solution: ls.Solution)
 
 def test_a_sample_of_what_a_fuzzer_makes() -> None:
     """Some of what `experiments/benchmark_robustness.py` tries by the ten thousand; half have a hash that fits."""
-    found = list(verdicts(400, seed=3))
-    assert [verdict for verdict in found if verdict.kind in FAILURES] == []
+    found = list(fuzzer.verdicts(400, seed=3))
+    assert [verdict for verdict in found if verdict.kind in fuzzer.FAILURES] == []
     kinds = Counter(verdict.kind for verdict in found)
     assert min(kinds[kind] for kind in ("refused", "identical", "accepted")) > 0, kinds
 
@@ -216,7 +222,7 @@ def test_a_sample_of_what_a_fuzzer_makes() -> None:
         ({"more": 1}, "meta: got 'more', want no other than"),
     ],
 )
-def test_what_is_in_a_rollout_is_what_it_must_be(run: Path, changes: dict[str, object], message: str | None) -> None:
+def test_what_is_in_a_rollout_is_what_it_must_be(run: Path, changes: dict[str, Any], message: str | None) -> None:
     """Files that are whole, and have the hash that belongs to what is in them: an older or another program's."""
     rewrite(run, **changes)
     if message is None:  # without pictures, and so not to be drawn
@@ -259,7 +265,7 @@ def test_what_is_in_a_rollout_is_what_it_must_be(run: Path, changes: dict[str, o
         ),
     ],
 )
-def test_what_is_in_a_solution_is_what_it_must_be(saved: Path, changes: dict[str, object], message: str) -> None:
+def test_what_is_in_a_solution_is_what_it_must_be(saved: Path, changes: dict[str, Any], message: str) -> None:
     rewrite(saved, **changes)
     with pytest.raises(ls.InputError, match=message) as caught:
         ls.load_solution(saved)
@@ -269,7 +275,7 @@ def test_what_is_in_a_solution_is_what_it_must_be(saved: Path, changes: dict[str
 def test_another_number_is_not_taken_for_what_was_saved(saved: Path) -> None:
     """An array that is dropped, or changed in its last bit, and the hash as it was."""
     _, meta = contents(saved)
-    changes: list[dict[str, object]] = [
+    changes: list[dict[str, Any]] = [
         {"clearance": None},
         {"policy.offset": lambda a: np.nextafter(a, np.inf)},
         {"trajectory.states": lambda a: np.where(a == a[0, 1], -0.0, a)},

@@ -128,13 +128,12 @@ class Spoiler:
     def judge(self, number: int, subject: str, what: str, path: Path, *, sealed: bool) -> Verdict:
         """What comes of a file that takes the place of a saved one."""
         saved, what = self.saved[subject], f"{what}{', sealed' if sealed else ''}"
-        begun, had = time.process_time(), most_memory()
+        begun, had, why = time.process_time(), most_memory(), ""
         try:
             loaded = saved.load(path)
+            kind = "identical" if same(loaded, saved.loaded) else "accepted" if sealed else "other"
         except Exception as error:
-            kind, why = refusal(error)
-        else:
-            kind, why = "identical" if same(loaded, saved.loaded) else "accepted" if sealed else "other", ""
+            loaded, (kind, why) = saved.loaded, refusal(error)
         if most_memory() > had + MEMORY:
             kind = "large"
         if kind == "accepted":
@@ -194,7 +193,8 @@ def use_rollout(rollout: ls.Rollout) -> None:
     """What people do with a rollout, but for drawing it."""
     print(rollout, rollout.outcome, rollout.saturated.mean(), file=_Nowhere())
     track = Track(rollout, 0)
-    track.driven(track.end / 2), track.planned(track.end / 2), track.force_at(track.end / 2), track.lost(track.end)
+    for look in (track.driven, track.planned, track.force_at, track.lost):
+        look(track.end / 2)
     track.number_at(track.error, track.end)
 
 
@@ -272,7 +272,7 @@ def same(a: object, b: object) -> bool:
         alike = isinstance(b, np.ndarray) and a.dtype == b.dtype and a.shape == b.shape
         return alike and np.ascontiguousarray(a).tobytes() == np.ascontiguousarray(b).tobytes()
     if isinstance(a, tuple | list):
-        return type(a) is type(b) and len(a) == len(b) and all(map(same, a, b))
+        return isinstance(b, tuple | list) and type(a) is type(b) and len(a) == len(b) and all(map(same, a, b))
     if isinstance(a, dict):
         return isinstance(b, dict) and a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
     return type(a) is type(b) and (a == b or (a != a and b != b))
