@@ -34,6 +34,7 @@ from lqrsim.stress.manifest import digest_of_rows
 from lqrsim.stress.results import Results
 from lqrsim.view.track import Track
 from robustness import mutations
+from robustness.common import Config
 from robustness.mutations import pick
 
 FAILURES = ("raw", "other", "useless", "slow", "large")
@@ -301,7 +302,7 @@ def verdicts(count: int, *, seed: int = 0, first: int = 0, progress: bool = Fals
             yield spoiler(number)
 
 
-def measure(config: Any) -> dict[str, Any]:
+def measure(config: Config) -> dict[str, Any]:
     """Counts of verdicts by what was spoilt, the time it took, and each failure with the number that repeats it."""
     begun, counts, failures = time.monotonic(), dict[str, Counter[str]](), []
     for verdict in verdicts(config.mutations, seed=config.seed, first=config.first, progress=not config.json):
