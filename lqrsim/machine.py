@@ -1,11 +1,13 @@
-"""The machine that this runs on: how many processors there are to use, and what to say of it beside times."""
+"""The machine that this runs on: how many processors there are, which kind, and what to say of it beside times."""
 
 import contextlib
 import functools
+import hashlib
 import os
 import platform
 import re
 from pathlib import Path
+from typing import Any
 
 
 def processors() -> int:
@@ -47,3 +49,19 @@ def _physical() -> int:
         with contextlib.suppress(OSError, ValueError):  # "max" where there is no limit
             there.append(int(Path(place).read_text(encoding="ascii")))
     return min(there)
+
+
+@functools.cache
+def processor() -> str:
+    """What code is compiled for, and a hash of all that it can do; NUMBA_CPU_NAME and NUMBA_CPU_FEATURES change it.
+
+    Where it differs, the same program gives other bits: instructions round differently, and sums are taken in another
+    order. Both the kind that is really there counts, for which NumPy and MuJoCo choose, and that which numba is told.
+    """
+    import llvmlite.binding as llvm
+    from numba.core import codegen, config, registry
+
+    target: Any = registry.cpu_target
+    triple, name, features = target.target_context.codegen().magic_tuple()
+    here = llvm.get_host_cpu_name(), codegen.get_host_cpu_features(), getattr(config, "USING_SVML", None)
+    return f"{name} {hashlib.sha256(repr((triple, name, features, *here)).encode()).hexdigest()[:8]}"

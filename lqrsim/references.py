@@ -74,7 +74,7 @@ def _own_function(target: str) -> Callable[..., object]:
 
 
 def _load_file(path: Path) -> ModuleType:
-    if not path.is_file():
+    if not os.path.isfile(path):  # not the method, which raises for names that are too long
         raise InputError(f"scenario: got {path}, want a Python file that exists")
     name = str(path.resolve())  # not the stem, which may be that of another module
     spec = importlib.util.spec_from_file_location(name, path)

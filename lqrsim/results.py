@@ -246,7 +246,7 @@ class Solution:
         None where the problem has no obstacles.
       solver, options: what was called, with which settings.
       problem_digest: hash of everything that defined the problem.
-      versions: of lqrsim and the libraries that the numbers depend on.
+      versions: of lqrsim and the libraries that the bits depend on, and the processor.
       scenario: what the command line was asked for; empty where a program called the solver.
       candidates: the starts that were tried, where there were several.
       multipliers: of each of the problem's constraints; none where the plan keeps them all without being made to.

@@ -27,7 +27,8 @@ from lqrsim.results import Trajectory
 class Rollout:
     """Closed-loop runs of one policy in MuJoCo, with everything that a picture of them needs.
 
-    K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, to the last bit.
+    K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, to the last bit
+    on equal processors.
 
     Attributes:
       robot, scene: their names. model: the MJCF that was run, as text.
@@ -44,7 +45,7 @@ class Rollout:
       diverged: (K,) whether the simulation became unstable; the states are NaN from there on.
       frame_times: (F,) seconds; frames: (K, F, nq) MuJoCo's qpos then, for drawing.
       disturbances: one description each. seed, first_trial: what the draws came from.
-      versions: of lqrsim and the libraries that the numbers depend on.
+      versions: of lqrsim and the libraries that the bits depend on, and the processor.
     """
 
     robot: str

@@ -81,7 +81,7 @@ def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
             path = MODELS / f"{check_name('scene', os.fspath(name_or_path), packaged)}.xml"
         except InputError as error:
             raise InputError(f"{error}; or the path of an .xml file") from None
-    elif not path.is_file():
+    elif not os.path.isfile(path):
         packaged = ", ".join(names())
         raise InputError(f"scene: got {os.fspath(name_or_path)!r}, want a file that exists, or one of: {packaged}")
     return scene_from_xml(_flatten(path), path.stem)
@@ -178,7 +178,7 @@ def _flatten(path: Path) -> str:
 
     def find(name: str) -> Path:
         # MuJoCo's rule, relative to the main file, and then the packaged models.
-        file = next((file for file in (path.parent / name, MODELS / name) if file.is_file()), None)
+        file = next((file for file in (path.parent / name, MODELS / name) if os.path.isfile(file)), None)
         if file is None:
             packaged = ", ".join(sorted(file.name for file in MODELS.glob("*.xml")))
             raise InputError(f"scene: got an include of {name!r}, want a file beside {path.name} or one of: {packaged}")

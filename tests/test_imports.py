@@ -14,6 +14,8 @@ PACKAGE = Path(lqrsim.__file__).parent
 # A module may import those above it, and those of its own room; nothing else of the package.
 ROOMS = (
     ("errors", "machine", "versions", "solvers.interface"),
+    ("plain",),
+    ("archive",),
     ("coordinates", "value_functions"),
     ("policy",),
     ("results",),
@@ -63,8 +65,8 @@ ALLOWED = {
     "mujoco": ("scenes", "simulation", "view", "verify"),
     "matplotlib": ("view",),
     "av": ("view", "verify"),
-    "numba": ("core", "pointers"),
-    "llvmlite": ("pointers",),
+    "numba": ("core", "machine", "pointers"),
+    "llvmlite": ("machine", "pointers"),
     "sympy": ("tracing", "dynamics", "rotations", "robots", "costs"),
     "tyro": ("cli", "commands"),
     "pyarrow": ("stress",),

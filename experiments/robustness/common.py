@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-Section = Literal["api"]
+Section = Literal["api", "files"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -12,10 +12,12 @@ class Config:
     """What to try."""
     calls: int = 20_000
     """How many hostile calls of the API."""
+    mutations: int = 20_000
+    """How many spoilt files."""
     seed: int = 0
     """Of all that is spoilt."""
     first: int = 0
-    """Number of the first call: --first N --calls 1 repeats call N alone."""
+    """Number of the first call or file: --first N --calls 1 repeats call N alone, --first N --mutations 1 file N."""
     only: str = ""
     """Only callables with this in their name."""
     quick: bool = False

@@ -39,7 +39,7 @@ class Search:
         from lqrsim.references import resolve
         from lqrsim.stress import given
         from lqrsim.stress.asked import described
-        from lqrsim.stress.results import digest_of, digest_of_solution
+        from lqrsim.stress.manifest import digest_of, digest_of_solution
         from lqrsim.stress.sweeps import sweep
         from lqrsim.stress.trials import controller, solve
         from lqrsim.versions import versions

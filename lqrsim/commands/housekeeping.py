@@ -65,6 +65,8 @@ class Cache:
     """Show what is kept of compiled solvers and derived formulas, or remove it.
 
     Without it everything works the same, and each kind of problem is compiled again, some 10 seconds.
+
+    What is kept is programs, which are loaded and run: do not share the folder with people you do not trust.
     """
 
     clear: bool = False

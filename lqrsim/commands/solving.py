@@ -105,7 +105,8 @@ class Solve:
 class Simulate:
     """Execute a policy closed-loop in MuJoCo and write the runs to rollout.npz.
 
-    Prints a line for each trial. Without a disturbance it is the plain closed loop. The same seed gives the same bits.
+    Prints a line for each trial. Without a disturbance it is the plain closed loop. The same seed gives the same bits
+    on equal processors.
 
       lqrsim simulate SOLUTION.npz --force-noise 0.1 --push 0.2 0 0 3.0 --trials 10
       lqrsim simulate SOLUTION.npz --disturbances severe --out runs/severe

@@ -14,8 +14,8 @@ class Stress:
     """Run many trials of several policies under disturbances of growing strength, and count how they end.
 
     What is stopped, however it is stopped, goes on with the same command; the tables are the same to the bit whatever
-    the workers, the batches and the interruptions. Prints the share of each that reached its goal with the exact
-    interval. `docs/file_format.md` says what is in the folder.
+    the workers, the batches and the interruptions, on equal processors. Prints the share of each that reached its goal
+    with the exact interval. `docs/file_format.md` says what is in the folder.
 
     Exits with 1 if trials came to nothing for an error.
     """
@@ -86,7 +86,8 @@ class Stress:
 class Replay:
     """Run one trial of a campaign again, to the bit, and write it to rollout.npz, to be looked at with `lqrsim render`.
 
-    Says whether it gave its row in the campaign's table again; exits with 1 if not.
+    Says whether it gave its row in the campaign's table again; exits with 1 if not. On another kind of processor than
+    the campaign's, or with other versions, bits can differ; then it says so.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
@@ -105,10 +106,13 @@ class Replay:
         from lqrsim import console, files
         from lqrsim.stress.asked import Cell
         from lqrsim.stress.results import Results, agrees, replay
+        from lqrsim.versions import changed
 
-        console.check_output("--out", self.out.parent)
+        console.check_output("--out", self.out.parent, self.out.name)
         results = Results(self.folder, scenario=self.scenario)
         cell = Cell.named(self.cell, results.cells)
+        if others := changed(results.manifest["versions"]):
+            console.say(f"bits can differ from the table's: got {others}")
         same = agrees(results, cell, self.trial)
         rollout = replay(results, cell, self.trial)
         console.say(rollout.summary())
@@ -143,7 +147,7 @@ class Report:
         page = self.out or self.folder / "report.html"
         if page.suffix != ".html":
             raise InputError(f"--out: got {page}, want a name that ends in .html")
-        console.check_output("--out", page.parent)
+        console.check_output("--out", page.parent, page.name)
         results = Results(self.folder, scenario=self.scenario)
         with console.progress("reporting", "part") as progress:
             report(results, page, videos=self.videos, progress=progress)

@@ -1,5 +1,6 @@
 """The command that lets pixels testify."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -40,7 +41,7 @@ class Verify:
         path = self.file if is_run else self.run_file or run_beside(self.file)
         rollout, beside = files.load_rollout(path), path.with_name("solution.npz")
         solution = None
-        if self.solution or beside.is_file():
+        if self.solution or os.path.isfile(beside):
             solution = files.load_solution(self.solution or beside)
             # What lies beside a run may be another's; what is given is meant.
             solution = solution if self.solution or follows(rollout, solution) else None

@@ -70,7 +70,7 @@ class Render:
             raise InputError(f"--out: got {out}, want a name that ends in .mp4, .gif or .png")
         if not is_still and (self.time is not None or self.every is not None):
             raise InputError(f"--time, --every: got them for {out.name}, want --out FILE.png: they are of stills")
-        console.check_output("--out", out.parent)
+        console.check_output("--out", out.parent, out.name)
         runs = [files.load_rollout(path) for path in self.rollouts]
         solutions = [files.load_solution(path) for path in self.solution]
         one_trial = len(self.trial) == 1

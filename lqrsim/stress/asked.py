@@ -23,6 +23,7 @@ from lqrsim.errors import (
 )
 from lqrsim.simulation.disturbances import Disturbance
 
+_FILES = 1_000_000  # of shards in a folder
 POLICIES = ("smooth", "ilqr", "open_loop", "replan")
 
 
@@ -132,6 +133,12 @@ class Campaign:
         for field in ("trials", "shard"):
             object.__setattr__(self, field, check_count(field, getattr(self, field)))
         object.__setattr__(self, "seed", check_seed("seed", self.seed))
+        files = -(-self.trials // self.shard) * len(self.cells)
+        if files > _FILES:
+            raise InputError(
+                f"trials: got {self.trials} in shards of {self.shard} for {len(self.cells)} cells, which are {files}"
+                f" files, want at most {_FILES}: fewer, or a larger shard"
+            )
         if self.replan_every is not None:
             object.__setattr__(self, "replan_every", check_number("replan_every", self.replan_every, above=0.0))
         object.__setattr__(self, "time_limit", check_number("time_limit", self.time_limit, above=0.0))

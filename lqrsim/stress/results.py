@@ -1,7 +1,5 @@
 """What a campaign came to: a folder that is opened and checked, its tables, and any of its trials once more."""
 
-import hashlib
-import json
 import os
 import shlex
 from collections import Counter
@@ -27,11 +25,10 @@ from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.outcomes import OUTCOMES, Outcomes
 from lqrsim.stress.asked import Campaign, Cell, Shard, shards_of
+from lqrsim.stress.manifest import cells_of, digest_of, digest_of_solution, read_manifest
 from lqrsim.stress.shards import Damaged, Table, read
 from lqrsim.stress.statistics import CONFIDENCE, rate
 from lqrsim.stress.trials import Trials
-
-FORMAT, VERSION = "lqrsim campaign", 1
 
 
 class Results:
@@ -51,7 +48,7 @@ class Results:
     def __init__(self, folder: str | os.PathLike[str], *, scenario: str | None = None) -> None:
         self.folder = check_path("folder", folder, "the path of a campaign's folder")
         self.manifest = read_manifest(self.folder)
-        self.cells = [Cell(*cell) for cell in self.manifest["cells"]]
+        self.cells = cells_of(self.manifest)
         self._scenario = scenario
         asked = self.manifest["campaign"]["scenario"]
         if scenario is not None and check_kind("scenario", scenario, str, "the campaign's reference") != asked:
@@ -130,9 +127,10 @@ class Results:
     def solution(self, policy: str) -> Solution:
         """What a policy was made from. Raises InputError if its file is damaged."""
         path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
-        if path.is_file() and digest_of(path.read_bytes()) != self.manifest["policies"][policy]["sha256"]:
+        hashes, solution = self.manifest["policies"][policy], files.load_solution(path)
+        if digest_of(path.read_bytes()) != hashes["sha256"] or digest_of_solution(solution) != hashes["digest"]:
             raise InputError(f"policy: got {path}, which is damaged, want what the campaign wrote: run it elsewhere")
-        return files.load_solution(path)
+        return solution
 
     def shards(self, cell: Cell | None = None) -> Iterator[Shard]:
         """The work of a cell, or all of it."""
@@ -143,7 +141,7 @@ class Results:
     def there(self) -> set[Shard]:
         """The shards that have a file."""
         folder = self.folder / "shards"
-        names = set(os.listdir(folder)) if folder.is_dir() else set()
+        names = set(os.listdir(folder)) if os.path.isdir(folder) else set()
         return {shard for shard in self.shards() if shard.file in names}
 
     def number(self, cell: Cell) -> int:
@@ -200,6 +198,8 @@ def replay(
 ) -> Rollout:
     """The very trial of a campaign again, to the bit until its first collision; and to its end without contacts.
 
+    That is so on the kind of processor and with the versions that `results.manifest["versions"]` has.
+
     Raises:
       InputError: no such cell or trial, or the scenario is one of yours and `Results` was not given it.
     """
@@ -222,35 +222,3 @@ def agrees(results: Results, cell: Cell, trial: int) -> bool:
     table, place = results.table(shard), trial - shard.first
     row = {name: table[name][place : place + 1] for name in again}
     return all(row[name].tobytes() == value.astype(row[name].dtype).tobytes() for name, value in again.items())
-
-
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """What a campaign's folder says of itself. Raises InputError."""
-    path = folder / "manifest.json"
-    if not path.is_file():
-        raise InputError(f"folder: got {folder}, want one that `lqrsim stress` wrote, with a manifest.json")
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        found, version = manifest["format"], manifest["version"]
-        whole = {"campaign", "cells", "policies", "digest", "model", "problem", "versions"} <= manifest.keys()
-    except OSError as error:
-        raise InputError(f"folder: got {path}, want a file that can be read ({error.strerror or error})") from None
-    except (ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(f"folder: got {path}, which is damaged, want what lqrsim wrote") from None
-    if found != FORMAT or version != VERSION:
-        raise InputError(f"folder: got {path}, a {found!r} {version}, want a {FORMAT!r} {VERSION}")
-    if not whole:
-        raise InputError(f"folder: got {path}, which is damaged, want what lqrsim wrote")
-    return manifest
-
-
-def digest_of(contents: bytes) -> str:
-    """Hash of a file's contents."""
-    return hashlib.sha256(contents).hexdigest()
-
-
-def digest_of_solution(solution: Solution) -> str:
-    """Hash of what running it depends on: not of how long it took to find."""
-    plan, policy = solution.trajectory, solution.policy
-    arrays = plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt])
-    return digest_of(b"".join(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes() for array in arrays))

@@ -105,7 +105,7 @@ class Footage:
 def read(path: str | os.PathLike[str]) -> Footage:
     """What the video says of itself. Raises InputError if it is none that lqrsim wrote."""
     path = check_path("video", path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # not the method, which raises where a folder cannot be read
         raise InputError(f"video: got {path}, want a file that exists")
     try:
         with av.open(str(path)) as container:
