@@ -120,9 +120,9 @@ def _page(results: Results, table: analysis.Table, scenario: Scenario) -> dict[s
         "compared": _compared(whole),
         "compared_note": "Trials of the same number have the same random numbers, whatever the policy. What tells"
         " policies apart are the trials that only one of them reached: p is McNemar's exact test, raised for the number"
-        " of comparisons on this page (Holm). Differences are the first less the second, with a paired bootstrap's 95 %"
-        " interval; that of rms is among the trials that both reached. Where nothing is random there is nothing to"
-        " compare.",
+        " of comparisons on this page (Holm). Differences are the first less the second, with 95 % intervals: of"
+        " success Tango's score interval, of rms Student's, among the trials that both reached. Where nothing is random"
+        " there is nothing to compare.",
         "modes": _modes(table),
         "measures": _measures(table, scenario),
         "measures_note": "Median, and from 5 to 95 % of the trials in parentheses. Until a trial collides or is lost;"
