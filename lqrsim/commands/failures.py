@@ -92,12 +92,13 @@ def write(folder: Path, name: str, about: dict[str, Any], trials: "TrialScore", 
 
 @dataclass(frozen=True, kw_only=True)
 class Rare(Search):
-    """Measure how likely a rare failure is, with far fewer trials than would have to be run to see it by chance.
+    """Measure how likely a failure is that is seldom seen.
 
-    Trials are split through levels of how near they come to failing, each not so rare given the one before. Prints the
-    levels as a first run finds them, and then the probability with its interval, from repetitions that are independent
-    and without bias. Writes rollout.npz, with the worst failure and others as they are typical, to be looked at with
-    `lqrsim render`, and rare.json, with what was asked and found.
+    It takes far fewer trials than would have to be run to see it by chance. Trials are split through levels of how near
+    they come to failing, each not so rare given the one before. Prints the levels as a first run finds them, and then
+    the probability with its interval, from repetitions that are independent and without bias. Writes rollout.npz, with
+    the worst failure and others as they are typical, to be looked at with `lqrsim render`, and rare.json, with what was
+    asked and found.
 
     Exits with 1 if no failure was found.
     """
@@ -163,12 +164,13 @@ class Rare(Search):
 
 @dataclass(frozen=True, kw_only=True)
 class Break(Search):
-    """Find the smallest disturbance that breaks the policy: of all failures the one that is nearest to no disturbance.
+    """Find the smallest disturbance that breaks the policy.
 
-    It is measured over all random numbers that a trial draws, in standard deviations. Prints it, what probability of
-    failure that would be if nothing else failed than what lies beyond, how much of it falls to each disturbance, and
-    what it does at its largest in physical units. Writes rollout.npz, with that trial, to be looked at with `lqrsim
-    render`, and break.json, with what was asked and found, the numbers too.
+    Of all failures it is the one that is nearest to no disturbance. That is measured over all random numbers that a
+    trial draws, in standard deviations. Prints it, what probability of failure that would be if nothing else failed
+    than what lies beyond, how much of it falls to each disturbance, and what it does at its largest in physical units.
+    Writes rollout.npz, with that trial, to be looked at with `lqrsim render`, and break.json, with what was asked and
+    found, the numbers too.
 
     What it finds fails; that nothing nearer does is not proven. Exits with 1 if no failure was found.
     """

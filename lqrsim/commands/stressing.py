@@ -11,11 +11,11 @@ from lqrsim.commands.options import Folder, optional
 
 @dataclass(frozen=True, kw_only=True)
 class Stress:
-    """Run many trials of several policies under disturbances of growing strength, and count how they end.
+    """Count how often policies fail under disturbances of growing strength.
 
-    What is stopped, however it is stopped, goes on with the same command; the tables are the same to the bit whatever
-    the workers, the batches and the interruptions. Prints the share of each that reached its goal with the exact
-    interval. `docs/file_format.md` says what is in the folder.
+    Runs many trials of each, the same ones for all policies. What is stopped, however it is stopped, goes on with the
+    same command; the tables are the same to the bit whatever the workers, the batches and the interruptions. Prints the
+    share of each that reached its goal with the exact interval. `docs/file_format.md` says what is in the folder.
 
     Exits with 1 if trials came to nothing for an error.
     """
@@ -84,9 +84,10 @@ class Stress:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Run one trial of a campaign again, to the bit, and write it to rollout.npz, to be looked at with `lqrsim render`.
+    """Run one trial of a stress test again, to the bit.
 
-    Says whether it gave its row in the campaign's table again; exits with 1 if not.
+    Writes it to rollout.npz, to be looked at with `lqrsim render`. Says whether it gave its row in the campaign's table
+    again; exits with 1 if not.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
@@ -119,9 +120,10 @@ class Replay:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Write the report of a stress test: one HTML page with tables, curves and videos of the worst trials.
+    """Write the report of a stress test, one HTML page.
 
-    The page needs no network and no other file. It can be written of a stress test that has not ended, and says so.
+    It has tables, curves and videos of the worst trials, and needs no network and no other file. It can be written of a
+    stress test that has not ended, and says so.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
