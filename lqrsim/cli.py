@@ -34,20 +34,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
       The exit code: 0 done; 1 not converged or out of bounds; 2 bad input, or what is printed cannot be written;
       130 stopped with Ctrl-C, 143 with SIGTERM; 141 nobody reads what it prints.
     """
-    if arguments is None:
+    own = arguments is None
+    if own:
         process.surround("lqrsim: stopped")
-        arguments = sys.argv[1:]
     try:
         try:
-            code = _run(list(arguments))
+            code = _run(list(sys.argv[1:] if arguments is None else arguments))
         except SystemExit:  # of --help, and of what can not be understood
             process.flush()
             raise
         process.flush()
         return code
     except KeyboardInterrupt:
+        if own:
+            process.leave()
         process.complain("lqrsim: stopped")
-        return process.stopped_code()
+        return 130
     except (BrokenPipeError, process.Unprintable) as error:
         process.nothing_to_print_to()
         cause = error.__cause__ if isinstance(error, process.Unprintable) else error

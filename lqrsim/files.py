@@ -6,7 +6,7 @@
 import contextlib
 import json
 import os
-import tempfile
+import secrets
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -49,23 +49,18 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
       InputError: the folder or the file cannot be written, or the disk is full.
     """
-    unfinished = None
+    # A name of its own, so that two writers cannot meet, and known before the file is there, so that Ctrl-C at any
+    # moment removes it; the suffix stays, for it says the format.
+    unfinished = path.parent / f".unfinished-{secrets.token_hex(8)}{path.suffix}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # A name of its own, so that two writers cannot meet; the suffix stays, for it says the format.
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".unfinished-", suffix=path.suffix)
-        os.close(handle)
-        unfinished = Path(name)
+        unfinished.touch(exist_ok=False)
         yield unfinished
-        # mkstemp makes a file for its owner alone; a result is as readable as any other new file.
-        mask = os.umask(0)
-        os.umask(mask)
-        unfinished.chmod(0o666 & ~mask)
         unfinished.replace(path)
     except OSError as error:
         raise InputError(f"output: got {path}, want a file that can be written ({error.strerror or error})") from None
     finally:
-        if unfinished is not None:
+        with contextlib.suppress(OSError):  # that is told already
             unfinished.unlink(missing_ok=True)
 
 

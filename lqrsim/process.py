@@ -8,12 +8,15 @@ import contextlib
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from types import FrameType
 from typing import NoReturn
 
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+NUDGE = getattr(signal, "SIGURG", None)  # which nobody else uses, and is ignored where it is not expected
+NUDGES = 100
 IMPATIENCE = 2.0  # s after a signal in which another one means the same, and does not stop the tidying up
 
 
@@ -26,9 +29,13 @@ class _Process:
 
     Attributes:
       stopped_by: number of the signal that stopped it, 0 for none; and when.
+      handled: how many signals. deferring: whether one is to wait, deferred: which one does.
       last_words: are written to stderr as it is stopped.
     """
 
+    handled = 0
+    deferring = False
+    deferred = 0
     stopped_by = 0
     when = -IMPATIENCE
     last_words = ""
@@ -42,12 +49,44 @@ def surround(last_words: str = "") -> None:
     """
     _Process.last_words = last_words
     _fill_streams()
-    _on_signals(_leave)
+    # Those that are ignored stay so: whoever started this, such as nohup, wants it.
+    for number in SIGNALS:
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+            signal.signal(number, _leave)
+    if hasattr(signal, "pthread_kill"):
+        _watch()
+
+
+def _watch() -> None:
+    """See to it that a signal is handled soon.
+
+    The system may give it to any thread, of OpenBLAS say. Python handles it on the main one, which is not told then: it
+    goes on with what it does, and if that is waiting, for as long as it waits. A signal of its own wakes it.
+    """
+    heard, hearing = os.pipe()
+    os.set_blocking(hearing, False)
+    signal.set_wakeup_fd(hearing, warn_on_full_buffer=False)
+    signal.signal(NUDGE, lambda number, frame: None)
+    main = threading.main_thread().ident
+    assert main is not None
+
+    def watch() -> None:
+        got = 0
+        while True:
+            got += sum(number in SIGNALS for number in os.read(heard, 64))
+            for _ in range(NUDGES):
+                if _Process.handled >= got:
+                    break
+                signal.pthread_kill(main, NUDGE)
+                time.sleep(0.02)
+            got = _Process.handled  # several of a kind are handled as one
+
+    threading.Thread(target=watch, name="signals", daemon=True).start()
 
 
 @contextlib.contextmanager
 def tidying() -> Iterator[None]:
-    """Within this block a signal raises KeyboardInterrupt, so that what is unfinished is removed; outside, it ends."""
+    """Within this block a signal raises KeyboardInterrupt, so that what is unfinished is removed."""
     ours = [number for number in SIGNALS if signal.getsignal(number) is _leave]
     for number in ours:
         signal.signal(number, _interrupt)
@@ -56,6 +95,19 @@ def tidying() -> Iterator[None]:
     finally:
         for number in ours:
             signal.signal(number, _leave)
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """What is done in this block is done as a whole; what would stop it stops it then."""
+    _Process.deferring = True
+    try:
+        yield
+    finally:
+        _Process.deferring = False
+        number, _Process.deferred = _Process.deferred, 0
+        if number:
+            _interrupt(number, None)
 
 
 def run_script(arguments: list[str]) -> None:
@@ -68,12 +120,14 @@ def run_script(arguments: list[str]) -> None:
         with tidying():
             runpy.run_path(arguments[0], run_name="__main__")
     except KeyboardInterrupt:
-        sys.exit(stopped_code())
+        leave()
 
 
-def stopped_code() -> int:
-    """The exit code of what was stopped, as shells have it."""
-    return 128 + (_Process.stopped_by or signal.SIGINT)
+def leave() -> NoReturn:
+    """End this process, which a signal has stopped, and which has tidied up. Another signal makes no difference now."""
+    with contextlib.suppress(OSError, ValueError):
+        sys.stdout.flush()
+    _leave(_Process.stopped_by or signal.SIGINT, None)
 
 
 def nothing_to_print_to() -> None:
@@ -103,13 +157,6 @@ def printing() -> Iterator[None]:
         raise Unprintable(error) from error
 
 
-def _on_signals(handler: "signal._HANDLER") -> None:
-    for number in SIGNALS:
-        # Those that are ignored stay so: whoever started this, such as nohup, wants it.
-        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
-            signal.signal(number, handler)
-
-
 def _leave(number: int, frame: FrameType | None) -> NoReturn:
     """At once: there is nothing to tidy up."""
     if _Process.last_words:
@@ -119,6 +166,10 @@ def _leave(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    _Process.handled += 1
+    if _Process.deferring:
+        _Process.deferred = number
+        return
     impatient = time.monotonic() - _Process.when < IMPATIENCE
     if not impatient:
         _Process.stopped_by, _Process.when = number, time.monotonic()
