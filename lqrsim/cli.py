@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from lqrsim import process
 
-DESCRIPTION = """Feedback policies by iterated LQR smoothing, executed in MuJoCo under disturbances and shown on video.
+DESCRIPTION = """Feedback policies by iterated LQR smoothing, executed in MuJoCo under
+disturbances and shown on video.
 
 The whole chain, for both robots, is `lqrsim demo`. Step by step, each command
 reading what the one before wrote:

@@ -118,10 +118,10 @@ class Rare(Search):
 
         from lqrsim import console
         from lqrsim.errors import check_count
-        from lqrsim.references import short_name
+        from lqrsim.references import folder_name, resolve
         from lqrsim.stress.splitting import NoFailure, split
 
-        folder = self.out or Path("runs/rare") / short_name(self.scenario)
+        folder = self.out or Path("runs/rare") / folder_name(resolve(self.scenario))
         console.check_output("--out", folder)
         check_count("particles", self.particles, at_least=20)
         check_count("repetitions", self.repetitions, at_least=2)
@@ -186,11 +186,11 @@ class Break(Search):
 
         from lqrsim import console
         from lqrsim.errors import InputError, check_count
-        from lqrsim.references import short_name
+        from lqrsim.references import folder_name, resolve
         from lqrsim.stress.breaking import in_words, smallest_failure
         from lqrsim.stress.splitting import NoFailure, split
 
-        folder = self.out or Path("runs/break") / short_name(self.scenario)
+        folder = self.out or Path("runs/break") / folder_name(resolve(self.scenario))
         console.check_output("--out", folder)
         check_count("rounds", self.rounds, at_least=0)
         trials, about = self._trials()

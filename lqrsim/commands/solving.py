@@ -69,11 +69,11 @@ class Solve:
         from lqrsim import console, files
         from lqrsim.constraints import Clearance
         from lqrsim.errors import InputError
-        from lqrsim.references import resolve, short_name
+        from lqrsim.references import folder_name, from_anywhere, resolve
 
-        folder = self.out or Path("runs") / short_name(self.scenario)
-        console.check_output("--out", folder)
         scenario = resolve(self.scenario)
+        folder = self.out or Path("runs") / folder_name(scenario)
+        console.check_output("--out", folder)
         problem = scenario.problem
         if self.clearance is not None:
             kept = Clearance(scenario.scene.world, radius=scenario.robot.radius, margin=self.clearance)
@@ -91,7 +91,7 @@ class Solve:
             if scenario.paper_start is None:
                 raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario that the paper has")
             options["start"] = scenario.paper_start
-        solution = replace(console.solve(problem, self.solver, **options), scenario=self.scenario)
+        solution = replace(console.solve(problem, self.solver, **options), scenario=from_anywhere(self.scenario))
         console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
         if self.figure is not None:
             from lqrsim.view.policy_plot import plot_policy

@@ -27,8 +27,11 @@ class Stress:
     NAME:KIND for one kind of them alone."""
     strengths: Annotated[tuple[float, ...], arg(metavar="FACTOR ...")] = (0.0, 0.5, 1.0, 1.5, 2.0)
     """What the disturbances are multiplied by; 0.5 and 2 make light calm and moderate."""
-    policies: tuple[Literal["smooth", "ilqr", "open_loop", "replan"], ...] = ("smooth", "ilqr", "open_loop", "replan")
-    """open_loop: the plan of smooth without feedback. replan: solves again as it goes. All meet the same numbers."""
+    policies: Annotated[
+        tuple[Literal["smooth", "ilqr", "open_loop", "replan"], ...] | None, arg(help_behavior_hint="")
+    ] = None
+    """open_loop: the plan of smooth without feedback. replan: solves again as it goes. All meet the same numbers. By
+    default all four; ilqr is left out where the scenario has constraints, which it cannot keep."""
     trials: int = 200
     """Of each sweep, strength and policy."""
     seed: int = 0
@@ -53,21 +56,22 @@ class Stress:
     def run(self) -> int:
         """Carry the command out; its exit code."""
         from lqrsim import console
-        from lqrsim.references import resolve, short_name
+        from lqrsim.references import folder_name, resolve
         from lqrsim.stress.campaign import Campaign, run_campaign
         from lqrsim.stress.results import Results
         from lqrsim.stress.sweeps import sweep
+        from lqrsim.stress.trials import possible
 
-        folder = self.out or Path("runs/stress") / short_name(self.scenario)
+        scenario = resolve(self.scenario)
+        folder = self.out or Path("runs/stress") / folder_name(scenario)
         if self.resume:
             campaign = Results(folder, scenario=self.scenario).campaign
         else:
-            scenario = resolve(self.scenario)
             campaign = Campaign(
                 scenario=self.scenario,
                 sweeps={name: sweep(name, scenario) for name in self.sweep},
                 strengths=self.strengths,
-                policies=self.policies,
+                policies=possible(scenario) if self.policies is None else self.policies,
                 trials=self.trials,
                 seed=self.seed,
                 replan_every=self.replan_every,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import InputError, check_count, check_name, check_number, excerpt
+from lqrsim.references import from_anywhere
 from lqrsim.simulation.disturbances import Disturbance
 
 POLICIES = ("smooth", "ilqr", "open_loop", "replan")
@@ -90,6 +91,7 @@ class Campaign:
             raise InputError(f"scenario: got {excerpt(self.scenario)}, want a reference, such as 'quadrotor'")
         if not isinstance(self.sweeps, Mapping) or not self.sweeps:
             raise InputError(f"sweeps: got {excerpt(self.sweeps)}, want at least one: name -> disturbances")
+        object.__setattr__(self, "scenario", from_anywhere(self.scenario))  # workers and reports may be elsewhere
         for name, disturbances in self.sweeps.items():
             if not isinstance(name, str) or not name or "," in name:
                 raise InputError(f"sweeps: got the name {excerpt(name)}, want one without a comma")

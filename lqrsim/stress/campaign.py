@@ -32,7 +32,7 @@ from lqrsim.stress.asked import Shard
 from lqrsim.stress.lock import sole_writer
 from lqrsim.stress.results import FORMAT, VERSION, Results, digest_of, digest_of_solution, read_manifest
 from lqrsim.stress.shards import Damaged, write
-from lqrsim.stress.trials import Job, lean, solve
+from lqrsim.stress.trials import Job, lean, left_out, possible, solve
 from lqrsim.versions import versions
 
 _log = logging.getLogger("lqrsim")
@@ -116,6 +116,12 @@ def _check_versions(results: Results) -> None:
 def _rehearse(campaign: Campaign, scenario: Scenario) -> None:
     """Raise InputError now for what every trial would raise it for, before anything is solved or written."""
     problem, plant = scenario.problem, scenario.plant()
+    for policy in campaign.policies:
+        if policy not in possible(scenario):
+            those = ", ".join(possible(scenario))
+            raise InputError(
+                f"policies: got {policy}, which cannot keep the scenario's constraints, want some of {those}"
+            )
     n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
     start = np.zeros(n) if problem.start is None else problem.start
     standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
@@ -164,7 +170,7 @@ def _begin(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
         "format": FORMAT, "version": VERSION, **asked, "policies": policies,
         "digest": digest_of(json.dumps(lasting, sort_keys=True).encode()),
         "cells": [(cell.policy, cell.sweep, cell.strength) for cell in campaign.cells],
-        "versions": versions(), "machine": description(),
+        "versions": versions(), "machine": description(), "left_out": left_out(campaign.policies, scenario),
     }  # fmt: skip
     write(json.dumps(manifest, indent=1).encode(), folder / "manifest.json")
 

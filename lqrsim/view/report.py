@@ -3,7 +3,6 @@
 import base64
 import json
 import os
-import shlex
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -103,8 +102,10 @@ def _page(results: Results, table: analysis.Table, scenario: Scenario) -> dict[s
     warnings = [] if done == all_trials else [f"Not finished: {done} of {all_trials} trials have been run."]
     if erred:
         warnings.append(f"{erred} trials did not run through; they count as failures.")
-    folder = shlex.quote(str(results.folder))
-    commands = {"To go on with the campaign, or to repair it": results.command, "This page": f"lqrsim report {folder}"}
+    commands = {
+        "To go on with the campaign, or to repair it": results.command,
+        "This page": results.command_of("report"),
+    }
     return {
         "title": f"Stress test of {scenario.name}",
         "warnings": warnings,
@@ -144,7 +145,7 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
             f"{name}: {_words(disturbances, scenario)}" for name, disturbances in campaign.sweeps.items()
         ],
         "Strengths": [", ".join(f"{strength:g}" for strength in sorted({cell.strength for cell in table}))],
-        "Policies": [", ".join(_policies(table))],
+        "Policies": [", ".join(_policies(table)), *([manifest["left_out"]] if manifest.get("left_out") else [])],
         "Trials": [
             f"{campaign.trials} of each combination, {sum(map(len, table.values()))} in all, with the same random"
             f" numbers in each, of seed {campaign.seed}."
@@ -361,7 +362,12 @@ def _films(results: Results, table: analysis.Table, count: int, folder: Path) ->
             " the plan; trace: what was driven, coloured by tracking error."
         )
     for one in chosen:
-        film = {"label": _label(one), "command": _replay_command(results.folder, one), "data": "", "problem": problem}
+        film = {
+            "label": _label(one),
+            "command": results.command_of("replay", "--cell", str(one.cell), "--trial", str(one.trial)),
+            "data": "",
+            "problem": problem,
+        }
         yield film if problem else film | _film(results, one, folder)
 
 
@@ -371,10 +377,6 @@ def _label(one: analysis.Trial) -> str:
         f"{one.cell.policy}, {one.cell.sweep} at strength {one.cell.strength:g}, trial {one.trial}:"
         f" {one.outcome}{what} after {one.ended:.2f} s, least clearance {one.clearance:.3f} m."
     )
-
-
-def _replay_command(folder: Path, one: analysis.Trial) -> str:
-    return shlex.join(["lqrsim", "replay", str(folder), "--cell", str(one.cell), "--trial", str(one.trial)])
 
 
 def _film(results: Results, one: analysis.Trial, folder: Path) -> dict[str, Any]:
