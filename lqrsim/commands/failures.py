@@ -175,8 +175,8 @@ class Break(Search):
     What it finds fails; that nothing nearer does is not proven. Exits with 1 if no failure was found.
     """
 
-    rounds: int = 20
-    """In which it comes nearer, at most; it ends where that gains no more."""
+    rounds: int = 40
+    """In which it comes nearer, at most; it ends where less than 1 % is left to be gained."""
     out: Folder = None
     """Folder for what is written. By default runs/break/ and the name of the scenario."""
 
@@ -214,6 +214,11 @@ class Break(Search):
             f"smallest failure: {nearest.distance:.3g} standard deviations from none, found with"
             f" {trials.simulations:,} trials"
         )
+        if not nearest.converged:
+            left = "an unknown share" if np.isnan(nearest.left) else f"some {100 * nearest.left:.1f} %"
+            console.say(
+                f"the rounds ended first: by the noise of what it knows, {left} may be left to gain; more --rounds"
+            )
         console.say(
             f"if all failures lay beyond it, one trial in {_rounded(1 / max(nearest.form, 1e-300))} would fail"
             f" (reliability {1 - nearest.form:.6g}); `lqrsim rare` measures how many do"
@@ -229,6 +234,7 @@ class Break(Search):
             console.say(f"largest {one.what}: {one.size:.3g} {one.unit}".rstrip() + f" at {one.time:.2f} s")
         found = {
             "distance": nearest.distance, "first_order_probability": nearest.form, "history": nearest.history.tolist(),
+            "left": None if np.isnan(nearest.left) else nearest.left, "converged": nearest.converged,
             "simulations": trials.simulations, "shares": shares, "sizes": trials.sizes,
             "largest": [vars(one) for one in largest], "numbers": nearest.numbers.tolist(),
         }  # fmt: skip

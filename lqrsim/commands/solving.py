@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class List:
-    """Print the scenarios: robot, scene, states, controls and their units."""
+    """Print the scenarios: robot, scene, states and controls with units."""
 
     def run(self) -> int:
         """Carry the command out; its exit code."""

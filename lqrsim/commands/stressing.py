@@ -11,7 +11,7 @@ from lqrsim.commands.options import Folder, optional
 
 @dataclass(frozen=True, kw_only=True)
 class Stress:
-    """Count how often policies fail under disturbances of growing strength.
+    """Count how often policies fail under growing disturbances.
 
     Runs many trials of each, the same ones for all policies. What is stopped, however it is stopped, goes on with the
     same command; the tables are the same to the bit whatever the workers, the batches and the interruptions. Prints the
