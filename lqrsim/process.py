@@ -15,7 +15,7 @@ from types import FrameType
 from typing import NoReturn
 
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-NUDGE = getattr(signal, "SIGURG", None)  # which nobody else uses, and is ignored where it is not expected
+NUDGE = getattr(signal, "SIGURG", signal.SIGINT)  # which nobody else uses, and is ignored where it is not expected
 NUDGES = 100
 IMPATIENCE = 2.0  # s after a signal in which another one means the same, and does not stop the tidying up
 

@@ -233,11 +233,13 @@ def test_a_lost_scheduler_is_one_line_and_what_is_done_stays(
     reference: Results, tmp_path: Path, number: int, capfd: pytest.CaptureFixture[str]
 ) -> None:
     distributed = pytest.importorskip("distributed")
-    told, silent = tmp_path / "scheduler.json", {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    program = [sys.executable, "-m"]
-    options = ["--scheduler-file", str(told), "--no-dashboard"]
-    scheduler = subprocess.Popen([*program, "distributed.cli.dask_scheduler", "--port", "0", *options], **silent)
-    worker = subprocess.Popen([*program, "distributed.cli.dask_worker", "--nthreads", "1", *options], **silent)
+    told = tmp_path / "scheduler.json"
+
+    def start(module: str, *options: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.{module}", *options, "--scheduler-file", str(told)]
+        return subprocess.Popen([*command, "--no-dashboard"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    scheduler, worker = start("dask_scheduler", "--port", "0"), start("dask_worker", "--nthreads", "1")
     try:
         until = time.monotonic() + 60
         while not told.is_file():

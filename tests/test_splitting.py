@@ -163,8 +163,8 @@ def test_intervals_cover(particles: int, repetitions: int) -> None:
     found = []
     for seed in range(400):
         try:
-            options = {"particles": particles, "repetitions": repetitions, "seed": seed}
-            found.append(split(along(3, 3.0), 3, **options).probability)
+            one = split(along(3, 3.0), 3, particles=particles, repetitions=repetitions, seed=seed)
+            found.append(one.probability)
         except NoFailure:
             continue
     assert len(found) > 390

@@ -163,6 +163,7 @@ def test_only_its_own_pages_are_let_in(served: int) -> None:
             headers |= {} if origin is None else {"Origin": origin}
             assert asked(served, f"/{path}", **headers)[0] == 403, (name, path, origin)
     with connect(f"{address}/state", origin=Origin(f"http://127.0.0.1:{served}")) as connection:
+        assert connection.response is not None
         assert "Access-Control-Allow-Origin" not in connection.response.headers
     with pytest.raises(InvalidStatus, match="403"):  # a server at ::1 may have the other name
         connect(f"{address}/state", origin=Origin(f"http://localhost:{served}"))
