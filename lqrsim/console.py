@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lqrsim import process
 from lqrsim.archive import excerpt_of
 from lqrsim.errors import InputError
 
@@ -18,13 +19,18 @@ if TYPE_CHECKING:
 
 
 def say(text: str = "") -> None:
-    """Print at once, also where the output goes to a file or a pipe, and above any progress bar."""
+    """Print at once, also where the output goes to a file or a pipe, and above any progress bar.
+
+    Raises:
+      process.Unprintable: it cannot be written.
+    """
     bars = sys.modules.get("tqdm")
-    if bars is None:
-        print(text, flush=True)
-    else:
-        bars.tqdm.write(text)
-        sys.stdout.flush()
+    with process.printing():
+        if bars is None:
+            print(text, flush=True)
+        else:
+            bars.tqdm.write(text)
+            sys.stdout.flush()
 
 
 def check_output(field: str, folder: Path, name: str = "") -> None:

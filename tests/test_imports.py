@@ -13,7 +13,7 @@ PACKAGE = Path(lqrsim.__file__).parent
 
 # A module may import those above it, and those of its own room; nothing else of the package.
 ROOMS = (
-    ("errors", "machine", "versions", "solvers.interface"),
+    ("errors", "machine", "process", "versions", "solvers.interface"),
     ("plain",),
     ("archive",),
     ("coordinates", "value_functions"),

@@ -12,7 +12,7 @@ from lqrsim.commands.options import optional
 
 @dataclass(frozen=True, kw_only=True)
 class Verify:
-    """Verify from pixels that a run, or the video of one, shows what the record says.
+    """Check from pixels that a run shows what its record says.
 
     A run is drawn, in calibrated fixed views; a video is decoded, and the robot's mark found in its panes `top` and
     `side`. Positions from pixels are compared with the simulator's and with the plan. See docs/verifying.md.

@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Render a run as a video or a still: obstacles, the plan, the trace actually driven, what disturbs, the robot.
+    """Draw a run, as a video or as a still.
 
-    Several runs, or several trials of one, are shown side by side and in step.
+    Shows the obstacles, the plan, the trace that was driven, what disturbs, and the robot. Several runs, or several
+    trials of one, are shown side by side and in step.
 
       lqrsim render runs/quadrotor/rollout.npz --camera chase
       lqrsim render RUN.npz --inset top side          # panes that `lqrsim verify` can measure
@@ -46,7 +47,7 @@ class Render:
     quality: Quality = "standard"
     """Size, smooth edges, shadows, and how much a video is compressed: 640 x 360, 1280 x 720 or 1920 x 1080."""
     size: Annotated[tuple[int, int] | None, optional("WIDTH HEIGHT")] = None
-    """In pixels. By default that of the quality, and half of it for a GIF."""
+    """In pixels. By default that of the quality, and half of it for a GIF, but not less than 480 x 270."""
     fps: Annotated[float | None, optional("RATE")] = None
     """Frames per second of a video. By default 30, and 15 for a GIF."""
     speed: float = 1.0
@@ -91,7 +92,7 @@ class Render:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Show a run, or a policy at work, in MuJoCo's own viewer: in a window, or without a display in a browser.
+    """Watch a run, or a policy at work, in a window or in a browser.
 
     lqrsim view RUN.npz plays what `lqrsim simulate` wrote. lqrsim view SCENARIO solves the scenario and runs its policy
     live, again and again, and you interfere: the arrow keys and Page Up and Down push the robot, seen from the camera;

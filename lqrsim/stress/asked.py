@@ -21,6 +21,7 @@ from lqrsim.errors import (
     check_text,
     excerpt,
 )
+from lqrsim.references import from_anywhere
 from lqrsim.simulation.disturbances import Disturbance
 
 _FILES = 1_000_000  # of shards in a folder
@@ -113,6 +114,7 @@ class Campaign:
         check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=4000)
         if not isinstance(self.sweeps, Mapping) or not self.sweeps:
             raise InputError(f"sweeps: got {excerpt(self.sweeps)}, want at least one: name -> disturbances")
+        object.__setattr__(self, "scenario", from_anywhere(self.scenario))  # workers and reports may be elsewhere
         sweeps: dict[str, tuple[Disturbance, ...]] = {}
         for name, disturbances in self.sweeps.items():
             check_text("sweeps: name", name, "a name without a comma")

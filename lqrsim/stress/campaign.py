@@ -33,7 +33,7 @@ from lqrsim.stress.lock import sole_writer
 from lqrsim.stress.manifest import NAME, digest_of, digest_of_solution, read_manifest, write_manifest
 from lqrsim.stress.results import Results
 from lqrsim.stress.shards import Damaged, write
-from lqrsim.stress.trials import Job, lean, solve
+from lqrsim.stress.trials import Job, lean, left_out, possible, solve
 from lqrsim.versions import changed, versions
 
 _log = logging.getLogger("lqrsim")
@@ -121,6 +121,12 @@ def _check_versions(results: Results) -> None:
 def _rehearse(campaign: Campaign, scenario: Scenario) -> None:
     """Raise InputError now for what every trial would raise it for, before anything is solved or written."""
     problem, plant = scenario.problem, scenario.plant()
+    for policy in campaign.policies:
+        if policy not in possible(scenario):
+            those = ", ".join(possible(scenario))
+            raise InputError(
+                f"policies: got {policy}, which cannot keep the scenario's constraints, want some of {those}"
+            )
     n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
     start = np.zeros(n) if problem.start is None else problem.start
     standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
@@ -160,7 +166,8 @@ def _begin(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
     for policy, solution in solve(campaign.policies, scenario).items():
         path = files.save(solution, folder / "policies" / f"{policy}.npz")
         policies[policy] = {"digest": digest_of_solution(solution), "sha256": digest_of(path.read_bytes())}
-    write_manifest(folder, asked | {"policies": policies, "versions": versions(), "machine": description()})
+    about = {"versions": versions(), "machine": description(), "left_out": left_out(campaign.policies, scenario)}
+    write_manifest(folder, asked | {"policies": policies} | about)
 
 
 def _compare(asked: dict[str, Any], manifest: dict[str, Any], folder: Path) -> None:

@@ -11,8 +11,10 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Generator, Iterable, Iterator
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 
+from lqrsim import process
 from lqrsim.errors import InputError
 from lqrsim.stress.asked import Shard
 from lqrsim.stress.trials import Job, failed_work, prepare, work
@@ -83,7 +85,7 @@ class _Worker:
     def __init__(self, job: Job) -> None:
         self.connection, theirs = _context.Pipe()
         self.process = _context.Process(target=_serve, args=(theirs, job), name="lqrsim worker", daemon=True)
-        with _one_thread(), _without_ctrl_c():
+        with process.uninterrupted(), _one_thread(), _without_ctrl_c():
             self.process.start()
         theirs.close()  # so that its death is an end of file here
         self.ready = self.late = False
@@ -163,10 +165,12 @@ def _one_thread() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """What is started in this block is not interrupted while it starts either; for this process it only waits."""
+    """What is started in this block is not interrupted while it starts either."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
+    # It is started with the first process, and takes SIGINT out of the mask in which that is then started.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

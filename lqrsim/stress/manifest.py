@@ -41,7 +41,7 @@ _MANIFEST = plain.record(
         "code": plain.mapped(plain.optional(_HASH)),
         "policies": plain.mapped(plain.record({"digest": _HASH, "sha256": _HASH})),
         "cells": plain.listed(plain.row(_POLICY, plain.line, _STRENGTH)), "versions": plain.mapped(plain.line),
-        "digest": _HASH, "machine": plain.line, "sha256": _HASH,
+        "digest": _HASH, "machine": plain.line, "left_out": plain.line, "sha256": _HASH,
     }
 )  # fmt: skip
 

@@ -11,16 +11,8 @@ from typing import Any
 import numpy as np
 
 from lqrsim import files
-from lqrsim.errors import (
-    InputError,
-    check_count,
-    check_flag,
-    check_kind,
-    check_name,
-    check_path,
-    excerpt,
-)
-from lqrsim.references import resolve
+from lqrsim.errors import InputError, check_count, check_flag, check_kind, check_name, check_path, excerpt
+from lqrsim.references import from_anywhere, resolve
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.outcomes import OUTCOMES, Outcomes
@@ -51,8 +43,10 @@ class Results:
         self.cells = cells_of(self.manifest)
         self._scenario = scenario
         asked = self.manifest["campaign"]["scenario"]
-        if scenario is not None and check_kind("scenario", scenario, str, "the campaign's reference") != asked:
-            raise InputError(f"scenario: got {excerpt(scenario)}, want {asked}, which {self.folder} was run on")
+        if scenario is not None:
+            check_kind("scenario", scenario, str, "the campaign's reference")
+            if from_anywhere(scenario) != from_anywhere(asked):
+                raise InputError(f"scenario: got {excerpt(scenario)}, want {asked}, which {self.folder} was run on")
 
     @cached_property
     def campaign(self) -> Campaign:
@@ -112,6 +106,7 @@ class Results:
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
             if ends["error"]:
                 reasons.update(self.reasons(cell).values())
+        lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
         lines += [f"{count} trials came to nothing: {reason}" for reason, count in reasons.most_common(5)]
         return "\n".join(lines)
 
@@ -182,10 +177,15 @@ class Results:
 
     @property
     def command(self) -> str:
-        """The command that goes on with the campaign, and repairs what is damaged."""
-        return shlex.join(
-            ["lqrsim", "stress", self.manifest["campaign"]["scenario"], "--resume", "--out", str(self.folder)]
-        )
+        """The command that goes on with the campaign, and repairs what is damaged; it runs in any working directory."""
+        asked = self.manifest["campaign"]["scenario"]
+        return shlex.join(["lqrsim", "stress", asked, "--resume", "--out", str(self.folder.absolute())])
+
+    def command_of(self, command: str, *options: str) -> str:
+        """`lqrsim report` or `lqrsim replay` of this campaign, which runs in any working directory."""
+        asked = self.manifest["campaign"]["scenario"]
+        own = ["--scenario", asked] if ":" in asked else []
+        return shlex.join(["lqrsim", command, str(self.folder.absolute()), *options, *own])
 
 
 def replay(

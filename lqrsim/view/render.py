@@ -20,6 +20,7 @@ from lqrsim.view.video import encoder, gif
 
 FADE_SECONDS = 0.25
 MOST = 1_000_000  # frames of a video
+SMALLEST = 480, 270  # pixels of a GIF that nobody gave a size: what is written on it can be read
 SAMPLES = 12  # moments that the palette of a GIF is made of
 
 
@@ -59,7 +60,8 @@ def render(
         caption: time, tracking error, clearance, what disturbs, and a legend.
       solution: of which the run is, for the tube; one for all, or one each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and how much the video is compressed.
-      size: width and height in pixels, both even; that of the quality by default, and half of it for a GIF.
+      size: width and height in pixels, both even; that of the quality by default, and half of it for a GIF, but
+        not less than 480 x 270.
       fps: frames a second, whatever the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
       speed: seconds of the run in a second of the video.
       progress: called after each frame with the number of frames done and of all frames.
@@ -132,7 +134,7 @@ def _multiples(every: float, time: float, drawn: Picture) -> list[float]:
 
 def _half(quality: Quality) -> tuple[int, int]:
     width, height = QUALITIES[check_name("quality", quality, QUALITIES)].size  # pyright: ignore[reportArgumentType]
-    return width // 2, height // 2
+    return max(width // 2, SMALLEST[0]), max(height // 2, SMALLEST[1])
 
 
 def _named(path: str | os.PathLike[str], *suffixes: str) -> Path:

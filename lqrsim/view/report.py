@@ -3,7 +3,6 @@
 import base64
 import json
 import os
-import shlex
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -107,8 +106,10 @@ def _page(results: Results, table: analysis.Table, scenario: Scenario) -> dict[s
     warnings = [] if done == all_trials else [f"Not finished: {done} of {all_trials} trials have been run."]
     if erred:
         warnings.append(f"{erred} trials did not run through; they count as failures.")
-    folder = shlex.quote(str(results.folder))
-    commands = {"To go on with the campaign, or to repair it": results.command, "This page": f"lqrsim report {folder}"}
+    commands = {
+        "To go on with the campaign, or to repair it": results.command,
+        "This page": results.command_of("report"),
+    }
     return {
         "title": f"Stress test of {scenario.name}",
         "warnings": warnings,
@@ -124,9 +125,9 @@ def _page(results: Results, table: analysis.Table, scenario: Scenario) -> dict[s
         "compared": _compared(whole),
         "compared_note": "Trials of the same number have the same random numbers, whatever the policy. What tells"
         " policies apart are the trials that only one of them reached: p is McNemar's exact test, raised for the number"
-        " of comparisons on this page (Holm). Differences are the first less the second, with a paired bootstrap's 95 %"
-        " interval; that of rms is among the trials that both reached. Where nothing is random there is nothing to"
-        " compare.",
+        " of comparisons on this page (Holm). Differences are the first less the second, with 95 % intervals: of"
+        " success Tango's score interval, of rms Student's, among the trials that both reached. Where nothing is random"
+        " there is nothing to compare.",
         "modes": _modes(table),
         "measures": _measures(table, scenario),
         "measures_note": "Median, and from 5 to 95 % of the trials in parentheses. Until a trial collides or is lost;"
@@ -148,7 +149,7 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
             f"{name}: {_words(disturbances, scenario)}" for name, disturbances in campaign.sweeps.items()
         ],
         "Strengths": [", ".join(f"{strength:g}" for strength in sorted({cell.strength for cell in table}))],
-        "Policies": [", ".join(_policies(table))],
+        "Policies": [", ".join(_policies(table)), *([manifest["left_out"]] if manifest.get("left_out") else [])],
         "Trials": [
             f"{campaign.trials} of each combination, {sum(map(len, table.values()))} in all, with the same random"
             f" numbers in each, of seed {campaign.seed}."
@@ -365,7 +366,12 @@ def _films(results: Results, table: analysis.Table, count: int, folder: Path) ->
             " the plan; trace: what was driven, coloured by tracking error."
         )
     for one in chosen:
-        film = {"label": _label(one), "command": _replay_command(results.folder, one), "data": "", "problem": problem}
+        film = {
+            "label": _label(one),
+            "command": results.command_of("replay", "--cell", str(one.cell), "--trial", str(one.trial)),
+            "data": "",
+            "problem": problem,
+        }
         yield film if problem else film | _film(results, one, folder)
 
 
@@ -375,10 +381,6 @@ def _label(one: analysis.Trial) -> str:
         f"{one.cell.policy}, {one.cell.sweep} at strength {one.cell.strength:g}, trial {one.trial}:"
         f" {one.outcome}{what} after {one.ended:.2f} s, least clearance {one.clearance:.3f} m."
     )
-
-
-def _replay_command(folder: Path, one: analysis.Trial) -> str:
-    return shlex.join(["lqrsim", "replay", str(folder), "--cell", str(one.cell), "--trial", str(one.trial)])
 
 
 def _film(results: Results, one: analysis.Trial, folder: Path) -> dict[str, Any]:
