@@ -173,8 +173,9 @@ def test_every_flipped_bit_is_harmless(saved: Path, drive_solution: ls.Solution)
         saved.write_bytes(packed)
 
 
-def test_a_sample_of_what_a_fuzzer_makes() -> None:
+def test_a_sample_of_what_a_fuzzer_makes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some of what `experiments/benchmark_robustness.py` tries by the ten thousand; half have a hash that fits."""
+    monkeypatch.setattr(fuzzer, "PATIENCE", 300.0)  # what hangs is found, and what a slow machine takes is no fault
     found = list(fuzzer.verdicts(400, seed=3))
     assert [verdict for verdict in found if verdict.kind in fuzzer.FAILURES] == []
     kinds = Counter(verdict.kind for verdict in found)
@@ -198,7 +199,7 @@ def test_a_sample_of_what_a_fuzzer_makes() -> None:
         ({"frames": lambda a: a[..., :0]}, None),
         ({"frames": lambda a: a[:, :0], "frame_times": lambda a: a[:0]}, None),
         ({"frame_times": lambda a: a[::-1].copy()}, "frame_times: got times that are not in order"),
-        ({"contacts": lambda a: a - 10**6}, "contacts: got less than none"),
+        ({"contacts": lambda a: a - 10**6}, r"contacts: got .*, want whole numbers from 0 to 150"),
         ({"states": lambda a: np.array(1.0)}, "states: got shape"),
         ({"torques": None}, "torques: got none, want it"),
         ({"bomb": np.zeros(3)}, "'bomb': got it, want only what belongs to this rollout"),
@@ -367,12 +368,14 @@ def test_a_name_twice_in_the_text_is_refused(saved: Path) -> None:
 def test_what_could_not_be_read_again_is_not_written(tmp_path: Path, drive_solution: ls.Solution) -> None:
     path = tmp_path / "solution.npz"
     for change in (
-        {"detail": 3},
+        {"detail": "\ud800"},
+        {"solver": "two\nlines"},
         {"options": {"a": {1, 2}}},
-        {"iterations": drive_solution.iterations * 2, "clearance": 1.0},
+        {"options": {"a": [[[[[[[1]]]]]]]}},
     ):
+        changed = dataclasses.replace(drive_solution, **change)
         with pytest.raises(ls.InputError, match="result: got a solution that cannot be written"):
-            ls.save(dataclasses.replace(drive_solution, **change), path)
+            ls.save(changed, path)
     with pytest.raises(ls.InputError, match="result: got 'it', want a Solution or a Rollout"):
         ls.save("it", path)  # pyright: ignore[reportArgumentType]
     assert not path.exists()
@@ -442,10 +445,10 @@ def test_outputs_with_names_that_are_too_long_give_one_line(
 
 @pytest.mark.parametrize("name", [LONG, f"{LONG}/solution.npz", "a\0b.npz", f"x.{LONG}"])
 def test_names_that_no_file_can_have(name: str, tmp_path: Path, drive_solution: ls.Solution) -> None:
-    with pytest.raises(ls.InputError, match=r"want a file that can be written|want a name that a file can have"):
+    with pytest.raises(ls.InputError, match=r"output: got .*want the path of a file, of names of at most 255"):
         ls.save(drive_solution, tmp_path / name)
     for load in (ls.load_solution, ls.load_rollout):
-        with pytest.raises(ls.InputError, match="want a file that exists"):
+        with pytest.raises(ls.InputError, match="want the path of a file, of names of at most 255 bytes"):
             load(tmp_path / name)
 
 

@@ -135,6 +135,28 @@ def test_no_worker_can_be_interrupted_while_it_starts(tmp_path: Path) -> None:
     assert done.stdout.split() == ["True", "True"]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="where MuJoCo comes with GLFW, which starts a process to be found")
+def test_a_worker_starts_no_other_process(tmp_path: Path) -> None:
+    """It would go on when the worker is killed, and complain that nobody reads what it says."""
+    code = tmp_path / "start.py"
+    code.write_text(
+        "import sys\n"
+        "if __name__ == '__mp_main__':\n"
+        "    sys.addaudithook(lambda event, _: print(event, flush=True) if event == 'subprocess.Popen' else None)\n"
+        "import mujoco\nfrom lqrsim.stress import executors\n"
+        "def work():\n"
+        "    print('glfw.library' in sys.modules)\n"
+        "if __name__ == '__main__':\n"
+        "    process = executors._context.Process(target=work)\n"
+        "    with executors._surroundings():\n"
+        "        process.start()\n"
+        "    process.join()\n"
+    )
+    surroundings = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYGLFW_LIBRARY")}
+    done = subprocess.run([sys.executable, code], capture_output=True, text=True, check=True, env=surroundings)
+    assert done.stdout.split() == ["True"]
+
+
 @pytest.mark.parametrize("ready", ["manifest.json", "shards/*.parquet"])
 def test_ctrl_c_in_a_stress_test_is_one_line(ready: str, tmp_path: Path) -> None:
     """To all processes at once, as a terminal does: while workers start, and while they work."""

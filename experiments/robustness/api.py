@@ -27,6 +27,7 @@ import numpy as np
 
 import lqrsim as ls
 from lqrsim.errors import LONGEST, InputError
+from robustness.common import Hang, limited
 from robustness.hostile import Deliberate, spoilt
 from robustness.subjects import Subject, subjects
 
@@ -35,10 +36,6 @@ PATIENCE = 120.0  # seconds of the processor that a call may take: with what it 
 WALL = 400.0  # seconds after which a call that takes none of the processor counts as hung, too
 HERE = Path(__file__).parent
 FAILURES = ("raw", "hang", "death")
-
-
-class Hang(BaseException):
-    """A call took too long."""
 
 
 @dataclass(frozen=True)
@@ -143,22 +140,6 @@ def where(error: BaseException) -> str:
     except Exception:
         text = ""
     return f"{type(error).__name__}: {text} at {place}"
-
-
-@contextlib.contextmanager
-def limited(seconds: float) -> Iterator[None]:
-    """Raise Hang after so many seconds of the processor."""
-
-    def hung(*_: object) -> None:
-        raise Hang(f"more than {seconds:g} s")
-
-    before = signal.signal(signal.SIGPROF, hung)
-    signal.setitimer(signal.ITIMER_PROF, seconds, 1.0)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        signal.signal(signal.SIGPROF, before)
 
 
 def work(connection: Any, seed: int, only: str, numbers: range) -> None:

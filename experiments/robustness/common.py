@@ -1,5 +1,8 @@
-"""What the sections share: what they are told."""
+"""What the sections share: what they are told, and a limit of time."""
 
+import contextlib
+import signal
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -24,3 +27,26 @@ class Config:
     """A fiftieth of it."""
     json: bool = False
     """Print all that is counted as JSON."""
+
+
+class Hang(BaseException):
+    """What is tried took too long."""
+
+
+@contextlib.contextmanager
+def limited(seconds: float) -> Iterator[None]:
+    """Raise Hang after so many seconds of the processor, where the system can."""
+    if not hasattr(signal, "SIGPROF"):  # Windows
+        yield
+        return
+
+    def hung(*_: object) -> None:
+        raise Hang(f"more than {seconds:g} s")
+
+    before = signal.signal(signal.SIGPROF, hung)
+    signal.setitimer(signal.ITIMER_PROF, seconds, 1.0)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)

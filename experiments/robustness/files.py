@@ -27,14 +27,14 @@ import numpy as np
 from tqdm import tqdm
 
 import lqrsim as ls
-from lqrsim.errors import InputError
+from lqrsim.errors import LONGEST, InputError
 from lqrsim.simulation.disturbances import MeasurementNoise
 from lqrsim.stress.campaign import Campaign, run_campaign
 from lqrsim.stress.manifest import digest_of_rows
 from lqrsim.stress.results import Results
 from lqrsim.view.track import Track
 from robustness import mutations
-from robustness.common import Config
+from robustness.common import Config, Hang, limited
 from robustness.mutations import pick
 
 FAILURES = ("raw", "other", "useless", "slow", "large")
@@ -131,20 +131,22 @@ class Spoiler:
         saved, what = self.saved[subject], f"{what}{', sealed' if sealed else ''}"
         begun, had, why = time.process_time(), most_memory(), ""
         try:
-            loaded = saved.load(path)
+            with limited(PATIENCE):
+                loaded = saved.load(path)
             kind = "identical" if same(loaded, saved.loaded) else "accepted" if sealed else "other"
-        except Exception as error:
+        except (Exception, Hang) as error:
             loaded, (kind, why) = saved.loaded, refusal(error)
         if most_memory() > had + MEMORY:
             kind = "large"
         if kind == "accepted":
             try:
-                saved.use(loaded)
-                again = ls.save(loaded, self.folder / "again.npz")
-                kind = "accepted" if same(saved.load(again), loaded) else "other"
-            except Exception as error:
+                with limited(PATIENCE):
+                    saved.use(loaded)
+                    again = ls.save(loaded, self.folder / "again.npz")
+                    kind = "accepted" if same(saved.load(again), loaded) else "other"
+            except (Exception, Hang) as error:
                 kind, why = refusal(error)
-                kind = "useless" if kind == "raw" else "accepted"
+                kind = {"raw": "useless", "refused": "accepted"}.get(kind, kind)
         if time.process_time() - begun > PATIENCE:
             kind = "slow"
         return Verdict(number, subject, kind, what, why)
@@ -164,12 +166,13 @@ class Spoiler:
         begun, had = time.process_time(), most_memory()
         try:
             path.write_bytes(spoilt)
-            results = Results(self.campaign)
-            found = everything(results)
-            kind, why = "identical" if same(found, self.tables) else "other", ""
-            if kind == "identical" and sealed:
-                _ = results.campaign
-        except Exception as error:
+            with limited(PATIENCE):
+                results = Results(self.campaign)
+                found = everything(results)
+                kind, why = "identical" if same(found, self.tables) else "other", ""
+                if kind == "identical" and sealed:
+                    _ = results.campaign
+        except (Exception, Hang) as error:
             kind, why = refusal(error)
         finally:
             path.write_bytes(data)
@@ -254,10 +257,12 @@ def spoilt_manifest(rng: np.random.Generator, data: bytes) -> tuple[str, bytes, 
     return what, json.dumps(manifest).encode(), sealed
 
 
-def refusal(error: Exception) -> tuple[str, str]:
+def refusal(error: Exception | Hang) -> tuple[str, str]:
     """Whether an exception is one clear line, and where it comes from if not."""
     line = str(error)
-    if isinstance(error, InputError) and len(line.splitlines()) == 1 and len(line) < 2000:
+    if isinstance(error, Hang):
+        return "slow", line
+    if isinstance(error, InputError) and len(line.splitlines()) == 1 and 0 < len(line) <= LONGEST:
         return "refused", line
     place = traceback.extract_tb(error.__traceback__)[-1]
     return "raw", f"{type(error).__name__}: {line[:200]} at {Path(place.filename).name}:{place.lineno}"

@@ -185,6 +185,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
                 "tables": {"partial": True},
             }.items()
         },
+        "Results.command_of": ({"self": results, "command": "replay"},),
         "Results.solution": ({"self": results, "policy": "open_loop"},),
         **{
             f"Results.{name}": ({"self": results, "shard": next(results.shards())},)

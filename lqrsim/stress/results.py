@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim import files
-from lqrsim.errors import InputError, check_count, check_flag, check_kind, check_name, check_path, excerpt
+from lqrsim.errors import InputError, check_count, check_flag, check_kind, check_name, check_path, check_text, excerpt
 from lqrsim.references import from_anywhere, resolve
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
@@ -182,7 +182,14 @@ class Results:
         return shlex.join(["lqrsim", "stress", asked, "--resume", "--out", str(self.folder.absolute())])
 
     def command_of(self, command: str, *options: str) -> str:
-        """`lqrsim report` or `lqrsim replay` of this campaign, which runs in any working directory."""
+        """`lqrsim report` or `lqrsim replay` of this campaign, which runs in any working directory.
+
+        Raises:
+          InputError: another command, or options that are no text.
+        """
+        check_name("command", command, ("report", "replay"))
+        for option in options:
+            check_text("options", option, "an option, such as --cell", at_most=4000)
         asked = self.manifest["campaign"]["scenario"]
         own = ["--scenario", asked] if ":" in asked else []
         return shlex.join(["lqrsim", command, str(self.folder.absolute()), *options, *own])
