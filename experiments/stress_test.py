@@ -83,7 +83,7 @@ def together(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, A
     )  # fmt: skip
     results = finished(config, asked, folder / "together")
     outcomes = {cell: results.outcomes(cell) for cell in results.cells}
-    against = {one.second: one for one in analysis.comparisons(outcomes, seed=config.seed)}
+    against = {one.second: one for one in analysis.comparisons(outcomes)}
     cells = []
     for cell, ended in outcomes.items():
         found = analysis.success(cell, ended)

@@ -11,10 +11,10 @@ Names are imported when they are first used, so that importing lqrsim costs noth
 """
 
 import importlib
-from importlib.metadata import version as _version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    __version__: str
     from lqrsim import robots as robots
     from lqrsim import rotations as rotations
     from lqrsim import scenarios as scenarios
@@ -200,11 +200,14 @@ _HOME = {
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 _SUBMODULES = ("robots", "rotations", "scenarios")
 
-__version__ = _version("lqrsim")
 __all__ = sorted([*_MODULE_OF, *_SUBMODULES])  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("lqrsim")
     if name in _SUBMODULES:
         return importlib.import_module(f"lqrsim.{name}")
     if name in _MODULE_OF:

@@ -1,8 +1,11 @@
 """What took long to make, kept on disk by content: compiled functions, and the sources traced from formulas.
 
-An item's name is a hash of all that it depends on, so an item can not be stale; its first line is a checksum, so a
-damaged one is as good as none. A cache that can not be read or written costs time, never an error. When the items
+An item's name is a hash of all that it depends on, so an item cannot be stale; its first line is a checksum, so a
+damaged one is as good as none. A cache that cannot be read or written costs time, never an error. When the items
 outgrow `LIMIT`, those that were used longest ago go.
+
+Items are programs: compiled functions are unpickled and run, and sources are executed. The checksum keeps off damage,
+not people. Who can write the folder can have code run by whoever reads it: share it with nobody whom you do not trust.
 """
 
 import contextlib
@@ -48,7 +51,7 @@ def key(*parts: str | bytes) -> str:
 
 
 def load(name: str) -> bytes | None:
-    """The contents of an item; None if there is none, or it is damaged or can not be read."""
+    """The contents of an item; None if there is none, or it is damaged or cannot be read."""
     path = folder() / f"{name}{_SUFFIX}"
     try:
         header, _, contents = path.read_bytes().partition(b"\n")

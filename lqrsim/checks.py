@@ -8,7 +8,7 @@ import numpy as np
 
 from lqrsim.costs import Term, terms_of
 from lqrsim.dynamics import Dynamics
-from lqrsim.errors import Array, InputError, check_count, check_number
+from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, check_text, excerpt, real, shaped
 from lqrsim.functions import External, brief, plain_names
 from lqrsim.problem import FixedState, Problem
 
@@ -123,6 +123,15 @@ class DerivativeCheck:
     control: Array
     tolerance: float
 
+    def __post_init__(self) -> None:
+        for name in ("what", "row", "column"):
+            check_text(f"DerivativeCheck: {name}", getattr(self, name), at_most=1000)
+        for name in ("error", "stated", "difference", "tolerance"):
+            object.__setattr__(self, name, float(shaped(f"DerivativeCheck: {name}", getattr(self, name), ())))
+        for name in ("state", "control"):
+            numbers = real(f"DerivativeCheck: {name}", getattr(self, name))
+            object.__setattr__(self, name, shaped(f"DerivativeCheck: {name}", numbers, (None,)))
+
     @property
     def good(self) -> bool:
         """Whether the error is within the tolerance; a NaN is not."""
@@ -157,17 +166,17 @@ def check_derivatives(
     Raises:
       InputError: a function fails, or an argument is not as described.
     """
-    check_count("samples", samples)
-    check_number("spread", spread, at_least=0.0)
-    check_number("tolerance", tolerance, above=0.0)
+    check_count("samples", samples, at_most=10_000)
+    spread = check_number("spread", spread, at_least=0.0)
+    tolerance = check_number("tolerance", tolerance, above=0.0)
     dynamics = subject.dynamics if isinstance(subject, Problem) else subject
     if not isinstance(dynamics, Dynamics):
-        raise InputError(f"subject: got {type(subject).__name__}, want a Problem or Dynamics")
+        raise InputError(f"subject: got {excerpt(subject)}, want a Problem or Dynamics")
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     x0, u0 = np.zeros(n), np.zeros(m)
     if isinstance(subject, Problem):
         x0, u0 = x0 if subject.start is None else subject.start, subject.nominal_control
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(check_seed("seed", seed))
     points = [(x0 + spread * rng.normal(size=n), u0 + spread * rng.normal(size=m)) for _ in range(samples)]
     states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     found: dict[str, list[DerivativeCheck]] = {}

@@ -1,68 +1,85 @@
 """The command line. Each command reads what the one before wrote; `lqrsim COMMAND --help` documents each."""
 
 import logging
-import os
 import sys
 from collections.abc import Sequence
 
-import tyro
+from lqrsim import process
 
-from lqrsim.commands.failures import Break, Rare
-from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
-from lqrsim.commands.solving import List, Simulate, Solve
-from lqrsim.commands.stressing import Replay, Report, Stress
-from lqrsim.commands.verifying import Verify
-from lqrsim.commands.viewing import Render, View
+DESCRIPTION = """Feedback policies by iterated LQR smoothing, executed in MuJoCo under
+disturbances and shown on video.
 
-DESCRIPTION = """Feedback policies by iterated LQR smoothing, executed in MuJoCo under disturbances and shown on video.
-
-The whole chain, for both robots, is `lqrsim demo`. Step by step, each command reading what the one before wrote:
+The whole chain, for both robots, is `lqrsim demo`. Step by step, each command
+reading what the one before wrote:
   lqrsim solve quadrotor --out runs/quadrotor
   lqrsim simulate runs/quadrotor/solution.npz --force-noise 0.1 --seed 1
   lqrsim render runs/quadrotor/rollout.npz
   lqrsim verify runs/quadrotor/rollout.npz
-Push the robot and watch the policy recover: `lqrsim view quadrotor`.
-How often policies fail, under what, and how sure that is: `lqrsim stress quadrotor`; where that is too seldom to be
-seen, `lqrsim rare quadrotor`; and how little it takes, `lqrsim break quadrotor`.
-The paper's results, beside what came out here: `lqrsim reproduce`.
 
-Exit codes: 0 done, 1 not converged or out of bounds, 2 bad input. The version is printed by `lqrsim --version`."""
+commands:
+{commands}
 
-Command = (
-    List
-    | Solve
-    | Simulate
-    | Render
-    | Verify
-    | View
-    | Demo
-    | Stress
-    | Replay
-    | Report
-    | Rare
-    | Break
-    | Reproduce
-    | Cache
-)
+`lqrsim COMMAND --help` documents each, `lqrsim --version` prints the version.
+Exit codes: 0 done, 1 not converged or out of bounds, 2 bad input, 130 stopped
+with Ctrl-C, 141 nobody reads what is printed."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Args:
-      arguments: what follows `lqrsim` on the command line; those of this process by default.
+      arguments: what follows `lqrsim` on the command line. By default those of this process, which then is the
+        command's own: signals stop it, and let it remove what it has not finished.
 
     Returns:
-      The exit code: 0 done; 1 not converged or out of bounds; 2 bad input; 130 stopped with Ctrl-C;
-      141 nobody reads what it prints.
+      The exit code: 0 done; 1 not converged or out of bounds; 2 bad input, or what is printed cannot be written;
+      130 stopped with Ctrl-C, 143 with SIGTERM; 141 nobody reads what it prints.
     """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    own = arguments is None
+    if own:
+        process.surround("lqrsim: stopped")
+    try:
+        try:
+            code = _run(list(sys.argv[1:] if arguments is None else arguments))
+        except SystemExit:  # of --help, and of what can not be understood
+            process.flush()
+            raise
+        process.flush()
+        return code
+    except KeyboardInterrupt:
+        if own:
+            process.leave()
+        process.complain("lqrsim: stopped")
+        return 130
+    except (BrokenPipeError, process.Unprintable) as error:
+        process.nothing_to_print_to()
+        cause = error.__cause__ if isinstance(error, process.Unprintable) else error
+        if isinstance(cause, BrokenPipeError):  # whoever reads what is printed, such as `head`, has had enough
+            return 141
+        why = cause.strerror if isinstance(cause, OSError) else cause
+        process.complain(f"lqrsim: error: standard output: got {why}, want one that can be written")
+        return 2
+
+
+def _run(arguments: list[str]) -> int:
     if arguments == ["--version"]:
         from importlib.metadata import version
 
-        print(f"lqrsim {version('lqrsim')}")
+        with process.printing():
+            print(f"lqrsim {version('lqrsim')}")
         return 0
-    command = tyro.cli(Command, prog="lqrsim", description=DESCRIPTION, args=arguments)
+
+    import tyro
+
+    from lqrsim.commands import COMMANDS, Command
+
+    if arguments in (["--help"], ["-h"]):
+        lines = "\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items())
+        with process.printing():
+            print(f"usage: lqrsim COMMAND ...\n\n{DESCRIPTION.format(commands=lines)}")
+        raise SystemExit(0)
+    with process.printing():
+        command = tyro.cli(Command, prog="lqrsim", args=arguments)
 
     from lqrsim.errors import InputError
 
@@ -71,18 +88,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logger.addHandler(notices)
     logger.setLevel(logging.INFO)
     try:
-        code = command.run()
-        sys.stdout.flush()  # while a broken pipe can still be handled
-        return code
+        with process.tidying():
+            return command.run()
     except InputError as error:
-        print(f"lqrsim: error: {error}", file=sys.stderr)
+        process.complain(f"lqrsim: error: {error}")
         return 2
-    except KeyboardInterrupt:
-        print("lqrsim: stopped", file=sys.stderr)
-        return 130
-    except BrokenPipeError:  # whoever reads what is printed, such as `head`, has had enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at the end
-        return 141
     finally:
         logger.removeHandler(notices)
 

@@ -1,6 +1,7 @@
 """What the commands share: progress on the terminal, and an early look at whether the outputs can be written."""
 
 import contextlib
+import os
 import sys
 import tempfile
 import time
@@ -8,6 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lqrsim import process
+from lqrsim.archive import excerpt_of
 from lqrsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,24 +19,37 @@ if TYPE_CHECKING:
 
 
 def say(text: str = "") -> None:
-    """Print at once, also where the output goes to a file or a pipe, and above any progress bar."""
+    """Print at once, also where the output goes to a file or a pipe, and above any progress bar.
+
+    Raises:
+      process.Unprintable: it cannot be written.
+    """
     bars = sys.modules.get("tqdm")
-    if bars is None:
-        print(text, flush=True)
-    else:
-        bars.tqdm.write(text)
-        sys.stdout.flush()
+    with process.printing():
+        if bars is None:
+            print(text, flush=True)
+        else:
+            bars.tqdm.write(text)
+            sys.stdout.flush()
 
 
-def check_output(field: str, folder: Path) -> None:
-    """Find out before the work starts whether `folder` can be written. Raises InputError if not."""
+def check_output(field: str, folder: Path, name: str = "") -> None:
+    """Find out before the work starts whether `folder`, or a file of that name in it, can be written.
+
+    Raises:
+      InputError: it cannot.
+    """
     existing = folder.absolute()
-    while not existing.exists() and existing != existing.parent:
+    while not os.path.exists(existing) and existing != existing.parent:
         existing = existing.parent
     try:
         tempfile.TemporaryFile(dir=existing).close()
-    except OSError as error:
-        raise InputError(f"{field}: got {folder}, want a folder that can be written ({error.strerror})") from None
+        with contextlib.suppress(FileNotFoundError):
+            os.lstat(folder / name)  # fails otherwise for what no file can be called
+    except (OSError, ValueError) as error:
+        reason, what = getattr(error, "strerror", None) or error, "file" if name else "folder"
+        place = excerpt_of(folder / name)
+        raise InputError(f"{field}: got {place}, want a {what} that can be written ({reason})") from None
 
 
 def solve(problem: "Problem", solver: str, **options: object) -> "Solution":

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lqrsim.costs import check_source
 from lqrsim.dynamics import Dynamics
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_count, check_flag, check_function, check_number, excerpt
 from lqrsim.world import ROW, World
 
 
@@ -21,6 +22,7 @@ class Inequalities:
     Attributes:
       source: defines `value(x, u, t, row, data)`, which returns one of the numbers, and `slope(x, u, t, row, data,
         gradient)`, which *adds* its gradient (n+m,), states before controls. The numba subset; see `costs.Term`.
+        Functions go by their bare names: `cos`, not `math.cos` or `np.cos`, which are refused.
       data: (any,) float64.
       rows: how many numbers there are at a step.
       says: what a message calls a row.
@@ -36,11 +38,9 @@ class Inequalities:
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", check_array("Inequalities: data", self.data, (None,), infinite=True))
         object.__setattr__(self, "rows", check_count("Inequalities: rows", self.rows, at_least=0))
-        if not callable(self.says):
-            raise InputError(f"Inequalities: says: got {excerpt(self.says)}, want a function of a row")
-        for name in ("value", "slope"):
-            if f"def {name}(" not in self.source:
-                raise InputError(f"Inequalities: source: got {excerpt(self.source)}, want it to define {name}(...)")
+        check_function("Inequalities: says", self.says, "a function of a row", optional=False)
+        object.__setattr__(self, "uses_control", check_flag("Inequalities: uses_control", self.uses_control))
+        check_source("Inequalities", self.source, {"value": 5, "slope": 6})
 
 
 class Constraint(abc.ABC):
@@ -67,7 +67,7 @@ class Clearance(Constraint):
 
     def __init__(self, world: World, *, radius: float, margin: float = 0.0) -> None:
         if not isinstance(world, World):
-            raise InputError(f"Clearance: world: got {type(world).__name__}, want a World, such as scene.world")
+            raise InputError(f"Clearance: world: got {excerpt(world)}, want a World, such as scene.world")
         self.world = world
         self.radius = check_number("Clearance: radius", radius, at_least=0.0)
         self.margin = check_number("Clearance: margin", margin)

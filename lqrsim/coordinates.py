@@ -5,7 +5,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, excerpt
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_items,
+    check_kind,
+    check_text,
+    excerpt,
+    numbers_of,
+    vectors_of,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +41,19 @@ class Coordinates:
     high: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        for field, least in (("names", False), ("units", True)):
+            given = check_items(field, getattr(self, field), str, "a tuple of texts, one an entry", at_most=10_000)
+            one_by_one = tuple(check_text(field, text, "texts", at_most=200, empty=least) for text in given)
+            object.__setattr__(self, field, one_by_one)
         size = len(self.names)
+        if not size:
+            raise InputError("names: got none, want one an entry, at least one")
+        for field in ("position", "angles", "rotation_vectors"):
+            given = check_items(field, getattr(self, field), (int, np.integer), "a tuple of indices", at_most=size)
+            counted = tuple(check_count(field, index, at_least=0) for index in given)
+            if len(set(counted)) < len(counted):
+                raise InputError(f"{field}: got {excerpt(counted)}, want different indices")
+            object.__setattr__(self, field, counted)
         if len(self.units) != size:
             raise InputError(
                 f"units: got {len(self.units)} of them, want {size}, one for each of {', '.join(self.names)}"
@@ -44,9 +67,9 @@ class Coordinates:
             width = 3 if field == "rotation_vectors" else 1
             if any(not 0 <= index <= size - width for index in indices):
                 raise InputError(f"{field}: got indices {indices}, want them between 0 and {size - width}")
-        if not self.low and not self.high:
-            object.__setattr__(self, "low", (-np.inf,) * size)
-            object.__setattr__(self, "high", (np.inf,) * size)
+        for field, endless in (("low", -np.inf), ("high", np.inf)):
+            if isinstance(getattr(self, field), tuple) and not getattr(self, field):
+                object.__setattr__(self, field, (endless,) * size)
         low = check_array("low", self.low, (size,), infinite=True)
         high = check_array("high", self.high, (size,), infinite=True)
         if (low >= high).any():
@@ -70,8 +93,15 @@ class Coordinates:
 
         Args:
           vector, near: (..., n); leading dimensions broadcast.
+
+        Raises:
+          InputError: not numbers of such shapes.
         """
-        out, near = np.broadcast_arrays(np.asarray(vector, dtype=np.float64), np.asarray(near, dtype=np.float64))
+        out, near = vectors_of("vector", vector, len(self)), vectors_of("near", near, len(self))
+        try:
+            out, near = np.broadcast_arrays(out, near)
+        except ValueError:
+            raise InputError(f"near: got shape {near.shape}, want one that goes with {out.shape} of vector") from None
         out = out.copy()
         for i in self.angles:
             out[..., i] -= 2 * np.pi * np.round((out[..., i] - near[..., i]) / (2 * np.pi))
@@ -81,7 +111,7 @@ class Coordinates:
 
     def difference(self, vector: npt.ArrayLike, near: npt.ArrayLike) -> Array:
         """`nearest(vector, near) - near`, (..., n): the error of `vector`, with whole turns taken out."""
-        return self.nearest(vector, near) - np.asarray(near, dtype=np.float64)
+        return self.nearest(vector, near) - vectors_of("near", near, len(self))
 
     def limited(self, low: npt.ArrayLike, high: npt.ArrayLike) -> "Coordinates":
         """The same with other limits, each a number or one an entry.
@@ -90,8 +120,8 @@ class Coordinates:
           InputError: not numbers, or not in order.
         """
         try:
-            sides = [np.broadcast_to(np.asarray(side, dtype=np.float64), len(self)) for side in (low, high)]
-        except (TypeError, ValueError):
+            sides = [np.broadcast_to(numbers_of("control_limits", side), len(self)) for side in (low, high)]
+        except ValueError:
             raise InputError(
                 f"control_limits: got {excerpt((low, high))}, want (lowest, highest), each a number or ({len(self)},)"
             ) from None
@@ -103,13 +133,16 @@ class Coordinates:
         return replace(self, low=tuple(sides[0].tolist()), high=tuple(sides[1].tolist()))
 
     def within(self, other: "Coordinates") -> "Coordinates":
-        """The same with limits that are also the other's."""
+        """The same with limits that are also the other's. Raises InputError where nothing is within both."""
+        check_kind("other", other, Coordinates, f"Coordinates of {len(self)} entries")
+        if len(other) != len(self):
+            raise InputError(f"other: got {len(other)} entries, want {len(self)}: {', '.join(self.names)}")
         low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)
         return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def clip(self, vector: npt.ArrayLike) -> Array:
         """`vector` (..., n) held within the limits."""
-        return np.clip(np.asarray(vector, dtype=np.float64), self.low, self.high)
+        return np.clip(vectors_of("vector", vector, len(self)), self.low, self.high)
 
 
 def _nearest_rotation_vector(vector: Array, near: Array) -> Array:

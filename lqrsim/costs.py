@@ -4,6 +4,8 @@ To add a kind of cost, subclass `Cost` and write `bind`; or state it as a formul
 """
 
 import abc
+import ast
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +15,20 @@ import numpy.typing as npt
 
 from lqrsim import tracing
 from lqrsim.dynamics import Dynamics
-from lqrsim.errors import Array, InputError, check_array, check_name, check_number, check_weight
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_flag,
+    check_function,
+    check_items,
+    check_kind,
+    check_name,
+    check_number,
+    check_weight,
+    excerpt,
+)
 from lqrsim.functions import External, check_signature, level_of, name_of
 from lqrsim.world import ROW, World
 
@@ -25,7 +40,8 @@ class Term:
     Attributes:
       source: defines `value(x, u, t, data)` and `derivatives(x, u, t, data, hessian, gradient)`, both returning the
         cost; the latter *adds* the Hessian (n+m, n+m) and gradient (n+m,) at the point, states before controls. The
-        numba subset; the names of `world.py` and `rotations.py`, and N, M, W, sqrt, exp and the like are at hand.
+        numba subset; the names of `world.py` and `rotations.py`, and N, M, W, sqrt, exp and the like are at hand, by
+        their bare names: `cos`, not `math.cos` or `np.cos`, which are refused.
       data: (any,) float64; the source can index it, but not ask for its length.
       bends: indices of the entries of (x, u) in which the Hessian may be indefinite: None for a convex term. The sum of
         all such terms is projected to the nearest positive-semidefinite matrix.
@@ -41,6 +57,19 @@ class Term:
     uses_control: bool = False
     factor: int | None = None
     functions: tuple[External, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "data", check_array("Term: data", self.data, (None,), infinite=True))
+        check_source("Term", self.source, {"value": 4, "derivatives": 6})
+        if self.bends is not None:
+            bends = check_items("Term: bends", self.bends, (int, np.integer), "a tuple of indices, or None")
+            object.__setattr__(self, "bends", tuple(check_count("Term: bends", i, at_least=0) for i in bends))
+        object.__setattr__(self, "uses_control", check_flag("Term: uses_control", self.uses_control))
+        if self.factor is not None:
+            last = len(self.data) - 1
+            object.__setattr__(self, "factor", check_count("Term: factor", self.factor, at_least=0, at_most=last))
+        wanted = "a tuple of External, as FunctionCost makes them"
+        object.__setattr__(self, "functions", check_items("Term: functions", self.functions, External, wanted))
 
 
 class Cost(abc.ABC):
@@ -66,15 +95,15 @@ class CostSum(Cost):
         self.terms = terms
 
     def bind(self, dynamics: Dynamics) -> Term:
-        raise TypeError("a sum is bound term by term")
+        raise InputError("cost: got a sum to bind, want its terms one by one")
 
 
-def terms_of(cost: Cost) -> tuple[Cost, ...]:
+def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
     """The terms of a sum; a single cost is its own. Raises InputError for what is no cost."""
     if isinstance(cost, CostSum):
         return cost.terms
     if not isinstance(cost, Cost):
-        raise InputError(f"cost: got {cost!r}, want a cost such as QuadraticCost(...) or a sum of costs")
+        raise InputError(f"{field}: got {excerpt(cost)}, want a cost such as QuadraticCost(...) or a sum of costs")
     return (cost,)
 
 
@@ -126,7 +155,7 @@ class ObstacleCost(Cost):
 
     def __init__(self, world: World, *, radius: float, sharpness: float = 10.0, weight: float = 1.0) -> None:
         if not isinstance(world, World):
-            raise InputError(f"ObstacleCost: world: got {type(world).__name__}, want a World, such as scene.world")
+            raise InputError(f"ObstacleCost: world: got {excerpt(world)}, want a World, such as scene.world")
         self.world = world
         self.radius = check_number("ObstacleCost: radius", radius, at_least=0.0)
         self.sharpness = check_number("ObstacleCost: sharpness", sharpness, above=0.0)
@@ -163,8 +192,9 @@ class SymbolicCost(Cost):
         if level_of(function, None) == "compiled":
             raise InputError(f"SymbolicCost: got the numba function {name_of(function)}, want FunctionCost for it")
         self.function = function
-        self.parameters = tracing.check_parameters(parameters or {})
-        self.convex = convex
+        check_signature(function, ("x", "u", "p"))
+        self.parameters = tracing.check_parameters(parameters)
+        self.convex = check_flag("SymbolicCost: convex", convex)
 
     @property
     def name(self) -> str:
@@ -227,18 +257,26 @@ class FunctionCost(Cost):
         convex: bool = False,
         level: str | None = None,
     ) -> None:
-        self.function, self.derivatives, self.convex = function, derivatives, convex
+        self.function, self.derivatives = function, derivatives
+        self.convex = check_flag("FunctionCost: convex", convex)
         self.level = level_of(function, level)
         if self.level == "symbolic":
             if level is not None:
                 raise InputError("FunctionCost: level: got 'symbolic', want 'compiled', 'plain', or a SymbolicCost")
             self.level = "plain"
         if isinstance(depends_on, str):
-            raise InputError(f"FunctionCost: depends_on: got {depends_on!r}, want a tuple of names: ({depends_on!r},)")
-        self.depends_on = None if depends_on is None else tuple(depends_on)
-        self.parameters = tracing.check_parameters(parameters or {})
+            said = excerpt(depends_on)
+            raise InputError(f"FunctionCost: depends_on: got {said}, want a tuple of names: ({said},)")
+        self.depends_on = None
+        if depends_on is not None:
+            wanted = "a tuple of names of states and controls, at least one"
+            self.depends_on = check_items("FunctionCost: depends_on", depends_on, str, wanted)
+            if not self.depends_on:  # a constant: nothing to minimise
+                raise InputError(f"FunctionCost: depends_on: got none, want {wanted}, or None for all of them")
+        self.parameters = tracing.check_parameters(parameters)
         check_signature(function, ("x", "u", "p"))
         if derivatives is not None:
+            check_function("FunctionCost: derivatives", derivatives, "a function of (x, u, p, gradient, hessian)")
             level_of(derivatives, self.level)
             check_signature(derivatives, ("x", "u", "p", "gradient", "hessian"))
 
@@ -266,6 +304,40 @@ class FunctionCost(Cost):
             uses_control=any(axis >= n for axis in axes),
             functions=functions,
         )
+
+
+def check_source(field: str, source: object, functions: Mapping[str, int]) -> None:
+    """Raises InputError unless it is source text that defines these functions, of so many arguments, and can compile.
+
+    What there is besides Python's own arithmetic is named without its module: cos, not math.cos or np.cos.
+    """
+    wanted = " and ".join(f"{name}(...)" for name in functions)
+    check_kind(f"{field}: source", source, str, f"text that defines {wanted}")
+    wrong = _wrong(str(source), tuple(functions.items()))
+    if wrong:
+        raise InputError(f"{field}: source: {wrong}")
+
+
+@functools.lru_cache(maxsize=256)  # a problem that is stated again and again has the same sources
+def _wrong(source: str, functions: tuple[tuple[str, int], ...]) -> str:
+    """What is wrong with a source; see `check_source`."""
+    try:
+        tree = ast.parse(source)
+    except Exception as error:  # SyntaxError, or what nesting, null characters and the like lead to
+        return f"got {excerpt(source)}, which is no Python ({error}), want functions"
+    defined = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    for name, count in functions:
+        found = defined.get(name)
+        if found is None:
+            return f"got {excerpt(source)}, want it to define {name}(...)"
+        if len(found.args.args) != count:
+            return f"got {name} of {len(found.args.args)} arguments, want {count}"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            return f"got an import in line {node.lineno}, want none: sqrt, exp, cos and the like are at hand"
+        if isinstance(node, ast.Attribute):
+            return f"got {ast.unparse(node)} in line {node.lineno}, want {node.attr}: modules are not at hand"
+    return ""
 
 
 def _check_size(field: str, weight: Array, want: int, what: str) -> None:

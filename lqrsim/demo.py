@@ -8,7 +8,7 @@ import numpy as np
 
 from lqrsim import console, files
 from lqrsim.errors import InputError
-from lqrsim.references import resolve, short_name
+from lqrsim.references import folder_name, from_anywhere, resolve
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.scenarios import Scenario
@@ -44,9 +44,9 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
     rows: list[str] = []
     failures: list[str] = []
     for reference, scenario in scenarios.items():
-        folder = out / short_name(reference)
+        folder = out / folder_name(scenario)
         console.say(f"\n== {reference}: {scenario.summary}")
-        solution = replace(console.solve(scenario.problem, "smooth"), scenario=reference)
+        solution = replace(console.solve(scenario.problem, "smooth"), scenario=from_anywhere(reference))
         console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
         if solution.cost_to_go is not None:
             drawn = plot_policy(

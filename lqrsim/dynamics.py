@@ -10,7 +10,17 @@ import numpy.typing as npt
 
 from lqrsim import differences, integration, tracing
 from lqrsim.coordinates import Coordinates
-from lqrsim.errors import Array, InputError, check_array, check_name, check_number, excerpt
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_function,
+    check_items,
+    check_name,
+    check_number,
+    excerpt,
+    numbers_of,
+)
 from lqrsim.functions import External, check_signature, level_of, name_of, plain_names
 
 Limits = tuple[npt.ArrayLike, npt.ArrayLike]
@@ -71,10 +81,9 @@ class Dynamics:
         jacobian: Callable[..., None] | None = None,
         level: str | None = None,
     ) -> None:
-        for field, given in (("states", states), ("controls", controls), ("parameters", parameters or {})):
+        for field, given in (("states", states), ("controls", controls)):
             if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
-                wanted = "value" if field == "parameters" else "unit"
-                raise InputError(f"{field}: got {excerpt(given)}, want a dictionary of name: {wanted}")
+                raise InputError(f"{field}: got {excerpt(given)}, want a dictionary of name: unit")
         if not states or not controls:
             raise InputError(
                 f"dynamics: got {len(states)} states and {len(controls)} controls, want at least one of each"
@@ -82,21 +91,29 @@ class Dynamics:
         names = tuple(states)
         for field, listed in (("position", position), ("angles", angles), ("rotation_vectors", rotation_vectors)):
             if isinstance(listed, str):
-                raise InputError(f"{field}: got {listed!r}, want a tuple of names: ({listed!r},)")
+                raise InputError(f"{field}: got {excerpt(listed)}, want a tuple of names: ({excerpt(listed)},)")
+        position, angles = (
+            check_items(field, listed, str, f"a tuple of names of states, of {', '.join(names)}")
+            for field, listed in (("position", position), ("angles", angles))
+        )
+        triples = [
+            check_items("rotation_vectors", triple, str, "tuples of three names of states")
+            for triple in check_items("rotation_vectors", rotation_vectors, (tuple, list), "a tuple of threes of names")
+        ]
 
         def index(field: str, name: str) -> int:
             return names.index(check_name(field, name, names))
 
         starts = []
-        for triple in rotation_vectors:
+        for triple in triples:
             indices = [index("rotation_vectors", name) for name in triple]
             if len(indices) != 3 or indices != list(range(indices[0], indices[0] + 3)):
-                raise InputError(f"rotation_vectors: got {tuple(triple)}, want three neighbouring states")
+                raise InputError(f"rotation_vectors: got {excerpt(tuple(triple))}, want three neighbouring states")
             starts.append(indices[0])
         limits = control_limits if control_limits is not None else (-np.inf, np.inf)
         try:
-            low, high = (np.broadcast_to(np.asarray(side, dtype=float), len(controls)).tolist() for side in limits)
-        except (TypeError, ValueError):
+            low, high = (np.broadcast_to(numbers_of("control_limits", side), len(controls)).tolist() for side in limits)
+        except Exception:  # no pair, no numbers, another number of them
             wanted = f"(lowest, highest), each a number or ({len(controls)},)"
             raise InputError(f"control_limits: got {excerpt(control_limits)}, want {wanted}") from None
         self.f, self.jacobian = f, jacobian
@@ -108,9 +125,10 @@ class Dynamics:
             )
         check_signature(f, ("x", "u", "p"))
         if jacobian is not None:
+            check_function("jacobian", jacobian, "a function of (x, u, p, fx, fu)")
             level_of(jacobian, self.level)
             check_signature(jacobian, ("x", "u", "p", "fx", "fu"))
-        self.parameters = tracing.check_parameters(parameters or {})
+        self.parameters = tracing.check_parameters(parameters)
         self.state_coordinates = Coordinates(
             names=names,
             units=tuple(states.values()),

@@ -4,42 +4,106 @@ Every message is one line that names the field, what it got and what it wanted (
 list to choose from, the valid names). The command line prints that line and exits with 2.
 """
 
+import dataclasses
 import difflib
+import inspect
+import itertools
+import math
+import os
 from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.machine import memory
+
 Array = npt.NDArray[np.floating]
+
+_FLOAT64 = np.dtype(np.float64)
+_LARGE = 10**7  # entries of an array from which on it is looked at whether there is memory for others of its size
+LONGEST = 1010  # characters of a message
+LARGEST_COUNT = 10**9  # of what has no limit of its own: a loop over more does not end in a working day
 
 
 class InputError(ValueError):
     """Something a caller passed is wrong; the message is one line that says what and what to do."""
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(message.splitlines()))  # what a user's function says may have several
+        line = " ".join(message.splitlines())  # what a user's function says may have several, and be pages long
+        super().__init__(line if len(line) <= LONGEST else f"{line[:700]} ... {line[-300:]}")
 
 
 def check_array(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...], *, infinite: bool = False) -> Array:
     """`value` as a read-only C-ordered float64 copy of the given shape (None matches any length).
 
     Raises:
-      InputError: not numeric, the wrong shape, or a NaN (or, unless allowed, infinite) entry.
+      InputError: not real numbers (text, complex numbers and generators are none), the wrong shape, or a NaN (or,
+        unless allowed, infinite) entry.
     """
-    try:
-        array = np.array(value, dtype=np.float64, order="C")
-    except (TypeError, ValueError):
-        raise InputError(f"{field}: got {excerpt(value)}, want numbers of shape {_shape(shape)}") from None
-    if len(array.shape) != len(shape) or any(
-        want is not None and got != want for got, want in zip(array.shape, shape, strict=True)
-    ):
-        raise InputError(f"{field}: got shape {_shape(array.shape)}, want {_shape(shape)}")
+    array = numbers_of(field, value, f"numbers of shape {_shape(shape)}")
+    check_shape(field, array, shape)
     bad = np.isnan(array) if infinite else ~np.isfinite(array)
     if bad.any():
         where = tuple(int(i) for i in np.argwhere(bad)[0])
         place = f" at index {list(where)}" if where else ""
         raise InputError(f"{field}: got {array[where]}{place}, want {'a number' if infinite else 'finite numbers'}")
     array.setflags(write=False)
+    return array
+
+
+def numbers_of(field: str, value: object, want: str = "numbers") -> Array:
+    """`value` as a new C-ordered float64 array of any shape and any numbers. Raises InputError for what has none."""
+    try:
+        given = np.asarray(value)
+        if given.size > _LARGE:
+            check_memory(field, given.size, 32, "what is made of which")
+        if given.dtype.kind not in "biufO":  # text, complex numbers, dates, records
+            raise TypeError
+        if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):  # a number that is not there
+            raise TypeError
+        if given.dtype.kind == "O" and any(isinstance(entry, (str, bytes)) for entry in given.flat):
+            raise TypeError
+        return np.array(given, dtype=np.float64, order="C")
+    except InputError:
+        raise
+    except MemoryError:
+        raise InputError(f"{field}: got {excerpt(value)}, which does not fit into memory, want {want}") from None
+    except Exception:  # whatever the object raises when it is asked for its numbers
+        raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
+
+
+def check_shape(field: str, array: npt.NDArray[Any], shape: tuple[int | None, ...]) -> None:
+    """Raises InputError unless the array has that shape (None matches any length)."""
+    found = array.shape
+    if len(found) != len(shape) or any(w is not None and g != w for g, w in zip(found, shape, strict=True)):
+        raise InputError(f"{field}: got shape {_shape(found)}, want {_shape(shape)}")
+
+
+def real(field: str, value: npt.ArrayLike, want: str = "numbers") -> Array:
+    """`value` as a float64 array of any shape and any numbers; not copied if it is that already. Raises InputError."""
+    done = type(value) is np.ndarray and value.dtype == np.float64
+    if done and value.size > _LARGE:  # pyright: ignore[reportAttributeAccessIssue]
+        # It may be there once for many places, as NumPy broadcasts, and what is made of it will not be.
+        check_memory(field, value.size, 32, "what is made of which")  # pyright: ignore[reportAttributeAccessIssue]
+    return value if done else numbers_of(field, value, want)  # pyright: ignore[reportReturnType]
+
+
+def shaped(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...]) -> Array:
+    """`value` as float64 of the given shape (None: any length), NaN and all; not copied if it is that already."""
+    if type(value) is np.ndarray and value.dtype is _FLOAT64 and value.shape == shape and value.size <= _LARGE:
+        return value  # without making a message: what a solver returns goes this way
+    array = real(field, value, f"numbers of shape {_shape(shape)}")
+    check_shape(field, array, shape)
+    return array
+
+
+def vectors_of(field: str, value: npt.ArrayLike, size: int) -> Array:
+    """`value` as float64 of shape (..., size), NaN and all; not copied if it is that already. Raises InputError."""
+    array = real(field, value, f"numbers of shape (..., {size})")
+    if array.shape[-1:] != (size,):
+        raise InputError(f"{field}: got shape {_shape(array.shape)}, want (..., {size})")
     return array
 
 
@@ -52,33 +116,139 @@ def check_number(
     at_most: float | None = None,
     below: float | None = None,
 ) -> float:
-    """`value` as a finite float within the stated bounds. Raises InputError otherwise."""
-    wants = ["a finite number"]
-    wants += [f"> {above:g}"] if above is not None else []
-    wants += [f">= {at_least:g}"] if at_least is not None else []
-    wants += [f"<= {at_most:g}"] if at_most is not None else []
-    wants += [f"< {below:g}"] if below is not None else []
+    """`value` as a finite float within the stated bounds. Raises InputError otherwise; text and True are no numbers."""
+    number = float("nan")
     try:
-        number = float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError):
+        if not isinstance(value, (str, bytes, bytearray, bool, np.bool_)) and np.ndim(value) == 0:  # pyright: ignore
+            number = float(value)  # pyright: ignore[reportArgumentType]
+    except Exception:  # whatever the object raises when it is asked for its value
         number = float("nan")
     good = (
-        np.isfinite(number)
+        math.isfinite(number)
         and (above is None or number > above)
         and (at_least is None or number >= at_least)
         and (at_most is None or number <= at_most)
         and (below is None or number < below)
     )
     if not good:
+        wants = ["a finite number"]
+        wants += [f"> {above:g}"] if above is not None else []
+        wants += [f">= {at_least:g}"] if at_least is not None else []
+        wants += [f"<= {at_most:g}"] if at_most is not None else []
+        wants += [f"< {below:g}"] if below is not None else []
         raise InputError(f"{field}: got {excerpt(value)}, want {' '.join(wants)}")
     return number
 
 
-def check_count(field: str, value: object, *, at_least: int = 1) -> int:
-    """`value` as an int that is not smaller than `at_least`. Raises InputError otherwise."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < at_least:
+def check_count(field: str, value: object, *, at_least: int = 1, at_most: int = LARGEST_COUNT) -> int:
+    """`value` as an int from `at_least` to `at_most`. Raises InputError otherwise."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.bool_))
+    if not whole or value < at_least:  # pyright: ignore[reportOperatorIssue]
         raise InputError(f"{field}: got {excerpt(value)}, want a whole number >= {at_least}")
-    return int(value)
+    if value > at_most:  # pyright: ignore[reportOperatorIssue]
+        raise InputError(f"{field}: got {excerpt(value)}, want a whole number from {at_least} to {at_most}")
+    return int(value)  # pyright: ignore[reportArgumentType]
+
+
+def check_seed(field: str, value: object) -> int:
+    """`value` as an int that is not negative, as long as it has at most 128 bits. Raises InputError otherwise."""
+    return check_count(field, value, at_least=0, at_most=2**128 - 1)
+
+
+def check_memory(field: str, count: int, each: int, what: str = "whose arrays") -> None:
+    """Raises InputError if `count` of what takes `each` bytes do not fit into this machine's memory."""
+    if count * each > (there := memory()):
+        raise InputError(
+            f"{field}: got {excerpt(count)}, {what} would take {_bytes(count * each)}, want at most {there // each}"
+            f" with the {_bytes(there)} that there are"
+        )
+
+
+def check_kind(field: str, value: object, kind: type | tuple[type, ...], want: str) -> Any:
+    """`value` if it is an instance of `kind`; otherwise an InputError with what is wanted: "a Problem, such as ..."."""
+    if not isinstance(value, kind):
+        raise InputError(f"{field}: got {excerpt(value)}, want {want}")
+    return value
+
+
+def check_function(
+    field: str, value: object, want: str, *, arguments: int | None = None, optional: bool = True
+) -> None:
+    """Raises InputError unless it can be called, with so many arguments, or is None and may be.
+
+    What it raises when it is called is its own, and is not turned into an InputError.
+    """
+    if optional and value is None:
+        return
+    if not callable(value):
+        raise InputError(f"{field}: got {excerpt(value)}, want {want}")
+    if arguments is None:
+        return
+    try:
+        inspect.signature(value).bind(*[None] * arguments)
+    except ValueError:  # a built-in tells nothing about itself
+        return
+    except TypeError as error:
+        raise InputError(
+            f"{field}: got {excerpt(value)}, which does not take {arguments} ({error}), want {want}"
+        ) from None
+    except Exception:  # an object that raises whatever it likes when it is looked at
+        raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
+
+
+def check_flag(field: str, value: object) -> bool:
+    """`value` as a bool. Raises InputError for what is neither True nor False."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise InputError(f"{field}: got {excerpt(value)}, want True or False")
+    return bool(value)
+
+
+def check_text(field: str, value: object, want: str = "text", *, at_most: int = 200, empty: bool = False) -> str:
+    """`value` if it is one printable line of text. Raises InputError otherwise.
+
+    Args:
+      at_most: characters. empty: whether there may be none.
+    """
+    if not isinstance(value, str) or not (value or empty) or not value.isprintable():
+        raise InputError(f"{field}: got {excerpt(value)}, want {want}: one printable line")
+    if len(value) > at_most:
+        raise InputError(f"{field}: got {len(value)} characters, {excerpt(value)}, want {want} of at most {at_most}")
+    return value
+
+
+def check_path(field: str, value: object, want: str = "the path of a file") -> Path:
+    """`value` as a path that a file can have: each name of at most 255 bytes. Raises InputError otherwise."""
+    try:
+        if not isinstance(value, (str, os.PathLike)):
+            raise TypeError
+        name = os.fspath(value)
+        good = isinstance(name, str) and name and "\0" not in name
+        good = good and all(len(part.encode()) <= 255 for part in Path(name).parts) and len(name.encode()) < 4096
+    except Exception:  # no path, or what can not be written as bytes
+        good, name = False, value
+    if not good:
+        raise InputError(f"{field}: got {excerpt(name)}, want {want}, of names of at most 255 bytes")
+    return Path(name)  # pyright: ignore[reportArgumentType]
+
+
+def check_items(
+    field: str, value: object, kind: type | tuple[type, ...], want: str, *, at_most: int = 1_000_000
+) -> tuple[Any, ...]:
+    """What `value` has in it, as a tuple of instances of `kind`. Raises InputError for text, mappings, other kinds."""
+    try:
+        if isinstance(value, (str, bytes, dict)):
+            raise TypeError
+        found = tuple(itertools.islice(iter(value), at_most + 1))  # pyright: ignore[reportCallIssue, reportArgumentType]
+    except InputError:
+        raise
+    except Exception:  # it is no collection, or raises whatever it likes as one
+        raise InputError(f"{field}: got {excerpt(value)}, want {want}") from None
+    if len(found) > at_most:
+        raise InputError(f"{field}: got more than {at_most} of them, want {want}")
+    for place, one in enumerate(found):
+        if not isinstance(one, kind):
+            raise InputError(f"{field}: got {excerpt(one)} at {place}, want {want}")
+    return found
 
 
 def check_weight(field: str, value: npt.ArrayLike, size: int | None = None, *, definite: bool = False) -> Array:
@@ -87,12 +257,11 @@ def check_weight(field: str, value: npt.ArrayLike, size: int | None = None, *, d
     Raises:
       InputError: wrong shape, NaN or infinite entries, not symmetric, or an eigenvalue of the wrong sign.
     """
-    try:
-        raw = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{field}: got {excerpt(value)}, want a matrix of numbers or its diagonal") from None
+    raw = numbers_of(field, value, "a matrix of numbers or its diagonal")
+    if raw.ndim == 1:
+        check_memory(field, len(raw), 16 * len(raw), "the square matrix of which")
     matrix = check_array(field, np.diag(raw) if raw.ndim == 1 else raw, (size, size))
-    if matrix.shape[0] != matrix.shape[1]:
+    if matrix.shape[0] != matrix.shape[1] or not matrix.size:
         raise InputError(f"{field}: got shape {_shape(matrix.shape)}, want a square matrix or its diagonal")
     scale = max(float(np.abs(matrix).max(initial=0.0)), np.finfo(float).tiny)
     skew = np.abs(matrix - matrix.T)
@@ -111,14 +280,14 @@ def check_weight(field: str, value: npt.ArrayLike, size: int | None = None, *, d
     return symmetric
 
 
-def check_name(field: str, name: str, valid: Iterable[str]) -> str:
+def check_name(field: str, name: object, valid: Iterable[str]) -> str:
     """`name` if it is one of `valid`; otherwise an InputError that lists them and guesses the meant one."""
     names = list(valid)
     if isinstance(name, str) and name in names:
         return name
-    near = difflib.get_close_matches(str(name), names, n=1)
+    near = difflib.get_close_matches(excerpt(name).strip("'"), names, n=1)
     hint = f" (did you mean {near[0]}?)" if near else ""
-    raise InputError(f"{field}: got {name!r}, want one of: {', '.join(names) or '(there are none)'}{hint}")
+    raise InputError(f"{field}: got {excerpt(name)}, want one of: {', '.join(names) or '(there are none)'}{hint}")
 
 
 def _shape(shape: tuple[int | None, ...]) -> str:
@@ -126,7 +295,27 @@ def _shape(shape: tuple[int | None, ...]) -> str:
     return f"({', '.join(sizes)}{',' if len(sizes) == 1 else ''})"
 
 
+def _bytes(count: int) -> str:
+    for unit in ("bytes", "kB", "MB", "GB", "TB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count = count / 1000  # pyright: ignore[reportAssignmentType]
+    return f"{count:.3g} PB" if count < 1e6 else f"{count:.1e} PB"
+
+
 def excerpt(value: object) -> str:
-    """A value for a message, cut where it gets long."""
-    text = " ".join(repr(value).split())
+    """A value for a message: one line, cut where it gets long, whatever its `__repr__` does."""
+    try:
+        if isinstance(value, (str, bytes, bytearray)):
+            value = value[:200]
+        elif type(value) in (list, tuple, set, frozenset, dict) and len(value) > 100:  # pyright: ignore[reportArgumentType]
+            return f"{type(value).__name__} of {len(value)}"  # pyright: ignore[reportArgumentType]
+        elif isinstance(value, int) and value.bit_length() > 1000:
+            return f"an int of {value.bit_length()} bits"
+        elif dataclasses.is_dataclass(value):  # some hold megabytes
+            return value.__name__ if isinstance(value, type) else f"{type(value).__name__}(...)"
+        text = " ".join(repr(value).split())
+    except Exception:  # a __repr__ that fails, or that is nested without end
+        return f"a {type(value).__name__}"
+    text = "".join(letter if letter.isprintable() else "?" for letter in text[:200])
     return text if len(text) <= 60 else f"{text[:57]}..."

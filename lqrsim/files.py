@@ -1,15 +1,11 @@
-"""Solutions and rollouts on disk: NumPy's .npz, data only, with everything that is not an array in one JSON text.
+"""Solutions and rollouts on disk: arrays by name, and everything that is not an array in one JSON text.
 
-`docs/file_format.md` says what is in them and loads a policy elsewhere, with NumPy alone. Loading never runs code.
+`docs/file_format.md` says what is in them and loads a policy elsewhere, with NumPy alone; `archive.py` has the rest.
+The tables here say what belongs into a file. What is saved and what is loaded are both held to them.
 """
 
-import contextlib
-import json
 import os
-import tempfile
-import zipfile
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, astuple, fields
 from pathlib import Path
 from typing import Any
@@ -17,164 +13,160 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim import plain
+from lqrsim.archive import Arrays, Header, opened, write
+from lqrsim.archive import replacing as replacing
 from lqrsim.coordinates import Coordinates
-from lqrsim.errors import Array, InputError, check_array
+from lqrsim.errors import InputError, check_array, check_kind, check_path, excerpt
 from lqrsim.policy import AffinePolicy
 from lqrsim.results import Candidate, Certificate, Iteration, Multipliers, Solution, Status, Trajectory
 from lqrsim.rollout import Rollout
 from lqrsim.value_functions import Moments, Quadratic
 
-VERSIONS = {"solution": 3, "rollout": 2}
+VERSIONS = {"solution": 4, "rollout": 3}
+
+# Shapes in letters: T steps, n states, m controls; the others stand for whatever it is, but the same in all of a file.
+Shapes = Mapping[str, str]
+_PLAN = {"trajectory.controls": "T m", "trajectory.states": "T+1 n"}
+
+_SOLUTION_ARRAYS = _PLAN | {
+    "policy.gain": "T m n", "policy.offset": "T m", "policy.nominal": "T n", "iterations": "iterations 7",
+    "certificate": "8",
+}  # fmt: skip
+# Each of these is there as a whole, or not at all.
+_SOLUTION_OPTIONAL: tuple[dict[str, str], ...] = (
+    {"inverse_policy.gain": "T m n", "inverse_policy.offset": "T m", "inverse_policy.nominal": "T n"},
+    {"cost_to_go.hessian": "T+1 n n", "cost_to_go.gradient": "T+1 n", "cost_to_go.constant": "T+1"},
+    {"cost_to_come.hessian": "T+1 n n", "cost_to_come.gradient": "T+1 n", "cost_to_come.constant": "T+1"},
+    {"cost_to_come.covariance": "T+1 n n", "cost_to_come.mean": "T+1 n", "cost_to_come.constant": "T+1"},
+    {"clearance": "T+1"},
+    {"candidates.states": "candidates T+1 n", "candidates.controls": "candidates T m"},
+)
+_ROLLOUT_ARRAYS = {  # of the same names in a Rollout
+    "states": "K T+1 n", "measured": "K T+1 n", "commanded": "K T m", "applied": "K T m", "forces": "K T 3",
+    "torques": "K T 3", "displaced": "K obstacles 3", "clearance": "K T+1", "contacts": "K", "diverged": "K",
+    "frame_times": "F", "frames": "K F nq",
+}  # fmt: skip
+_CERTIFICATE = tuple(field.name for field in fields(Certificate))  # before the gap, in the array of that name
+_DTYPES = {"contacts": "<i8", "diverged": "|b1"}  # all others are <f8
+
+_COORDINATES = {  # of the same names in Coordinates
+    "names": plain.listed(plain.line), "units": plain.listed(plain.line), "position": plain.listed(plain.count),
+    "angles": plain.listed(plain.count), "rotation_vectors": plain.listed(plain.count),
+    "low": plain.listed(plain.any_number), "high": plain.listed(plain.any_number),
+}  # fmt: skip
+_COMMON = {
+    "format": plain.line, "version": plain.count, "sha256": plain.line,
+    "states": plain.record(_COORDINATES), "controls": plain.record(_COORDINATES),
+    "dt": plain.number(at_least=1e-9, at_most=1e9),
+}  # fmt: skip
+_STATUS = plain.one_of(Status)
+_SOLUTION_TEXTS: dict[str, plain.Check] = {  # of the same names in a Solution
+    "detail": plain.text, "solver": plain.line, "options": plain.mapped(plain.anything), "problem_digest": plain.line,
+    "versions": plain.mapped(plain.line), "scenario": plain.line,
+}  # fmt: skip
+_SOLUTION_LISTS: dict[str, plain.Check] = {
+    "status": _STATUS, "methods": plain.listed(plain.line), "penalties": plain.listed(plain.number(at_least=0.0)),
+    "candidates": plain.listed(plain.row(plain.line, plain.any_number, plain.count, plain.optional(_STATUS))),
+}  # fmt: skip
+_ROLLOUT_TEXTS: dict[str, plain.Check] = {  # of the same names in a Rollout
+    "robot": plain.line, "scene": plain.line, "model": plain.text, "policy_digest": plain.line,
+    "radius": plain.number(at_least=0.0), "goal_radius": plain.number(above=0.0), "seed": plain.count,
+    "first_trial": plain.count, "versions": plain.mapped(plain.line), "disturbances": plain.listed(plain.text),
+}  # fmt: skip
 
 
 def save(result: Solution | Rollout, path: str | os.PathLike[str]) -> Path:
     """Write a solution or a rollout; the file is whole or not there. Returns its path.
 
     Raises:
-      InputError: the file cannot be written.
+      InputError: the file cannot be written; or what it would hold could not be read again.
     """
-    path = Path(path)
-    kind, arrays, texts = _solution_parts(result) if isinstance(result, Solution) else _rollout_parts(result)
-    meta = {"format": f"lqrsim {kind}", "version": VERSIONS[kind], **texts}
-    with replacing(path) as unfinished, unfinished.open("wb") as file:
-        # Through a file object: given a name, NumPy appends .npz to it.
-        np.savez_compressed(file, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
+    path = check_path("output", path)
+    check_kind("result", result, (Solution, Rollout), "a Solution or a Rollout")
+    kind = "solution" if isinstance(result, Solution) else "rollout"
+    try:
+        arrays, texts = _solution_parts(result) if isinstance(result, Solution) else _rollout_parts(result)
+        meta = plain.parse(plain.canonical({"format": f"lqrsim {kind}", "version": VERSIONS[kind], **texts}))
+        arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        headers = {name: Header(array.dtype.str, array.shape) for name, array in arrays.items()}
+        _check(kind, headers, meta | {"sha256": ""})
+        _MAKERS[kind](arrays, meta)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(
+            f"result: got a {kind} that cannot be written ({error}), want one as lqrsim makes it"
+        ) from None
+    write(path, arrays, meta)
     return path
 
 
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A name to write to, which takes the place of `path` when the block ends, and disappears if it fails.
-
-    Raises:
-      InputError: the folder or the file cannot be written, or the disk is full.
-    """
-    unfinished = None
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # A name of its own, so that two writers cannot meet; the suffix stays, for it says the format.
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".unfinished-", suffix=path.suffix)
-        os.close(handle)
-        unfinished = Path(name)
-        yield unfinished
-        # mkstemp makes a file for its owner alone; a result is as readable as any other new file.
-        mask = os.umask(0)
-        os.umask(mask)
-        unfinished.chmod(0o666 & ~mask)
-        unfinished.replace(path)
-    except OSError as error:
-        raise InputError(f"output: got {path}, want a file that can be written ({error.strerror or error})") from None
-    finally:
-        if unfinished is not None:
-            unfinished.unlink(missing_ok=True)
-
-
 def load_solution(path: str | os.PathLike[str]) -> Solution:
-    """Read what `save` wrote of a Solution.
+    """Read what `save` wrote of a Solution. Loading never runs code.
 
     Raises:
-      InputError: no such file, not a solution, damaged, or of another version.
+      InputError: no such file, not a solution, of another version, or anything in it is not what was written.
     """
-    arrays, meta = _read(Path(path), "solution")
-    with _complete(path, "solution"):
-        states, controls = _coordinates(meta["states"]), _coordinates(meta["controls"])
-        n, m, steps, dt = len(states), len(controls), len(arrays["policy.gain"]), float(meta["dt"])
-
-        def policy(name: str) -> AffinePolicy:
-            return AffinePolicy(
-                gain=check_array(f"{name}.gain", arrays[f"{name}.gain"], (steps, m, n)),
-                offset=check_array(f"{name}.offset", arrays[f"{name}.offset"], (steps, m)),
-                nominal=check_array(f"{name}.nominal", arrays[f"{name}.nominal"], (steps, n), infinite=True),
-                dt=dt,
-                state_coordinates=states,
-                control_coordinates=controls,
-            )
-
-        def value(kind: type[Quadratic] | type[Moments], name: str) -> Any:
-            shapes = (steps + 1, n, n), (steps + 1, n), (steps + 1,)
-            keys = [field.name for field in fields(kind)]
-            return kind(*(_array(arrays, f"{name}.{key}", shape) for key, shape in zip(keys, shapes, strict=True)))
-
-        def cost_to_come() -> Quadratic | Moments | None:
-            if "cost_to_come.covariance" in arrays:
-                return value(Moments, "cost_to_come")
-            return value(Quadratic, "cost_to_come") if "cost_to_come.hessian" in arrays else None
-
-        log = _array(arrays, "iterations", (None, 7))
-
-        def candidate(i: int, start: str, cost: float, count: int, status: str | None) -> Candidate:
-            plan = Trajectory(
-                _array(arrays, "candidates.states", (None, steps + 1, n))[i],
-                _array(arrays, "candidates.controls", (None, steps, m))[i], dt,
-            )  # fmt: skip
-            return Candidate(start, float(cost), int(count), None if status is None else Status(status), plan)
-
-        rows = zip(log.tolist(), meta["methods"], strict=True)
-        return Solution(
-            status=Status(meta["status"]),
-            detail=meta["detail"],
-            policy=policy("policy"),
-            inverse_policy=policy("inverse_policy") if "inverse_policy.gain" in arrays else None,
-            cost_to_go=value(Quadratic, "cost_to_go") if "cost_to_go.hessian" in arrays else None,
-            cost_to_come=cost_to_come(),
-            trajectory=_trajectory(arrays, steps, n, m, dt),
-            iterations=tuple(Iteration(*numbers, method=str(method)) for numbers, method in rows),
-            clearance=_array(arrays, "clearance", (steps + 1,)) if "clearance" in arrays else None,
-            certificate=Certificate(**meta["certificate"]),
-            gap=float(meta["gap"]),
-            solver=meta["solver"],
-            options=meta["options"],
-            problem_digest=meta["problem_digest"],
-            versions=meta["versions"],
-            scenario=meta["scenario"],
-            candidates=tuple(candidate(i, *one) for i, one in enumerate(meta["candidates"])),
-            multipliers=tuple(
-                Multipliers(_array(arrays, f"multipliers.{i}", (steps + 1, None)), float(penalty))
-                for i, penalty in enumerate(meta["penalties"])
-            ),
-        )
+    return _load(path, "solution")
 
 
 def load_rollout(path: str | os.PathLike[str]) -> Rollout:
     """Read what `save` wrote of a Rollout. Raises InputError as `load_solution` does."""
-    arrays, meta = _read(Path(path), "rollout")
-    with _complete(path, "rollout"):
-        states, controls = _coordinates(meta["states"]), _coordinates(meta["controls"])
-        n, m = len(states), len(controls)
-        trials, knots, _ = arrays["states"].shape
-        shapes = {
-            "states": (trials, knots, n), "measured": (trials, knots, n), "commanded": (trials, knots - 1, m),
-            "applied": (trials, knots - 1, m), "forces": (trials, knots - 1, 3), "torques": (trials, knots - 1, 3),
-            "displaced": (trials, None, 3), "clearance": (trials, knots),
-            "frame_times": (None,), "frames": (trials, len(arrays["frame_times"]), None),
-        }  # fmt: skip
-        return Rollout(
-            **{name: _array(arrays, name, shape) for name, shape in shapes.items()},
-            contacts=_array(arrays, "contacts", (trials,)).astype(np.int64),
-            diverged=_array(arrays, "diverged", (trials,)).astype(bool),
-            plan=_trajectory(arrays, knots - 1, n, m, float(meta["dt"])),
-            state_coordinates=states,
-            control_coordinates=controls,
-            disturbances=tuple(meta["disturbances"]),
-            **{key: meta[key] for key in _ROLLOUT_TEXTS},
-        )
+    return _load(path, "rollout")
 
 
-_ROLLOUT_ARRAYS = (
-    "states", "measured", "commanded", "applied", "forces", "torques", "displaced", "clearance", "contacts", "diverged",
-    "frame_times", "frames",
-)  # fmt: skip
-_ROLLOUT_TEXTS = (
-    "robot", "scene", "model", "policy_digest", "radius", "goal_radius", "seed", "first_trial", "versions",
-)  # fmt: skip
+def _load(path: str | os.PathLike[str], kind: str) -> Any:
+    with opened(check_path(kind, path), kind, VERSIONS[kind]) as archive:
+        _check(kind, archive.headers, archive.meta)
+        return _MAKERS[kind](archive.arrays(), archive.meta)
 
 
-def _solution_parts(solution: Solution) -> tuple[str, dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    arrays: dict[str, npt.NDArray[Any]] = {
-        "trajectory.states": solution.trajectory.states,
-        "trajectory.controls": solution.trajectory.controls,
-        "iterations": np.array([astuple(iteration)[:-1] for iteration in solution.iterations]).reshape(-1, 7),
-    }
+def _check(kind: str, headers: Mapping[str, Header], meta: dict[str, Any]) -> None:
+    """Raise InputError unless the text is as it must be, and the arrays are those, of those shapes, that go with it."""
+    own = _ROLLOUT_TEXTS if kind == "rollout" else _SOLUTION_TEXTS | _SOLUTION_LISTS
+    plain.record(_COMMON | own)("meta", meta)
+    sizes = {"n": len(meta["states"]["names"]), "m": len(meta["controls"]["names"])}
+    if kind == "rollout":
+        wanted = _PLAN | _ROLLOUT_ARRAYS
+    else:
+        sizes |= {"iterations": len(meta["methods"]), "candidates": len(meta["candidates"])}
+        wanted = _SOLUTION_ARRAYS | {f"multipliers.{i}": f"T+1 rows{i}" for i in range(len(meta["penalties"]))}
+        for group in _SOLUTION_OPTIONAL:
+            if group.keys() <= headers.keys() - wanted.keys():
+                wanted |= group
+        ended = [status for _, _, _, status in meta["candidates"] if status is not None]
+        if bool(meta["candidates"]) != ("candidates.states" in wanted) or (meta["candidates"] and not ended):
+            raise InputError("meta.candidates: got some without plans, plans without them, or none that ended")
+    if missing := sorted(wanted.keys() - headers.keys()):
+        raise InputError(f"{missing[0]}: got none, want it")
+    if unknown := sorted(headers.keys() - wanted.keys()):
+        raise InputError(f"{excerpt(unknown[0])}: got it, want only what belongs to this {kind}")
+    for name, letters in wanted.items():
+        _check_array(name, headers[name], letters.split(), sizes)
+    if min(sizes[letter] for letter in ("T", "m", "n") + (("K",) if kind == "rollout" else ())) < 1:
+        raise InputError(f"shapes: got {sizes}, want at least one step, state, control and trial")
+
+
+def _check_array(name: str, header: Header, letters: list[str], sizes: dict[str, int]) -> None:
+    """Raise InputError unless an array has its kind of numbers, and its shape; its letters get their sizes."""
+    dtype = _DTYPES.get(name, "<f8")
+    if header.dtype != dtype:
+        raise InputError(f"{name}: got numbers of type {header.dtype}, want {dtype}")
+    fits = len(header.shape) == len(letters)
+    for letter, length in zip(letters, header.shape, strict=False):
+        base = letter.removesuffix("+1")
+        more = int(base != letter)
+        fits &= length == (int(base) if base.isdecimal() else sizes.setdefault(base, length - more)) + more
+    if not fits:
+        raise InputError(f"{name}: got shape {header.shape}, want ({', '.join(letters)}), where {sizes}")
+
+
+def _solution_parts(solution: Solution) -> tuple[Arrays, dict[str, Any]]:
+    log = [astuple(iteration)[:-1] for iteration in solution.iterations]
+    arrays: Arrays = {
+        "trajectory.states": solution.trajectory.states, "trajectory.controls": solution.trajectory.controls,
+        "iterations": np.array(log, dtype=np.float64).reshape(-1, 7),
+        "certificate": np.array([*astuple(solution.certificate), solution.gap]),
+    }  # fmt: skip
     for name, law in {"policy": solution.policy, "inverse_policy": solution.inverse_policy}.items():
         if law is not None:
             arrays |= {f"{name}.gain": law.gain, f"{name}.offset": law.offset, f"{name}.nominal": law.nominal}
@@ -188,12 +180,11 @@ def _solution_parts(solution: Solution) -> tuple[str, dict[str, npt.NDArray[Any]
         arrays["candidates.states"] = np.array([plan.states for plan in plans])
         arrays["candidates.controls"] = np.array([plan.controls for plan in plans])
     arrays |= {f"multipliers.{i}": one.values for i, one in enumerate(solution.multipliers)}
-    texts = {
-        "status": solution.status.value, "detail": solution.detail, "dt": solution.trajectory.dt,
+    texts = {name: getattr(solution, name) for name in _SOLUTION_TEXTS}
+    texts |= {
+        "status": solution.status.value, "dt": solution.trajectory.dt,
+        "options": dict(solution.options), "versions": dict(solution.versions),
         "states": asdict(solution.policy.state_coordinates), "controls": asdict(solution.policy.control_coordinates),
-        "certificate": asdict(solution.certificate), "gap": solution.gap,
-        "solver": solution.solver, "options": dict(solution.options), "problem_digest": solution.problem_digest,
-        "versions": dict(solution.versions), "scenario": solution.scenario,
         "methods": [iteration.method for iteration in solution.iterations],
         "candidates": [
             (one.start, one.cost, one.iterations, None if one.status is None else one.status.value)
@@ -201,63 +192,83 @@ def _solution_parts(solution: Solution) -> tuple[str, dict[str, npt.NDArray[Any]
         ],
         "penalties": [one.penalty for one in solution.multipliers],
     }  # fmt: skip
-    return "solution", arrays, texts
+    return arrays, texts
 
 
-def _rollout_parts(rollout: Rollout) -> tuple[str, dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    arrays = {name: getattr(rollout, name) for name in _ROLLOUT_ARRAYS}
+def _solution(arrays: Arrays, meta: dict[str, Any]) -> Solution:
+    states, controls, dt = _coordinates(meta["states"]), _coordinates(meta["controls"]), float(meta["dt"])
+
+    def policy(name: str) -> AffinePolicy | None:
+        if f"{name}.gain" not in arrays:
+            return None
+        parts = {part: arrays[f"{name}.{part}"] for part in ("gain", "offset", "nominal")}
+        for part, array in parts.items():
+            check_array(f"{name}.{part}", array, (None,) * array.ndim, infinite=part == "nominal")
+        return AffinePolicy(**parts, dt=dt, state_coordinates=states, control_coordinates=controls)
+
+    def value(kind: type[Any], name: str) -> Any:
+        parts = [f"{name}.{field.name}" for field in fields(kind)]
+        return kind(*(arrays[part] for part in parts)) if parts[0] in arrays else None
+
+    law = policy("policy")
+    assert law is not None  # its arrays are there, or the file was refused
+    rows = zip(arrays["iterations"].tolist(), meta["methods"], strict=True)
+    candidates = (
+        Candidate(
+            start,
+            float(cost),
+            iterations,
+            None if status is None else Status(status),
+            Trajectory(arrays["candidates.states"][i], arrays["candidates.controls"][i], dt),
+        )
+        for i, (start, cost, iterations, status) in enumerate(meta["candidates"])
+    )
+    multipliers = (
+        Multipliers(arrays[f"multipliers.{i}"], float(penalty)) for i, penalty in enumerate(meta["penalties"])
+    )
+    return Solution(
+        status=Status(meta["status"]),
+        policy=law,
+        inverse_policy=policy("inverse_policy"),
+        cost_to_go=value(Quadratic, "cost_to_go"),
+        cost_to_come=value(Quadratic, "cost_to_come") or value(Moments, "cost_to_come"),
+        trajectory=Trajectory(arrays["trajectory.states"], arrays["trajectory.controls"], dt),
+        iterations=tuple(Iteration(*numbers, method=method) for numbers, method in rows),
+        clearance=arrays.get("clearance"),
+        certificate=Certificate(**dict(zip(_CERTIFICATE, arrays["certificate"].tolist(), strict=False))),
+        gap=float(arrays["certificate"][-1]),
+        candidates=tuple(candidates),
+        multipliers=tuple(multipliers),
+        **{name: meta[name] for name in _SOLUTION_TEXTS},
+    )
+
+
+def _rollout_parts(rollout: Rollout) -> tuple[Arrays, dict[str, Any]]:
+    arrays: dict[str, npt.NDArray[Any]] = {name: getattr(rollout, name) for name in _ROLLOUT_ARRAYS}
     arrays |= {"trajectory.states": rollout.plan.states, "trajectory.controls": rollout.plan.controls}
-    texts = {key: getattr(rollout, key) for key in _ROLLOUT_TEXTS}
+    texts = {name: getattr(rollout, name) for name in _ROLLOUT_TEXTS}
     texts |= {
-        "versions": dict(rollout.versions), "dt": rollout.plan.dt, "disturbances": list(rollout.disturbances),
+        "versions": dict(rollout.versions), "dt": rollout.plan.dt,
         "states": asdict(rollout.state_coordinates), "controls": asdict(rollout.control_coordinates),
     }  # fmt: skip
-    return "rollout", arrays, texts
+    return arrays, texts
 
 
-def _read(path: Path, kind: str) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    """All arrays of a file, and its JSON. Raises InputError unless it is a whole file of this kind and version."""
-    if not path.is_file():
-        raise InputError(f"{kind}: got {path}, want a file that exists")
-    try:
-        # Opened here, for NumPy leaves a file open that is no archive.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        meta = json.loads(str(arrays.pop("meta")))
-        found, version = meta["format"], meta["version"]
-    except OSError as error:
-        raise InputError(f"{kind}: got {path}, want a file that can be read ({error.strerror or error})") from None
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, AttributeError):
-        raise InputError(f"{kind}: got {path}, which is damaged, want a file that lqrsim wrote") from None
-    if found != f"lqrsim {kind}":
-        raise InputError(f"{kind}: got {path}, which holds a {found!r}, want a {f'lqrsim {kind}'!r}")
-    if version != VERSIONS[kind]:
-        raise InputError(f"{kind}: got {path} of version {version}, want version {VERSIONS[kind]}: write it again")
-    return arrays, meta
+def _rollout(arrays: Arrays, meta: dict[str, Any]) -> Rollout:
+    times = arrays["frame_times"]
+    if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+        raise InputError("frame_times: got times that are not in order, want each after the one before")
+    return Rollout(
+        **{name: arrays[name] for name in _ROLLOUT_ARRAYS},
+        plan=Trajectory(arrays["trajectory.states"], arrays["trajectory.controls"], float(meta["dt"])),
+        state_coordinates=_coordinates(meta["states"]),
+        control_coordinates=_coordinates(meta["controls"]),
+        **{name: meta[name] for name in _ROLLOUT_TEXTS},
+    )
 
 
-@contextlib.contextmanager
-def _complete(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
-    """Turn what a missing or misshapen part raises into one line."""
-    try:
-        yield
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        reason = f"{error}" if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-        raise InputError(f"{kind}: got {path}, which is damaged ({reason}), want a file that lqrsim wrote") from None
+_MAKERS = {"solution": _solution, "rollout": _rollout}
 
 
-def _array(arrays: Mapping[str, npt.NDArray[Any]], name: str, shape: tuple[int | None, ...]) -> Array:
-    """One array in the given shape; NaN is allowed, for it is what a diverged run or a failed solve holds."""
-    array = arrays[name]
-    if array.ndim != len(shape) or any(want not in (None, got) for got, want in zip(array.shape, shape, strict=True)):
-        raise InputError(f"{name}: got shape {array.shape}, want {shape}")
-    return np.asarray(array, dtype=np.float64)
-
-
-def _trajectory(arrays: Mapping[str, npt.NDArray[Any]], steps: int, n: int, m: int, dt: float) -> Trajectory:
-    states = _array(arrays, "trajectory.states", (steps + 1, n))
-    return Trajectory(states, _array(arrays, "trajectory.controls", (steps, m)), dt)
-
-
-def _coordinates(fields: Mapping[str, Any]) -> Coordinates:
-    return Coordinates(**{key: tuple(value) for key, value in fields.items()})
+def _coordinates(texts: Mapping[str, Any]) -> Coordinates:
+    return Coordinates(**{name: tuple(value) if isinstance(value, list) else value for name, value in texts.items()})

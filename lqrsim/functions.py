@@ -28,10 +28,10 @@ LEVELS = ("symbolic", "compiled", "plain")
 def level_of(function: Any, asked: str | None) -> str:
     """The level at which a function is stated: as asked, else compiled for a numba function and symbolic for others."""
     if not callable(function):
-        raise InputError(f"function: got {function!r}, want a function of (x, u, p)")
+        raise InputError(f"function: got {excerpt(function)}, want a function of (x, u, p)")
     is_compiled = hasattr(function, "py_func")
     if asked is not None and not isinstance(asked, str):
-        raise InputError(f"level: got {asked!r}, want one of: {', '.join(LEVELS)}")
+        raise InputError(f"level: got {excerpt(asked)}, want one of: {', '.join(LEVELS)}")
     if asked is None:
         return "compiled" if is_compiled else "symbolic"
     if check_name("level", asked, LEVELS) != "compiled" and is_compiled:
@@ -42,7 +42,8 @@ def level_of(function: Any, asked: str | None) -> str:
 def name_of(function: Any) -> str:
     """What messages call a function."""
     plain = getattr(function, "py_func", function)
-    return getattr(plain, "__qualname__", None) or type(plain).__name__
+    name = getattr(plain, "__qualname__", None)
+    return name if isinstance(name, str) and name else type(plain).__name__
 
 
 @cache
@@ -252,3 +253,5 @@ def check_signature(function: Any, wanted: Sequence[str]) -> None:
         raise InputError(f"{name_of(function)}: {error}, want a function of ({', '.join(wanted)})") from None
     except ValueError:  # a built-in tells nothing about itself
         return
+    except Exception:  # an object that raises whatever it likes when it is looked at
+        raise InputError(f"function: got {excerpt(function)}, want a function of ({', '.join(wanted)})") from None

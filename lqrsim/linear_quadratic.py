@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_memory, excerpt
 from lqrsim.value_functions import Quadratic
 
 
@@ -46,6 +46,7 @@ class Stage:
         if 0 in shape:
             raise InputError(f"Stage: B: got shape {shape}, want at least one of each")
         n, m = shape[-2:]
+        check_memory("Stage: B", n, 8 * n * (shape[0] if len(shape) == 3 else 1), "whose A")
         shapes = {
             "A": (n, n), "B": (n, m), "c": (n,), "Q": (n, n), "P": (m, n), "R": (m, m), "q": (n,), "r": (m,),
             "constant": (),
@@ -59,7 +60,7 @@ class Stage:
                 if field.name in ("A", "R"):
                     raise InputError(f"Stage: {field.name}: got None, want an array of shape {shapes[field.name]}")
                 value = np.zeros(want)
-            with contextlib.suppress(ValueError):  # what is ragged has no shape, and is refused below
+            with contextlib.suppress(Exception):  # what is ragged or no array has no shape, and is refused below
                 if time and np.ndim(value) == len(want):  # the same at each step
                     value = np.broadcast_to(value, (*time, *np.shape(value)))
             array = check_array(f"Stage: {field.name}", value, (*time, *want))
@@ -85,7 +86,7 @@ def check_end(field: str, cost: Quadratic, n: int) -> tuple[Array, Array, float]
       InputError: it is no Quadratic of n states, or its Hessian is not symmetric.
     """
     if not isinstance(cost, Quadratic):
-        raise InputError(f"{field}: got {type(cost).__name__}, want a Quadratic")
+        raise InputError(f"{field}: got {excerpt(cost)}, want a Quadratic")
     hessian = check_array(f"{field}: hessian", cost.hessian, (n, n))
     if not np.allclose(hessian, hessian.T, rtol=1e-9, atol=0):
         raise InputError(f"{field}: hessian: got a matrix that is not symmetric, want a symmetric one")
@@ -96,6 +97,6 @@ def check_end(field: str, cost: Quadratic, n: int) -> tuple[Array, Array, float]
 def _shape(value: npt.ArrayLike) -> tuple[int, ...]:
     """() for what is ragged and has none."""
     try:
-        return np.shape(value)
-    except ValueError:
+        return np.asarray(value).shape
+    except Exception:  # or raises whatever it likes when it is asked
         return ()

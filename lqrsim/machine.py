@@ -1,9 +1,13 @@
-"""The machine that this runs on: how many processors there are to use, and what to say of it beside times."""
+"""The machine that this runs on: how many processors there are, which kind, and what to say of it beside times."""
 
+import contextlib
+import functools
+import hashlib
 import os
 import platform
 import re
 from pathlib import Path
+from typing import Any
 
 
 def processors() -> int:
@@ -20,3 +24,44 @@ def description() -> str:
         found = None
     processor = found[1].strip() if found else platform.processor() or platform.machine()
     return f"{processors()} x {processor}, {platform.system()}"
+
+
+def memory() -> int:
+    """Bytes of memory that this process may come to use: what the machine has, or less where a limit says so."""
+    there = [_physical()]
+    with contextlib.suppress(ImportError, OSError, ValueError):  # not on Windows
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY:
+            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+            there.append(max(limit - pages * resource.getpagesize(), 0))
+    return min(there)
+
+
+@functools.cache
+def _physical() -> int:
+    """What the machine or its container has; of Windows, which does not say it so, what programs have there."""
+    there = [1 << 34]
+    with contextlib.suppress(AttributeError, OSError, ValueError):
+        there = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    for place in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with contextlib.suppress(OSError, ValueError):  # "max" where there is no limit
+            there.append(int(Path(place).read_text(encoding="ascii")))
+    return min(there)
+
+
+@functools.cache
+def processor() -> str:
+    """What code is compiled for, and a hash of all that it can do; NUMBA_CPU_NAME and NUMBA_CPU_FEATURES change it.
+
+    Where it differs, the same program gives other bits: instructions round differently, and sums are taken in another
+    order. Both the kind that is really there counts, for which NumPy and MuJoCo choose, and that which numba is told.
+    """
+    import llvmlite.binding as llvm
+    from numba.core import codegen, config, registry
+
+    target: Any = registry.cpu_target
+    triple, name, features = target.target_context.codegen().magic_tuple()
+    here = llvm.get_host_cpu_name(), codegen.get_host_cpu_features(), getattr(config, "USING_SVML", None)
+    return f"{name} {hashlib.sha256(repr((triple, name, features, *here)).encode()).hexdigest()[:8]}"

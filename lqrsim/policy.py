@@ -6,7 +6,17 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.coordinates import Coordinates
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_count,
+    check_flag,
+    check_kind,
+    check_number,
+    excerpt,
+    shaped,
+    vectors_of,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,14 +40,32 @@ class AffinePolicy:
     state_coordinates: Coordinates
     control_coordinates: Coordinates
 
+    def __post_init__(self) -> None:
+        for name in ("state_coordinates", "control_coordinates"):
+            check_kind(f"AffinePolicy: {name}", getattr(self, name), Coordinates, "Coordinates")
+        n, m = len(self.state_coordinates), len(self.control_coordinates)
+        for name, shape in (("gain", (m, n)), ("offset", (m,)), ("nominal", (n,))):
+            array = shaped(
+                f"AffinePolicy: {name}", getattr(self, name), (self.steps if name != "gain" else None, *shape)
+            )
+            if not len(array):
+                raise InputError(f"AffinePolicy: {name}: got none, want one a step, at least one")
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "dt", check_number("AffinePolicy: dt", self.dt, above=0.0))
+
     @property
     def steps(self) -> int:
         """T, the number of laws."""
         return len(self.gain)
 
     def control(self, state: npt.ArrayLike, step: int) -> Array:
-        """The law of one step before saturation, (..., m), at states (..., n) given in the nominal's representative."""
-        return np.asarray(state, dtype=np.float64) @ self.gain[step].T + self.offset[step]
+        """The law of one step before saturation, (..., m), at states (..., n) given in the nominal's representative.
+
+        Raises:
+          InputError: no such step, counted from 0, or no such states.
+        """
+        step = check_count("step", step, at_least=0, at_most=self.steps - 1)
+        return vectors_of("state", state, self.gain.shape[-1]) @ self.gain[step].T + self.offset[step]
 
     def __call__(self, state: npt.ArrayLike, t: float, *, interpolate: bool = False) -> Array:
         """The control (..., m) to apply in a measured state (..., n), `t` seconds after the start.
@@ -49,18 +77,14 @@ class AffinePolicy:
         Raises:
           InputError: `t` is negative or not finite, or the state is not finite or not of length n.
         """
-        state = np.asarray(state, dtype=np.float64)
-        if state.shape[-1:] != self.gain.shape[-1:]:
-            raise InputError(f"state: got shape {state.shape}, want ({self.gain.shape[-1]},) in its last dimension")
+        state, t = vectors_of("state", state, self.gain.shape[-1]), check_number("t", t, at_least=0.0)
         if not np.isfinite(state).all():
-            raise InputError(f"state: got {state}, want finite numbers")
-        if not (np.isfinite(t) and t >= 0):
-            raise InputError(f"t: got {t}, want seconds since the start, >= 0")
+            raise InputError(f"state: got {excerpt(state)}, want finite numbers")
         # A time that is a knot up to rounding belongs to the law that begins there.
         knot = t / self.dt + 1e-9
-        step = min(int(knot), self.steps - 1)
+        step = int(min(knot, self.steps - 1))
         gain, offset, nominal = self.gain[step], self.offset[step], self.nominal[step]
-        if interpolate and step + 1 < self.steps:
+        if check_flag("interpolate", interpolate) and step + 1 < self.steps:
             weight = max(knot - 1e-9 - step, 0.0)
             gain = (1 - weight) * gain + weight * self.gain[step + 1]
             offset = (1 - weight) * offset + weight * self.offset[step + 1]

@@ -11,7 +11,18 @@ from lqrsim.constraints import Constraint, Inequalities
 from lqrsim.coordinates import Coordinates
 from lqrsim.costs import ControlCost, Cost, ObstacleCost, QuadraticCost, Term, terms_of
 from lqrsim.dynamics import Dynamics
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_items,
+    check_kind,
+    check_memory,
+    check_name,
+    check_number,
+    excerpt,
+)
 
 
 @dataclass(frozen=True)
@@ -21,7 +32,10 @@ class FixedState:
     state: npt.ArrayLike
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "state", check_array("FixedState: state", self.state, (None,)))
+        state = check_array("FixedState: state", self.state, (None,))
+        if not len(state):
+            raise InputError("FixedState: state: got no numbers, want one a state")
+        object.__setattr__(self, "state", state)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,26 +73,22 @@ class Problem:
         object.__setattr__(self, "dt", check_number("dt", self.dt, above=0.0))
         object.__setattr__(self, "steps", check_count("steps", self.steps))
         if not isinstance(self.dynamics, Dynamics):
-            raise InputError(
-                f"dynamics: got {type(self.dynamics).__name__}, want Dynamics(...), such as robot.dynamics"
-            )
-        costs = {"stage_cost": terms_of(self.stage_cost), "final_cost": terms_of(self.final_cost)}
+            raise InputError(f"dynamics: got {excerpt(self.dynamics)}, want Dynamics(...), such as robot.dynamics")
+        check_memory("steps", self.steps, self.bytes_per_step)
+        costs = {name: terms_of(getattr(self, name), name) for name in ("stage_cost", "final_cost")}
         if isinstance(self.initial, FixedState):
             state = check_array("initial: FixedState", self.initial.state, (len(self.dynamics.state_coordinates),))
             # Costs nothing, and lets a fixed and a soft start share what is compiled.
             costs["initial"] = (QuadraticCost(np.zeros(len(state)), about=state),)
         else:
-            costs["initial"] = terms_of(self.initial)
-        bound = {name: tuple(cost.bind(self.dynamics) for cost in terms) for name, terms in costs.items()}
+            costs["initial"] = terms_of(self.initial, "initial")
+        bound = {name: tuple(_bound(cost, self.dynamics) for cost in terms) for name, terms in costs.items()}
         for name in ("initial", "final_cost"):
             if any(term.uses_control for term in bound[name]):
                 raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
         object.__setattr__(self, "_terms", bound)
-        if not isinstance(self.constraints, Sequence) or not all(isinstance(c, Constraint) for c in self.constraints):
-            raise InputError(
-                f"constraints: got {excerpt(self.constraints)}, want a list of them, such as [Clearance(...)]"
-            )
-        object.__setattr__(self, "constraints", tuple(self.constraints))
+        wanted = "a list of constraints, such as [Clearance(...)]"
+        object.__setattr__(self, "constraints", check_items("constraints", self.constraints, Constraint, wanted))
         bound_constraints = tuple(constraint.bind(self.dynamics) for constraint in self.constraints)
         for constraint, inequalities in zip(self.constraints, bound_constraints, strict=True):
             if not isinstance(inequalities, Inequalities):
@@ -88,7 +98,7 @@ class Problem:
         if self.control_limits is not None:
             try:
                 low, high = self.control_limits
-            except (TypeError, ValueError):
+            except Exception:  # no pair, or what raises whatever it likes as one
                 raise InputError(
                     f"control_limits: got {excerpt(self.control_limits)}, want (lowest, highest)"
                 ) from None
@@ -96,6 +106,12 @@ class Problem:
             _check_within_reach(limited, self.dynamics.control_coordinates)
             object.__setattr__(self, "control_limits", (limited.low, limited.high))
         self._check_start_clear()
+
+    @property
+    def bytes_per_step(self) -> int:
+        """Memory that a solver takes for a step, at least, from one start: value functions, laws and trajectories."""
+        n, m = len(self.dynamics.state_coordinates), len(self.dynamics.control_coordinates)
+        return 8 * (3 * n * n + 3 * m * n + 10 * n + 7 * m)
 
     @property
     def start(self) -> Array | None:
@@ -130,7 +146,7 @@ class Problem:
 
     def terms(self, which: str) -> tuple[Term, ...]:
         """The bound terms of `initial`, `stage_cost` or `final_cost`."""
-        return self._terms[which]
+        return self._terms[check_name("which", which, self._terms)]
 
     @property
     def inequalities(self) -> tuple[Inequalities, ...]:
@@ -172,6 +188,12 @@ class Problem:
                     f"initial: got a start at ({where}) m, {-distances.min():.3g} m inside obstacle {name!r},"
                     f" want it clear of obstacles by the robot's radius of {cost.radius:g} m"
                 )
+
+
+def _bound(cost: Cost, dynamics: Dynamics) -> Term:
+    """The cost for a system. Raises InputError if what is bound is no term."""
+    wanted = "a Term"
+    return check_kind(f"{type(cost).__name__}.bind", cost.bind(dynamics), Term, wanted)
 
 
 def _check_within_reach(limits: Coordinates, actuators: Coordinates) -> None:

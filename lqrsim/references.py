@@ -12,6 +12,7 @@ import importlib.util
 import inspect
 import os
 import re
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -39,7 +40,8 @@ def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
     target, settings = _parts(reference)
     if ":" in target:
         if registered_only:
-            raise InputError(f"scenario: got a file made with {target!r}, want --scenario {reference} to run that code")
+            option = shlex.join(["--scenario", reference])
+            raise InputError(f"scenario: got a file made with {target!r}, want {option} to run that code")
         make = _own_function(target)
     else:
         make = _registered_function(target)
@@ -49,9 +51,18 @@ def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
     return scenario
 
 
-def short_name(reference: str) -> str:
-    """A name for files: `quadrotor` of `quadrotor,query=3`, `hallway` of `my_robot.py:hallway`."""
-    return _parts(reference)[0].rpartition(":")[2]
+def from_anywhere(reference: str) -> str:
+    """The same reference, as it can be given in any working directory: a file's path is made absolute."""
+    target, settings = _parts(reference)
+    place, colon, name = target.rpartition(":")
+    if colon and place.endswith(".py"):
+        target = f"{Path(place).absolute()}:{name}"
+    return ",".join([target, *settings])
+
+
+def folder_name(scenario: "Scenario") -> str:
+    """The scenario's name, as a folder may be called on any system."""
+    return re.sub(r"[^\w.-]+", "_", scenario.name)[:100].strip("._ ") or "scenario"
 
 
 def _parts(reference: str) -> tuple[str, list[str]]:
@@ -74,7 +85,7 @@ def _own_function(target: str) -> Callable[..., object]:
 
 
 def _load_file(path: Path) -> ModuleType:
-    if not path.is_file():
+    if not os.path.isfile(path):  # not the method, which raises for names that are too long
         raise InputError(f"scenario: got {path}, want a Python file that exists")
     name = str(path.resolve())  # not the stem, which may be that of another module
     spec = importlib.util.spec_from_file_location(name, path)

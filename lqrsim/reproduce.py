@@ -34,6 +34,10 @@ SCRIPTS = (
 )
 
 Found = dict[str, Any]
+TIDYING = 20.0  # s
+
+# A script as it runs by itself, but that signals let it remove what it has not finished, and without a word.
+_START = "import sys; from lqrsim.process import run_script; run_script(sys.argv[1:])"
 VERDICTS = {True: "holds", False: "**does not hold**", None: "not tested"}
 
 
@@ -92,15 +96,29 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
 
 def _run(name: str, out: Path, *, quick: bool) -> Found | Failure:
     """What a script prints. It is a process of its own, so that none of them finds what another left behind."""
-    command = [sys.executable, EXPERIMENTS / f"{name}.py", "--json", "--out", out, *(["--quick"] if quick else [])]
+    script = EXPERIMENTS / f"{name}.py"
+    command = [sys.executable, "-c", _START, script, "--json", "--out", out, *(["--quick"] if quick else [])]
     below = os.environ | {"TQDM_POSITION": "1"}  # its bars go below ours
-    # Ctrl-C reaches it, too; `run` waits for it to end, and ends it if it does not.
-    done = subprocess.run([str(part) for part in command], stdout=subprocess.PIPE, text=True, env=below, check=False)
+    with subprocess.Popen([str(part) for part in command], stdout=subprocess.PIPE, text=True, env=below) as running:
+        try:
+            printed, _ = running.communicate()
+        except BaseException:
+            _end(running)
+            raise
     try:
-        return json.loads(done.stdout) if done.returncode == 0 else Failure(name, done.returncode)
+        return json.loads(printed) if running.returncode == 0 else Failure(name, running.returncode)
     except ValueError:
-        sys.stderr.write(f"{name}: printed something that is not its result:\n{done.stdout[:1000]}\n")
-        return Failure(name, done.returncode)
+        sys.stderr.write(f"{name}: printed something that is not its result:\n{printed[:1000]}\n")
+        return Failure(name, running.returncode)
+
+
+def _end(running: subprocess.Popen[str]) -> None:
+    """Have a script end. It may have been told already, as by Ctrl-C; it gets time to remove what is unfinished."""
+    running.terminate()
+    try:
+        running.wait(TIDYING)
+    except subprocess.TimeoutExpired:
+        running.kill()
 
 
 def page(saved: Mapping[str, Any]) -> str:

@@ -6,22 +6,49 @@ reads it back; `rollout.py` has what comes out of running it.
 
 import enum
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_count
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_count,
+    check_items,
+    check_kind,
+    check_number,
+    check_shape,
+    check_text,
+    excerpt,
+    real,
+    shaped,
+)
 from lqrsim.policy import AffinePolicy
 from lqrsim.value_functions import Moments, Quadratic, TotalCost
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """States (T+1, n) and the controls (T, m) held between them, `dt` seconds apart."""
+    """States (T+1, n) and the controls (T, m) held between them, `dt` seconds apart.
+
+    Raises:
+      InputError: they do not fit together, there is no step, or dt is not above 0. NaN is what a failed solve has.
+    """
 
     states: Array
     controls: Array
     dt: float
+
+    def __post_init__(self) -> None:
+        controls = shaped("Trajectory: controls", self.controls, (None, None))
+        if not controls.size:
+            raise InputError(f"Trajectory: controls: got shape {controls.shape}, want (T, m), at least one of each")
+        states = shaped("Trajectory: states", self.states, (len(controls) + 1, None))
+        if not states.size:
+            raise InputError(f"Trajectory: states: got shape {states.shape}, want ({len(states)}, n), at least one n")
+        object.__setattr__(self, "states", states)
+        object.__setattr__(self, "controls", controls)
+        object.__setattr__(self, "dt", check_number("Trajectory: dt", self.dt, above=0.0))
 
     @property
     def steps(self) -> int:
@@ -109,6 +136,9 @@ _STATUS_TEXT = {
 }
 
 
+ITERATION_NUMBERS = ("cost", "improvement", "gap", "optimality", "dynamics_residual", "violation", "seconds")
+
+
 @dataclass(frozen=True)
 class Iteration:
     """One line of the log.
@@ -140,6 +170,12 @@ class Iteration:
     seconds: float
     method: str
 
+    def __post_init__(self) -> None:
+        for name in ITERATION_NUMBERS:
+            if type(value := getattr(self, name)) is not float:
+                object.__setattr__(self, name, float(shaped(f"Iteration: {name}", value, ())))
+        check_kind("Iteration: method", self.method, str, "text")
+
     HEADER = (
         f"{'iteration':>9} {'cost':>14} {'improvement':>12} {'gap':>10} {'optimality':>11} {'violation':>10} {'ms':>8}"
         "  method"
@@ -147,6 +183,7 @@ class Iteration:
 
     def row(self, number: int) -> str:
         """This iteration as a line under `HEADER`."""
+        number = check_count("number", number, at_least=0)
         optimality = "-" if np.isnan(self.optimality) else f"{self.optimality:.1e}"
         improvement = "-" if np.isinf(self.improvement) else f"{self.improvement:.2e}"
         gap = "-" if np.isnan(self.gap) else f"{self.gap:.1e}"
@@ -183,6 +220,11 @@ class Certificate:
     violation: float
     optimality: float
 
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = float(shaped(f"Certificate: {field.name}", getattr(self, field.name), ()))
+            object.__setattr__(self, field.name, value)
+
 
 @dataclass(frozen=True)
 class Multipliers:
@@ -195,6 +237,13 @@ class Multipliers:
 
     values: Array
     penalty: float
+
+    def __post_init__(self) -> None:
+        values = shaped("Multipliers: values", self.values, (None, None))
+        if not len(values):
+            raise InputError(f"Multipliers: values: got shape {values.shape}, want (T+1, rows)")
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "penalty", check_number("Multipliers: penalty", self.penalty, at_least=0.0))
 
 
 @dataclass(frozen=True)
@@ -215,6 +264,15 @@ class Candidate:
     iterations: int
     status: Status | None
     trajectory: Trajectory
+
+    def __post_init__(self) -> None:
+        check_text("Candidate: start", self.start, "what it was", at_most=1000, empty=True)
+        if np.isnan(cost := float(shaped("Candidate: cost", self.cost, ()))):
+            raise InputError("Candidate: cost: got nan, want a number, infinite where there is none")
+        object.__setattr__(self, "cost", cost)
+        check_count("Candidate: iterations", self.iterations, at_least=0)
+        check_kind("Candidate: status", self.status, (Status, type(None)), "a Status or None")
+        check_kind("Candidate: trajectory", self.trajectory, Trajectory, "a Trajectory")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,7 +295,7 @@ class Solution:
       certificate: what the plan is, recomputed from the problem; cost, violation and optimality are read from it.
       gap: of the plan; see `Iteration.gap`. NaN if there is none.
       problem_digest: hash of everything that defined the problem.
-      versions: of lqrsim and the libraries that the numbers depend on.
+      versions: of lqrsim and the libraries that the bits depend on, and the processor.
       scenario: what the command line was asked for; empty where a program called the solver.
       candidates: the starts that were tried, where there were several.
       multipliers: of each of the problem's constraints; none where the plan keeps them all without being made to.
@@ -261,6 +319,47 @@ class Solution:
     scenario: str = ""
     candidates: tuple[Candidate, ...] = ()
     multipliers: tuple[Multipliers, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_kind("Solution: status", self.status, Status, f"a Status, one of {', '.join(Status.__members__)}")
+        check_kind("Solution: policy", self.policy, AffinePolicy, "an AffinePolicy")
+        check_kind("Solution: trajectory", self.trajectory, Trajectory, "a Trajectory")
+        check_kind("Solution: inverse_policy", self.inverse_policy, (AffinePolicy, type(None)), "an AffinePolicy, None")
+        check_kind("Solution: cost_to_go", self.cost_to_go, (Quadratic, type(None)), "a Quadratic or None")
+        kinds = (Quadratic, Moments, type(None))
+        check_kind("Solution: cost_to_come", self.cost_to_come, kinds, "a Quadratic, Moments or None")
+        for name, kind in (("iterations", Iteration), ("candidates", Candidate), ("multipliers", Multipliers)):
+            items = check_items(f"Solution: {name}", getattr(self, name), kind, f"a tuple of {kind.__name__}")
+            object.__setattr__(self, name, items)
+        for name in ("detail", "solver", "problem_digest", "scenario"):
+            check_kind(f"Solution: {name}", getattr(self, name), str, "text")
+        for name in ("options", "versions"):
+            given = check_kind(f"Solution: {name}", getattr(self, name), Mapping, "a dictionary by name")
+            if not all(isinstance(key, str) for key in given):
+                raise InputError(f"Solution: {name}: got {excerpt(given)}, want a dictionary by name")
+        self._check_shapes()
+
+    def _check_shapes(self) -> None:
+        """Raises InputError for parts of several problems."""
+        states, steps = self.trajectory.states.shape, self.trajectory.steps
+        laws = {"policy": self.policy, "inverse_policy": self.inverse_policy}
+        arrays: dict[str, tuple[Array, tuple[int | None, ...]]] = {
+            f"{name}.gain": (law.gain, (steps, self.trajectory.controls.shape[1], states[1]))
+            for name, law in laws.items()
+            if law is not None
+        }
+        if self.cost_to_go is not None:
+            arrays["cost_to_go.gradient"] = self.cost_to_go.gradient, states
+        if isinstance(self.cost_to_come, Quadratic):
+            arrays["cost_to_come.gradient"] = self.cost_to_come.gradient, states
+        elif self.cost_to_come is not None:
+            arrays["cost_to_come.mean"] = self.cost_to_come.mean, states
+        if self.clearance is not None:
+            arrays["clearance"] = real("Solution: clearance", self.clearance), states[:1]
+            object.__setattr__(self, "clearance", arrays["clearance"][0])
+        arrays |= {f"multipliers[{i}]": (one.values, (steps + 1, None)) for i, one in enumerate(self.multipliers)}
+        for name, (array, shape) in arrays.items():
+            check_shape(f"Solution: {name}", array, shape)
 
     @property
     def success(self) -> bool:

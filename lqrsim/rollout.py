@@ -7,7 +7,19 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.coordinates import Coordinates
-from lqrsim.errors import Array
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_items,
+    check_kind,
+    check_number,
+    check_seed,
+    check_shape,
+    check_text,
+    excerpt,
+    numbers_of,
+    shaped,
+)
 from lqrsim.results import Trajectory
 
 
@@ -15,7 +27,8 @@ from lqrsim.results import Trajectory
 class Rollout:
     """Closed-loop runs of one policy in MuJoCo, with everything that a picture of them needs.
 
-    K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, to the last bit.
+    K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, to the last bit
+    on equal processors.
 
     Attributes:
       robot, scene: their names. model: the MJCF that was run, as text.
@@ -32,7 +45,7 @@ class Rollout:
       diverged: (K,) whether the simulation became unstable; the states are NaN from there on.
       frame_times: (F,) seconds; frames: (K, F, nq) MuJoCo's qpos then, for drawing.
       disturbances: one description each. seed, first_trial: what the draws came from.
-      versions: of lqrsim and the libraries that the numbers depend on.
+      versions: of lqrsim and the libraries that the bits depend on, and the processor.
     """
 
     robot: str
@@ -60,6 +73,54 @@ class Rollout:
     seed: int
     first_trial: int = 0
     versions: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_kind("Rollout: plan", self.plan, Trajectory, "a Trajectory")
+        for name in ("state_coordinates", "control_coordinates"):
+            check_kind(f"Rollout: {name}", getattr(self, name), Coordinates, "Coordinates")
+        for name in ("robot", "scene", "policy_digest"):
+            check_text(f"Rollout: {name}", getattr(self, name), "a name", empty=True)
+        check_kind("Rollout: model", self.model, str, "the MJCF as text")
+        said = check_items("Rollout: disturbances", self.disturbances, str, "a description of each, as text")
+        object.__setattr__(self, "disturbances", said)
+        for name, above in (("radius", None), ("goal_radius", 0.0)):
+            least = 0.0 if above is None else None
+            number = check_number(f"Rollout: {name}", getattr(self, name), above=above, at_least=least)
+            object.__setattr__(self, name, number)
+        for name in ("seed", "first_trial"):
+            object.__setattr__(self, name, check_seed(f"Rollout: {name}", getattr(self, name)))
+        given = check_kind("Rollout: versions", self.versions, Mapping, "a dictionary of name: version")
+        if not all(isinstance(one, str) for item in given.items() for one in item):
+            raise InputError(f"Rollout: versions: got {excerpt(given)}, want a dictionary of name: version")
+        self._check_shapes()
+
+    def _check_shapes(self) -> None:
+        """Raises InputError for arrays that do not fit together."""
+        n, m, steps = len(self.state_coordinates), len(self.control_coordinates), self.plan.steps
+        check_shape("Rollout: plan.states", self.plan.states, (steps + 1, n))
+        check_shape("Rollout: plan.controls", self.plan.controls, (steps, m))
+        states = shaped("Rollout: states", self.states, (None, steps + 1, n))
+        trials, times = len(states), shaped("Rollout: frame_times", self.frame_times, (None,))
+        if not trials:
+            raise InputError("Rollout: states: got no trial, want at least one")
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "states": states.shape, "measured": states.shape, "commanded": (trials, steps, m),
+            "applied": (trials, steps, m), "forces": (trials, steps, 3), "torques": (trials, steps, 3),
+            "displaced": (trials, None, 3), "clearance": (trials, steps + 1), "frame_times": (None,),
+            "frames": (trials, len(times), None),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, shaped(f"Rollout: {name}", getattr(self, name), shape))
+        for name, kind in (("contacts", np.int64), ("diverged", np.bool_)):
+            numbers = numbers_of(f"Rollout: {name}", getattr(self, name))
+            check_shape(f"Rollout: {name}", numbers, (trials,))
+            # A period of contact is counted, and a trial has diverged or not.
+            most = steps if name == "contacts" else 1
+            if not ((numbers >= 0) & (numbers <= most) & (numbers == np.floor(numbers))).all():
+                raise InputError(
+                    f"Rollout: {name}: got {excerpt(numbers.tolist())}, want whole numbers from 0 to {most}"
+                )
+            object.__setattr__(self, name, numbers.astype(kind))
 
     @property
     def trials(self) -> int:
@@ -110,8 +171,9 @@ class Rollout:
         error = self.tracking_error
         for k, outcome in enumerate(self.outcome):
             if self.diverged[k]:
-                last = self.times[np.isfinite(self.states[k]).all(axis=1)][-1]
-                lines.append(f"  trial {self.first_trial + k}: diverged after {last:.2f} s")
+                whole = self.times[np.isfinite(self.states[k]).all(axis=1)]
+                when = f"after {whole[-1]:.2f} s" if len(whole) else "at once"
+                lines.append(f"  trial {self.first_trial + k}: diverged {when}")
                 continue
             rms, worst = float(np.sqrt(np.mean(error[k] ** 2))), float(error[k].max())
             lines.append(

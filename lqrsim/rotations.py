@@ -16,11 +16,14 @@ from functools import cache
 from math import cos, sin, sqrt
 from typing import Any
 
+from lqrsim.errors import InputError, check_items, excerpt
+
 RATIOS = ("sine_ratio", "cosine_ratio", "cotangent_ratio")
 
 
 def rotate(r: Sequence[Any], v: Sequence[Any]) -> list[Any]:
     """The vector `exp([r]) v`: v turned by the rotation vector r; SymPy expressions in, three of them out."""
+    r, v = _three("r", r), _three("v", v)
     sine, cosine, _ = (_symbolic(name)(_dot(r, r)) for name in RATIOS)
     once = _cross(r, v)
     twice = _cross(r, once)
@@ -32,10 +35,27 @@ def vector_rate(r: Sequence[Any], w: Sequence[Any]) -> list[Any]:
 
     Paper: Sec. VI-B, `rdot = w + 1/2 [r] w + (1 - 1/2 |r| / tan(1/2 |r|)) [r]^2 w / |r|^2`.
     """
+    r, w = _three("r", r), _three("w", w)
     cotangent = _symbolic("cotangent_ratio")(_dot(r, r))
     once = _cross(r, w)
     twice = _cross(r, once)
     return [w[i] + once[i] / 2 + cotangent * twice[i] for i in range(3)]
+
+
+def _three(field: str, vector: Sequence[Any]) -> tuple[Any, ...]:
+    """The vector's three expressions. Raises InputError for anything else."""
+    import sympy
+
+    found = check_items(field, vector, object, "three expressions or numbers", at_most=3)
+    if len(found) != 3 or any(isinstance(one, str) for one in found):
+        raise InputError(f"{field}: got {excerpt(vector)}, want three expressions or numbers")
+    try:
+        expressions = [sympy.sympify(one, strict=True) for one in found]
+    except Exception:  # SympifyError, or whatever an object raises when it is asked
+        expressions = [None]
+    if not all(isinstance(one, sympy.Expr) for one in expressions):
+        raise InputError(f"{field}: got {excerpt(vector)}, want three expressions or numbers")
+    return tuple(expressions)
 
 
 def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:

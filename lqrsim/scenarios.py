@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lqrsim.costs import ControlCost, ObstacleCost, QuadraticCost
-from lqrsim.errors import check_count, check_name
+from lqrsim.errors import check_count, check_items, check_kind, check_name, check_number, check_seed, check_text
 from lqrsim.problem import Problem
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
@@ -39,6 +39,18 @@ class Scenario:
     tracking_bound: float
     disturbances: tuple[Disturbance, ...] = ()
     paper_start: InitialPrior | None = None
+
+    def __post_init__(self) -> None:
+        check_text("Scenario: name", self.name, "a name")
+        check_text("Scenario: summary", self.summary, "what it is", at_most=1000, empty=True)
+        check_kind("Scenario: robot", self.robot, Robot, "a Robot, such as Quadrotor()")
+        check_kind("Scenario: scene", self.scene, Scene, "a Scene, such as load_scene('cage')")
+        check_kind("Scenario: problem", self.problem, Problem, "a Problem")
+        check_number("Scenario: tracking_bound", self.tracking_bound, above=0.0)
+        wanted = "disturbances, such as ControlNoise(0.05)"
+        found = check_items("Scenario: disturbances", self.disturbances, Disturbance, wanted)
+        object.__setattr__(self, "disturbances", found)
+        check_kind("Scenario: paper_start", self.paper_start, (InitialPrior, type(None)), "an InitialPrior or None")
 
     def plant(self) -> Plant:
         """The robot in its scene as a MuJoCo model that is ready to run."""
@@ -98,9 +110,7 @@ def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
     Args:
       query, seed: which of the random starts and goals; see `quadrotor_queries`.
     """
-    starts, goals = quadrotor_queries(
-        check_count("query", query, at_least=0) + 1, seed=check_count("seed", seed, at_least=0)
-    )
+    starts, goals = quadrotor_queries(check_count("query", query, at_least=0, at_most=999_999) + 1, seed=seed)
     robot, scene = Quadrotor(), load_scene("cage")
     weight = np.full(12, 500.0)
     problem = Problem(
@@ -136,7 +146,8 @@ def quadrotor_queries(count: int, *, seed: int = 0) -> tuple[np.ndarray, np.ndar
     A start lies on an edge of the cube of half-side 2.25 m: one coordinate uniform, the others at +-2.25 m with a
     jitter of +-0.01 m; its goal is the antipode.
     """
-    rng = np.random.default_rng(seed)
+    check_count("count", count, at_least=0, at_most=1_000_000)
+    rng = np.random.default_rng(check_seed("seed", seed))
     goals = np.zeros((count, 12))
     for goal in goals:
         edge = int(rng.integers(12))

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_name
+from lqrsim.errors import InputError, check_kind, check_name, check_path, check_text
 from lqrsim.world import KINDS, Obstacle, World
 
 try:
@@ -54,6 +54,14 @@ class Scene:
     model: mujoco.MjModel
     world: World
 
+    def __post_init__(self) -> None:
+        check_text("Scene: name", self.name, "a name", at_most=1000)
+        check_kind("Scene: xml", self.xml, str, "the MJCF as text")
+        check_kind("Scene: model", self.model, mujoco.MjModel, "a mujoco.MjModel")
+        check_kind("Scene: world", self.world, World, "a World")
+        if len(self.world) != (count := len(obstacle_geoms(self.model))):
+            raise InputError(f"Scene: world: got {len(self.world)} obstacles, want {count}, those of the model")
+
 
 def names() -> list[str]:
     """The packaged scenes: the files in models/ that include a robot."""
@@ -66,14 +74,14 @@ def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
     Raises:
       InputError: no such scene or file; it does not parse or compile; an obstacle is of a type without a distance.
     """
-    path = Path(name_or_path)
+    path = check_path("scene", name_or_path, "the name of a packaged scene, or the path of an .xml file")
     if path.suffix.lower() != ".xml":
         packaged = names()
         try:
             path = MODELS / f"{check_name('scene', os.fspath(name_or_path), packaged)}.xml"
         except InputError as error:
             raise InputError(f"{error}; or the path of an .xml file") from None
-    elif not path.is_file():
+    elif not os.path.isfile(path):
         packaged = ", ".join(names())
         raise InputError(f"scene: got {os.fspath(name_or_path)!r}, want a file that exists, or one of: {packaged}")
     return scene_from_xml(_flatten(path), path.stem)
@@ -170,7 +178,7 @@ def _flatten(path: Path) -> str:
 
     def find(name: str) -> Path:
         # MuJoCo's rule, relative to the main file, and then the packaged models.
-        file = next((file for file in (path.parent / name, MODELS / name) if file.is_file()), None)
+        file = next((file for file in (path.parent / name, MODELS / name) if os.path.isfile(file)), None)
         if file is None:
             packaged = ", ".join(sorted(file.name for file in MODELS.glob("*.xml")))
             raise InputError(f"scene: got an include of {name!r}, want a file beside {path.name} or one of: {packaged}")

@@ -11,9 +11,11 @@ from types import SimpleNamespace
 from typing import Any
 
 from lqrsim import cache
-from lqrsim.errors import InputError, check_number, excerpt
+from lqrsim.errors import InputError, check_kind, check_number, excerpt
 from lqrsim.fingerprint import fingerprint
 from lqrsim.rotations import RATIOS
+
+MOST = 1000  # parameters of a function
 
 
 class Parameters(SimpleNamespace):
@@ -25,12 +27,17 @@ class Parameters(SimpleNamespace):
         raise InputError(f"parameter: got {name!r}, want one of: {', '.join(vars(self)) or '(there are none)'}")
 
 
-def check_parameters(parameters: Mapping[str, float]) -> dict[str, float]:
+def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]:
     """The parameters as floats. Raises InputError unless each is finite and its name can be written `p.name`."""
+    if parameters is None:
+        return {}
+    check_kind("parameters", parameters, Mapping, "a dictionary of name: value")
+    if len(parameters) > MOST:
+        raise InputError(f"parameters: got {len(parameters)}, want at most {MOST}")
     for name in parameters:
-        if not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):
+        if not isinstance(name, str) or not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):
             raise InputError(
-                f"parameters: got the name {name!r}, want a Python name without a leading underscore, for p.name"
+                f"parameters: got the name {excerpt(name)}, want a Python name without a leading underscore, for p.name"
             )
     # Python reads p.µ by the normal form of the name.
     normal = {unicodedata.normalize("NFKC", name): value for name, value in parameters.items()}

@@ -1,11 +1,32 @@
 """Value functions: quadratics of the state, by their coefficients or by their moments. NumPy only."""
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array
+from lqrsim.errors import Array, InputError, check_kind, check_shape, real, shaped, vectors_of
+
+
+def _fit(value: object, names: tuple[str, str, str]) -> None:
+    """Keep a matrix, a vector and a number, or all of them along the same axes, as arrays. Raises InputError."""
+    kind = type(value).__name__
+    vector = real(f"{kind}: {names[1]}", getattr(value, names[1]))
+    if not vector.ndim or not vector.shape[-1]:
+        raise InputError(f"{kind}: {names[1]}: got shape {vector.shape}, want (..., n), of at least one state")
+    for name, shape in zip(names, ((*vector.shape, vector.shape[-1]), vector.shape, vector.shape[:-1]), strict=True):
+        object.__setattr__(value, name, shaped(f"{kind}: {name}", getattr(value, name), shape))
+
+
+@contextlib.contextmanager
+def _invertible(what: str) -> Iterator[None]:
+    """Raises InputError for what is singular."""
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise InputError(f"{what}: got a singular matrix ({error}), want invertible ones") from None
 
 
 @dataclass(frozen=True)
@@ -24,18 +45,29 @@ class Quadratic:
     gradient: Array
     constant: Array | float
 
+    def __post_init__(self) -> None:
+        _fit(self, ("hessian", "gradient", "constant"))
+
     def __add__(self, other: "Quadratic") -> "Quadratic":
+        check_kind("other", other, Quadratic, "a Quadratic")
+        if other.hessian.shape != self.hessian.shape:
+            raise InputError(f"other: got a hessian of shape {other.hessian.shape}, want {self.hessian.shape}")
         return Quadratic(self.hessian + other.hessian, self.gradient + other.gradient, self.constant + other.constant)
 
     def __call__(self, states: npt.ArrayLike) -> Array:
-        """The values (T+1,) at states (T+1, n), one a knot."""
-        x = np.asarray(states, dtype=np.float64)
+        """The values (T+1,) at states (T+1, n), one a knot. Raises InputError for other shapes."""
+        x = vectors_of("states", states, self.gradient.shape[-1])
+        try:
+            np.broadcast_shapes(x.shape, self.gradient.shape)
+        except ValueError:
+            raise InputError(f"states: got shape {x.shape}, want one that goes with {self.gradient.shape}") from None
         curved = 0.5 * np.einsum("...i,...ij,...j->...", x, self.hessian, x)
         return curved + np.einsum("...i,...i->...", x, self.gradient) + self.constant
 
     def minimizer(self) -> Array:
-        """The states (T+1, n) of least value. Paper: Eq. (21). Raises LinAlgError where a Hessian is singular."""
-        return -np.linalg.solve(self.hessian, self.gradient[..., None])[..., 0]
+        """The states (T+1, n) of least value. Paper: Eq. (21). Raises InputError where a Hessian is singular."""
+        with _invertible("hessian"):
+            return -np.linalg.solve(self.hessian, self.gradient[..., None])[..., 0]
 
     def minimum(self) -> Array:
         """The least value at each knot, (T+1,)."""
@@ -59,9 +91,13 @@ class Moments:
     mean: Array
     constant: Array
 
+    def __post_init__(self) -> None:
+        _fit(self, ("covariance", "mean", "constant"))
+
     def quadratic(self) -> Quadratic:
-        """The same functions by their coefficients. Raises LinAlgError where a covariance is singular."""
-        hessian = np.linalg.inv(self.covariance)
+        """The same functions by their coefficients. Raises InputError where a covariance is singular."""
+        with _invertible("covariance"):
+            hessian = np.linalg.inv(self.covariance)
         hessian = 0.5 * (hessian + np.swapaxes(hessian, -1, -2))
         gradient = -np.einsum("...ij,...j->...i", hessian, self.mean)
         return Quadratic(hessian, gradient, self.constant - 0.5 * np.einsum("...i,...i->...", gradient, self.mean))
@@ -82,8 +118,14 @@ class TotalCost:
     cost_to_go: Quadratic
     cost_to_come: Quadratic | Moments
 
+    def __post_init__(self) -> None:
+        check_kind("TotalCost: cost_to_go", self.cost_to_go, Quadratic, "a Quadratic")
+        check_kind("TotalCost: cost_to_come", self.cost_to_come, (Quadratic, Moments), "a Quadratic or Moments")
+        come = self.cost_to_come.gradient if isinstance(self.cost_to_come, Quadratic) else self.cost_to_come.mean
+        check_shape("TotalCost: cost_to_come", come, self.cost_to_go.gradient.shape)
+
     def minimizer(self) -> Array:
-        """The states (T+1, n) of least total cost; x_hat. Paper: Eq. (21). Raises LinAlgError where there is none."""
+        """The states (T+1, n) of least total cost; x_hat. Paper: Eq. (21). Raises InputError where there is none."""
         if isinstance(self.cost_to_come, Quadratic):
             return (self.cost_to_go + self.cost_to_come).minimizer()
         moved = np.einsum("...ij,...j->...i", self.cost_to_come.covariance, self.costate())
@@ -96,7 +138,8 @@ class TotalCost:
             return np.einsum("...ij,...j->...i", go.hessian, self.minimizer()) + go.gradient
         covariance, mean = self.cost_to_come.covariance, self.cost_to_come.mean
         slope = np.einsum("...ij,...j->...i", go.hessian, mean) + go.gradient
-        return np.linalg.solve(np.eye(mean.shape[-1]) + go.hessian @ covariance, slope[..., None])[..., 0]
+        with _invertible("covariance"):
+            return np.linalg.solve(np.eye(mean.shape[-1]) + go.hessian @ covariance, slope[..., None])[..., 0]
 
     def covariance(self) -> Array:
         """The inverses (T+1, n, n) of the Hessians: zero in a direction in which no state can be reached.
@@ -104,8 +147,9 @@ class TotalCost:
         As of a normal distribution, at k standard deviations the total cost is `k^2/2` above its least.
         """
         come, curvature = self.cost_to_come, self.cost_to_go.hessian
-        covariance = come.covariance if isinstance(come, Moments) else np.linalg.inv(come.hessian)
-        return covariance @ np.linalg.inv(np.eye(covariance.shape[-1]) + curvature @ covariance)
+        with _invertible("hessian"):
+            covariance = come.covariance if isinstance(come, Moments) else np.linalg.inv(come.hessian)
+            return covariance @ np.linalg.inv(np.eye(covariance.shape[-1]) + curvature @ covariance)
 
     def minimum(self) -> Array:
         """The least total cost at each knot, (T+1,): for a linear-quadratic problem the same number at all."""

@@ -1,14 +1,30 @@
-"""The versions that a result depends on; every saved result carries them."""
+"""The versions, and the kind of processor, that a result's bits depend on; every saved result carries them."""
 
 import platform
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
+
+from lqrsim.machine import processor
 
 
 @cache
 def versions() -> dict[str, str]:
-    """Name -> version of lqrsim, of the libraries that its numbers depend on, and of Python."""
-    return {"python": platform.python_version()} | versions_of("lqrsim", "numpy", "numba", "mujoco")
+    """Name -> version of lqrsim, of the libraries that its numbers depend on, and of Python; and the `processor`.
+
+    Where all of them are equal, the same program gives the same bits.
+    """
+    installed = versions_of("lqrsim", "numpy", "numba", "mujoco")
+    return {"python": platform.python_version()} | installed | {"processor": processor()}
+
+
+def changed(was: Mapping[str, str]) -> str:
+    """What is another here than it was there, as `name new (was old)`; empty where the bits are the same."""
+    now = versions()
+    names = [*now, *(name for name in was if name not in now)]
+    return ", ".join(
+        f"{name} {now.get(name)} (was {was.get(name)})" for name in names if now.get(name) != was.get(name)
+    )
 
 
 def versions_of(*names: str) -> dict[str, str]:

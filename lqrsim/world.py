@@ -12,7 +12,7 @@ from math import inf, sqrt
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_name
+from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, check_text, real
 from lqrsim.solvers.interface import stack
 
 KINDS = ("plane", "sphere", "capsule", "cylinder", "box")
@@ -38,6 +38,7 @@ class Obstacle:
     size: Array
 
     def __post_init__(self) -> None:
+        check_text("obstacle: name", self.name, "a name", at_most=1000)
         check_name(f"obstacle {self.name!r}: kind", self.kind, KINDS)
         object.__setattr__(self, "position", check_array(f"obstacle {self.name!r}: position", self.position, (3,)))
         rotation = check_array(f"obstacle {self.name!r}: rotation", self.rotation, (3, 3))
@@ -63,7 +64,7 @@ class World:
     obstacles: Sequence[Obstacle] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "obstacles", tuple(self.obstacles))
+        object.__setattr__(self, "obstacles", check_items("obstacles", self.obstacles, Obstacle, "a list of Obstacle"))
 
     def __len__(self) -> int:
         return len(self.obstacles)
@@ -86,19 +87,19 @@ class World:
         Raises:
           InputError: an obstacle is tilted, so that it has no outline from above among the primitives.
         """
-        if dimension == 3:
+        if check_count("dimension", dimension, at_least=2, at_most=3) == 3:
             return self
         return World([flat for obstacle in self.obstacles if (flat := _from_above(obstacle)) is not None])
 
     def distances(self, point: npt.ArrayLike) -> Array:
         """Signed distances in metres to each obstacle, (len(self),), of one point (2,) or (3,); negative inside."""
-        x, y, z = (*np.asarray(point, dtype=np.float64).tolist(), 0.0)[:3]
+        x, y, z = (*_places("point", point, one=True).tolist(), 0.0)[:3]
         data = self.table.ravel()
         return np.array([signed_distance(data, ROW * i, x, y, z) for i in range(len(self))])
 
     def distance(self, points: npt.ArrayLike) -> Array:
         """Signed distance in metres to the nearest obstacle, (...), of points (..., 2 or 3); infinite without any."""
-        points = np.asarray(points, dtype=np.float64)
+        points = _places("points", points)
         flat = [self.distances(point).min(initial=np.inf) for point in points.reshape(-1, points.shape[-1])]
         return np.array(flat).reshape(points.shape[:-1])
 
@@ -106,9 +107,17 @@ class World:
         """Which obstacle is nearest, (...), at points (..., 2 or 3). Raises InputError in an empty world."""
         if not self.obstacles:
             raise InputError("nearest: got a world without obstacles, want at least one")
-        points = np.asarray(points, dtype=np.float64)
+        points = _places("points", points)
         flat = [int(self.distances(point).argmin()) for point in points.reshape(-1, points.shape[-1])]
         return np.array(flat, dtype=np.int64).reshape(points.shape[:-1])
+
+
+def _places(field: str, points: npt.ArrayLike, *, one: bool = False) -> Array:
+    """Points (..., 2 or 3), or only one of them, as an array. Raises InputError for what is none."""
+    array = real(field, points)
+    if array.shape[-1:] not in ((2,), (3,)) or (one and array.ndim > 1):
+        raise InputError(f"{field}: got shape {array.shape}, want {'' if one else '..., '}2 or 3 coordinates")
+    return array
 
 
 def _from_above(obstacle: Obstacle) -> Obstacle | None:

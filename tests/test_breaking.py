@@ -31,6 +31,24 @@ def test_many_numbers_take_longer_but_get_there() -> None:
     assert (np.diff(found.history) <= 0).all()
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_it_goes_on_until_little_is_left(seed: int) -> None:
+    """It says how much is left, whenever it is stopped: to a fifth of that, for it is of noise; and ends at 1 %."""
+    normal = np.full(200, 1 / np.sqrt(200))
+
+    def score(z: np.ndarray) -> np.ndarray:
+        return z @ normal - 4.0
+
+    stopped = smallest_failure(score, 200, rounds=8, seed=seed)
+    assert not stopped.converged
+    assert stopped.left > 0.02
+    assert 1 - 4.0 / stopped.distance == pytest.approx(stopped.left, rel=0.2)
+    found = smallest_failure(score, 200, rounds=100, seed=seed)
+    assert found.converged
+    assert 4.0 < found.distance < 4.0 * 1.013
+    assert len(found.history) > 20
+
+
 def test_the_nearer_of_two_ways_to_fail_is_found() -> None:
     """The farther one is a quarter as frequent, so that random failures are of both."""
     found = smallest_failure(lambda z: np.maximum(z[:, 0] - 3.0, -z[:, 1] - 3.4), 10)
@@ -98,7 +116,7 @@ def test_disturbances_in_physical_units(quadrotor: ls.Scenario, quadrotor_soluti
     ("call", "message"),
     [
         (lambda: smallest_failure(lambda z: z[:, 0], 0), "size: got 0"),
-        (lambda: smallest_failure(lambda z: z[:, 0], 2, pairs=0), "pairs: got 0"),
+        (lambda: smallest_failure(lambda z: z[:, 0], 2, pairs=1), "pairs: got 1"),
         (lambda: smallest_failure(lambda z: z[:, 0] - 9, 2, failures=np.ones((1, 2))), "failures: got none that fails"),
         (lambda: smallest_failure(lambda z: z[:, 0], 2, failures=np.ones((0, 2))), "failures: got none, want"),
         (lambda: smallest_failure(lambda z: z[:, 0], 2, failures=np.ones((1, 3))), r"failures: got shape \(1, 3\)"),

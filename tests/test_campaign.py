@@ -227,6 +227,47 @@ def test_dask_does_the_same(reference: Results, tmp_path: Path) -> None:
     same_bits(tmp_path, reference)
 
 
+@LINUX
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_lost_scheduler_is_one_line_and_what_is_done_stays(
+    reference: Results, tmp_path: Path, number: int, capfd: pytest.CaptureFixture[str]
+) -> None:
+    distributed = pytest.importorskip("distributed")
+    told = tmp_path / "scheduler.json"
+
+    def start(module: str, *options: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.{module}", *options, "--scheduler-file", str(told)]
+        return subprocess.Popen([*command, "--no-dashboard"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    scheduler, worker = start("dask_scheduler", "--port", "0"), start("dask_worker", "--nthreads", "1")
+    try:
+        until = time.monotonic() + 60
+        while not told.is_file():
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        with distributed.Client(scheduler_file=str(told)) as client:
+            client.wait_for_workers(1, timeout=60)
+            address = client.scheduler.address
+
+        def lose(done: int, total: int) -> None:
+            if done:
+                scheduler.send_signal(number)
+                scheduler.wait(20)
+
+        capfd.readouterr()
+        with pytest.raises(InputError, match=r"scheduler: got .*run the same command again") as caught:
+            run_campaign(CAMPAIGN, tmp_path / "run", scheduler=address, progress=lose)
+        assert "\n" not in str(caught.value)
+        assert capfd.readouterr() == ("", "")
+    finally:
+        for process in (worker, scheduler):
+            process.kill()
+            process.wait()
+    assert list((tmp_path / "run" / "shards").glob("*.parquet"))
+    run_campaign(CAMPAIGN, tmp_path / "run", workers=0)
+    same_bits(tmp_path / "run", reference)
+
+
 # What goes wrong in trials.
 
 

@@ -1,5 +1,6 @@
 """The commands, each on what the one before wrote; and bad input: one line, no traceback, a non-zero exit."""
 
+import shlex
 import signal
 import subprocess
 import sys
@@ -12,6 +13,8 @@ import pytest
 import lqrsim as ls
 from lqrsim import cache
 from lqrsim.cli import main
+from lqrsim.commands import COMMANDS
+from lqrsim.reproduce import SCRIPTS
 from lqrsim.view import gl
 
 OWN_SCENARIOS = """
@@ -157,6 +160,23 @@ def test_own_scenario_in_a_file(own: Path, tmp_path: Path, capsys: pytest.Captur
     assert main(["simulate", str(solution), "--scenario", reference]) == 0
 
 
+def test_runs_are_named_after_the_scenario(
+    own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not after the function that makes it; and what a file cannot be called is left out."""
+    own.write_text(own.read_text().replace('name="shorter"', 'name="a/b: short, 2 m"'))
+    monkeypatch.chdir(tmp_path)
+    assert main(["solve", "own.py:shorter,steps=100"]) == 0
+    solution = tmp_path / "runs" / "a_b_short_2_m" / "solution.npz"
+    assert "wrote runs/a_b_short_2_m/solution.npz" in capsys.readouterr().out
+    # What it says is to be given in any working directory.
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert main(["simulate", str(solution)]) == 2
+    option = one_line(capsys).split(" want ")[1].removesuffix(" to run that code\n")
+    assert main(["simulate", str(solution), *shlex.split(option)]) == 0
+
+
 def test_own_scenario_in_a_module(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(own.parent)
     monkeypatch.setattr(sys, "path", [*sys.path])
@@ -210,6 +230,25 @@ def test_bad_input_is_one_line(
     message = one_line(capsys)
     assert all(part in message for part in says), message
     assert sorted(path.name for path in tmp_path.iterdir()) in (before, sorted([*before, "__pycache__"]))
+
+
+def test_help_has_a_line_for_each_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    begun = lines.index("commands:") + 1
+    listed = lines[begun : lines.index("", begun)]
+    assert [line.split()[0] for line in listed] == list(COMMANDS)
+    assert all(line[2:].split(maxsplit=1)[1] == COMMANDS[line.split()[0]] for line in listed)
+    assert all(line.endswith(".") for line in listed)
+
+
+def test_help_of_reproduce_lists_all_results(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["reproduce", "--help"])
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in SCRIPTS)
 
 
 @pytest.mark.parametrize(

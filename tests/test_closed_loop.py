@@ -302,7 +302,7 @@ def test_a_plan_that_is_not_finite_is_refused(cage):
         ({"seed": -1}, "^seed: got -1, want a whole number >= 0$"),
         ({"first_trial": 0.5}, "^first_trial: got 0.5"),
         ({"goal_radius": float("nan")}, "^goal_radius: got nan"),
-        ({"disturbances": ["wind"]}, "^disturbances: got 'wind', want Disturbance objects"),
+        ({"disturbances": ["wind"]}, "^disturbances: got 'wind' at 0, want disturbances"),
     ],
 )
 def test_bad_options_are_told(cage, options, message):

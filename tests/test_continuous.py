@@ -333,5 +333,5 @@ def test_a_fixed_start_is_refused(differential_drive: ls.Scenario) -> None:
     problem = dataclasses.replace(differential_drive.problem, initial=ls.FixedState((0, -2.5, np.pi)))
     with pytest.raises(ls.InputError, match=r"^initial: got a FixedState, want an initial cost"):
         smooth_continuous(problem)
-    with pytest.raises(ls.InputError, match=r"^problem: got str, want a Problem"):
+    with pytest.raises(ls.InputError, match=r"^problem: got 'drive', want a Problem"):
         smooth_continuous("drive")  # pyright: ignore[reportArgumentType]

@@ -2,14 +2,15 @@
 
 import re
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim import cli, robots
+from lqrsim import robots
 from lqrsim.cli import main
+from lqrsim.commands import COMMANDS
 from lqrsim.simulation.disturbances import KINDS, PRESETS
 from lqrsim.view import gl
 
@@ -118,6 +119,7 @@ def test_stress_testing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_commands_of_pages_exist() -> None:
-    commands = {command.__name__.lower() for command in get_args(cli.Command)}
     for page in DOCS.glob("*.md"):
-        assert set(re.findall(r"^`*lqrsim (\w+)", page.read_text(encoding="utf-8"), re.MULTILINE)) <= commands, page
+        assert set(re.findall(r"^`*lqrsim (\w+)", page.read_text(encoding="utf-8"), re.MULTILINE)) <= COMMANDS.keys(), (
+            page
+        )

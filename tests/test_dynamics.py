@@ -165,7 +165,7 @@ FIELDS = {
         (_tangled, {}, r"_tangled\(x, u, p\): got what can not be compiled .*besselj.*, want elementary functions"),
         (_piece, {}, r"_piece\(x, u, p\): got Piecewise.* in entry 1, want its last case to be \(expression, True\)"),
         (_pendulum, {"parameters": {"_k": 1.0}}, "got the name '_k', want a Python name without a leading underscore"),
-        (_pendulum, {"parameters": {1: 1.0}}, "parameters: got {1: 1.0}, want a dictionary of name: value"),
+        (_pendulum, {"parameters": {1: 1.0}}, "parameters: got the name 1, want a Python name"),
         (_pendulum, {"states": ["angle", "speed"]}, "states: got .*, want a dictionary of name: unit"),
         (_pendulum, {"control_limits": ("a", "b")}, r"control_limits: got .*, want \(lowest, highest\), each a number"),
         (_pendulum, {"level": 3}, "level: got 3, want one of: symbolic, compiled, plain"),

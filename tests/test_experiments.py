@@ -98,6 +98,17 @@ def test_benchmark_says_what_it_skips(tmp_path: Path) -> None:
     assert script.report({"peers": {"skipped": "no such thing"}}) == "peers: skipped: no such thing"
 
 
+def test_benchmark_of_intervals() -> None:
+    """A small part: differences cover exactly computed 93 % or more; so few rare studies only that it counts them."""
+    script = import_module("benchmark_intervals")
+    result = script.main(script.Config(quick=True, studies=10))
+    assert all(0.93 < one["least"] <= one["mean"] <= 1 for one in result["differences"])
+    for one in result["rare"]:
+        assert one["covered"] == pytest.approx(1 - one["below"] - one["above"])
+        assert one["covered"] > 0.5
+    assert "rare failures, 95 % intervals" in script.report(result)
+
+
 def test_benchmark_of_reliability() -> None:
     """On few problems: bad advice breaks the bare method and not the guarded one, which changes nothing elsewhere."""
     script = import_module("benchmark_reliability")

@@ -1,29 +1,29 @@
 """Files: what goes in comes out to the bit, needs only NumPy to read, and a bad one gets one line."""
 
+import contextlib
 import dataclasses
+import hashlib
+import importlib
+import io
 import json
 import pickle
+import tracemalloc
+import warnings
 import zipfile
+from collections import Counter
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
 import lqrsim as ls
 from lqrsim import files
+from lqrsim.cli import main
 
-
-def same(a: object, b: object) -> bool:
-    """Equal in every field, arrays to the bit."""
-    if dataclasses.is_dataclass(a) and not isinstance(a, type):
-        return type(a) is type(b) and all(
-            same(getattr(a, field.name), getattr(b, field.name)) for field in dataclasses.fields(a)
-        )
-    if isinstance(a, np.ndarray):
-        return isinstance(b, np.ndarray) and a.dtype == b.dtype and np.array_equal(a, b, equal_nan=True)
-    if isinstance(a, tuple):
-        return isinstance(b, tuple) and len(a) == len(b) and all(map(same, a, b))
-    return a == b or (a != a and b != b)
+fuzzer: ModuleType = importlib.import_module("robustness.files")
+same = fuzzer.same
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_a_policy_is_read_with_numpy_alone(saved: Path, drive_solution: ls.Solut
     with np.load(saved) as archive:
         gain, offset, nominal = (archive[f"policy.{name}"] for name in ("gain", "offset", "nominal"))
         meta = json.loads(str(archive["meta"]))
-    assert (meta["format"], meta["version"]) == ("lqrsim solution", 3)
+    assert (meta["format"], meta["version"]) == ("lqrsim solution", 4)
     state, t = drive_solution.trajectory.states[7] + [0.01, 0.02, 2 * np.pi], 7 / 6
     step = min(int(t / meta["dt"] + 1e-9), len(gain) - 1)
     for i in meta["states"]["angles"]:
@@ -59,13 +59,41 @@ def test_a_policy_is_read_with_numpy_alone(saved: Path, drive_solution: ls.Solut
     np.testing.assert_allclose(control, drive_solution.policy(state, t), rtol=0, atol=1e-12)
 
 
-def rewrite(path: Path, **changes: object) -> None:
-    """Change what a solution file says of itself."""
+def content_hash(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> str:
+    """The hash in a file, as docs/file_format.md describes it, and not as the package computes it."""
+    text = json.dumps({k: v for k, v in meta.items() if k != "sha256"}, sort_keys=True, separators=(",", ":"))
+    found = hashlib.sha256(text.encode())
+    for name, array in sorted(arrays.items()):
+        found.update(f"\n{name} {array.dtype.str} {array.shape}\n".encode() + array.tobytes())
+    return found.hexdigest()
+
+
+def contents(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     with np.load(path) as archive:
         arrays = dict(archive)
-    meta = json.loads(str(arrays.pop("meta"))) | {k: v for k, v in changes.items() if not isinstance(v, np.ndarray)}
-    arrays |= {key: value for key, value in changes.items() if isinstance(value, np.ndarray)}
-    np.savez(path, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
+    return arrays, json.loads(str(arrays.pop("meta")))
+
+
+def rewrite(path: Path, *, sealed: Any = True, **changes: Any) -> None:
+    """Change what a file says, as another program could: with the hash that belongs to it, or the old one.
+
+    An array replaces one, None takes one out, and a function changes it; anything else is metadata.
+    """
+    arrays, meta = contents(path)
+    for name, change in changes.items():
+        if name in arrays:
+            array = arrays.pop(name)
+            if change is not None:
+                changed: Any = change(array) if callable(change) else change
+                arrays[name] = np.asarray(changed)
+        elif isinstance(change, np.ndarray):
+            arrays[name] = change
+        else:
+            meta[name] = change(meta[name]) if callable(change) else change
+    if sealed:
+        meta["sha256"] = content_hash(arrays, meta)
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
 
 
 def _save_bare_array(path: Path) -> None:
@@ -77,16 +105,16 @@ def _save_bare_array(path: Path) -> None:
     ("spoil", "message"),
     [
         (lambda path: path.unlink(), "want a file that exists"),
-        (lambda path: path.write_bytes(path.read_bytes()[:-4000]), "which is damaged, want a file that lqrsim wrote"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-4000]), "which is damaged .*want a file that lqrsim wrote"),
         (lambda path: path.write_bytes(b""), "which is damaged"),
         (lambda path: path.write_text("gain: 3"), "which is damaged"),
         (lambda path: np.savez(path, a=np.zeros(3)), "which is damaged"),
         (lambda path: _save_bare_array(path), "which is damaged"),
         (lambda path: path.write_bytes(pickle.dumps({"gain": 1})), "which is damaged"),
         (lambda path: np.savez(path, meta=np.array([{}], dtype=object)), "which is damaged"),
-        (lambda path: rewrite(path, version=1), "of version 1, want version 3"),
+        (lambda path: rewrite(path, version=1), "of version 1, want version 4"),
         (lambda path: rewrite(path, format="lqrsim rollout"), "holds a 'lqrsim rollout', want a 'lqrsim solution'"),
-        (lambda path: rewrite(path, status="great"), "which is damaged .*'great' is not a valid Status"),
+        (lambda path: rewrite(path, status="great"), r"meta\.status: got 'great', want one of: converged"),
         (lambda path: rewrite(path, **{"policy.offset": np.zeros((150, 3))}), r"policy.offset: got shape \(150, 3\)"),
         (lambda path: rewrite(path, **{"policy.gain": np.full((150, 2, 3), np.nan)}), "policy.gain: got nan at index"),
         (lambda path: rewrite(path, dt=None), "which is damaged"),
@@ -99,18 +127,329 @@ def test_a_spoilt_file_gets_one_line(saved: Path, spoil, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_every_flipped_byte_is_harmless(saved: Path, drive_solution: ls.Solution) -> None:
-    """The archive's check sums notice, or it did not matter: never another exception, never another policy."""
+@pytest.fixture(scope="module")
+def rollout(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> ls.Rollout:
+    plant, disturbances = differential_drive.plant(), [ls.ControlNoise(0.01), ls.ForceNoise(0.1)]
+    return ls.simulate(plant, drive_solution, disturbances=disturbances, trials=2, seed=2**40)
+
+
+@pytest.fixture
+def run(tmp_path: Path, rollout: ls.Rollout) -> Path:
+    return ls.save(rollout, tmp_path / "rollout.npz")
+
+
+def test_a_rollout_survives_and_is_saved_again_as_it_was(saved: Path, run: Path, rollout: ls.Rollout) -> None:
+    loaded = ls.load_rollout(run)
+    assert same(loaded, rollout)
+    for path, one in ((run, loaded), (saved, ls.load_solution(saved))):
+        assert ls.save(one, path.with_name("again.npz")).read_bytes() == path.read_bytes()
+
+
+def test_the_hash_is_of_the_content(saved: Path, run: Path) -> None:
+    for path in (saved, run):
+        arrays, meta = contents(path)
+        assert meta["sha256"] == content_hash(arrays, meta)
+
+
+def test_every_flipped_bit_is_harmless(saved: Path, drive_solution: ls.Solution) -> None:
+    """It is noticed, or it did not matter: never another exception, and never another solution."""
+    packed = saved.read_bytes()
+    arrays, meta = contents(saved)
+    with saved.open("wb") as file:
+        np.savez(file, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
+    rng = np.random.default_rng(0)
+    for original in (packed, saved.read_bytes()):
+        assert same(ls.load_solution(saved), drive_solution)
+        # Half of them near the names and sizes at the end, where a bit makes a parser say most.
+        for place in [
+            *rng.integers(len(original), size=60),
+            *rng.integers(len(original) - 1500, len(original), size=60),
+        ]:
+            spoilt = bytearray(original)
+            spoilt[place] ^= 1 << int(rng.integers(8))
+            saved.write_bytes(bytes(spoilt))
+            with contextlib.suppress(ls.InputError):
+                assert same(ls.load_solution(saved), drive_solution)
+        saved.write_bytes(packed)
+
+
+def test_a_sample_of_what_a_fuzzer_makes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some of what `experiments/benchmark_robustness.py` tries by the ten thousand; half have a hash that fits."""
+    monkeypatch.setattr(fuzzer, "PATIENCE", 300.0)  # what hangs is found, and what a slow machine takes is no fault
+    found = list(fuzzer.verdicts(400, seed=3))
+    assert [verdict for verdict in found if verdict.kind in fuzzer.FAILURES] == []
+    kinds = Counter(verdict.kind for verdict in found)
+    assert min(kinds[kind] for kind in ("refused", "identical", "accepted")) > 0, kinds
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        # Arrays that have the hash that belongs to them.
+        ({"states": lambda a: a.astype(np.float32)}, "'states': got no array of numbers as lqrsim writes them"),
+        ({"frames": lambda a: a.astype(np.float16)}, "which is damaged"),
+        ({"clearance": lambda a: a.astype(int)}, "clearance: got numbers of type <i8, want <f8"),
+        ({"clearance": lambda a: a > 0}, r"clearance: got numbers of type \|b1, want <f8"),
+        ({"frame_times": lambda a: a.astype("M8[s]")}, "which is damaged"),
+        ({"states": lambda a: a.astype(">f8")}, "which is damaged"),
+        ({"states": np.asfortranarray}, "which is damaged"),
+        ({"contacts": lambda a: a.astype(float)}, "contacts: got numbers of type <f8, want <i8"),
+        ({"diverged": lambda a: a.view(np.uint8)}, "which is damaged"),
+        ({"forces": lambda a: a.transpose(0, 2, 1).copy()}, r"forces: got shape \(2, 3, 150\), want \(K, T, 3\)"),
+        ({"frames": lambda a: a[..., :0]}, None),
+        ({"frames": lambda a: a[:, :0], "frame_times": lambda a: a[:0]}, None),
+        ({"frame_times": lambda a: a[::-1].copy()}, "frame_times: got times that are not in order"),
+        ({"contacts": lambda a: a - 10**6}, r"contacts: got .*, want whole numbers from 0 to 150"),
+        ({"states": lambda a: np.array(1.0)}, "states: got shape"),
+        ({"torques": None}, "torques: got none, want it"),
+        ({"bomb": np.zeros(3)}, "'bomb': got it, want only what belongs to this rollout"),
+        # Text of another type or range.
+        *(({name: 7}, f"{name}: got 7, want text") for name in ("robot", "scene", "model", "policy_digest")),
+        *(({name: "7"}, f"{name}: got '7', want a number") for name in ("radius", "goal_radius", "dt")),
+        *(({name: -1}, f"{name}: got -1, want") for name in ("radius", "goal_radius", "dt", "seed", "first_trial")),
+        *(({name: True}, f"{name}: got True, want") for name in ("radius", "goal_radius", "dt", "seed", "first_trial")),
+        *(({name: np.nan}, f"{name}: got nan, want") for name in ("radius", "goal_radius", "dt", "seed")),
+        ({"dt": 1e30}, r"dt: got 1e\+30, want a finite number >= 1e-09 <= 1e\+09"),
+        ({"seed": 1.5}, "seed: got 1.5, want a whole number"),
+        ({"radius": 10**400}, "radius: got"),
+        ({"robot": "a\nb"}, "robot: got 'a.nb', want one line"),
+        ({"robot": "x" * 5000}, "robot: got 'xxx.*want one line of at most 1000 characters"),
+        ({"robot": "\ud800"}, "robot: got .* want text without halves of letters"),
+        ({"disturbances": "wind"}, "disturbances: got 'wind', want a list"),
+        ({"disturbances": [1]}, r"disturbances\[0\]: got 1, want text"),
+        ({"versions": ["1"]}, "versions: got .*, want an object"),
+        ({"versions": {"numpy": 2}}, "versions.numpy: got 2, want text"),
+        ({"states": None, "controls": 3}, "which is damaged"),
+        ({"more": 1}, "meta: got 'more', want no other than"),
+    ],
+)
+def test_what_is_in_a_rollout_is_what_it_must_be(run: Path, changes: dict[str, Any], message: str | None) -> None:
+    """Files that are whole, and have the hash that belongs to what is in them: an older or another program's."""
+    rewrite(run, **changes)
+    if message is None:  # without pictures, and so not to be drawn
+        with pytest.raises(ls.InputError, match=r"frames|without one finite state"):
+            ls.render(ls.load_rollout(run), run.with_suffix(".mp4"))
+        return
+    with pytest.raises(ls.InputError, match=message) as caught:
+        ls.load_rollout(run)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"states": {"names": [1, 2, 3]}}, "states: got none of 'angles', want it"),
+        ({"states": lambda one: one | {"names": [1, 2, 3]}}, r"states.names\[0\]: got 1, want text"),
+        ({"states": lambda one: one | {"names": ["x", "x", "y"]}}, "a name twice"),
+        ({"states": lambda one: one | {"position": [0, 7]}}, "position: got"),
+        ({"states": lambda one: one | {"low": [np.nan] * 3}}, "low: got nan"),
+        ({"controls": "none"}, "controls: got 'none', want an object"),
+        ({"candidates": lambda one: [[*one[0][:2], np.inf, one[0][3]], *one[1:]]}, r"candidates\[0\]\[2\]: got inf"),
+        ({"candidates": lambda one: [[*row[:3], None] for row in one]}, "candidates: got .* none that ended"),
+        ({"candidates": lambda one: one[:-1]}, r"candidates.states: got shape"),
+        ({"candidates": []}, "candidates: got some without plans, plans without them"),
+        ({"methods": lambda one: one[:-1]}, "iterations: got shape"),
+        ({"penalties": [1.0]}, "multipliers.0: got none, want it"),
+        ({"status": None}, "status: got None, want one of: converged"),
+        ({"options": {"a": [[[[[[[[1]]]]]]]]}}, "options.*got lists or objects in each other, want at most 6"),
+        ({"scenario": ["quadrotor"]}, "scenario: got .*, want text"),
+        ({"version": 4.5}, "of version 4.5, want version 4"),
+        ({"cost_to_go.gradient": None}, "cost_to_go.constant.*: got it, want only what belongs"),
+        ({"inverse_policy.gain": lambda a: a * np.nan}, "inverse_policy.gain: got nan at index"),
+        ({"iterations": lambda a: a[:, :6]}, r"iterations: got shape \(\d+, 6\), want \(iterations, 7\)"),
+        (
+            {
+                name: lambda a: a[:0]
+                for name in ("policy.gain", "policy.offset", "policy.nominal", "trajectory.controls")
+            },
+            "trajectory.states: got shape|at least one step",
+        ),
+    ],
+)
+def test_what_is_in_a_solution_is_what_it_must_be(saved: Path, changes: dict[str, Any], message: str) -> None:
+    rewrite(saved, **changes)
+    with pytest.raises(ls.InputError, match=message) as caught:
+        ls.load_solution(saved)
+    assert "\n" not in str(caught.value)
+
+
+def test_another_number_is_not_taken_for_what_was_saved(saved: Path) -> None:
+    """An array that is dropped, or changed in its last bit, and the hash as it was."""
+    _, meta = contents(saved)
+    changes: list[dict[str, Any]] = [
+        {"clearance": None},
+        {"policy.offset": lambda a: np.nextafter(a, np.inf)},
+        {"trajectory.states": lambda a: np.where(a == a[0, 1], -0.0, a)},
+        {"detail": "it was fine"},
+        {"dt": np.nextafter(meta["dt"], 1.0)},
+    ]
     original = saved.read_bytes()
-    for place in np.random.default_rng(0).integers(len(original), size=60):
-        spoilt = bytearray(original)
-        spoilt[place] ^= 0x55
-        saved.write_bytes(bytes(spoilt))
+    for change in changes:
+        saved.write_bytes(original)
+        rewrite(saved, sealed=False, **change)
+        with pytest.raises(ls.InputError, match="sha256: got another than that of the content"):
+            ls.load_solution(saved)
+
+
+def add_member(path: Path, name: str, data: bytes) -> None:
+    with warnings.catch_warnings(), zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        warnings.simplefilter("ignore")  # of a name that is there already
+        archive.writestr(name, data)
+
+
+def npy(array: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("policy.gain.npy", npy(np.zeros((150, 2, 3))), "'policy.gain': got it twice, want it once"),
+        ("meta.npy", npy(np.array("{}")), "'meta': got it twice"),
+        ("readme.txt", b"hello", "'readme.txt': got a part of that name, want arrays alone"),
+        ("multipliers.0.npy", b"hello", "'multipliers.0': got no array of numbers"),
+        ("multipliers.0.npy", b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16, "'multipliers.0': got no array"),
+        ("multipliers.0.npy", npy(np.zeros((151, 1))), "'multipliers.0': got it, want only what belongs"),
+        ("clearance ", b"", "got a part of that name"),
+    ],
+)
+def test_other_members_are_refused(saved: Path, name: str, data: bytes, message: str) -> None:
+    add_member(saved, name, data)
+    with pytest.raises(ls.InputError, match=message):
+        ls.load_solution(saved)
+
+
+def test_nothing_is_unpacked_before_it_is_known_to_belong(saved: Path, drive_solution: ls.Solution) -> None:
+    """Members of a quarter of a gigabyte, a thousandth of it in the file; and one that says it has three."""
+    zeros = npy(np.zeros(1 << 25))
+    lie = npy(np.zeros(8)).replace(b"(8,), }" + b" " * 9, b"(400000000,), }" + b" ")
+    original = saved.read_bytes()
+    for name, data in (("bomb.npy", zeros), ("clearance.npy", zeros), ("multipliers.0.npy", lie)):
+        saved.write_bytes(original)
+        if name == "clearance.npy":
+            with (
+                zipfile.ZipFile(saved, "w", zipfile.ZIP_DEFLATED) as archive,
+                zipfile.ZipFile(io.BytesIO(original)) as old,
+            ):
+                for member in old.namelist():
+                    archive.writestr(member, data if member == name else old.read(member))
+        else:
+            add_member(saved, name, data)
+        tracemalloc.start()
         try:
-            loaded = ls.load_solution(saved)
-        except ls.InputError:
-            continue
-        assert (loaded.policy.gain == drive_solution.policy.gain).all()
+            with pytest.raises(ls.InputError, match="which is damaged"):
+                ls.load_solution(saved)
+            assert tracemalloc.get_traced_memory()[1] < 20e6  # bytes
+        finally:
+            tracemalloc.stop()
+
+
+@pytest.mark.parametrize("text", ["[" * 1000 + "]" * 1000, '{"a":' * 5000, "9" * 5000, "[]", "NaN", "", '{"format"'])
+def test_any_text_is_one_line(saved: Path, text: str) -> None:
+    arrays, _ = contents(saved)
+    with saved.open("wb") as file:
+        np.savez(file, allow_pickle=False, meta=np.array(text), **arrays)
+    with pytest.raises(ls.InputError, match="which is damaged") as caught:
+        ls.load_solution(saved)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_name_twice_in_the_text_is_refused(saved: Path) -> None:
+    arrays, meta = contents(saved)
+    with saved.open("wb") as file:
+        text = json.dumps(meta)[:-1] + f', "dt": {meta["dt"]}}}'
+        np.savez(file, allow_pickle=False, meta=np.array(text), **arrays)
+    with pytest.raises(ls.InputError, match="a name twice in one object"):
+        ls.load_solution(saved)
+
+
+def test_what_could_not_be_read_again_is_not_written(tmp_path: Path, drive_solution: ls.Solution) -> None:
+    path = tmp_path / "solution.npz"
+    for change in (
+        {"detail": "\ud800"},
+        {"solver": "two\nlines"},
+        {"options": {"a": {1, 2}}},
+        {"options": {"a": [[[[[[[1]]]]]]]}},
+    ):
+        changed = dataclasses.replace(drive_solution, **change)
+        with pytest.raises(ls.InputError, match="result: got a solution that cannot be written"):
+            ls.save(changed, path)
+    with pytest.raises(ls.InputError, match="result: got 'it', want a Solution or a Rollout"):
+        ls.save("it", path)  # pyright: ignore[reportArgumentType]
+    assert not path.exists()
+
+
+def test_what_compresses_too_well_can_be_read_again(
+    tmp_path: Path, rollout: ls.Rollout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Many trials that are all alike look like a bomb; they are written as they are, then."""
+    monkeypatch.setattr("lqrsim.archive._LARGE", 1 << 20)
+    calm = {name: np.zeros((400, *getattr(rollout, name).shape[1:])) for name in ("states", "measured", "commanded")}
+    calm |= {name: np.zeros((400, *getattr(rollout, name).shape[1:])) for name in ("applied", "forces", "torques")}
+    calm |= {name: np.zeros((400, *getattr(rollout, name).shape[1:])) for name in ("displaced", "clearance", "frames")}
+    whole = dataclasses.replace(rollout, **calm, contacts=np.zeros(400, np.int64), diverged=np.zeros(400, bool))
+    path = ls.save(whole, tmp_path / "calm.npz")
+    assert path.stat().st_size > 1 << 22
+    assert same(ls.load_rollout(path), whole)
+
+
+LONG = "x" * 300
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "render {bad}", "render {good} --solution {bad} --out {out}.mp4",
+        "verify {bad}", "verify {good} --solution {bad}", "simulate {bad}",
+        "view {bad}", "report {bad}", "replay {bad} --cell 0 --trial 0",
+        "stress differential_drive --resume --out {bad}",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("kind", ["damaged", "long", "missing", "folder"])
+def test_commands_give_one_line(
+    command: str, kind: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = tmp_path / {"long": f"{LONG}.npz"}.get(kind, f"{kind}.npz")
+    if kind == "damaged":
+        spoilt = bytearray(run.read_bytes())
+        spoilt[len(spoilt) // 2] ^= 1
+        bad.write_bytes(bytes(spoilt))
+    elif kind == "folder":
+        bad.mkdir()
+        (bad / "manifest.json").write_text("[" * 9999)
+    assert main([word.format(bad=bad, good=run, out=tmp_path / "out") for word in command.split()]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("lqrsim: error: ")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "simulate {solution} --scenario differential_drive --out {long}", "render {run} --out {long}.mp4",
+        "stress differential_drive --trials 1 --out {long}", "solve differential_drive --out {long}",
+        "report {run} --out {long}.html",
+    ],
+)  # fmt: skip
+def test_outputs_with_names_that_are_too_long_give_one_line(
+    command: str, run: Path, saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    long = tmp_path / LONG
+    assert main([word.format(solution=saved, run=run, long=long) for word in command.split()]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("lqrsim: error: ")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", [LONG, f"{LONG}/solution.npz", "a\0b.npz", f"x.{LONG}"])
+def test_names_that_no_file_can_have(name: str, tmp_path: Path, drive_solution: ls.Solution) -> None:
+    with pytest.raises(ls.InputError, match=r"output: got .*want the path of a file, of names of at most 255"):
+        ls.save(drive_solution, tmp_path / name)
+    for load in (ls.load_solution, ls.load_rollout):
+        with pytest.raises(ls.InputError, match="want the path of a file, of names of at most 255 bytes"):
+            load(tmp_path / name)
 
 
 def test_loading_never_runs_code(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 import tyro
 from PIL import Image, ImageSequence
 
-from lqrsim import cli
+from lqrsim.commands import Command
 from lqrsim.view import gl
 
 ROOT = Path(__file__).parent.parent
@@ -75,7 +75,7 @@ def test_command_lines_of_the_pages_parse() -> None:
     for line in lines:
         arguments = shlex.split(line)[1:]
         if arguments != ["--version"]:
-            command = tyro.cli(cli.Command, prog="lqrsim", args=arguments)
+            command = tyro.cli(Command, prog="lqrsim", args=arguments)
             assert type(command).__name__.lower() == arguments[0], line
 
 

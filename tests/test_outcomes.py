@@ -108,6 +108,8 @@ class TestReplanning:
         solved = ls.simulate(plant, quadrotor_solution, controller=again, disturbances=push, frames=False)
         differ = np.abs(policy.commanded - solved.commanded)[0].max(axis=1) > 1e-6
         assert np.flatnonzero(differ)[0] == 30
+        assert (again.solved, again.kept) == (4, {})  # at 1, 2, 3 and 4 s
+        assert again.summary() == "solved again 4 times"
 
     @pytest.mark.parametrize("name", ["differential_drive", "quadrotor"])
     def test_it_does_not_leave_for_a_worse_optimum(self, name: str, request: pytest.FixtureRequest) -> None:
@@ -134,6 +136,11 @@ class TestReplanning:
         run = ls.simulate(plant, quadrotor_solution, controller=again, disturbances=push, contacts=False, frames=False)
         assert run.collided.all()
         assert np.isfinite(run.commanded).all()
+        # It says how often, and why.
+        assert again.solved + again.kept.total() == 49
+        assert again.kept.total() > 0
+        assert again.summary().startswith(f"solved again {again.solved} times, kept the law before")
+        assert all(reason in again.summary() for reason in again.kept)
 
     def test_a_rate_beyond_the_control_rate_is_refused(self, quadrotor: ls.Scenario, quadrotor_solution) -> None:
         with pytest.raises(ls.InputError, match=r"Replanning: every: got 0\.01, want a finite number >= 0\.033"):

@@ -75,7 +75,7 @@ FIELDS = {
         ({"steps": 0}, "steps: got 0, want a whole number >= 1"),
         ({"steps": 1.5}, "steps: got 1.5, want a whole number >= 1"),
         ({"steps": True}, "steps: got True, want a whole number >= 1"),
-        ({"dynamics": None}, "dynamics: got NoneType, want Dynamics"),
+        ({"dynamics": None}, "dynamics: got None, want Dynamics"),
         ({"stage_cost": 3.0}, "cost: got 3.0, want a cost such as QuadraticCost"),
         ({"initial": ls.FixedState((1.0, 2.0))}, r"initial: FixedState: got shape \(2,\), want \(3,\)"),
         ({"initial": ls.FixedState((0.3, 0.0, 0.0))}, r"start at \(0.3, 0\) m, 0.3 m inside obstacle 'pillar'"),
@@ -97,7 +97,7 @@ FIELDS = {
         ({"control_limits": (0.5, -0.5)}, "control_limits: got 0.5 to -0.5 for .*, want the first below the second"),
         ({"control_limits": ((0, 0), (1, 1))}, "control_limits: got .*, want \\(lowest, highest\\), each a number"),
         ({"control_limits": 3.0}, "control_limits: got 3.0, want \\(lowest, highest\\)"),
-        ({"constraints": ["far away"]}, "constraints: got .*, want a list of them"),
+        ({"constraints": ["far away"]}, "constraints: got .*, want a list of constraints"),
     ],
 )
 def test_bad_problems_get_one_line(fields: dict, message: str) -> None:
@@ -125,8 +125,8 @@ def test_bad_problems_get_one_line(fields: dict, message: str) -> None:
         (lambda: ls.QuadraticCost([1.0], about=[0, 0]), r"about: got shape \(2,\), want \(1,\)"),
         (lambda: ls.ObstacleCost(PILLAR, radius=-1.0), "radius: got -1.0, want a finite number >= 0"),
         (lambda: ls.ObstacleCost(PILLAR, radius=0.1, sharpness=0.0), "sharpness: got 0.0, want a finite number > 0"),
-        (lambda: ls.ObstacleCost(None, radius=0.1), "world: got NoneType, want a World"),  # pyright: ignore[reportArgumentType]
-        (lambda: ls.InitialPrior([-1.0], about=[0.0]), "weight: got -1, want numbers >= 0"),
+        (lambda: ls.ObstacleCost(None, radius=0.1), "world: got None, want a World"),  # pyright: ignore[reportArgumentType]
+        (lambda: ls.InitialPrior([-1.0], about=[0.0]), r"weight: got \[-1.0\], want numbers >= 0"),
         (
             lambda: ls.Obstacle("it", "cone", np.zeros(3), np.eye(3), np.ones(3)),
             "kind: got 'cone', want one of: plane, sphere",

@@ -8,7 +8,7 @@ from typing import get_args
 import pytest
 
 import lqrsim as ls
-from lqrsim import cli
+from lqrsim.commands import Command
 
 README = Path(__file__).parent.parent / "README.md"
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -32,5 +32,5 @@ def test_commands_exist() -> None:
     """Every `python3 run.py X` and `lqrsim X` that it shows is a command."""
     text = README.read_text(encoding="utf-8")
     assert {"demo", "test"} <= set(re.findall(r"python3 run\.py (\w+)", text)) <= {"demo", "test", "check", "setup"}
-    commands = {command.__name__.lower() for command in get_args(cli.Command)}
+    commands = {command.__name__.lower() for command in get_args(Command)}
     assert set(re.findall(r"^\$? ?lqrsim (\w+)", text, re.MULTILINE)) <= commands

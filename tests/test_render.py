@@ -148,11 +148,25 @@ def test_same_rollout_gives_the_same_bytes(rollout: ls.Rollout, tmp_path: Path) 
 
 
 @draws
+def test_many_disturbances_do_not_fill_a_small_picture(
+    quadrotor: ls.Scenario, quadrotor_solution: ls.Solution, tmp_path: Path
+) -> None:
+    """All of a preset, which takes more lines than there is room for: the rest is counted; GIFs can be read."""
+    plant = quadrotor.plant()
+    run = ls.simulate(plant, quadrotor_solution, disturbances=ls.preset("light", plant))
+    for insets in ((), ("top",)):
+        ls.still(run, tmp_path / "a.png", size=(320, 180), insets=insets)
+    path = render(run, tmp_path / "a.gif", quality="draft", fps=1)
+    with Image.open(path) as image:
+        assert image.size == (480, 270)
+
+
+@draws
 def test_draft_and_gif_show_the_same_run(flight: ls.Rollout, tmp_path: Path) -> None:
     """A GIF loops, in real time, and its colours are near those of the video."""
     path = render(flight, tmp_path / "run.gif", quality="draft", fps=3)
     with Image.open(path) as image:
-        assert image.size == (320, 180)
+        assert image.size == (480, 270)
         assert image.info["loop"] == 0
         durations, frames = [], []
         for frame in ImageSequence.Iterator(image):
@@ -160,7 +174,7 @@ def test_draft_and_gif_show_the_same_run(flight: ls.Rollout, tmp_path: Path) -> 
             frames.append(np.asarray(frame.convert("RGB")).astype(int))
     assert sum(durations) / 1e3 == pytest.approx(len(frames) / 3, abs=0.01)
     assert set(durations) <= {330, 340}
-    video = decode(render(flight, tmp_path / "run.mp4", quality="draft", size=(320, 180), fps=3))
+    video = decode(render(flight, tmp_path / "run.mp4", quality="draft", size=(480, 270), fps=3))
     assert len(video) == len(frames)
     assert max(np.abs(one - other).mean() for one, other in zip(frames, video, strict=True)) < 4
     assert render(flight, tmp_path / "again.gif", quality="draft", fps=3).read_bytes() == path.read_bytes()

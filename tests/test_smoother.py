@@ -73,7 +73,7 @@ class TestForms:
         assert max(solution.gap, solution.dynamics_residual) < 1e-3
         # The least total cost is the cost, at every step (Eq. (20)); the constants know nothing of the rollout.
         np.testing.assert_allclose(solution.total_cost.minimum(), solution.cost, rtol=1e-3)
-        with pytest.raises(np.linalg.LinAlgError):
+        with pytest.raises(ls.InputError, match="singular"):
             solution.cost_to_come.quadratic()  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
 
     def test_a_fixed_start_is_the_limit_of_a_soft_one(self, differential_drive: ls.Scenario) -> None:

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import optimize, stats
 
 import lqrsim as ls
-from lqrsim.stress.statistics import bootstrap, compare, holm, rate, wilson
+from lqrsim.stress.statistics import bootstrap, compare, holm, mean, paired_difference, rate, wilson
 
 
 def at_least(successes: int, trials: int, p: float) -> float:
@@ -82,6 +83,70 @@ def test_paired_test_is_the_sign_test_of_those_that_differ() -> None:
     assert compare(first, first).p_value == 1
 
 
+@pytest.mark.parametrize(
+    ("only_first", "only_second", "trials", "confidence", "published"),
+    [
+        (1, 7, 21, 0.95, (-0.517, -0.026)),  # Fagerland, Lydersen & Laake, Statistics in Medicine 33 (2014)
+        (0, 1, 44, 0.90, (-0.096, 0.037)),  # Tango, Statistics in Medicine 17 (1998)
+    ],
+)
+def test_published_differences(
+    only_first: int, only_second: int, trials: int, confidence: float, published: tuple[float, float]
+) -> None:
+    found = paired_difference(only_first, only_second, trials, confidence=confidence)
+    assert (round(found.low, 3), round(found.high, 3)) == published
+    assert found.value == (only_first - only_second) / trials
+
+
+@given(st.integers(1, 80).flatmap(lambda n: st.tuples(st.integers(0, n), st.integers(0, n), st.just(n))))
+def test_ends_of_a_difference_are_where_the_score_test_just_rejects(case: tuple[int, int, int]) -> None:
+    """Its definition, with the likeliest shares found by brute force in place of the formula; 1e-4, for that search."""
+    only_first, only_second, trials = case
+    if only_first + only_second > trials:
+        return
+    found = paired_difference(only_first, only_second, trials)
+    mirrored = paired_difference(only_second, only_first, trials)
+    assert (mirrored.low, mirrored.high) == (pytest.approx(-found.high), pytest.approx(-found.low))
+    assert -1 <= found.low <= found.value <= found.high <= 1
+    assert found.high - found.low > 0
+    counts = np.array([only_first, only_second, trials - only_first - only_second])
+    for end in (found.low, found.high):
+        if abs(end) > 0.999:
+            continue
+        least, most = max(0.0, -end), (1 - end) / 2
+
+        def unlikely(share: float, end: float = end) -> float:
+            shares = np.maximum([share + end, share, 1 - end - 2 * share], 1e-300)
+            return -float(counts @ np.log(shares))
+
+        share = optimize.minimize_scalar(unlikely, bounds=(least, most), method="bounded", options={"xatol": 1e-10}).x
+        deviation = np.sqrt(max(2 * share + end - end * end, 0) / trials)
+        assert abs(found.value - end) == pytest.approx(1.959964 * deviation, abs=1e-4)
+
+
+@pytest.mark.parametrize("trials", [20, 50])
+@pytest.mark.parametrize(("first", "second"), [(0.01, 0.0), (0.05, 0.04), (0.3, 0.2), (0.6, 0.0)])
+def test_differences_cover(trials: int, first: float, second: float) -> None:
+    """Summed over all outcomes. A score interval covers 95 % in the mean, and nowhere here less than 94 %."""
+    covered = 0.0
+    for one, other in product(range(trials + 1), repeat=2):
+        if one + other <= trials:
+            weight = stats.multinomial.pmf(
+                [one, other, trials - one - other], trials, [first, second, 1 - first - second]
+            )
+            if weight > 1e-7:
+                found = paired_difference(one, other, trials)
+                covered += weight * (found.low <= first - second <= found.high)
+    assert covered > 0.94
+
+
+def test_mean_has_student_s_interval() -> None:
+    """Of 1, 2, 3: t of 2 degrees of freedom is 4.303, over the root of 3."""
+    found = mean([1.0, 2.0, 3.0])
+    assert found.value == 2
+    np.testing.assert_allclose((found.low, found.high), (2 - 4.3027 / 3**0.5, 2 + 4.3027 / 3**0.5), atol=1e-4)
+
+
 def test_bootstrap_of_a_mean_is_near_the_normal_interval() -> None:
     """At 2,000 normal draws the two agree to the noise of 10,000 resamples: 3 % of the width."""
     sample = np.random.default_rng(1).normal(size=2000)
@@ -117,6 +182,10 @@ def test_bootstrap_covers() -> None:
         (lambda: rate(1, 2, confidence=1.0), "confidence: got 1.0"),
         (lambda: compare([True], [True, False]), "second: got shape"),
         (lambda: compare([], []), "second: got shape"),
+        (lambda: paired_difference(0, 0, 0), "trials: got 0"),
+        (lambda: paired_difference(3, 2, 4), "trials: got 4, want at least the 5"),
+        (lambda: paired_difference(-1, 2, 4), "only_first: got -1"),
+        (lambda: mean([1.0]), "sample: got 1 numbers"),
         (lambda: bootstrap(np.mean, [1.0]), "samples: got shapes"),
         (lambda: bootstrap(np.mean, [1.0, 2.0], [1.0]), "samples: got shapes"),
     ],

@@ -132,19 +132,75 @@ def test_only_loopback_is_listened_to(served: int) -> None:
     assert refused("::1", served)
 
 
-def test_files_and_pages_of_other_sites_are_refused(served: int) -> None:
-    ours = f"http://localhost:{served}"
-    for path, origin in (("drop", None), ("drop", ours), ("state", "http://example.org"), ("ui", "null")):
-        with pytest.raises(InvalidStatus, match="403"):
-            connect(f"ws://127.0.0.1:{served}/{path}", origin=Origin(origin) if origin else None)
-    with connect(f"ws://127.0.0.1:{served}/state", origin=Origin(ours)):
-        pass
+def asked(port: int, path: str, **headers: str | tuple[str, ...]) -> tuple[int, dict[str, str], bytes]:
+    """What a plain socket gets: status, headers and the beginning of the body."""
+    lines = [
+        f"{name}: {one}"
+        for name, values in headers.items()
+        for one in ([values] if isinstance(values, str) else values)
+    ]
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as connection:
+        connection.sendall("\r\n".join([f"GET {path} HTTP/1.1", *lines, "", ""]).encode())
+        found = b""
+        while b"\r\n\r\n" not in found and (part := connection.recv(65536)):
+            found += part
+    head, _, body = found.partition(b"\r\n\r\n")
+    status, *rest = head.decode().split("\r\n")
+    return int(status.split()[1]), dict(line.split(": ", 1) for line in rest), body
+
+
+def test_only_its_own_pages_are_let_in(served: int) -> None:
+    """A page of another site, or of another port of this machine, says so in Origin; no page can leave it out."""
+    for name in ("localhost", "127.0.0.1"):
+        address = f"ws://127.0.0.1:{served}"
+        ours = f"http://{name}:{served}"
+        others = ("http://example.org", "null", f"http://{name}:{served + 1}", f"http://{name}", f"https://{name}:{served}",
+                  f"{ours}.example.org", f"http://example.org:{served}")  # fmt: skip
+        refused = [("drop", None), ("drop", ours), *((path, other) for path in ("ui", "state") for other in others)]
+        for path, origin in refused:
+            headers = {"Host": f"{name}:{served}", "Upgrade": "websocket", "Connection": "Upgrade",
+                       "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="}  # fmt: skip
+            headers |= {} if origin is None else {"Origin": origin}
+            assert asked(served, f"/{path}", **headers)[0] == 403, (name, path, origin)
+    with connect(f"{address}/state", origin=Origin(f"http://127.0.0.1:{served}")) as connection:
+        assert connection.response is not None
+        assert "Access-Control-Allow-Origin" not in connection.response.headers
+    with pytest.raises(InvalidStatus, match="403"):  # a server at ::1 may have the other name
+        connect(f"{address}/state", origin=Origin(f"http://localhost:{served}"))
+
+
+def test_only_by_its_own_name_does_it_answer(served: int) -> None:
+    """A site whose name is made to point to this machine would have pages of the same origin."""
+    ours, other = f"localhost:{served}", f"example.org:{served}"
+    others = ((), "example.org", other, "localhost", f"localhost:{served + 1}", f"0.0.0.0:{served}", (ours, other))
+    for path in ("/", "/model", "/model?total_bytes", "/index.html", "/state"):
+        for host in others:
+            status, _, body = asked(served, path, Host=host)
+            assert (status, len(body) < 200) == (403, True), (path, host)
+
+
+def test_what_it_serves_is_for_its_own_pages(served: int) -> None:
+    for path in ("/", "/model", "/model?total_bytes", "/nothing"):
+        for name in ("localhost", "127.0.0.1"):
+            status, headers, _ = asked(served, path, Host=f"{name}:{served}")
+            assert status == (404 if path == "/nothing" else 200)
+            assert not [header for header in headers if header.lower().startswith("access-control")]
+            assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
+            assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+            other = asked(served, path, Host=f"{name}:{served}", Origin="http://example.org")
+            assert (other[0], len(other[2]) < 200) == (403, True)
 
 
 BIND = """from mujoco.studio.web import web_server
 bind = web_server.bind_public_socket
 web_server.bind_public_socket = lambda host, port=0: bind({}, port)"""
 SERVE = """from mujoco.studio.web import web_server
+def shared(process):
+    def answer(connection, request, response):
+        response = process(connection, request, response) or response
+        response.headers["Access-Control-Allow-Origin"] = "*"
+        return response
+    return answer
 serve = web_server.serve
 web_server.serve = lambda handler, **options: serve(handler, **{{**options, {}}})"""
 
@@ -154,8 +210,8 @@ web_server.serve = lambda handler, **options: serve(handler, **{{**options, {}}}
     [
         (BIND.format("'0.0.0.0'"), r"others can reach at \S+, port \d+"),
         (BIND.format("'::'"), r"others can reach at \S+, port \d+"),
-        (SERVE.format("'origins': None"), r"lets http://example\.org in to /state, port \d+"),
-        (SERVE.format("'process_request': None"), r"lets http://localhost:\d+ in to /drop, port \d+"),
+        (SERVE.format("'process_request': None"), r"lets http://127\.0\.0\.1:\d+ in to /drop, port \d+"),
+        (SERVE.format("'process_response': shared(options['process_response'])"), r"lets any page read /, port \d+"),
     ],
 )
 def test_a_server_that_is_not_private_is_refused(rollout: ls.Rollout, before: str, reason: str, tmp_path: Path) -> None:
@@ -301,7 +357,7 @@ def test_a_browser_draws_the_run(served: int, rollout: ls.Rollout, tmp_path: Pat
         pictures = list(itertools.islice(page.pictures(), 3))
         frames = {frame.tobytes() for frame in rollout.frames[0]}
         seen = set()
-        ours = Origin(f"http://localhost:{served}")
+        ours = Origin(f"http://127.0.0.1:{served}")
         with connect(f"ws://127.0.0.1:{served}/state", origin=ours, max_size=None) as spectator:
             until = time.monotonic() + 60
             while len(seen) < 10 and time.monotonic() < until:

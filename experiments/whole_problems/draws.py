@@ -79,7 +79,7 @@ def _options(rng: Generator, problem: ls.Problem) -> dict[str, Any]:
         controls = problem.nominal_control + size * rng.normal(size=(problem.steps, m))
         states = np.cumsum(0.1 * size * rng.normal(size=(problem.steps + 1, n)), axis=0)
         options["start"] = controls if begin < 0.1 else ls.Trajectory(states, controls, problem.dt)
-    elif problem.obstacle_costs and begin < 0.4:
+    elif begin < 0.4 and any(len(cost.world) for cost in problem.obstacle_costs):
         options["starts"] = int(rng.integers(1, 4))
     if begin > 0.9:
         options["first_pass"] = "backward"

@@ -39,7 +39,7 @@ class Search:
         from lqrsim.references import resolve
         from lqrsim.stress import given
         from lqrsim.stress.asked import described
-        from lqrsim.stress.results import digest_of, digest_of_solution
+        from lqrsim.stress.manifest import digest_of, digest_of_solution
         from lqrsim.stress.sweeps import sweep
         from lqrsim.stress.trials import controller, solve
         from lqrsim.versions import versions
@@ -92,12 +92,13 @@ def write(folder: Path, name: str, about: dict[str, Any], trials: "TrialScore", 
 
 @dataclass(frozen=True, kw_only=True)
 class Rare(Search):
-    """Measure how likely a rare failure is, with far fewer trials than would have to be run to see it by chance.
+    """Measure how likely a failure is that is seldom seen.
 
-    Trials are split through levels of how near they come to failing, each not so rare given the one before. Prints the
-    levels as a first run finds them, and then the probability with its interval, from repetitions that are independent
-    and without bias. Writes rollout.npz, with the worst failure and others as they are typical, to be looked at with
-    `lqrsim render`, and rare.json, with what was asked and found.
+    It takes far fewer trials than would have to be run to see it by chance. Trials are split through levels of how near
+    they come to failing, each not so rare given the one before. Prints the levels as a first run finds them, and then
+    the probability with its interval, from repetitions that are independent and without bias. Writes rollout.npz, with
+    the worst failure and others as they are typical, to be looked at with `lqrsim render`, and rare.json, with what was
+    asked and found.
 
     Exits with 1 if no failure was found.
     """
@@ -117,10 +118,10 @@ class Rare(Search):
 
         from lqrsim import console
         from lqrsim.errors import check_count
-        from lqrsim.references import short_name
+        from lqrsim.references import folder_name, resolve
         from lqrsim.stress.splitting import NoFailure, split
 
-        folder = self.out or Path("runs/rare") / short_name(self.scenario)
+        folder = self.out or Path("runs/rare") / folder_name(resolve(self.scenario))
         console.check_output("--out", folder)
         check_count("particles", self.particles, at_least=20)
         check_count("repetitions", self.repetitions, at_least=2)
@@ -163,18 +164,19 @@ class Rare(Search):
 
 @dataclass(frozen=True, kw_only=True)
 class Break(Search):
-    """Find the smallest disturbance that breaks the policy: of all failures the one that is nearest to no disturbance.
+    """Find the smallest disturbance that breaks the policy.
 
-    It is measured over all random numbers that a trial draws, in standard deviations. Prints it, what probability of
-    failure that would be if nothing else failed than what lies beyond, how much of it falls to each disturbance, and
-    what it does at its largest in physical units. Writes rollout.npz, with that trial, to be looked at with `lqrsim
-    render`, and break.json, with what was asked and found, the numbers too.
+    Of all failures it is the one that is nearest to no disturbance. That is measured over all random numbers that a
+    trial draws, in standard deviations. Prints it, what probability of failure that would be if nothing else failed
+    than what lies beyond, how much of it falls to each disturbance, and what it does at its largest in physical units.
+    Writes rollout.npz, with that trial, to be looked at with `lqrsim render`, and break.json, with what was asked and
+    found, the numbers too.
 
     What it finds fails; that nothing nearer does is not proven. Exits with 1 if no failure was found.
     """
 
-    rounds: int = 20
-    """In which it comes nearer, at most; it ends where that gains no more."""
+    rounds: int = 40
+    """In which it comes nearer, at most; it ends where less than 1 % is left to be gained."""
     out: Folder = None
     """Folder for what is written. By default runs/break/ and the name of the scenario."""
 
@@ -184,11 +186,11 @@ class Break(Search):
 
         from lqrsim import console
         from lqrsim.errors import InputError, check_count
-        from lqrsim.references import short_name
+        from lqrsim.references import folder_name, resolve
         from lqrsim.stress.breaking import in_words, smallest_failure
         from lqrsim.stress.splitting import NoFailure, split
 
-        folder = self.out or Path("runs/break") / short_name(self.scenario)
+        folder = self.out or Path("runs/break") / folder_name(resolve(self.scenario))
         console.check_output("--out", folder)
         check_count("rounds", self.rounds, at_least=0)
         trials, about = self._trials()
@@ -212,6 +214,11 @@ class Break(Search):
             f"smallest failure: {nearest.distance:.3g} standard deviations from none, found with"
             f" {trials.simulations:,} trials"
         )
+        if not nearest.converged:
+            left = "an unknown share" if np.isnan(nearest.left) else f"some {100 * nearest.left:.1f} %"
+            console.say(
+                f"the rounds ended first: by the noise of what it knows, {left} may be left to gain; more --rounds"
+            )
         console.say(
             f"if all failures lay beyond it, one trial in {_rounded(1 / max(nearest.form, 1e-300))} would fail"
             f" (reliability {1 - nearest.form:.6g}); `lqrsim rare` measures how many do"
@@ -227,6 +234,7 @@ class Break(Search):
             console.say(f"largest {one.what}: {one.size:.3g} {one.unit}".rstrip() + f" at {one.time:.2f} s")
         found = {
             "distance": nearest.distance, "first_order_probability": nearest.form, "history": nearest.history.tolist(),
+            "left": None if np.isnan(nearest.left) else nearest.left, "converged": nearest.converged,
             "simulations": trials.simulations, "shares": shares, "sizes": trials.sizes,
             "largest": [vars(one) for one in largest], "numbers": nearest.numbers.tolist(),
         }  # fmt: skip

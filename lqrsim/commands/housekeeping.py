@@ -38,7 +38,7 @@ class Demo:
 
 @dataclass(frozen=True, kw_only=True)
 class Reproduce:
-    """Run the experiments of the paper again and say which of its statements hold, each with its figure.
+    """Run the paper's experiments, and say which of its statements hold.
 
     Writes results.md, which sums them up, results.json, which has every number, and the figures as png and pdf. Takes
     some minutes. Other people's solvers are compared with where the bench extra is installed.
@@ -46,8 +46,9 @@ class Reproduce:
     Exits with 1 if an experiment failed; whether the paper's statements hold does not count.
     """
 
-    results: Annotated[Positional[tuple[str, ...]], arg(metavar="RESULT ...")] = ()
-    """Which: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback. By default all."""
+    results: Annotated[Positional[tuple[str, ...]], arg(metavar="RESULT ...", help_behavior_hint="")] = ()
+    """Which: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback, stress_test. By
+    default all."""
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/paper")
     """Where to write."""
     quick: bool = False
@@ -62,9 +63,12 @@ class Reproduce:
 
 @dataclass(frozen=True, kw_only=True)
 class Cache:
-    """Show what is kept of compiled solvers and derived formulas, or remove it.
+    """Show what is kept of compiled solvers, or remove it.
 
-    Without it everything works the same, and each kind of problem is compiled again, some 10 seconds.
+    That is code and derived formulas. Without it everything works the same, and each kind of problem is compiled again,
+    some 10 seconds.
+
+    What is kept is programs, which are loaded and run: do not share the folder with people you do not trust.
     """
 
     clear: bool = False
@@ -72,19 +76,19 @@ class Cache:
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim import cache
+        from lqrsim import cache, console
         from lqrsim.errors import InputError
 
         if self.clear:
             try:
-                print(f"removed {cache.clear()} items from {cache.folder()}")
+                console.say(f"removed {cache.clear()} items from {cache.folder()}")
             except OSError as error:
                 raise InputError(f"--clear: got {cache.folder()}, want files that can be removed ({error})") from None
             return 0
         items = cache.items()
         for item in items:
             used = time.strftime("%Y-%m-%d %H:%M", time.localtime(item.used))
-            print(f"{item.size / 1e6:8.2f} MB  last used {used}  {item.what}")
+            console.say(f"{item.size / 1e6:8.2f} MB  last used {used}  {item.what}")
         total = sum(item.size for item in items) / 1e6
-        print(f"{len(items)} items, {total:.1f} of at most {cache.LIMIT / 1e6:.0f} MB, in {cache.folder()}")
+        console.say(f"{len(items)} items, {total:.1f} of at most {cache.LIMIT / 1e6:.0f} MB, in {cache.folder()}")
         return 0

@@ -14,30 +14,30 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class List:
-    """Print the scenarios: name, robot, scene, states and controls with their units."""
+    """Print the scenarios: robot, scene, states and controls with units."""
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim import scenarios
+        from lqrsim import console, scenarios
         from lqrsim.references import resolve
 
         for name in scenarios.names():
             scenario = resolve(name)
             problem = scenario.problem
-            print(f"{name}: {scenario.summary}")
-            print(f"  robot:    {scenario.robot.name} in scene {scenario.scene.name}")
-            print(f"  horizon:  {problem.steps} steps of {problem.dt:.4g} s")
-            print(f"  states:   {', '.join(problem.dynamics.state_coordinates.labels)}")
-            print(f"  controls: {', '.join(problem.dynamics.control_coordinates.labels)}")
+            console.say(f"{name}: {scenario.summary}")
+            console.say(f"  robot:    {scenario.robot.name} in scene {scenario.scene.name}")
+            console.say(f"  horizon:  {problem.steps} steps of {problem.dt:.4g} s")
+            console.say(f"  states:   {', '.join(problem.dynamics.state_coordinates.labels)}")
+            console.say(f"  controls: {', '.join(problem.dynamics.control_coordinates.labels)}")
         return 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Solve:
-    """Compute a feedback policy for a scenario and write it to solution.npz.
+    """Compute a feedback policy for a scenario.
 
-    Prints each iteration as it ends, then the status and, if it failed, the remedy. The solution is written in any
-    case; the exit code is 1 if the solver did not converge.
+    Prints each iteration as it ends, then the status and, if it failed, the remedy. Writes solution.npz in any case;
+    the exit code is 1 if the solver did not converge.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -69,11 +69,11 @@ class Solve:
         from lqrsim import console, files
         from lqrsim.constraints import Clearance
         from lqrsim.errors import InputError
-        from lqrsim.references import resolve, short_name
+        from lqrsim.references import folder_name, from_anywhere, resolve
 
-        folder = self.out or Path("runs") / short_name(self.scenario)
-        console.check_output("--out", folder)
         scenario = resolve(self.scenario)
+        folder = self.out or Path("runs") / folder_name(scenario)
+        console.check_output("--out", folder)
         problem = scenario.problem
         if self.clearance is not None:
             kept = Clearance(scenario.scene.world, radius=scenario.robot.radius, margin=self.clearance)
@@ -91,7 +91,7 @@ class Solve:
             if scenario.paper_start is None:
                 raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario that the paper has")
             options["start"] = scenario.paper_start
-        solution = replace(console.solve(problem, self.solver, **options), scenario=self.scenario)
+        solution = replace(console.solve(problem, self.solver, **options), scenario=from_anywhere(self.scenario))
         console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
         if self.figure is not None:
             from lqrsim.view.policy_plot import plot_policy
@@ -103,9 +103,10 @@ class Solve:
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate:
-    """Execute a policy closed-loop in MuJoCo and write the runs to rollout.npz.
+    """Execute a policy in MuJoCo, in closed loop.
 
-    Prints a line for each trial. Without a disturbance it is the plain closed loop. The same seed gives the same bits.
+    Writes the runs to rollout.npz, and prints a line for each trial. Without a disturbance it is the plain closed loop.
+    The same seed gives the same bits on equal processors.
 
       lqrsim simulate SOLUTION.npz --force-noise 0.1 --push 0.2 0 0 3.0 --trials 10
       lqrsim simulate SOLUTION.npz --disturbances severe --out runs/severe

@@ -11,11 +11,12 @@ from lqrsim.commands.options import Folder, optional
 
 @dataclass(frozen=True, kw_only=True)
 class Stress:
-    """Run many trials of several policies under disturbances of growing strength, and count how they end.
+    """Count how often policies fail under growing disturbances.
 
-    What is stopped, however it is stopped, goes on with the same command; the tables are the same to the bit whatever
-    the workers, the batches and the interruptions. Prints the share of each that reached its goal with the exact
-    interval. `docs/file_format.md` says what is in the folder.
+    Runs many trials of each, the same ones for all policies. What is stopped, however it is stopped, goes on with the
+    same command; the tables are the same to the bit whatever the workers, the batches and the interruptions, on equal
+    processors. Prints the share of each that reached its goal with the exact interval. `docs/file_format.md` says what
+    is in the folder.
 
     Exits with 1 if trials came to nothing for an error.
     """
@@ -27,8 +28,11 @@ class Stress:
     NAME:KIND for one kind of them alone."""
     strengths: Annotated[tuple[float, ...], arg(metavar="FACTOR ...")] = (0.0, 0.5, 1.0, 1.5, 2.0)
     """What the disturbances are multiplied by; 0.5 and 2 make light calm and moderate."""
-    policies: tuple[Literal["smooth", "ilqr", "open_loop", "replan"], ...] = ("smooth", "ilqr", "open_loop", "replan")
-    """open_loop: the plan of smooth without feedback. replan: solves again as it goes. All meet the same numbers."""
+    policies: Annotated[
+        tuple[Literal["smooth", "ilqr", "open_loop", "replan"], ...] | None, arg(help_behavior_hint="")
+    ] = None
+    """open_loop: the plan of smooth without feedback. replan: solves again as it goes. All meet the same numbers. By
+    default all four; ilqr is left out where the scenario has constraints, which it cannot keep."""
     trials: int = 200
     """Of each sweep, strength and policy."""
     seed: int = 0
@@ -53,21 +57,22 @@ class Stress:
     def run(self) -> int:
         """Carry the command out; its exit code."""
         from lqrsim import console
-        from lqrsim.references import resolve, short_name
+        from lqrsim.references import folder_name, resolve
         from lqrsim.stress.campaign import Campaign, run_campaign
         from lqrsim.stress.results import Results
         from lqrsim.stress.sweeps import sweep
+        from lqrsim.stress.trials import possible
 
-        folder = self.out or Path("runs/stress") / short_name(self.scenario)
+        scenario = resolve(self.scenario)
+        folder = self.out or Path("runs/stress") / folder_name(scenario)
         if self.resume:
             campaign = Results(folder, scenario=self.scenario).campaign
         else:
-            scenario = resolve(self.scenario)
             campaign = Campaign(
                 scenario=self.scenario,
                 sweeps={name: sweep(name, scenario) for name in self.sweep},
                 strengths=self.strengths,
-                policies=self.policies,
+                policies=possible(scenario) if self.policies is None else self.policies,
                 trials=self.trials,
                 seed=self.seed,
                 replan_every=self.replan_every,
@@ -84,9 +89,11 @@ class Stress:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Run one trial of a campaign again, to the bit, and write it to rollout.npz, to be looked at with `lqrsim render`.
+    """Run one trial of a stress test again, to the bit.
 
-    Says whether it gave its row in the campaign's table again; exits with 1 if not.
+    Writes it to rollout.npz, to be looked at with `lqrsim render`. Says whether it gave its row in the campaign's table
+    again; exits with 1 if not. On another kind of processor than the campaign's, or with other versions, bits can
+    differ; then it says so.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
@@ -105,10 +112,13 @@ class Replay:
         from lqrsim import console, files
         from lqrsim.stress.asked import Cell
         from lqrsim.stress.results import Results, agrees, replay
+        from lqrsim.versions import changed
 
-        console.check_output("--out", self.out.parent)
+        console.check_output("--out", self.out.parent, self.out.name)
         results = Results(self.folder, scenario=self.scenario)
         cell = Cell.named(self.cell, results.cells)
+        if others := changed(results.manifest["versions"]):
+            console.say(f"bits can differ from the table's: got {others}")
         same = agrees(results, cell, self.trial)
         rollout = replay(results, cell, self.trial)
         console.say(rollout.summary())
@@ -119,9 +129,10 @@ class Replay:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Write the report of a stress test: one HTML page with tables, curves and videos of the worst trials.
+    """Write the report of a stress test, one HTML page.
 
-    The page needs no network and no other file. It can be written of a stress test that has not ended, and says so.
+    It has tables, curves and videos of the worst trials, and needs no network and no other file. It can be written of a
+    stress test that has not ended, and says so.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
@@ -143,7 +154,7 @@ class Report:
         page = self.out or self.folder / "report.html"
         if page.suffix != ".html":
             raise InputError(f"--out: got {page}, want a name that ends in .html")
-        console.check_output("--out", page.parent)
+        console.check_output("--out", page.parent, page.name)
         results = Results(self.folder, scenario=self.scenario)
         with console.progress("reporting", "part") as progress:
             report(results, page, videos=self.videos, progress=progress)

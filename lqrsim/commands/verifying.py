@@ -1,5 +1,6 @@
 """The command that lets pixels testify."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +12,7 @@ from lqrsim.commands.options import optional
 
 @dataclass(frozen=True, kw_only=True)
 class Verify:
-    """Verify from pixels that a run, or the video of one, shows what the record says.
+    """Check from pixels that a run shows what its record says.
 
     A run is drawn, in calibrated fixed views; a video is decoded, and the robot's mark found in its panes `top` and
     `side`. Positions from pixels are compared with the simulator's and with the plan. See docs/verifying.md.
@@ -40,7 +41,7 @@ class Verify:
         path = self.file if is_run else self.run_file or run_beside(self.file)
         rollout, beside = files.load_rollout(path), path.with_name("solution.npz")
         solution = None
-        if self.solution or beside.is_file():
+        if self.solution or os.path.isfile(beside):
             solution = files.load_solution(self.solution or beside)
             # What lies beside a run may be another's; what is given is meant.
             solution = solution if self.solution or follows(rollout, solution) else None

@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Render a run as a video or a still: obstacles, the plan, the trace actually driven, what disturbs, the robot.
+    """Draw a run, as a video or as a still.
 
-    Several runs, or several trials of one, are shown side by side and in step.
+    Shows the obstacles, the plan, the trace that was driven, what disturbs, and the robot. Several runs, or several
+    trials of one, are shown side by side and in step.
 
       lqrsim render runs/quadrotor/rollout.npz --camera chase
       lqrsim render RUN.npz --inset top side          # panes that `lqrsim verify` can measure
@@ -46,7 +47,7 @@ class Render:
     quality: Quality = "standard"
     """Size, smooth edges, shadows, and how much a video is compressed: 640 x 360, 1280 x 720 or 1920 x 1080."""
     size: Annotated[tuple[int, int] | None, optional("WIDTH HEIGHT")] = None
-    """In pixels. By default that of the quality, and half of it for a GIF."""
+    """In pixels. By default that of the quality, and half of it for a GIF, but not less than 480 x 270."""
     fps: Annotated[float | None, optional("RATE")] = None
     """Frames per second of a video. By default 30, and 15 for a GIF."""
     speed: float = 1.0
@@ -70,7 +71,7 @@ class Render:
             raise InputError(f"--out: got {out}, want a name that ends in .mp4, .gif or .png")
         if not is_still and (self.time is not None or self.every is not None):
             raise InputError(f"--time, --every: got them for {out.name}, want --out FILE.png: they are of stills")
-        console.check_output("--out", out.parent)
+        console.check_output("--out", out.parent, out.name)
         runs = [files.load_rollout(path) for path in self.rollouts]
         solutions = [files.load_solution(path) for path in self.solution]
         one_trial = len(self.trial) == 1
@@ -91,7 +92,7 @@ class Render:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Show a run, or a policy at work, in MuJoCo's own viewer: in a window, or without a display in a browser.
+    """Watch a run, or a policy at work, in a window or in a browser.
 
     lqrsim view RUN.npz plays what `lqrsim simulate` wrote. lqrsim view SCENARIO solves the scenario and runs its policy
     live, again and again, and you interfere: the arrow keys and Page Up and Down push the robot, seen from the camera;
@@ -124,14 +125,15 @@ class View:
     def run(self) -> int:
         """Carry the command out; its exit code."""
         from lqrsim import console, files
-        from lqrsim.errors import check_count, check_number
+        from lqrsim.errors import check_count, check_number, check_seed
         from lqrsim.references import resolve
         from lqrsim.view import viewer
 
         check_number("--speed", self.speed, at_least=0.01, at_most=100)
         check_number("--push", self.push, at_least=0)
         check_number("--disturbances", self.disturbances, at_least=0)
-        check_count("--seed", self.seed, at_least=0)
+        check_seed("--seed", self.seed)
+        check_count("--port", self.port, at_least=0, at_most=65535)
         if self.seconds is not None:
             check_number("--seconds", self.seconds, above=0)
         kind = self.viewer if self.viewer != "auto" else "window" if viewer.has_display() else "browser"

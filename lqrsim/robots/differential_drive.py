@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.dynamics import Dynamics
-from lqrsim.errors import Array
+from lqrsim.errors import Array, check_number, vectors_of
 from lqrsim.robots.base import Robot
 
 
@@ -30,12 +30,17 @@ class DifferentialDrive(Robot):
     actuators: ClassVar[tuple[str, ...]] = ("create_wheel_left", "create_wheel_right")
     wheels: ClassVar[tuple[str, ...]] = ("create_tread_left", "create_tread_right")
 
+    def __post_init__(self) -> None:
+        for name in ("axle_length", "radius", "max_speed", "wheel_radius"):
+            object.__setattr__(self, name, check_number(f"{self.name}: {name}", getattr(self, name), above=0.0))
+
     @property
     def dynamics(self) -> Dynamics:
         return _dynamics(self)
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
-        qpos = np.asarray(qpos, dtype=np.float64)
+        qpos = vectors_of("qpos", qpos, 9)
+        vectors_of("qvel", qvel, 8)
         qw, qx, qy, qz = np.moveaxis(qpos[..., 3:7], -1, 0)
         heading = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
         state = np.concatenate([qpos[..., :2], heading[..., None]], axis=-1)
@@ -43,7 +48,7 @@ class DifferentialDrive(Robot):
 
     def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
         """At rest, wheels on a floor at height zero."""
-        state = np.asarray(state, dtype=np.float64)
+        state = vectors_of("state", state, 3)
         qpos = np.zeros((*state.shape[:-1], 9))
         qpos[..., :2] = state[..., :2]
         qpos[..., 2] = self.wheel_radius

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lqrsim import rotations
 from lqrsim.dynamics import Dynamics
-from lqrsim.errors import Array
+from lqrsim.errors import Array, InputError, check_number, vectors_of
 from lqrsim.robots.base import Robot
 
 
@@ -39,6 +39,13 @@ class Quadrotor(Robot):
         "quadrotor_rotor_4",
     )
 
+    def __post_init__(self) -> None:
+        positive = ("mass", "inertia", "arm", "max_force", "radius")
+        for name in (*positive, "torque_ratio", "drag", "gravity"):
+            above, least = (0.0, None) if name in positive else (None, 0.0)
+            number = check_number(f"{self.name}: {name}", getattr(self, name), above=above, at_least=least)
+            object.__setattr__(self, name, number)
+
     @property
     def hover_force(self) -> float:
         """Force of each rotor in N that carries the weight."""
@@ -49,13 +56,15 @@ class Quadrotor(Robot):
         return _dynamics(self)
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
-        qpos, qvel = np.asarray(qpos, dtype=np.float64), np.asarray(qvel, dtype=np.float64)
+        qpos, qvel = vectors_of("qpos", qpos, 7), vectors_of("qvel", qvel, 6)
+        if qpos.shape[:-1] != qvel.shape[:-1]:
+            raise InputError(f"qvel: got shape {qvel.shape}, want that of qpos, {qpos.shape}, with 6 numbers")
         rotation = _rotation_vector(qpos[..., 3:7])
         state = np.concatenate([qpos[..., :3], qvel[..., :3], rotation, qvel[..., 3:6]], axis=-1)
         return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
 
     def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
-        state = np.asarray(state, dtype=np.float64)
+        state = vectors_of("state", state, 12)
         position, velocity, rotation, angular_velocity = np.split(state, 4, axis=-1)
         qpos = np.concatenate([position, _quaternion(rotation)], axis=-1)
         return qpos, np.concatenate([velocity, angular_velocity], axis=-1)
@@ -102,5 +111,5 @@ def _rotation_vector(quaternion: Array) -> Array:
     angle = 2 * np.arctan2(sine, np.abs(scalar))
     # Without a turn the ratio is 2 / scalar, whatever the length; there the division is by zero.
     small = sine < 1e-12
-    ratio = np.divide(angle, sine, out=2.0 / np.abs(scalar), where=~small) if small.any() else angle / sine
+    ratio = np.divide(angle, sine, out=np.asarray(2.0 / np.abs(scalar)), where=~small) if small.any() else angle / sine
     return np.copysign(ratio, scalar)[..., None] * quaternion[..., 1:]

@@ -7,13 +7,30 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import compiled
-from lqrsim.errors import Array, InputError, check_count, check_number
-from lqrsim.results import Solution
+from lqrsim.coordinates import Coordinates
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_count,
+    check_flag,
+    check_function,
+    check_items,
+    check_kind,
+    check_memory,
+    check_number,
+    check_seed,
+    check_text,
+    excerpt,
+    shaped,
+)
+from lqrsim.results import Solution, Trajectory
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.controllers import Controller, Feedback
 from lqrsim.simulation.disturbances import Disturbance, Effect
-from lqrsim.simulation.physics import Physics, unlogged
-from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.disturbances.base import Hook
+from lqrsim.simulation.physics import Physics, part_of, unlogged
+from lqrsim.simulation.plant import MOST_STEPS, Plant
+from lqrsim.solvers.common import check_threads
 from lqrsim.versions import versions
 
 
@@ -56,29 +73,46 @@ def simulate(
       InputError: the policy is for another robot, or its plan is not finite; the control period is no multiple of the
         physics step; a disturbance does not fit; or an option is out of range.
     """
-    check_count("seed", seed, at_least=0)
-    check_count("trials", trials)
-    check_count("first_trial", first_trial, at_least=0)
-    threads = None if threads is None else check_count("threads", threads)
+    check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
+    check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
+    kinds = (Controller, type(None))
+    check_kind("controller", controller, kinds, "a Controller, such as Feedback(solution.policy), or None")
+    disturbances = check_items("disturbances", disturbances, Disturbance, "disturbances, such as ControlNoise(0.05)")
+    seed, first_trial = check_seed("seed", seed), check_seed("first_trial", first_trial)
+    trials, threads = check_count("trials", trials), check_threads(threads)
+    frames, contacts = check_flag("frames", frames), check_flag("contacts", contacts)
+    wanted = "a function of the trial and the disturbance's number that returns a numpy.random.Generator"
+    check_function("generators", generators, wanted, arguments=2)
+    check_function("progress", progress, "a function of how many periods are done, of how many", arguments=2)
+    check_function("watch", watch, "a function of the time, MuJoCo's qpos and who is unstable", arguments=3)
     goal_radius = plant.robot.radius if goal_radius is None else check_number("goal_radius", goal_radius, above=0.0)
     controller = Feedback(solution.policy) if controller is None else controller
     plan, space = solution.trajectory, plant.robot.dynamics.control_coordinates
-    _check_solution(solution, controller, plant)
+    states_space, controls_space = _check_solution(solution, controller, plant)
     substeps = plant.substeps(plan.dt)
+    _check_size(plant, plan, substeps, trials, frames=frames)
 
     def seeded(trial: int, stream: int) -> np.random.Generator:
         # Of NumPy's generators the quickest to make and to draw from, which shows in the time of the loop.
         return np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(trial, stream))))
 
+    named = [type(disturbance).__name__ for disturbance in disturbances]
     effects = _start(disturbances, plant, solution, generators or seeded, range(first_trial, first_trial + trials))
     displaced = np.zeros((trials, len(plant.world), 3))
-    for effect in effects:
-        displaced += 0.0 if effect.displaced is None else effect.displaced
+    n, m = len(plant.robot.dynamics.state_coordinates), len(space)
+    for name, effect in zip(named, effects, strict=True):
+        if effect.displaced is not None:
+            displaced += shaped(f"{name}: displaced", effect.displaced, displaced.shape)
+    if not np.isfinite(displaced).all():
+        raise InputError("disturbances: got obstacles that are displaced infinitely far, want finite numbers")
 
     physics = Physics(plant, trials, substeps, frames=frames, contacts=contacts, threads=threads, watch=watch)
     begun = np.tile(plan.states[0], (trials, 1))
-    for effect in effects:
-        begun = begun if effect.begin is None else effect.begin(begun)
+    for name, effect in zip(named, effects, strict=True):
+        if effect.begin is not None:
+            begun = shaped(f"{name}: begin: returned", effect.begin(begun), (trials, n))
+    if not np.isfinite(begun).all():
+        raise InputError("disturbances: got a start that is infinitely far away, want finite numbers")
     physics.place(begun)
     for effect in effects:
         if effect.alter is not None:
@@ -88,14 +122,21 @@ def simulate(
     if any(effect.alter for effect in effects) or displaced.any():
         physics.simulations.set_const()
 
-    measures = [effect.measure for effect in effects if effect.measure is not None]
-    actuations = [effect.actuate for effect in effects if effect.actuate is not None]
-    wrenches = [(slice(0, 3), effect.force) for effect in effects if effect.force is not None]
-    wrenches += [(slice(3, 6), effect.torque) for effect in effects if effect.torque is not None]
+    def hooks(kind: str) -> list[tuple[str, Hook]]:
+        """What is called in each period, and what messages call it."""
+        given = [(name, getattr(effect, kind)) for name, effect in zip(named, effects, strict=True)]
+        return [(f"{name}: {kind}: returned", hook) for name, hook in given if hook is not None]
+
+    measures, actuations = hooks("measure"), hooks("actuate")
+    wrenches = [(slice(0, 3), *one) for one in hooks("force")] + [(slice(3, 6), *one) for one in hooks("torque")]
+    asked = f"{type(controller).__name__}: control: returned"
     control = controller.start(trials)
+    check_function(
+        f"{type(controller).__name__}.start", control, "a function of step and states", arguments=2, optional=False
+    )
     low, high = (np.array(limits) for limits in (space.low, space.high))
 
-    steps, (n, m) = plan.steps, (plan.states.shape[1], plan.controls.shape[1])
+    steps = plan.steps
     states, measured = _records(trials, steps + 1, n), _records(trials, steps + 1, n)
     commanded, applied, wrench = _records(trials, steps, m), _records(trials, steps, m), _records(trials, steps, 6)
     contact_periods = np.zeros(trials, dtype=np.int64)
@@ -106,8 +147,8 @@ def simulate(
         for step in range(steps + 1):
             state = physics.state()
             shown = state.copy()
-            for measure in measures:
-                shown = measure(step, shown)
+            for name, measure in measures:
+                shown = shaped(name, measure(step, shown), shown.shape)
             states[:, step], measured[:, step] = state, shown
             lost |= physics.unstable | _not_finite(shown)
             if lost.any():
@@ -115,14 +156,14 @@ def simulate(
                 shown[lost] = plan.states[step]  # a lost trial goes on with the plan's state, so that the others do
             if step == steps:
                 break
-            command = control(step, shown)
+            command = shaped(asked, control(step, shown), (trials, m))
             lost |= _not_finite(command)
             applying = command.copy()
-            for actuate in actuations:
-                applying = actuate(step, applying)
+            for name, actuate in actuations:
+                applying = shaped(name, actuate(step, applying), applying.shape)
             applying = np.clip(applying, low, high)
-            for which, push in wrenches:
-                wrench[:, step, which] += push(step, state)
+            for which, name, push in wrenches:
+                wrench[:, step, which] += shaped(name, push(step, state), (trials, 3))
             commanded[:, step], applied[:, step] = command, applying
             touched, pictures = physics.advance(applying, wrench[:, step])
             contact_periods += touched & ~lost
@@ -132,7 +173,7 @@ def simulate(
 
     drawn = np.stack(seen, axis=1)
     for array in (states, measured):
-        compiled.turn_to_nearest(controller.spaces[0], array.transpose(1, 0, 2), plan.states)
+        compiled.turn_to_nearest(states_space, array.transpose(1, 0, 2), plan.states)
     if lost.any():
         # A frame belongs to the knot that ends its period: the trial was lost somewhere before that.
         knot_of_frame = -(np.arange(len(seen)) // -max(physics.parts, 1))
@@ -148,8 +189,8 @@ def simulate(
         model=plant.scene.xml,
         plan=plan,
         policy_digest=controller.digest,
-        state_coordinates=controller.spaces[0],
-        control_coordinates=controller.spaces[1],
+        state_coordinates=states_space,
+        control_coordinates=controls_space,
         radius=plant.robot.radius,
         goal_radius=goal_radius,
         states=states,
@@ -193,10 +234,22 @@ def _start(
 ) -> list[Effect]:
     effects = []
     for stream, disturbance in enumerate(disturbances):
-        if not isinstance(disturbance, Disturbance):
-            raise InputError(f"disturbances: got {disturbance!r}, want Disturbance objects, such as ControlNoise(0.05)")
-        effects.append(disturbance.start(plant, solution.trajectory, _Streams(generators, trials, stream)))
+        effect = disturbance.start(plant, solution.trajectory, _Streams(generators, trials, stream))
+        effects.append(check_kind(f"{type(disturbance).__name__}.start", effect, Effect, "an Effect"))
     return effects
+
+
+def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, frames: bool) -> None:
+    """Raises InputError for a run that would not end, or does not fit into memory."""
+    if plan.steps * substeps > MOST_STEPS:
+        raise InputError(
+            f"solution: got a plan of {plan.steps} control periods of {plan.dt:g} s, which are {plan.steps * substeps}"
+            f" physics steps, want at most {MOST_STEPS}"
+        )
+    n, m = plan.states.shape[1], plan.controls.shape[1]
+    pictures = plan.steps * (substeps // part_of(plant, substeps)) + 1 if frames else 1
+    numbers = (plan.steps + 1) * 3 * (2 * n + 2 * m + 6 + 1) + 2 * pictures * plant.model.nq + 3 * len(plant.world)
+    check_memory("trials", trials, 8 * numbers + 2000, "whose records")
 
 
 class _Streams(Sequence[np.random.Generator]):
@@ -214,18 +267,33 @@ class _Streams(Sequence[np.random.Generator]):
             return [self[number] for number in range(*place.indices(len(self)))]
         trial = self._trials[place]
         if trial not in self._made:
-            self._made[trial] = self._make(trial, self._stream)
+            made = self._make(trial, self._stream)
+            for draw in ("standard_normal", "random"):  # those of `Given` are no Generators
+                if not callable(getattr(made, draw, None)):
+                    raise InputError(f"generators: got {excerpt(made)}, want a numpy.random.Generator of each trial")
+            self._made[trial] = made
         return self._made[trial]
 
 
-def _check_solution(solution: Solution, controller: Controller, plant: Plant) -> None:
+def _check_solution(solution: Solution, controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:
+    """What the controller's states and controls are. Raises InputError unless they, and the plan, are the plant's."""
     dynamics = plant.robot.dynamics
     wanted = dynamics.state_coordinates.names, dynamics.control_coordinates.names
-    for field, space, want in zip(("states", "controls"), controller.spaces, wanted, strict=True):
+    kind = type(controller).__name__
+    check_text(f"{kind}.digest", controller.digest, "a hash as text")
+    spaces = check_items(f"{kind}.spaces", controller.spaces, Coordinates, "Coordinates of states and of controls")
+    if len(spaces) != 2:
+        raise InputError(f"{kind}.spaces: got {len(spaces)}, want two: of the states, of the controls")
+    for field, space, want in zip(("states", "controls"), spaces, wanted, strict=True):
         if space.names != want:
             raise InputError(
                 f"solution: got a policy with {field} {', '.join(space.names)}, want those of robot"
                 f" {plant.robot.name}: {', '.join(want)}"
             )
-    if not np.isfinite(solution.trajectory.states).all():
+    plan = solution.trajectory
+    if plan.states.shape[1] != len(wanted[0]) or plan.controls.shape[1] != len(wanted[1]):
+        shapes = f"{plan.states.shape[1]} states and {plan.controls.shape[1]} controls"
+        raise InputError(f"solution: got a plan of {shapes}, want {len(wanted[0])} and {len(wanted[1])}")
+    if not (np.isfinite(plan.states).all() and np.isfinite(plan.controls).all()):
         raise InputError(f"solution: got a plan that is not finite ({solution.status.name}), want one that can be run")
+    return spaces[0], spaces[1]

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import compiled
-from lqrsim.errors import Array
+from lqrsim.errors import Array, InputError, check_kind, check_shape, excerpt, numbers_of, shaped
 from lqrsim.problem import Problem
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.plant import Plant
@@ -42,6 +42,24 @@ class Outcomes:
     saturated: Array
     cost: Array
 
+    def __post_init__(self) -> None:
+        trial = numbers_of("Outcomes: trial", self.trial)
+        check_shape("Outcomes: trial", trial, (None,))
+        if not ((trial >= 0) & (trial == np.floor(trial)) & (trial < 2**63)).all():
+            raise InputError(f"Outcomes: trial: got {excerpt(self.trial)}, want whole numbers >= 0")
+        if type(self.trial) is not np.ndarray or self.trial.dtype != np.int64:
+            object.__setattr__(self, "trial", trial.astype(np.int64))
+        for field in fields(self)[1:]:
+            value, name = getattr(self, field.name), f"Outcomes: {field.name}"
+            if field.name not in ("outcome", "obstacle"):
+                object.__setattr__(self, field.name, shaped(name, value, trial.shape))
+                continue
+            if not isinstance(value, np.ndarray) or value.dtype.kind != "U":
+                raise InputError(f"{name}: got {excerpt(value)}, want an array of texts")
+            check_shape(name, value, trial.shape)
+        if not np.isin(self.outcome, OUTCOMES).all():
+            raise InputError(f"Outcomes: outcome: got {excerpt(self.outcome)}, want each one of {', '.join(OUTCOMES)}")
+
     def __len__(self) -> int:
         return len(self.trial)
 
@@ -56,6 +74,18 @@ def outcomes(rollout: Rollout, plant: Plant, problem: Problem | None = None) -> 
     Args:
       plant: that it was run on. problem: whose cost to work out; NaN without one.
     """
+    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
+    check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
+    check_kind("problem", problem, (Problem, type(None)), "a Problem or None")
+    if rollout.displaced.shape[1] != len(plant.world):
+        raise InputError(f"plant: got one of {len(plant.world)} obstacles, want that of the rollout's, {rollout.scene}")
+    if problem is not None and (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
+        got = f"{problem.steps} steps of {problem.dt:g} s"
+        raise InputError(f"problem: got {got}, want {rollout.plan.steps} of {rollout.plan.dt:g} s, as in the rollout")
+    if problem is not None and problem.dynamics.state_coordinates.names != rollout.state_coordinates.names:
+        raise InputError(
+            f"problem: got one of another system, want states {', '.join(rollout.state_coordinates.names)}"
+        )
     plan, dt, steps = rollout.plan, rollout.plan.dt, rollout.plan.steps
     hit = np.less(rollout.clearance, 0)
     lost = np.any(~np.isfinite(rollout.states), axis=2)

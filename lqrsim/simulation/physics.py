@@ -47,10 +47,7 @@ class Physics:
         model = plant.model if contacts else plant.without_contacts
         self.simulations = batch.Batch(model, trials, min(trials, threads or processors()))
         self._sensors = self.simulations.bind("sensordata") if contacts else None
-        # The longest equal parts of the period that are short enough to draw.
-        parts = [part for part in range(1, substeps + 1) if substeps % part == 0]
-        drawn = max([part for part in parts if part * plant.timestep <= FRAME_PERIOD + 1e-9], default=1)
-        self._part = drawn if frames else substeps
+        self._part = part_of(plant, substeps) if frames else substeps
         self.parts = substeps // self._part if frames else 0
         self._steps = substeps // self._part
         self._qpos, self._qvel = self.simulations.bind("qpos"), self.simulations.bind("qvel")
@@ -97,6 +94,12 @@ class Physics:
         if warned.any():
             self.unstable |= (warned[:, _UNSTABLE] > 0).any(axis=1)
         return touched, frames
+
+
+def part_of(plant: Plant, substeps: int) -> int:
+    """Physics steps of a frame: the longest equal parts of the control period that are short enough to draw."""
+    longest = min(substeps, int((FRAME_PERIOD + 1e-9) / plant.timestep))
+    return max((part for part in range(1, longest + 1) if substeps % part == 0), default=1)
 
 
 def _span(indices: Indices) -> slice | Indices:

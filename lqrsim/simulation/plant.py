@@ -10,11 +10,25 @@ import numpy.typing as npt
 from mujoco import batch
 
 from lqrsim import compiled
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_items,
+    check_kind,
+    check_number,
+    check_seed,
+    excerpt,
+    shaped,
+    vectors_of,
+)
 from lqrsim.robots.base import Robot
 from lqrsim.scenes import Scene, obstacle_geoms
 from lqrsim.world import World
 
+MOST_STEPS = 100_000_000  # of the physics in a run: minutes or hours
+MOST_CHECKED = 1_000_000  # of `check_plant`, which makes them one by one
 Indices = npt.NDArray[np.intp]
 
 
@@ -33,6 +47,8 @@ class Plant:
     """
 
     def __init__(self, robot: Robot, scene: Scene) -> None:
+        check_kind("robot", robot, Robot, "a Robot, such as Quadrotor()")
+        check_kind("scene", scene, Scene, "a Scene, such as load_scene('cage')")
         wanted = {
             "body": ([robot.body], [scene.model.body(i).name for i in range(scene.model.nbody)]),
             "joint": (robot.joints, [scene.model.joint(i).name for i in range(scene.model.njnt)]),
@@ -63,7 +79,13 @@ class Plant:
 
     def substeps(self, period: float) -> int:
         """Physics steps in a control period of that many seconds. Raises InputError if it is no multiple of one."""
-        steps = check_number("control period", period, above=0.0) / self.timestep
+        period = check_number("control period", period, above=0.0)
+        steps = period / self.timestep
+        if steps > MOST_STEPS:
+            raise InputError(
+                f"control period: got {period:g} s, which are {steps:.3g} physics steps of {self.timestep:g} s, want at"
+                f" most {MOST_STEPS}"
+            )
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise InputError(
                 f"control period: got {period:g} s, want a multiple of the physics step of scene {self.scene.name},"
@@ -82,7 +104,12 @@ class Plant:
         Args:
           displaced: (K, obstacles, 3), by how much obstacles are elsewhere in each trial; states are then (K, k, n).
         """
-        states = np.asarray(states, dtype=np.float64)
+        states = vectors_of("states", states, len(self.robot.dynamics.state_coordinates))
+        if displaced is not None:
+            wanted = (len(states) if states.ndim == 3 else None, len(self.world), 3)
+            displaced = shaped("displaced", displaced, wanted)
+            if displaced.any() and states.ndim != 3:
+                raise InputError(f"states: got shape {states.shape} beside displaced obstacles, want (K, k, n)")
         if not len(self.world):
             return np.full(states.shape[:-1], np.inf)
         position = states[..., list(self.robot.dynamics.state_coordinates.position)]
@@ -99,9 +126,15 @@ class Plant:
             places[:, geom.id] += displaced[:, number] @ drawn.xmat[geom.bodyid[0]].reshape(3, 3)
 
     def _compile(self, *, contacts: bool = True) -> mujoco.MjModel:
-        spec = mujoco.MjSpec.from_string(self.scene.xml)
-        # The sensors need names; geoms without one get the obstacle's. A geom's id is its place in the compiled model.
-        spec.compile()
+        try:
+            spec = mujoco.MjSpec.from_string(self.scene.xml)
+            # The sensors need names; geoms without one get the obstacle's. A geom's id is its place once compiled.
+            again = spec.compile()
+        except (ValueError, mujoco.FatalError) as error:
+            raise InputError(f"scene {self.scene.name}: xml: got one that MuJoCo refuses: {error}") from None
+        had, has = self.scene.model, again
+        if (had.ngeom, had.nbody, had.nq, had.nv, had.nu) != (has.ngeom, has.nbody, has.nq, has.nv, has.nu):
+            raise InputError(f"scene {self.scene.name}: got a model that is not of its xml, want one of load_scene")
         geoms = {geom.id: geom for geom in spec.geoms}
         for geom, obstacle in zip(obstacle_geoms(self.scene.model), self.scene.world.obstacles, strict=True):
             geoms[geom].name = obstacle.name
@@ -144,6 +177,19 @@ class PlantCheck:
     simulated: Array
     predicted: Array
     tolerance: float
+
+    def __post_init__(self) -> None:
+        for name in ("names", "units"):
+            found = check_items(f"PlantCheck: {name}", getattr(self, name), str, "texts, one a state")
+            object.__setattr__(self, name, found)
+        n = len(self.names)
+        if not n or len(self.units) != n:
+            raise InputError(f"PlantCheck: units: got {len(self.units)} for {n} names, want one a state, at least one")
+        for name in ("errors", "changes", "state", "simulated", "predicted", "control"):
+            size = None if name == "control" else n
+            object.__setattr__(self, name, shaped(f"PlantCheck: {name}", getattr(self, name), (size,)))
+        for name in ("period", "tolerance"):
+            object.__setattr__(self, name, check_number(f"PlantCheck: {name}", getattr(self, name), above=0.0))
 
     @property
     def relative(self) -> Array:
@@ -204,11 +250,6 @@ def check_plant(
     Raises:
       InputError: the robot is not in the scene, an argument is not as described, or the controls have no limits.
     """
-    if not isinstance(robot, Robot) or not isinstance(scene, Scene):
-        got = f"{excerpt(robot)} and {excerpt(scene)}"
-        raise InputError(
-            f"check_plant: got {got}, want a robot and a scene, such as Quadrotor() and load_scene('cage')"
-        )
     plant = Plant(robot, scene)
     period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
     substeps = plant.substeps(period)
@@ -230,13 +271,20 @@ def check_plant(
     for name in plant.world.names:
         geom = plant.model.geom(name)
         geom.contype[:], geom.conaffinity[:] = 0, 0
-    rng, data = np.random.default_rng(check_count("seed", seed, at_least=0)), mujoco.MjData(plant.model)
-    check_number("spread", spread, at_least=0.0)
+    rng, data = np.random.default_rng(check_seed("seed", seed)), mujoco.MjData(plant.model)
+    spread = check_number("spread", spread, at_least=0.0)
     if settle is None:
         settle = 0.5 if 2 * len(plant.qvel) > n else 0.0
-    waiting = round(check_number("settle", settle, at_least=0.0) / plant.timestep)
-    found = []
-    for _ in range(check_count("samples", samples)):
+    waiting = check_number("settle", settle, at_least=0.0) / plant.timestep
+    samples = check_count("samples", samples, at_most=100_000)
+    if not samples * (waiting + substeps) <= MOST_CHECKED:
+        raise InputError(
+            f"samples: got {samples}, which are {samples * (waiting + substeps):.3g} physics steps in all, want at most"
+            f" {MOST_CHECKED}: fewer samples, or a shorter period and time to settle"
+        )
+    waiting, found = round(waiting), []
+    tolerance = check_number("tolerance", tolerance, above=0.0)
+    for _ in range(samples):
         state, control = middle + spread * rng.normal(size=n), rng.uniform(low, high)
         mujoco.mj_resetData(plant.model, data)
         data.qpos[plant.qpos], data.qvel[plant.qvel] = robot.configuration(state)
@@ -255,7 +303,7 @@ def check_plant(
     check = PlantCheck(
         names=dynamics.state_coordinates.names, units=dynamics.state_coordinates.units, errors=errors.max(axis=0),
         changes=changes.max(axis=0), period=period, state=state, control=control, simulated=simulated,
-        predicted=predicted, tolerance=check_number("tolerance", tolerance, above=0.0),
+        predicted=predicted, tolerance=tolerance,
     )  # fmt: skip
     at = int(errors[:, check.names.index(check.worst)].argmax())
     state, control, simulated, predicted = found[at]

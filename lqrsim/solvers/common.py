@@ -12,7 +12,18 @@ import numpy as np
 from lqrsim import compiled
 from lqrsim.checks import check_functions, check_start, functions_of
 from lqrsim.constraints import Clearance
-from lqrsim.errors import Array, InputError, check_count, check_name, check_number, excerpt
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_count,
+    check_flag,
+    check_function,
+    check_items,
+    check_kind,
+    check_memory,
+    check_name,
+    check_number,
+)
 from lqrsim.functions import External
 from lqrsim.machine import processors
 from lqrsim.policy import AffinePolicy
@@ -48,6 +59,7 @@ _METHODS = {
     interface.ILQR: "ilqr",
 }
 LOG_COLUMNS = 6
+MOST_STARTS, MOST_THREADS = 10_000, 1024
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,11 +74,13 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_name("stop", self.stop, ("optimal", "cost"))
+        if callable(self.start) and not isinstance(self.start, AffinePolicy):
+            check_function("start", self.start, "a function of a Problem, or what it returns", arguments=1)
         # What is kept is plain Python's: NumPy's numbers would be other types for the compiler, and not for JSON.
         object.__setattr__(self, "tolerance", check_number("tolerance", self.tolerance, above=0.0))
-        object.__setattr__(self, "max_iterations", check_count("max_iterations", self.max_iterations))
-        if self.max_iterations > 1_000_000:  # the log of so many takes 48 MB
-            raise InputError(f"max_iterations: got {self.max_iterations}, want at most 1000000")
+        # The log of so many takes 48 MB.
+        most = check_count("max_iterations", self.max_iterations, at_most=1_000_000)
+        object.__setattr__(self, "max_iterations", most)
         if self.time_limit is not None:
             object.__setattr__(self, "time_limit", check_number("time_limit", self.time_limit, above=0.0))
 
@@ -98,7 +112,7 @@ class SmootherSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.starts is not None:
-            object.__setattr__(self, "starts", check_count("starts", self.starts))
+            object.__setattr__(self, "starts", check_count("starts", self.starts, at_most=MOST_STARTS))
             if self.starts > 1 and self.start is not None:
                 raise InputError(f"starts: got {self.starts} beside a start, want one of the two")
         object.__setattr__(self, "gap_tolerance", check_number("gap_tolerance", self.gap_tolerance, above=0.0))
@@ -106,9 +120,7 @@ class SmootherSettings(Settings):
         object.__setattr__(self, "constraint_tolerance", number)
         check_name("form", self.form, tuple(compiled.FORMS))
         check_name("first_pass", self.first_pass, ("forward", "backward"))
-        if not isinstance(self.safeguard, bool | np.bool_):
-            raise InputError(f"safeguard: got {excerpt(self.safeguard)}, want True or False")
-        object.__setattr__(self, "safeguard", bool(self.safeguard))
+        object.__setattr__(self, "safeguard", check_flag("safeguard", self.safeguard))
 
     @property
     def core_form(self) -> str:
@@ -249,9 +261,8 @@ def solve_all(
     progress: Callable[[int, int], object] | None,
 ) -> list[Solution]:
     """Solve each problem with `solve(problem, settings, each=False)`, on several threads; the answers in order."""
-    if progress is not None and not callable(progress):
-        raise InputError(f"progress: got {progress!r}, want a function of how many are done, of how many")
-    threads = processors() if threads is None else check_count("threads", threads)
+    check_function("progress", progress, "a function of how many are done, of how many", arguments=2)
+    threads = check_threads(threads)
     for i, problem in enumerate(problems):
         try:
             check(problem, settings)
@@ -287,21 +298,27 @@ def workers(threads: int, functions: Iterable[External]) -> Iterator[ThreadPoolE
 
 def check_callback(callback: Callback | None) -> None:
     """Raises InputError for what can not be called."""
-    if callback is not None and not callable(callback):
-        raise InputError(f"callback: got {excerpt(callback)}, want a function of an Iteration")
+    check_function("callback", callback, "a function of an Iteration", arguments=1)
+
+
+def check_threads(threads: int | None) -> int:
+    """How many threads to use; by default as many as there are processors. Raises InputError."""
+    return processors() if threads is None else check_count("threads", threads, at_most=MOST_THREADS)
+
+
+def check_attempts(problem: Problem, starts: int) -> None:
+    """Raises InputError if the arrays of so many starts do not fit into memory."""
+    check_memory("starts", starts, problem.steps * problem.bytes_per_step)
 
 
 def list_of(problems: Iterable[Problem]) -> list[Problem]:
     """The problems as a list. Raises InputError for what is no collection."""
-    if not isinstance(problems, Iterable):
-        raise InputError(f"problems: got {type(problems).__name__}, want a list of Problem")
-    return list(problems)
+    return list(check_items("problems", problems, object, "a list of Problem"))
 
 
 def check_problem(problem: Problem) -> None:
     """Raises InputError unless it is a problem."""
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem: got {type(problem).__name__}, want a Problem")
+    check_kind("problem", problem, Problem, "a Problem, such as scenario.problem")
 
 
 def check_outcome(problem: Problem, ending: Ending, x: Array, u: Array, *, refuse: bool) -> Ending:

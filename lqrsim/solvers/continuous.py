@@ -13,7 +13,18 @@ import numpy.typing as npt
 from scipy.interpolate import PPoly
 
 from lqrsim.checks import check_functions, check_start, functions_of
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_function,
+    check_items,
+    check_kind,
+    check_number,
+    excerpt,
+    real,
+)
 from lqrsim.functions import External
 from lqrsim.linear_quadratic import Stage, check_end
 from lqrsim.problem import FixedState, Problem
@@ -54,6 +65,15 @@ class ContinuousSolution:
     iterations: tuple[Iteration, ...] = ()
     _backward: "Pass | None" = field(repr=False)
     _forward: "Pass | None" = field(repr=False)
+
+    def __post_init__(self) -> None:
+        check_kind("ContinuousSolution: status", self.status, Status, "a Status")
+        check_kind("ContinuousSolution: detail", self.detail, str, "text")
+        check_number("ContinuousSolution: horizon", self.horizon, above=0.0)
+        log = check_items("ContinuousSolution: iterations", self.iterations, Iteration, "a tuple of Iteration")
+        object.__setattr__(self, "iterations", log)
+        for name in ("_backward", "_forward"):
+            check_kind(f"ContinuousSolution: {name}", getattr(self, name), (Pass, type(None)), "a Pass or None")
 
     @property
     def success(self) -> bool:
@@ -116,7 +136,7 @@ class ContinuousSolution:
     def _at(self, what: str, found: "Pass | None", t: npt.ArrayLike) -> tuple["Pass", Array]:
         if found is None:
             raise InputError(f"{what}: got a solution that is {self.status.value} before a pass ended, want a success")
-        times, slack = _numbers("t", t), 1e-9 * self.horizon  # a time may be out by rounding
+        times, slack = real("t", t), 1e-9 * self.horizon  # a time may be out by rounding
         outside = ~((times >= -slack) & (times <= self.horizon + slack))
         if outside.any():
             raise InputError(f"t: got {times[outside].flat[0]:g}, want seconds from 0 to {self.horizon:g}")
@@ -129,20 +149,13 @@ class ContinuousSolution:
 
     def _law(self, what: str, found: "Pass | None", x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
         found, times = self._at(what, found, t)
-        states, want = _numbers("x", x), f"(..., {found.states}), one state or one for each of the times"
+        states, want = real("x", x), f"(..., {found.states}), one state or one for each of the times"
         if states.shape[-1:] != (found.states,) or (times.ndim and states.shape[:-1] not in ((), times.shape)):
             raise InputError(f"x: got shape {states.shape}, want {want}")
         if not np.isfinite(states).all():
-            raise InputError(f"x: got {states}, want finite numbers")
+            raise InputError(f"x: got {excerpt(states)}, want finite numbers")
         _, law = found.at(times)
         return np.einsum("...ij,...j->...i", law[..., :-1], states) + law[..., -1]
-
-
-def _numbers(field: str, value: npt.ArrayLike) -> Array:
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{field}: got {excerpt(value)}, want numbers") from None
 
 
 def smooth_lq_continuous(
@@ -176,12 +189,14 @@ def smooth_lq_continuous(
     def at(t: float) -> Stage:
         given = stage(t) if callable(stage) else stage
         if not isinstance(given, Stage) or np.ndim(given.B) != 2:
-            got = f"one with {np.ndim(given.B)} dimensions in B" if isinstance(given, Stage) else type(given).__name__
+            got = f"one with {np.ndim(given.B)} dimensions in B" if isinstance(given, Stage) else excerpt(given)
             raise InputError(
                 f"stage: got {got}, want a Stage without a leading axis, or a function of t that gives one"
             )
         return given
 
+    if callable(stage):
+        check_function("stage", stage, "a Stage, or a function of t that gives one", arguments=1)
     first = at(0.0)
     n, m = first.states, first.controls
 
@@ -262,8 +277,8 @@ def smooth_continuous(
     Raises:
       InputError: an argument is not as described; the dynamics or a cost is not finite at the start.
     """
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem: got {type(problem).__name__}, want a Problem")
+    check_kind("problem", problem, Problem, "a Problem, such as scenario.problem")
+    check_function("callback", callback, "a function of an Iteration", arguments=1)
     if isinstance(problem.initial, FixedState):
         raise InputError(
             "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start);"
@@ -271,9 +286,9 @@ def smooth_continuous(
         )
     if problem.constraints:
         raise InputError("constraints: got some, want none in continuous time; smooth keeps them")
-    check_number("tolerance", tolerance, above=0.0)
-    check_number("gap_tolerance", gap_tolerance, above=0.0)
-    check_count("max_iterations", max_iterations)
+    tolerance = check_number("tolerance", tolerance, above=0.0)
+    gap_tolerance = check_number("gap_tolerance", gap_tolerance, above=0.0)
+    check_count("max_iterations", max_iterations, at_most=1_000_000)
     tolerances = tolerances_of(rtol, atol)
     m = len(problem.dynamics.control_coordinates)
     prior = start.fitting(problem) if isinstance(start, InitialPrior) else None

@@ -7,7 +7,7 @@ import numpy as np
 
 from lqrsim import compiled
 from lqrsim.coordinates import Coordinates
-from lqrsim.errors import Array, InputError, check_array, check_name, check_number
+from lqrsim.errors import Array, InputError, check_array, check_kind, check_memory, check_name, check_number
 from lqrsim.linear_quadratic import Stage, check_end
 from lqrsim.policy import AffinePolicy
 from lqrsim.problem import FixedState
@@ -43,13 +43,13 @@ def smooth_lq(
     clock = time.perf_counter()
     check_name("form", form, tuple(compiled.FORMS))
     dt = check_number("dt", dt, above=0.0)
-    if not isinstance(stage, Stage):
-        raise InputError(f"stage: got {type(stage).__name__}, want a Stage")
+    check_kind("stage", stage, Stage, "a Stage")
     if np.ndim(stage.B) != 3:
         raise InputError("stage: got one stage, want one a step: B of shape (T, n, m)")
     parts = _parts(stage)
     A, B, c, Q, P, R, q, r, constant = parts
     steps, n, m = B.shape
+    check_memory("stage: steps", steps, 8 * (6 * n * n + 5 * m * n + 3 * m * m))
     jacobian = np.ascontiguousarray(np.concatenate([A, B], axis=2))
     inverse, c_inverse = (jacobian, c.copy()) if form == "dual" else _inverse(A, B, c)
     cost = np.ascontiguousarray(np.block([[Q, np.swapaxes(P, 1, 2)], [P, R]]))

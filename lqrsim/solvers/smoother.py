@@ -5,8 +5,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from lqrsim.checks import check_functions
-from lqrsim.errors import InputError, check_count
-from lqrsim.machine import processors
+from lqrsim.errors import InputError
 from lqrsim.problem import FixedState, Problem
 from lqrsim.results import Solution
 from lqrsim.solvers.attempt import Attempt
@@ -15,12 +14,14 @@ from lqrsim.solvers.common import (
     SmootherSettings,
     Stop,
     assemble,
+    check_attempts,
     check_callback,
     check_problem,
+    check_threads,
     list_of,
     solve_all,
 )
-from lqrsim.solvers.search import Search, check_starts, guides
+from lqrsim.solvers.search import STARTS, Search, check_starts, guides
 from lqrsim.solvers.start import StartLike, resolve
 
 
@@ -90,7 +91,7 @@ def smooth(
     )  # fmt: skip
     check_callback(callback)
     _check(problem, settings)
-    threads = processors() if threads is None else check_count("threads", threads)
+    threads = check_threads(threads)
     return _solve(problem, settings, each=True, threads=threads, callback=callback)
 
 
@@ -175,6 +176,8 @@ def _solve(
 
 def _check(problem: Problem, settings: SmootherSettings) -> None:
     check_problem(problem)
+    several = settings.start is None and len(problem.obstacle_costs) > 0
+    check_attempts(problem, settings.starts or (STARTS if several else 1))
     if settings.form == "primal" and isinstance(problem.initial, FixedState):
         raise InputError(
             "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start):"

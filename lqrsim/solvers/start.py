@@ -7,7 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_count, excerpt
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_kind,
+    check_number,
+    excerpt,
+    numbers_of,
+)
 from lqrsim.policy import AffinePolicy
 from lqrsim.problem import Problem
 from lqrsim.results import Multipliers, Solution, Trajectory
@@ -37,13 +46,16 @@ class InitialPrior:
         controls: npt.ArrayLike | None = None,
     ) -> None:
         self.weight = check_array("InitialPrior: weight", weight, (None,))
-        if (self.weight < 0).any():
-            raise InputError(f"InitialPrior: weight: got {self.weight.min():g}, want numbers >= 0")
-        try:
-            time = () if np.ndim(about) == 1 else (None,)
-        except ValueError:  # ragged: the check below says so
-            time = ()
-        self.about = check_array("InitialPrior: about", about, (*time, len(self.weight)))
+        if not len(self.weight) or (self.weight < 0).any():
+            raise InputError(
+                f"InitialPrior: weight: got {excerpt(self.weight.tolist())}, want numbers >= 0, one a state"
+            )
+        given = numbers_of("InitialPrior: about", about, f"numbers ({len(self.weight)},) or (T+1, {len(self.weight)})")
+        self.about = check_array("InitialPrior: about", given, (*[None] * (given.ndim == 2), len(self.weight)))
+        if len(self.about) < 2 and self.about.ndim == 2:
+            raise InputError(
+                f"InitialPrior: about: got {len(self.about)} rows, want one for each of at least two times"
+            )
         self.iterations = check_count("InitialPrior: iterations", iterations)
         shares = check_array("InitialPrior: obstacles", obstacles, (None,))
         if ((shares < 0) | (shares > 1)).any():
@@ -51,15 +63,12 @@ class InitialPrior:
         self.obstacles = tuple(shares.tolist())
         self.controls = controls
         if controls is not None:
-            try:
-                self.controls = np.array(controls, dtype=np.float64)
-            except (TypeError, ValueError):
-                raise InputError(
-                    f"InitialPrior: controls: got {excerpt(controls)}, want controls (m,) or (T, m)"
-                ) from None
+            self.controls = numbers_of("InitialPrior: controls", controls, "controls (m,) or (T, m)")
 
     def at(self, step: float) -> Array:
-        """Where it is zero, (n,), at a step or between two."""
+        """Where it is zero, (n,), at a step or between two. Raises InputError for what is none."""
+        most = None if self.about.ndim == 1 else len(self.about) - 1
+        step = check_number("step", step, at_least=0.0, at_most=most)
         if self.about.ndim == 1:
             return self.about
         before = min(int(step), len(self.about) - 2)
@@ -68,6 +77,7 @@ class InitialPrior:
 
     def fitting(self, problem: Problem) -> "InitialPrior":
         """Itself. Raises InputError if it does not fit the problem."""
+        check_kind("problem", problem, Problem, "a Problem")
         n = len(problem.dynamics.state_coordinates)
         check_array("start: InitialPrior: weight", self.weight, (n,))
         if self.about.ndim == 2:
@@ -156,9 +166,9 @@ def resolve(start: StartLike, problem: Problem) -> Start:
         return Start(np.zeros((steps, m, n)), controls, None, given, _summary(start, states, controls))
     wanted, given = problem.nominal_control if start is None else start, None
     try:
-        given = np.array(wanted, dtype=np.float64)
+        given = numbers_of("start", wanted)
         controls = np.broadcast_to(given, (steps, m))
-    except (TypeError, ValueError):
+    except ValueError:  # InputError too
         got = excerpt(wanted) if given is None else f"shape {given.shape}"
         raise InputError(
             f"start: got {got}, want controls ({m},) or ({steps}, {m}), an InitialPrior, a Trajectory, an AffinePolicy"

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number
 from lqrsim.simulation.outcomes import Outcomes
 from lqrsim.stress.asked import Cell
-from lqrsim.stress.statistics import CONFIDENCE, Estimate, Pairs, bootstrap, compare, holm, rate, wilson
+from lqrsim.stress.statistics import CONFIDENCE, Estimate, Pairs, compare, holm, mean, paired_difference, rate, wilson
 
 Table = Mapping[Cell, Outcomes]
 
@@ -121,11 +121,11 @@ class Comparison:
     adjusted: float
 
 
-def comparisons(table: Table, *, resamples: int = 2000, seed: int = 0) -> list[Comparison]:
+def comparisons(table: Table) -> list[Comparison]:
     """The first policy of the table against each other one, in every sweep and at every strength at which it meets it.
 
-    Differences are on the same trials, intervals are those of a paired bootstrap. Where the trials of both are all
-    alike, they are one trial and there is nothing to test.
+    Differences are on the same trials: of success with Tango's score interval, of errors with Student's. Where the
+    trials of both are all alike, they are one trial and there is nothing to test.
 
     Raises:
       InputError: two policies ran other trials.
@@ -138,7 +138,7 @@ def comparisons(table: Table, *, resamples: int = 2000, seed: int = 0) -> list[C
             if cell.policy != policies[0] or second not in table:
                 continue
             if not (_alike(table[cell]) and _alike(table[second])):
-                found.append(_compared(cell, second, table[cell], table[second], resamples, seed))
+                found.append(_compared(cell, second, table[cell], table[second]))
     adjusted = holm([one.pairs.p_value for one in found])
     return [
         Comparison(one.first, one.second, one.pairs, one.success, one.rms, one.both, float(p))
@@ -146,21 +146,13 @@ def comparisons(table: Table, *, resamples: int = 2000, seed: int = 0) -> list[C
     ]
 
 
-def _compared(first: Cell, second: Cell, one: Outcomes, other: Outcomes, resamples: int, seed: int) -> Comparison:
+def _compared(first: Cell, second: Cell, one: Outcomes, other: Outcomes) -> Comparison:
     if not np.array_equal(one.trial, other.trial):
         raise InputError(f"{second}: got other trials than those of {first}, want the same, in the same order")
     pairs = compare(succeeded(one), succeeded(other))
-    # A resample of pairs is a draw of how many of each kind are in it.
-    kinds = np.array([pairs.only_first, pairs.only_second, len(one) - pairs.only_first - pairs.only_second]) / len(one)
-    counts = np.random.default_rng(seed).multinomial(len(one), kinds, size=resamples)
-    tail = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile((counts[:, 0] - counts[:, 1]) / len(one), (tail, 100 - tail))
-    difference = Estimate((pairs.only_first - pairs.only_second) / len(one), float(low), float(high))
+    difference = paired_difference(pairs.only_first, pairs.only_second, len(one))
     both = succeeded(one) & succeeded(other)
-    rms = None
-    if both.sum() > 1:
-        apart = one.rms[both] - other.rms[both]
-        rms = bootstrap(lambda x, axis: np.mean(x, axis), apart, resamples=resamples, seed=seed)
+    rms = mean(one.rms[both] - other.rms[both]) if both.sum() > 1 else None
     return Comparison(first, second, pairs, difference, rms, int(both.sum()), pairs.p_value)
 
 

@@ -10,9 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_count, check_name, check_number, excerpt
+from lqrsim.errors import (
+    InputError,
+    check_count,
+    check_items,
+    check_kind,
+    check_name,
+    check_number,
+    check_seed,
+    check_text,
+    excerpt,
+)
+from lqrsim.references import from_anywhere
 from lqrsim.simulation.disturbances import Disturbance
 
+_FILES = 1_000_000  # of shards in a folder
 POLICIES = ("smooth", "ilqr", "open_loop", "replan")
 
 
@@ -24,18 +36,27 @@ class Cell:
     sweep: str
     strength: float
 
+    def __post_init__(self) -> None:
+        for name in ("policy", "sweep"):
+            check_text(f"Cell: {name}", getattr(self, name), "a name")
+        object.__setattr__(self, "strength", check_number("Cell: strength", self.strength, at_least=0.0))
+
     def __str__(self) -> str:
         return f"{self.policy},{self.sweep},{self.strength:g}"
 
     @classmethod
     def named(cls, text: str, cells: Sequence["Cell"]) -> "Cell":
         """One of `cells`, by its number or as policy,sweep,strength. Raises InputError if there is none."""
-        if text.isdecimal() and int(text) < len(cells):
+        cells = check_items("cells", cells, Cell, "a list of Cell")
+        if not cells:
+            raise InputError("cells: got none, want at least one")
+        check_kind("cell", text, str, f"text: a number from 0 to {len(cells) - 1}, or as {cells[0]}")
+        if text.isdecimal() and len(text) < 10 and int(text) < len(cells):
             return cells[int(text)]
         for cell in cells:
             if text == str(cell):
                 return cell
-        raise InputError(f"cell: got {text!r}, want 0 to {len(cells) - 1}, or as {cells[0]} to {cells[-1]}")
+        raise InputError(f"cell: got {excerpt(text)}, want 0 to {len(cells) - 1}, or as {cells[0]} to {cells[-1]}")
 
 
 @dataclass(frozen=True)
@@ -45,6 +66,10 @@ class Shard:
     cell: int
     first: int
     count: int
+
+    def __post_init__(self) -> None:
+        for name, least in (("cell", 0), ("first", 0), ("count", 1)):
+            check_count(f"Shard: {name}", getattr(self, name), at_least=least)
 
     @property
     def file(self) -> str:
@@ -86,26 +111,36 @@ class Campaign:
     time_limit: float = 300.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.scenario, str) or not self.scenario:
-            raise InputError(f"scenario: got {excerpt(self.scenario)}, want a reference, such as 'quadrotor'")
+        check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=4000)
         if not isinstance(self.sweeps, Mapping) or not self.sweeps:
             raise InputError(f"sweeps: got {excerpt(self.sweeps)}, want at least one: name -> disturbances")
+        object.__setattr__(self, "scenario", from_anywhere(self.scenario))  # workers and reports may be elsewhere
+        sweeps: dict[str, tuple[Disturbance, ...]] = {}
         for name, disturbances in self.sweeps.items():
-            if not isinstance(name, str) or not name or "," in name:
+            check_text("sweeps: name", name, "a name without a comma")
+            if "," in name:
                 raise InputError(f"sweeps: got the name {excerpt(name)}, want one without a comma")
-            for one in disturbances:
-                if not isinstance(one, Disturbance):
-                    raise InputError(f"sweeps: {name}: got {excerpt(one)}, want Disturbance objects")
-        numbers = tuple(check_number("strengths", strength, at_least=0.0) for strength in self.strengths)
-        for policy in self.policies:
+            wanted = "a tuple of disturbances, such as (ControlNoise(0.05),)"
+            sweeps[name] = check_items(f"sweeps: {name}", disturbances, Disturbance, wanted)
+        strengths = check_items("strengths", self.strengths, object, "a tuple of numbers", at_most=1000)
+        numbers = tuple(check_number("strengths", strength, at_least=0.0) for strength in strengths)
+        policies = check_items("policies", self.policies, object, f"a tuple of {', '.join(POLICIES)}", at_most=100)
+        for policy in policies:
             check_name("policies", policy, POLICIES)
-        for field, values in (("strengths", numbers), ("policies", tuple(self.policies))):
+        for field, values in (("strengths", numbers), ("policies", policies)):
             if not values or len(set(values)) < len(values):
                 raise InputError(f"{field}: got {excerpt(values)}, want at least one, and each once")
             object.__setattr__(self, field, values)
-        object.__setattr__(self, "sweeps", {name: tuple(sweep) for name, sweep in self.sweeps.items()})
-        for field, least in (("trials", 1), ("seed", 0), ("shard", 1)):
-            object.__setattr__(self, field, check_count(field, getattr(self, field), at_least=least))
+        object.__setattr__(self, "sweeps", sweeps)
+        for field in ("trials", "shard"):
+            object.__setattr__(self, field, check_count(field, getattr(self, field)))
+        object.__setattr__(self, "seed", check_seed("seed", self.seed))
+        files = -(-self.trials // self.shard) * len(self.cells)
+        if files > _FILES:
+            raise InputError(
+                f"trials: got {self.trials} in shards of {self.shard} for {len(self.cells)} cells, which are {files}"
+                f" files, want at most {_FILES}: fewer, or a larger shard"
+            )
         if self.replan_every is not None:
             object.__setattr__(self, "replan_every", check_number("replan_every", self.replan_every, above=0.0))
         object.__setattr__(self, "time_limit", check_number("time_limit", self.time_limit, above=0.0))
@@ -122,7 +157,9 @@ class Campaign:
             yield from shards_of(number, self.trials, self.shard)
 
     def disturbances(self, cell: Cell) -> list[Disturbance]:
-        """What a cell's trials meet."""
+        """What a cell's trials meet. Raises InputError for a cell of another campaign."""
+        check_kind("cell", cell, Cell, "a Cell of the campaign")
+        check_name("cell: sweep", cell.sweep, self.sweeps)
         return [disturbance.scaled(cell.strength) for disturbance in self.sweeps[cell.sweep]]
 
     def as_json(self) -> dict[str, Any]:
@@ -138,10 +175,13 @@ class Campaign:
         Raises:
           InputError: it is damaged, or has a disturbance that is not known here.
         """
+        check_kind("campaign", fields, Mapping, "what lqrsim wrote")
         try:
             sweeps = {name: tuple(_made(one) for one in sweep) for name, sweep in fields["sweeps"].items()}
             return cls(**{**fields, "sweeps": sweeps})
-        except (KeyError, TypeError, AttributeError) as error:
+        except InputError:
+            raise
+        except Exception as error:  # whatever a disturbance raises of settings that are not its own
             raise InputError(f"campaign: got {excerpt(fields)}, want what lqrsim wrote ({error})") from None
 
 

@@ -9,6 +9,10 @@ measures. The search uses no derivatives, and scores many vectors at once:
 3. Around the best failure it scores pairs z + s e, z - s e with random e. The mean of (difference of scores) e points
    to where scores grow fastest. Means of the last rounds are added up. Rays between there and the best failure are
    tried.
+4. How near that gets depends on how well the slope is known: in the direction of a noisy one, a plane is further away,
+   by the cosine of the angle between the two. The halves of the pairs have independent noise, so that what they agree
+   in tells that angle. Rounds are added up for as long as the failure stays where it is, and it ends where the noise
+   leaves less to be gained than the tolerance.
 
 What it finds fails; that nothing nearer does is not proven, and starting elsewhere is a check.
 """
@@ -18,13 +22,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_array, check_count, check_number
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_function,
+    check_memory,
+    check_number,
+    check_seed,
+)
 from lqrsim.rollout import Rollout
 from lqrsim.stress.given import normal_tail
-from lqrsim.stress.splitting import Score, split
+from lqrsim.stress.splitting import MOST, Score, scores_of, split
 
 MIXTURES = 1 - np.geomspace(1, 0.02, 12)  # how much of the best failure is in the rays that are tried; none, 98 %
-FORGETTING = 0.95  # of what earlier rounds said of the slope, each round
+FORGETTING = 0.95  # of what earlier rounds said of the slope, each round that comes nearer by more than
+SETTLED = 0.01  # of the distance
 
 
 @dataclass(frozen=True)
@@ -35,6 +49,8 @@ class Breaking:
       numbers: z, (d,). distance: |z|. score: of z, positive.
       form: Phi(-|z|), a first-order estimate of the probability of failure.
       history: |z| after each round, the start first. simulations: scores that were asked for in all.
+      left: the share of |z| that the noise of the slope leaves to be gained, were failures all beyond a plane; NaN
+        where there is no slope. converged: it is less than the tolerance, and the last rounds came no nearer.
     """
 
     numbers: Array
@@ -43,6 +59,8 @@ class Breaking:
     form: float
     history: Array
     simulations: int
+    left: float
+    converged: bool
 
 
 def smallest_failure(
@@ -50,10 +68,10 @@ def smallest_failure(
     size: int,
     *,
     failures: Array | None = None,
-    rounds: int = 20,
+    rounds: int = 40,
     pairs: int | None = None,
     spread: float = 0.5,
-    tolerance: float = 1e-3,
+    tolerance: float = 0.01,
     seed: int = 0,
     progress: Callable[[int, int], object] | None = None,
 ) -> Breaking:
@@ -62,7 +80,8 @@ def smallest_failure(
     Args:
       score: of vectors (K, size), (K,); positive is failure.
       failures: (k, size) to begin with; by default those of a small splitting.
-      rounds: at most; it ends earlier after five rounds that gain less than `tolerance` of the distance together.
+      rounds: at most; it ends earlier where the noise leaves less than `tolerance` of the distance to be gained, and
+        five rounds together gain less than a tenth of that.
       pairs: scored in each round; by default half the size, and at least 250: with fewer the slope is mostly noise.
       spread: of these, s; each number of e is standard normal, over the root of `size`.
       progress: called with the rounds that are done, and all of them.
@@ -71,39 +90,47 @@ def smallest_failure(
       InputError: an option is out of range, or none of the failures is one.
       NoFailure: none was given, and none was found.
     """
+    check_function("score", score, "a function of vectors (K, size)", arguments=1, optional=False)
+    check_function("progress", progress, "a function of how many rounds are done, of how many", arguments=2)
     check_count("size", size)
-    check_count("rounds", rounds, at_least=0)
-    pairs = max(250, size // 2) if pairs is None else check_count("pairs", pairs)
-    check_number("spread", spread, above=0.0)
-    check_number("tolerance", tolerance, above=0.0)
-    rng, asked = np.random.default_rng(seed), 0
+    check_count("rounds", rounds, at_least=0, at_most=MOST)
+    pairs = max(250, size // 2) if pairs is None else check_count("pairs", pairs, at_least=2)
+    check_memory("pairs", pairs, 8 * 5 * size, "whose vectors")
+    check_memory("size", size, 8 * 16 * 12, "whose vectors")  # of the rays
+    spread = check_number("spread", spread, above=0.0, at_most=1e6)
+    tolerance = check_number("tolerance", tolerance, above=0.0)
+    rng, asked = np.random.default_rng(check_seed("seed", seed)), 0
 
     def counted(vectors: Array) -> Array:
         nonlocal asked
         asked += len(vectors)
-        return score(vectors)
+        return scores_of(score, vectors)
 
     if failures is None:
         failures = split(counted, size, particles=200, keep=0.2, repetitions=2, seed=seed).failures
     failures = check_array("failures", failures, (None, size))
     best = _begin(counted, failures)
     history = [float(np.linalg.norm(best))]
-    slope = np.zeros(size)
+    halves, left, converged = np.zeros((2, size)), float("nan"), False
     if progress is not None:
         progress(0, rounds)
     for number in range(rounds):
         # The oldest rounds were elsewhere.
-        slope = FORGETTING * slope + _slope(counted, best, pairs, spread, rng)
-        nearer = _nearer(counted, best, slope)
+        forgetting = FORGETTING if history[-1] < (1 - SETTLED) * history[-2:][0] else 1.0
+        halves = forgetting * halves + _slopes(counted, best, pairs, spread, rng)
+        left = _left(halves)
+        nearer = _nearer(counted, best, halves.sum(axis=0))
         best = best if nearer is None else nearer
         history.append(float(np.linalg.norm(best)))
         if progress is not None:
             progress(number + 1, rounds)
-        if number >= 5 and history[-1] > (1 - tolerance) * history[-6]:
+        stays = number >= 5 and history[-1] > (1 - tolerance / 10) * history[-6]
+        converged = stays and left < tolerance
+        if converged:
             break
     final = float(counted(best[None])[0])
     distance = history[-1]
-    return Breaking(best, distance, final, normal_tail(distance), np.array(history), asked)
+    return Breaking(best, distance, final, normal_tail(distance), np.array(history), asked, left, converged)
 
 
 def _begin(score: Score, failures: Array) -> Array:
@@ -152,15 +179,24 @@ def _along(score: Score, directions: Array, reach: Array, *, grid: int = 16, ref
     return failing[row] * directions[row]
 
 
-def _slope(score: Score, best: Array, pairs: int, spread: float, rng: np.random.Generator) -> Array:
-    """Which way scores grow around the best failure; its noise falls with the number of pairs."""
+def _slopes(score: Score, best: Array, pairs: int, spread: float, rng: np.random.Generator) -> Array:
+    """Which way scores grow around the best failure, by each half of the pairs, (2, d): their noise is independent."""
     away = spread * rng.standard_normal((pairs, len(best))) / np.sqrt(len(best))
     scores = score(np.concatenate([best + away, best - away]))
     # What is lost has an infinite score, which says nothing of a slope but which side is the worse.
     highest = scores[np.isfinite(scores)].max(initial=0.0)
     scores = np.minimum(scores, highest + 1.0)
     difference = scores[:pairs] - scores[pairs:]
-    return difference @ away / (pairs * spread**2) * len(best)
+    half = pairs // 2
+    parts = [difference[:half] @ away[:half], difference[half:] @ away[half:]]
+    return np.array(parts) / (pairs * spread**2) * len(best)
+
+
+def _left(halves: Array) -> float:
+    """The share of the distance that the slope's noise leaves to be gained of a plane; NaN if the halves disagree."""
+    lengths = float(np.linalg.norm(halves[0]) * np.linalg.norm(halves[1]))
+    agree = float(halves[0] @ halves[1]) / lengths if lengths > 0 else 0.0
+    return 1 - float(np.sqrt(2 * agree / (1 + agree))) if agree > 0 else float("nan")
 
 
 def _nearer(score: Score, best: Array, slope: Array) -> Array | None:

@@ -3,8 +3,8 @@
     campaign = Campaign(scenario="quadrotor", sweeps={"gusts": (ls.ForceNoise(0.2),)})
     results = run_campaign(campaign, "runs/stress/quadrotor")
 
-A trial's rows depend on the campaign alone: not on how many workers there are, on what they do at once, or on how often
-the campaign was interrupted.
+On equal processors a trial's rows depend on the campaign alone: not on how many workers there are, on what they do at
+once, or on how often the campaign was interrupted.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim import files
-from lqrsim.errors import InputError, check_count, excerpt
+from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path, check_text, excerpt
 from lqrsim.machine import description, processors
 from lqrsim.references import resolve
 from lqrsim.results import Trajectory
@@ -30,14 +30,16 @@ from lqrsim.stress.asked import Campaign as Campaign
 from lqrsim.stress.asked import Cell as Cell
 from lqrsim.stress.asked import Shard
 from lqrsim.stress.lock import sole_writer
-from lqrsim.stress.results import FORMAT, VERSION, Results, digest_of, digest_of_solution, read_manifest
+from lqrsim.stress.manifest import NAME, digest_of, digest_of_solution, read_manifest, write_manifest
+from lqrsim.stress.results import Results
 from lqrsim.stress.shards import Damaged, write
-from lqrsim.stress.trials import Job, lean, solve
-from lqrsim.versions import versions
+from lqrsim.stress.trials import Job, lean, left_out, possible, solve
+from lqrsim.versions import changed, versions
 
 _log = logging.getLogger("lqrsim")
 
-_OWN = {"manifest.json", "campaign.lock", "policies", "shards", "damaged"}
+MOST_WORKERS = 1024
+_OWN = {NAME, "campaign.lock", "policies", "shards", "damaged"}
 
 
 def run_campaign(
@@ -62,9 +64,13 @@ def run_campaign(
       InputError: something that is asked can not be run; the folder is another campaign's, no campaign's, being
         written, or on a full disk; or the cluster can not be reached.
     """
-    folder = Path(folder)
-    workers = processors() if workers is None else check_count("workers", workers, at_least=0)
-    check_count("batch", batch)
+    check_kind("campaign", campaign, Campaign, "a Campaign")
+    folder = check_path("folder", folder, "the path of a folder")
+    workers = processors() if workers is None else check_count("workers", workers, at_least=0, at_most=MOST_WORKERS)
+    batch = check_count("batch", batch, at_most=100_000)
+    if scheduler is not None:
+        check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
+    check_function("progress", progress, "a function of how many trials are done, of how many", arguments=2)
     scenario = resolve(campaign.scenario)
     _rehearse(campaign, scenario)
     _look_at(folder)
@@ -105,17 +111,22 @@ def _job(results: Results, campaign: Campaign, batch: int) -> Job:
 
 
 def _check_versions(results: Results) -> None:
-    was, now = results.manifest["versions"], versions()
-    changed = [f"{name} {new} (was {was.get(name)})" for name, new in now.items() if new != was.get(name)]
-    if changed:
+    if others := changed(results.manifest["versions"]):
         raise InputError(
-            f"versions: got {', '.join(changed)}, want those {results.folder} was begun with, or another folder"
+            f"versions: got {others}, with which bits can differ, want those {results.folder} was begun with, or"
+            " another folder"
         )
 
 
 def _rehearse(campaign: Campaign, scenario: Scenario) -> None:
     """Raise InputError now for what every trial would raise it for, before anything is solved or written."""
     problem, plant = scenario.problem, scenario.plant()
+    for policy in campaign.policies:
+        if policy not in possible(scenario):
+            those = ", ".join(possible(scenario))
+            raise InputError(
+                f"policies: got {policy}, which cannot keep the scenario's constraints, want some of {those}"
+            )
     n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
     start = np.zeros(n) if problem.start is None else problem.start
     standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
@@ -134,7 +145,7 @@ def _rehearse(campaign: Campaign, scenario: Scenario) -> None:
 
 def _look_at(folder: Path) -> None:
     """Raise InputError for a folder that is not empty, and no campaign's."""
-    if folder.is_dir() and not (folder / "manifest.json").exists():
+    if os.path.isdir(folder) and not os.path.exists(folder / NAME):
         others = sorted(name for name in os.listdir(folder) if name not in _OWN and not name.startswith(".unfinished-"))
         if others:
             raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty one or a campaign's")
@@ -148,25 +159,15 @@ def _begin(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
         "problem": scenario.problem.digest,
         "code": _code(campaign),
     }
-    if (folder / "manifest.json").exists():
+    if os.path.exists(folder / NAME):
         _compare(asked, read_manifest(folder), folder)
         return
     policies = {}
     for policy, solution in solve(campaign.policies, scenario).items():
         path = files.save(solution, folder / "policies" / f"{policy}.npz")
         policies[policy] = {"digest": digest_of_solution(solution), "sha256": digest_of(path.read_bytes())}
-    # All that the rows depend on, and nothing that differs when the same is begun again.
-    lasting = asked | {
-        "campaign": {name: value for name, value in asked["campaign"].items() if name != "time_limit"},
-        "policies": {policy: hashes["digest"] for policy, hashes in policies.items()},
-    }
-    manifest = {
-        "format": FORMAT, "version": VERSION, **asked, "policies": policies,
-        "digest": digest_of(json.dumps(lasting, sort_keys=True).encode()),
-        "cells": [(cell.policy, cell.sweep, cell.strength) for cell in campaign.cells],
-        "versions": versions(), "machine": description(),
-    }  # fmt: skip
-    write(json.dumps(manifest, indent=1).encode(), folder / "manifest.json")
+    about = {"versions": versions(), "machine": description(), "left_out": left_out(campaign.policies, scenario)}
+    write_manifest(folder, asked | {"policies": policies} | about)
 
 
 def _compare(asked: dict[str, Any], manifest: dict[str, Any], folder: Path) -> None:
@@ -181,7 +182,7 @@ def _compare(asked: dict[str, Any], manifest: dict[str, Any], folder: Path) -> N
         if asked[field] != manifest[field]:
             raise InputError(f"scenario: got a {what} that is not the one {folder} was begun with, want another folder")
     for kind, digest in asked["code"].items():
-        if digest != manifest.get("code", {}).get(kind):
+        if digest != manifest["code"].get(kind):
             raise InputError(f"{kind}: got a file that has changed since {folder} was begun, want it as it was then")
 
 

@@ -1,10 +1,13 @@
 """A running dask cluster that does a campaign's work. Tables come back as bytes, so that no folder need be shared."""
 
+import asyncio
 import contextlib
 import itertools
+import logging
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import CancelledError
 from typing import Any
 
 from lqrsim.errors import InputError
@@ -14,6 +17,7 @@ from lqrsim.stress.trials import Job, failed_work, work
 from lqrsim.versions import versions
 
 _POLL = 0.5  # s between two looks at what takes too long
+AGAIN = "run the same command again, it goes on from here"
 _lock = threading.Lock()
 
 
@@ -30,7 +34,7 @@ def connected(address: str) -> Iterator[Any]:
         client = distributed.Client(address, timeout=10, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"scheduler: got {address}, want a dask scheduler that answers ({error})") from None
-    with contextlib.closing(client):
+    with _unheard(), contextlib.closing(client):
         try:
             found: Any = client.run(versions)
         except Exception as error:  # whatever a worker has
@@ -75,18 +79,39 @@ def spread(job: Job, shards: list[Shard], client: Any, time_limit: float) -> Don
                     del flying[future]
                     _stop(client, future, begun[shard][0])
                     yield shard, failed_work(job, shard, f"took longer than {time_limit:g} s, and was stopped")
+    except (CancelledError, asyncio.CancelledError):  # of what it was given
+        raise InputError(f"scheduler: got it lost or restarted, want it to keep what it is given: {AGAIN}") from None
     except OSError as error:  # also dask's own, of connections
-        raise InputError(f"scheduler: got none any more ({error}), want it to answer: run the same again") from None
+        raise InputError(f"scheduler: got none any more ({error}), want it to answer: {AGAIN}") from None
     finally:
-        client.unsubscribe_topic(job.run)
-        client.cancel(list(flying))
+        with contextlib.suppress(Exception):  # it may be gone
+            client.unsubscribe_topic(job.run)
+            client.cancel(list(flying))
+
+
+@contextlib.contextmanager
+def _unheard() -> Iterator[None]:
+    """Within this block dask does not write tracebacks to the screen; what matters of them is raised."""
+
+    def silent(record: logging.LogRecord) -> bool:
+        return False
+
+    known = [one for one in logging.Logger.manager.loggerDict.values() if isinstance(one, logging.Logger)]
+    loggers = [one for one in known if one.name.split(".")[0] == "distributed"]
+    for logger in loggers:
+        logger.addFilter(silent)
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeFilter(silent)
 
 
 def _collected(job: Job, shard: Shard, future: Any) -> bytes:
     if future.status == "finished":
         return future.result()
     if future.status in ("cancelled", "lost"):
-        raise InputError("scheduler: got it restarted, want it to keep what it is given: run the same again")
+        raise CancelledError
     error = future.exception()
     return failed_work(job, shard, " ".join(f"{type(error).__name__}: {error}".split()))
 

@@ -7,12 +7,15 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Generator, Iterable, Iterator
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 
+from lqrsim import process
 from lqrsim.errors import InputError
 from lqrsim.stress.asked import Shard
 from lqrsim.stress.trials import Job, failed_work, prepare, work
@@ -83,7 +86,7 @@ class _Worker:
     def __init__(self, job: Job) -> None:
         self.connection, theirs = _context.Pipe()
         self.process = _context.Process(target=_serve, args=(theirs, job), name="lqrsim worker", daemon=True)
-        with _one_thread(), _without_ctrl_c():
+        with process.uninterrupted(), _surroundings(), _without_ctrl_c():
             self.process.start()
         theirs.close()  # so that its death is an end of file here
         self.ready = self.late = False
@@ -146,11 +149,18 @@ def _exit(code: int | None) -> str:
 
 
 @contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """What is started in this block computes with one thread: there are as many processes as processors."""
-    names = [f"{name}_NUM_THREADS" for name in _ONE_THREAD]
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
+def _surroundings() -> Iterator[None]:
+    """What is started in this block computes with one thread: there are as many processes as processors.
+
+    And it takes the GLFW that this process has. To find one, GLFW's package starts a process of its own as MuJoCo is
+    imported, which would outlive a worker that is stopped then, and complain that nobody reads what it has found.
+    """
+    ours = dict.fromkeys([f"{name}_NUM_THREADS" for name in _ONE_THREAD], "1")
+    glfw = getattr(sys.modules.get("glfw.library"), "glfw", None)
+    if glfw is not None and sys.platform != "win32":  # there it starts none
+        ours["PYGLFW_LIBRARY"] = glfw._name
+    before = {name: os.environ.get(name) for name in ours}
+    os.environ.update(ours)
     try:
         yield
     finally:
@@ -163,10 +173,12 @@ def _one_thread() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """What is started in this block is not interrupted while it starts either; for this process it only waits."""
+    """What is started in this block is not interrupted while it starts either."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
+    # It is started with the first process, and takes SIGINT out of the mask in which that is then started.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

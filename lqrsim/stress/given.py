@@ -11,7 +11,18 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr, ndtri
 
-from lqrsim.errors import Array, InputError, check_array, check_count
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_flag,
+    check_function,
+    check_items,
+    check_kind,
+    excerpt,
+    shaped,
+)
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.closed_loop import simulate
@@ -103,12 +114,14 @@ def collision(rollout: Rollout) -> Array:
 
     What is lost counts as infinitely far.
     """
+    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     clearance = np.where(np.isnan(rollout.clearance), np.inf, rollout.clearance).min(axis=1)
     return np.where(rollout.diverged, np.inf, -clearance)
 
 
 def miss(rollout: Rollout) -> Array:
     """Positive for each trial that does not reach its goal, (K,), in metres: it collides, or ends too far away."""
+    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     away = rollout.tracking_error[:, -1] - rollout.goal_radius
     return np.maximum(collision(rollout), np.where(rollout.diverged, np.inf, away))
 
@@ -138,7 +151,12 @@ class TrialScore:
     simulations: int = 0
 
     def __post_init__(self) -> None:
+        wanted = "disturbances, such as ControlNoise(0.05)"
+        self.disturbances = check_items("disturbances", self.disturbances, Disturbance, wanted)
+        check_function("failure", self.failure, "a function of a Rollout", arguments=1, optional=False)
+        self.contacts = check_flag("contacts", self.contacts)
         check_count("batch", self.batch)
+        check_count("simulations", self.simulations, at_least=0)
         counting = [_Counting() for _ in self.disturbances]
         self._simulate(1, lambda trial, stream: counting[stream], frames=False)
         self.sizes = tuple(one.used for one in counting)
@@ -151,9 +169,16 @@ class TrialScore:
     def __call__(self, numbers: npt.ArrayLike) -> Array:
         every = check_array("numbers", numbers, (None, self.size))
         parts: Iterable[Array] = (every[first : first + self.batch] for first in range(0, len(every), self.batch))
-        scores = [self.failure(self.rollout(part, frames=False)) for part in parts]
+        scores = [self._score(self.rollout(part, frames=False)) for part in parts]
         self.simulations += len(every)
         return np.concatenate(scores) if scores else np.zeros(0)
+
+    def _score(self, rollout: Rollout) -> Array:
+        """One number a trial, which is not NaN. Raises InputError for anything else."""
+        scores = shaped("failure: returned", self.failure(rollout), (rollout.trials,))
+        if np.isnan(scores).any():
+            raise InputError(f"failure: got {excerpt(scores.tolist())} returned, want numbers: positive is failure")
+        return scores
 
     def rollout(self, numbers: npt.ArrayLike, *, frames: bool = True) -> Rollout:
         """The trials with these numbers, (K, size), in full; their `seed` means nothing."""

@@ -1,7 +1,5 @@
 """What a campaign came to: a folder that is opened and checked, its tables, and any of its trials once more."""
 
-import hashlib
-import json
 import os
 import shlex
 from collections import Counter
@@ -13,17 +11,16 @@ from typing import Any
 import numpy as np
 
 from lqrsim import files
-from lqrsim.errors import InputError, check_count, check_name
-from lqrsim.references import resolve
+from lqrsim.errors import InputError, check_count, check_flag, check_kind, check_name, check_path, check_text, excerpt
+from lqrsim.references import from_anywhere, resolve
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.outcomes import OUTCOMES, Outcomes
 from lqrsim.stress.asked import Campaign, Cell, Shard, shards_of
+from lqrsim.stress.manifest import cells_of, digest_of, digest_of_solution, read_manifest
 from lqrsim.stress.shards import Damaged, Table, read
 from lqrsim.stress.statistics import CONFIDENCE, rate
 from lqrsim.stress.trials import Trials
-
-FORMAT, VERSION = "lqrsim campaign", 1
 
 
 class Results:
@@ -41,13 +38,15 @@ class Results:
     """
 
     def __init__(self, folder: str | os.PathLike[str], *, scenario: str | None = None) -> None:
-        self.folder = Path(folder)
+        self.folder = check_path("folder", folder, "the path of a campaign's folder")
         self.manifest = read_manifest(self.folder)
-        self.cells = [Cell(*cell) for cell in self.manifest["cells"]]
+        self.cells = cells_of(self.manifest)
         self._scenario = scenario
         asked = self.manifest["campaign"]["scenario"]
-        if scenario is not None and scenario != asked:
-            raise InputError(f"scenario: got {scenario}, want {asked}, which {self.folder} was run on")
+        if scenario is not None:
+            check_kind("scenario", scenario, str, "the campaign's reference")
+            if from_anywhere(scenario) != from_anywhere(asked):
+                raise InputError(f"scenario: got {excerpt(scenario)}, want {asked}, which {self.folder} was run on")
 
     @cached_property
     def campaign(self) -> Campaign:
@@ -107,6 +106,7 @@ class Results:
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
             if ends["error"]:
                 reasons.update(self.reasons(cell).values())
+        lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
         lines += [f"{count} trials came to nothing: {reason}" for reason, count in reasons.most_common(5)]
         return "\n".join(lines)
 
@@ -122,9 +122,10 @@ class Results:
     def solution(self, policy: str) -> Solution:
         """What a policy was made from. Raises InputError if its file is damaged."""
         path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
-        if path.is_file() and digest_of(path.read_bytes()) != self.manifest["policies"][policy]["sha256"]:
+        hashes, solution = self.manifest["policies"][policy], files.load_solution(path)
+        if digest_of(path.read_bytes()) != hashes["sha256"] or digest_of_solution(solution) != hashes["digest"]:
             raise InputError(f"policy: got {path}, which is damaged, want what the campaign wrote: run it elsewhere")
-        return files.load_solution(path)
+        return solution
 
     def shards(self, cell: Cell | None = None) -> Iterator[Shard]:
         """The work of a cell, or all of it."""
@@ -135,11 +136,12 @@ class Results:
     def there(self) -> set[Shard]:
         """The shards that have a file."""
         folder = self.folder / "shards"
-        names = set(os.listdir(folder)) if folder.is_dir() else set()
+        names = set(os.listdir(folder)) if os.path.isdir(folder) else set()
         return {shard for shard in self.shards() if shard.file in names}
 
     def number(self, cell: Cell) -> int:
         """The place of a cell among `cells`. Raises InputError if it is none of them."""
+        check_kind("cell", cell, Cell, "a Cell of the campaign")
         if cell not in self.cells:
             first, last = self.cells[0], self.cells[-1]
             raise InputError(f"cell: got {cell}, want one of the {len(self.cells)}, from {first} to {last}")
@@ -147,6 +149,8 @@ class Results:
 
     def path(self, shard: Shard) -> Path:
         """Its file."""
+        check_kind("shard", shard, Shard, "a Shard of the campaign")
+        check_count("shard: cell", shard.cell, at_least=0, at_most=len(self.cells) - 1)
         return self.folder / "shards" / shard.file
 
     def read(self, shard: Shard) -> Table:
@@ -155,6 +159,7 @@ class Results:
 
     def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[tuple[Shard, Table]]:
         """The shards of a cell one by one. Raises InputError for what is damaged, or missing unless `partial`."""
+        check_flag("partial", partial)
         for shard in self.shards(cell):
             if self.path(shard).is_file() or not partial:
                 yield shard, self.table(shard)
@@ -172,10 +177,22 @@ class Results:
 
     @property
     def command(self) -> str:
-        """The command that goes on with the campaign, and repairs what is damaged."""
-        return shlex.join(
-            ["lqrsim", "stress", self.manifest["campaign"]["scenario"], "--resume", "--out", str(self.folder)]
-        )
+        """The command that goes on with the campaign, and repairs what is damaged; it runs in any working directory."""
+        asked = self.manifest["campaign"]["scenario"]
+        return shlex.join(["lqrsim", "stress", asked, "--resume", "--out", str(self.folder.absolute())])
+
+    def command_of(self, command: str, *options: str) -> str:
+        """`lqrsim report` or `lqrsim replay` of this campaign, which runs in any working directory.
+
+        Raises:
+          InputError: another command, or options that are no text.
+        """
+        check_name("command", command, ("report", "replay"))
+        for option in options:
+            check_text("options", option, "an option, such as --cell", at_most=4000)
+        asked = self.manifest["campaign"]["scenario"]
+        own = ["--scenario", asked] if ":" in asked else []
+        return shlex.join(["lqrsim", command, str(self.folder.absolute()), *options, *own])
 
 
 def replay(
@@ -188,11 +205,14 @@ def replay(
 ) -> Rollout:
     """The very trial of a campaign again, to the bit until its first collision; and to its end without contacts.
 
+    That is so on the kind of processor and with the versions that `results.manifest["versions"]` has.
+
     Raises:
       InputError: no such cell or trial, or the scenario is one of yours and `Results` was not given it.
     """
     results = results if isinstance(results, Results) else Results(results)
     results.number(cell)
+    frames, contacts = check_flag("frames", frames), check_flag("contacts", contacts)
     if check_count("trial", trial, at_least=0) >= results.manifest["campaign"]["trials"]:
         raise InputError(f"trial: got {trial}, want less than {results.manifest['campaign']['trials']}")
     return results.trials.run(cell, trial, frames=frames, contacts=contacts)
@@ -209,35 +229,3 @@ def agrees(results: Results, cell: Cell, trial: int) -> bool:
     table, place = results.table(shard), trial - shard.first
     row = {name: table[name][place : place + 1] for name in again}
     return all(row[name].tobytes() == value.astype(row[name].dtype).tobytes() for name, value in again.items())
-
-
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """What a campaign's folder says of itself. Raises InputError."""
-    path = folder / "manifest.json"
-    if not path.is_file():
-        raise InputError(f"folder: got {folder}, want one that `lqrsim stress` wrote, with a manifest.json")
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        found, version = manifest["format"], manifest["version"]
-        whole = {"campaign", "cells", "policies", "digest", "model", "problem", "versions"} <= manifest.keys()
-    except OSError as error:
-        raise InputError(f"folder: got {path}, want a file that can be read ({error.strerror or error})") from None
-    except (ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(f"folder: got {path}, which is damaged, want what lqrsim wrote") from None
-    if found != FORMAT or version != VERSION:
-        raise InputError(f"folder: got {path}, a {found!r} {version}, want a {FORMAT!r} {VERSION}")
-    if not whole:
-        raise InputError(f"folder: got {path}, which is damaged, want what lqrsim wrote")
-    return manifest
-
-
-def digest_of(contents: bytes) -> str:
-    """Hash of a file's contents."""
-    return hashlib.sha256(contents).hexdigest()
-
-
-def digest_of_solution(solution: Solution) -> str:
-    """Hash of what running it depends on: not of how long it took to find."""
-    plan, policy = solution.trajectory, solution.policy
-    arrays = plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt])
-    return digest_of(b"".join(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes() for array in arrays))

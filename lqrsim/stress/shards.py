@@ -42,7 +42,10 @@ def unpack(contents: bytes, shard: Shard, campaign: str) -> Table:
     """The table again. Raises Damaged unless it is, to the bit, what `pack` was given for this shard."""
     about = _about(shard, campaign)
     try:
-        arrow = pq.read_table(io.BytesIO(contents), page_checksum_verification=True, use_threads=False)
+        file = pq.ParquetFile(io.BytesIO(contents), page_checksum_verification=True)
+        if file.metadata.num_rows != shard.count:  # before room for them is taken
+            raise ValueError(f"{file.metadata.num_rows} rows")
+        arrow = file.read(use_threads=False)
         meta = json.loads((arrow.schema.metadata or {})[_KEY])
         table = {name: _column(arrow[name]) for name in arrow.column_names}
         good = meta == about | {"sha256": _digest(table, about)}

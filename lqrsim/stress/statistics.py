@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from lqrsim.errors import Array, InputError, check_count, check_number
+from lqrsim.errors import Array, InputError, check_array, check_count, check_number
 
 CONFIDENCE = 0.95
 
@@ -80,6 +80,61 @@ def compare(first: npt.ArrayLike, second: npt.ArrayLike) -> Pairs:
     return Pairs(only_first, only_second, float(stats.binomtest(only_first, split).pvalue) if split else 1.0)
 
 
+def paired_difference(only_first: int, only_second: int, trials: int, *, confidence: float = CONFIDENCE) -> Estimate:
+    """How much more often the first of two policies succeeds, on the same trials, with Tango's score interval.
+
+    It holds each difference that the score test does not reject, with the shares most likely under that difference
+    (Tango, Statistics in Medicine 17, 1998). It has a width also where no trial told the two apart.
+
+    Args:
+      only_first, only_second: in how many trials only that one succeeded. trials: in all.
+
+    Raises:
+      InputError: no trials, or fewer than those that tell the two apart.
+    """
+    check_count("trials", trials)
+    apart = check_count("only_first", only_first, at_least=0) + check_count("only_second", only_second, at_least=0)
+    if apart > trials:
+        raise InputError(f"trials: got {trials}, want at least the {apart} in which only one succeeded")
+    check_number("confidence", confidence, above=0, below=1)
+    surplus, z = only_first - only_second, float(stats.norm.ppf(0.5 + confidence / 2))
+
+    def accepted(difference: float) -> bool:
+        # The likeliest share of trials in which only the second succeeds, given the difference, is a quadratic's root.
+        linear = (2 * trials - surplus) * difference - apart
+        constant = -only_second * difference * (1 - difference)
+        share = (np.sqrt(max(linear**2 - 8 * trials * constant, 0.0)) - linear) / (4 * trials)
+        variance = trials * max(2 * share + difference * (1 - difference), 0.0)
+        return bool((surplus - trials * difference) ** 2 <= z * z * variance)
+
+    low, high = (_last(accepted, surplus / trials, end) for end in (-1.0, 1.0))
+    return Estimate(surplus / trials, low, high, confidence)
+
+
+def _last(accepted: Callable[[float], bool], inside: float, end: float) -> float:
+    """The last number from `inside` to `end` that is accepted, by bisection to rounding."""
+    outside = end
+    for _ in range(60):
+        middle = (inside + outside) / 2
+        inside, outside = (middle, outside) if accepted(middle) else (inside, middle)
+    return inside
+
+
+def mean(sample: npt.ArrayLike, *, confidence: float = CONFIDENCE) -> Estimate:
+    """The mean of a sample (K,) with Student's interval.
+
+    Raises:
+      InputError: fewer than two numbers, or one that is not finite.
+    """
+    numbers = check_array("sample", sample, (None,))
+    if len(numbers) < 2:
+        raise InputError(f"sample: got {len(numbers)} numbers, want at least 2")
+    check_number("confidence", confidence, above=0, below=1)
+    reach = stats.t.ppf(0.5 + confidence / 2, len(numbers) - 1) * numbers.std(ddof=1) / np.sqrt(len(numbers))
+    middle = float(numbers.mean())
+    return Estimate(middle, middle - float(reach), middle + float(reach), confidence)
+
+
 def holm(p_values: npt.ArrayLike) -> Array:
     """The p-values of several tests, made larger so that any one false alarm is as rare as they say (Holm, 1979)."""
     values = np.asarray(p_values, dtype=np.float64)
@@ -111,6 +166,7 @@ def bootstrap(
     if not arrays or any(array.shape != arrays[0].shape or array.ndim != 1 for array in arrays) or len(arrays[0]) < 2:
         raise InputError(f"samples: got shapes {[array.shape for array in arrays]}, want one length of at least 2")
     check_number("confidence", confidence, above=0, below=1)
+    check_count("resamples", resamples, at_most=1_000_000)
     found = stats.bootstrap(
         arrays,
         statistic,

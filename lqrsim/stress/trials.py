@@ -2,7 +2,7 @@
 
 import logging
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from lqrsim.simulation.controllers import Controller, Feedback, Replanning
 from lqrsim.simulation.outcomes import Outcomes, outcomes
 from lqrsim.solvers.ilqr import ilqr
 from lqrsim.solvers.smoother import smooth
-from lqrsim.stress.asked import Campaign, Cell, Shard
+from lqrsim.stress.asked import POLICIES, Campaign, Cell, Shard
 from lqrsim.stress.shards import Table, pack
 
 _log = logging.getLogger("lqrsim")
@@ -62,6 +62,17 @@ def solve(policies: tuple[str, ...], scenario: Scenario) -> dict[str, Solution]:
         if not found[policy].success:
             _log.warning("%s did not converge (%s); its plan is run as it is", policy, found[policy].status.name)
     return {policy: found[policy] for policy in policies}
+
+
+def possible(scenario: Scenario) -> tuple[str, ...]:
+    """The policies that the scenario can have: all of POLICIES, but for those that cannot keep its constraints."""
+    return tuple(policy for policy in POLICIES if not (policy == "ilqr" and scenario.problem.constraints))
+
+
+def left_out(policies: Sequence[str], scenario: Scenario) -> str:
+    """Which policies are not among these for what they cannot do, in a line; empty if there is none."""
+    missing = [policy for policy in POLICIES if policy not in {*policies, *possible(scenario)}]
+    return f"left out: {', '.join(missing)}, which cannot keep the scenario's constraints" if missing else ""
 
 
 def controller(policy: str, scenario: Scenario, solution: Solution, replan_every: float | None = None) -> Controller:

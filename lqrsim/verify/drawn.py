@@ -39,6 +39,7 @@ def verify_run(
     Raises:
       InputError: there is no such trial, nothing to draw, or no OpenGL.
     """
+    record.check_asked(solution, progress)
     model, size = record.model(rollout, trial), len(rollout.state_coordinates.position)
     geom = _part(model)
     views = [cameras.top(rollout), cameras.side(rollout)][: size - 1]

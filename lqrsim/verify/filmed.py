@@ -11,7 +11,7 @@ import numpy.typing as npt
 from av.error import FFmpegError
 
 from lqrsim import files
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import Array, InputError, check_count
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.verify import pixels, record
@@ -54,6 +54,8 @@ def verify_video(
     Raises:
       InputError: the file is not lqrsim's, or has not the panes that it takes.
     """
+    record.check_asked(solution, progress)
+    trial = None if trial is None else check_count("trial", trial, at_least=0)
     told = footage.read(path)
     digest, size = footage.digest(rollout), len(rollout.state_coordinates.position)
     run = told.runs.index(digest) if digest in told.runs else 0

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import Array, InputError, check_function, check_kind
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.controllers import Feedback
@@ -14,6 +14,12 @@ from lqrsim.verify.verdict import Test
 from lqrsim.view.recorded import model_of, robot_body
 
 Progress = Callable[[int, int], object]
+
+
+def check_asked(solution: Solution | None, progress: Progress | None) -> None:
+    """Raises InputError for what is no solution, or can not be called."""
+    check_kind("solution", solution, (Solution, type(None)), "the Solution of the run, or None")
+    check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)
 
 
 def model(rollout: Rollout, trial: int) -> mujoco.MjModel:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array
+from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt, shaped
 from lqrsim.verify.faults import explain
 
 HIDDEN = 0.05  # of the frames that may not show what is tracked
@@ -22,6 +22,12 @@ class Test:
     name: str
     passed: bool | None
     said: str
+
+    def __post_init__(self) -> None:
+        for name in ("name", "said"):
+            check_kind(f"Test: {name}", getattr(self, name), str, "text")
+        if self.passed not in (True, False, None):
+            raise InputError(f"Test: passed: got {excerpt(self.passed)}, want True, False or None")
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,20 @@ class Verification:
     scale: float
     tests: tuple[Test, ...]
     likely: str
+
+    def __post_init__(self) -> None:
+        for name in ("subject", "method", "likely"):
+            check_kind(f"Verification: {name}", getattr(self, name), str, "text")
+        times = shaped("Verification: times", self.times, (None,))
+        if not len(times):
+            raise InputError("Verification: times: got none, want one a frame")
+        object.__setattr__(self, "times", times)
+        seen = shaped("Verification: seen", self.seen, (len(times), None))
+        for name in ("seen", "actual", "planned"):
+            object.__setattr__(self, name, shaped(f"Verification: {name}", getattr(self, name), seen.shape))
+        for name in ("rms", "worst", "shift", "scale"):
+            object.__setattr__(self, name, float(shaped(f"Verification: {name}", getattr(self, name), ())))
+        object.__setattr__(self, "tests", check_items("Verification: tests", self.tests, Test, "a tuple of tests"))
 
     @property
     def passed(self) -> bool:

@@ -1,15 +1,16 @@
 """MuJoCo's viewer in a browser, on loopback only.
 
 MuJoCo 4.0's server listens to the whole network, without a password, takes files from whoever asks, and lets pages of
-any site in. It has no options about that. So what makes its socket and its server is replaced while it starts, and then
-it is tried out: if anything but loopback answers, or the server is another than the one that this was written for, it
-is closed again and nothing is shown.
+any site in. It has no options about that. So what makes its socket and its server is replaced while it starts. It
+answers only requests that call it by its own name and port: a site whose name is made to point to this machine calls it
+by that name. Of pages it answers only its own: any other, be it of another port of this machine, has another origin.
+Then it is tried out: if anything but loopback answers, or it lets in what it should not, it is closed again and nothing
+is shown.
 """
 
 import contextlib
 import http
 import http.client
-import re
 import socket
 import threading
 import time
@@ -35,7 +36,10 @@ from lqrsim.view.screen import PUSHES, Screen
 
 TESTED = "4.0."  # MuJoCo's versions whose server is known
 LOOPBACK = "127.0.0.1"
-OURS = re.compile(r"http://(localhost|127\.0\.0\.1)(:\d+)?")  # pages that may connect
+NAMES = LOOPBACK, "localhost"  # that it may be called by
+# What it sends is for its own pages alone: no other page may read it, embed it, or show it in a frame.
+PRIVATE = {"Cross-Origin-Resource-Policy": "same-origin", "Content-Security-Policy": "frame-ancestors 'none'"}
+SHARED = "Access-Control-Allow-Origin"
 STARTING = 10.0  # s, that the server may take to start
 FORGOTTEN = 0.5  # s; a hand that is not heard of for so long has let go
 
@@ -199,7 +203,7 @@ class Browser(Screen):
 
 @contextlib.contextmanager
 def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
-    """While it lasts, MuJoCo's server is made to listen on loopback only, to take no files, and to admit few pages.
+    """While it lasts, MuJoCo's server is made to listen on loopback only, to take no files, and to admit its own pages.
 
     Args:
       sockets: gets what it listens on.
@@ -210,13 +214,23 @@ def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
         sockets.append(bind(LOOPBACK, port))
         return sockets[-1]
 
-    def serve_few(handler: Callable[..., Any], *, process_request: Callable[..., Any], **options: Any) -> Any:
+    def serve_few(
+        handler: Callable[..., Any],
+        *,
+        process_request: Callable[..., Any],
+        process_response: Callable[..., Any],
+        **options: Any,
+    ) -> Any:
         def admit(connection: Any, request: Any) -> Any:
-            if request.path.split("?")[0] == "/drop":
-                return connection.respond(http.HTTPStatus.FORBIDDEN, "no files are taken\n")
+            why = _refusal(request, sockets[-1].getsockname()[1])
+            if why:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"{why}\n")
             return process_request(connection, request)
 
-        return serve(handler, process_request=admit, origins=[OURS], **options)
+        def answer(connection: Any, request: Any, response: Any) -> Any:
+            return _private(process_response(connection, request, response) or response)
+
+        return serve(handler, process_request=admit, process_response=answer, **options)
 
     web_server.bind_public_socket, web_server.serve = bind_private, serve_few
     web_viewer._print_url_banner = lambda host, port: None
@@ -225,6 +239,26 @@ def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
     finally:
         web_server.bind_public_socket, web_server.serve = bind, serve
         web_viewer._print_url_banner = banner
+
+
+def _refusal(request: Any, port: int) -> str:
+    """Why a request is refused; empty if it is not."""
+    hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+    ours = [f"{name}:{port}" for name in NAMES] + (list(NAMES) if port == 80 else [])
+    if len(hosts) != 1 or hosts[0] not in ours:
+        return f"this server is called {' or '.join(ours)}"
+    if origins and origins != [f"http://{hosts[0]}"]:
+        return "only pages of this server are let in"
+    return "no files are taken" if request.path.split("?")[0] == "/drop" else ""
+
+
+def _private(response: Any) -> Any:
+    """The response as no other page may use it."""
+    for name in (SHARED, *PRIVATE):
+        if name in response.headers:
+            del response.headers[name]
+    response.headers.update(PRIVATE)
+    return response
 
 
 def _check_private(port: int) -> None:
@@ -237,9 +271,20 @@ def _check_private(port: int) -> None:
     for address in _other_addresses():
         if _answers(address, port):
             raise InputError(f"browser: got a server that others can reach at {address}, port {port}; it was closed")
-    for path, origin in (("/drop", f"http://localhost:{port}"), ("/state", "http://example.org")):
-        if _admits(path, origin, port):
-            raise InputError(f"browser: got a server that lets {origin} in to {path}, port {port}; it was closed")
+    here = f"{LOOPBACK}:{port}"
+    for path, host, origin in (
+        ("/drop", here, f"http://{here}"),
+        ("/state", here, "http://example.org"),
+        ("/ui", here, f"http://{LOOPBACK}:{port % 65535 + 1}"),
+        ("/", f"example.org:{port}", None),
+        ("/model", f"example.org:{port}", None),
+    ):
+        if _asked(path, host, origin, port)[0] != http.HTTPStatus.FORBIDDEN:
+            who = origin or f"http://{host}"
+            raise InputError(f"browser: got a server that lets {who} in to {path}, port {port}; it was closed")
+    for path in ("/", "/model"):
+        if _asked(path, here, None, port)[1]:
+            raise InputError(f"browser: got a server that lets any page read {path}, port {port}; it was closed")
 
 
 def _other_addresses() -> list[str]:
@@ -254,14 +299,17 @@ def _other_addresses() -> list[str]:
     return sorted(found - {LOOPBACK})
 
 
-def _admits(path: str, origin: str, port: int) -> bool:
-    """Whether a page of that origin may open a WebSocket there."""
-    key = {"Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="}
+def _asked(path: str, host: str, origin: str | None, port: int) -> tuple[int, bool]:
+    """The status of an answer, and whether other pages may read it; with an origin, to the opening of a WebSocket."""
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=STARTING)
     with contextlib.closing(connection):
-        headers = {"Connection": "Upgrade", "Upgrade": "websocket", "Origin": origin, **key}
+        headers = {"Host": host}
+        if origin is not None:
+            key = {"Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="}
+            headers |= {"Connection": "Upgrade", "Upgrade": "websocket", "Origin": origin, **key}
         connection.request("GET", path, headers=headers)
-        return connection.getresponse().status != http.HTTPStatus.FORBIDDEN
+        answer = connection.getresponse()
+        return answer.status, answer.getheader(SHARED) is not None
 
 
 def _answers(address: str, port: int) -> bool:

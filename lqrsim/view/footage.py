@@ -6,14 +6,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import av
 import numpy as np
 from av.error import FFmpegError
 
-from lqrsim.errors import InputError, check_count, check_number
+from lqrsim.errors import InputError, check_count, check_kind, check_number, check_path
 from lqrsim.rollout import Rollout
 from lqrsim.view.cameras import Camera
 
@@ -105,7 +104,8 @@ class Footage:
 
 def read(path: str | os.PathLike[str]) -> Footage:
     """What the video says of itself. Raises InputError if it is none that lqrsim wrote."""
-    if not Path(path).is_file():
+    path = check_path("video", path)
+    if not os.path.isfile(path):  # not the method, which raises where a folder cannot be read
         raise InputError(f"video: got {path}, want a file that exists")
     try:
         with av.open(str(path)) as container:
@@ -117,6 +117,7 @@ def read(path: str | os.PathLike[str]) -> Footage:
 
 def digest(rollout: Rollout) -> str:
     """What tells a rollout from any other: a hash of its plan, states, controls, and where its draws came from."""
+    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     hasher = hashlib.sha256(f"{rollout.robot} {rollout.scene} {rollout.seed} {rollout.first_trial}".encode())
     for array in (rollout.plan.states, rollout.plan.controls, rollout.states, rollout.applied):
         hasher.update(f"{array.shape}".encode() + np.ascontiguousarray(array, dtype=np.float64).tobytes())

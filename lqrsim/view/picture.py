@@ -8,7 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_count, check_name
+from lqrsim.errors import (
+    InputError,
+    check_count,
+    check_items,
+    check_kind,
+    check_name,
+    check_text,
+    excerpt,
+)
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.view import gl, marker
@@ -21,6 +29,7 @@ from lqrsim.view.stage import Box, Stage, stage
 from lqrsim.view.telling import Caption, Legend
 from lqrsim.view.track import Track
 
+LARGEST = 8192  # pixels of a side: what OpenGL can surely draw
 RUNS = 6  # more can not be told apart side by side
 INSETS = 3
 READABLE = 300  # height of a picture in pixels from which on captions take a small part of it
@@ -76,16 +85,23 @@ def picture(
     check_name("quality", quality, QUALITIES)
     look = QUALITIES[quality]
     size = _checked_size(look.size if size is None else size)
+    check_text("camera", camera, "the name of a camera")
+    insets = check_items("insets", insets, str, f"a tuple of the names of cameras, {INSETS} at most", at_most=100)
+    overlays = check_items("overlays", overlays, object, f"a tuple of: {', '.join(OVERLAYS)}", at_most=100)
     for overlay in overlays:
         check_name("overlays", overlay, OVERLAYS)
+    titles = check_items("titles", titles, str, "a tuple of texts, one a run", at_most=RUNS)
+    for title in titles:
+        check_text("titles", title, "a title", at_most=100, empty=True)
     if len(insets) > INSETS:
         raise InputError(f"insets: got {len(insets)}, want {INSETS} at most")
     distinct, shown = _shown(runs, trial)
     tracks = [Track(distinct[number], row) for number, row in shown]
     common = scale(tracks)
-    drawn = [
-        Overlays(*each, overlays, common) for each in zip(tracks, _one_each("solution", solution, tracks), strict=True)
-    ]
+    solutions = _one_each("solution", solution, tracks)
+    for one in solutions:
+        check_kind("solution", one, (Solution, type(None)), "the Solution of the run, or None")
+    drawn = [Overlays(*each, overlays, common) for each in zip(tracks, solutions, strict=True)]
     names = _one_each("titles", list(titles), tracks) if titles else [None] * len(tracks)
     gl.bind()
     over = len(tracks) == 1 and not insets and size[1] >= READABLE and leaves_room(camera, tracks[0], size[0] / size[1])
@@ -166,9 +182,10 @@ class Picture:
 
 
 def _checked_size(size: Any) -> tuple[int, int]:
-    if np.shape(size) != (2,):
-        raise InputError(f"size: got {size!r}, want a width and a height in pixels")
-    width, height = (check_count("size", pixels, at_least=64) for pixels in size)
+    pixels = check_items("size", size, object, "a width and a height in pixels", at_most=2)
+    if len(pixels) != 2:
+        raise InputError(f"size: got {excerpt(size)}, want a width and a height in pixels")
+    width, height = (check_count("size", one, at_least=64, at_most=LARGEST) for one in pixels)
     if width % 2 or height % 2:
         raise InputError(f"size: got {width} x {height}, want even numbers, which h264 needs")
     return width, height
@@ -179,10 +196,12 @@ def _shown(
 ) -> tuple[list[Rollout], list[tuple[int, int]]]:
     """The rollouts, each once, and which run and trial each part of the picture shows."""
     if isinstance(runs, Rollout):
-        rows = list(trial) if isinstance(trial, Sequence) else [trial]
+        rows: tuple[Any, ...] = (trial,)
+        if isinstance(trial, Sequence) and not isinstance(trial, str):
+            rows = check_items("trial", trial, object, f"1 to {RUNS} of them", at_most=RUNS)
         distinct, shown = [runs], [(0, row) for row in rows]
     else:
-        distinct = list(runs)
+        distinct = list(check_items("runs", runs, Rollout, f"a Rollout, or 1 to {RUNS} of them", at_most=RUNS))
         shown = list(enumerate(_one_each("trial", trial, distinct)))
     if not 1 <= len(shown) <= RUNS:
         raise InputError(f"runs: got {len(shown)} to show, want 1 to {RUNS}")
@@ -191,7 +210,7 @@ def _shown(
 
 def _one_each(field: str, given: Any, of: Sequence[object]) -> list[Any]:
     """What is given once for all, or once for each of them."""
-    if not isinstance(given, Sequence):
+    if not isinstance(given, Sequence) or isinstance(given, str):
         return [given] * len(of)
     if len(given) != len(of):
         raise InputError(f"{field}: got {len(given)}, want one for each of {len(of)} runs")

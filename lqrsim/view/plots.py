@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import Array, InputError, check_count, check_kind, check_text
 from lqrsim.results import Solution, Trajectory
 from lqrsim.rollout import Rollout
 from lqrsim.view import scenery, style
@@ -30,7 +30,7 @@ def plot_run(
     Raises:
       InputError: the rollouts are of other systems, or the file can not be written.
     """
-    _check(solution, rollouts, trial)
+    _check(solution, rollouts, trial, world)
     with style.figure(path, size=(11, 7.5)) as figure:
         strips = len(solution.policy.control_coordinates)
         left = figure.add_gridspec(1, 1, left=0.05, right=0.455, bottom=0.13, top=0.95)[0]
@@ -52,11 +52,17 @@ def plot_run(
     return Path(path)
 
 
-def _check(solution: Solution, rollouts: Mapping[str, Rollout], trial: int) -> None:
+def _check(solution: Solution, rollouts: Mapping[str, Rollout], trial: int, world: World) -> None:
+    check_kind("solution", solution, Solution, "a Solution")
+    check_kind("world", world, World, "a World, such as scene.world")
+    check_kind("rollouts", rollouts, Mapping, "a dictionary of label: Rollout")
+    check_count("trial", trial, at_least=0)
     if not 1 <= len(rollouts) <= len(RUNS):
         raise InputError(f"rollouts: got {len(rollouts)}, want 1 to {len(RUNS)}")
     spaces = solution.policy.state_coordinates, solution.policy.control_coordinates
     for name, run in rollouts.items():
+        check_text("rollouts: label", name, "a label", at_most=100)
+        check_kind(f"rollouts[{name!r}]", run, Rollout, "a Rollout, such as simulate(...) returns")
         if (run.state_coordinates, run.control_coordinates) != spaces:
             want = ", ".join(spaces[0].names)
             raise InputError(f"rollouts[{name!r}]: got a run of another system, want states {want}")

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.policy import AffinePolicy
 from lqrsim.results import Solution
 from lqrsim.view import scenery, style
@@ -34,6 +34,9 @@ def plot_policy(solution: Solution, path: str | os.PathLike[str], *, world: Worl
     Raises:
       InputError: the solution has no policy or no position, or the file can not be written.
     """
+    check_kind("solution", solution, Solution, "a Solution")
+    check_kind("world", world, World, "a World, such as scene.world")
+    radius = check_number("radius", radius, at_least=0.0)
     if solution.cost_to_go is None:
         raise InputError(
             f"solution: got one without a cost-to-go ({solution.status.name}), want one of a solve that was"

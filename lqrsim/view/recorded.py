@@ -3,12 +3,13 @@
 import mujoco
 import numpy as np
 
-from lqrsim.errors import InputError, check_count
+from lqrsim.errors import InputError, check_count, check_kind
 from lqrsim.rollout import Rollout
 
 
 def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
     """The model that was run, anew. Raises InputError unless there is such a trial of it, of a robot with a place."""
+    check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     if not 0 <= check_count("trial", trial, at_least=0) < rollout.trials:
         raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
     if len(rollout.state_coordinates.position) not in (2, 3):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lqrsim.errors import InputError, check_number
+from lqrsim.errors import InputError, check_function, check_name, check_number, check_path, excerpt
 from lqrsim.files import replacing
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
@@ -19,6 +19,8 @@ from lqrsim.view.stage import ROBOTS
 from lqrsim.view.video import encoder, gif
 
 FADE_SECONDS = 0.25
+MOST = 1_000_000  # frames of a video
+SMALLEST = 480, 270  # pixels of a GIF that nobody gave a size: what is written on it can be read
 SAMPLES = 12  # moments that the palette of a GIF is made of
 
 
@@ -58,7 +60,8 @@ def render(
         caption: time, tracking error, clearance, what disturbs, and a legend.
       solution: of which the run is, for the tube; one for all, or one each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and how much the video is compressed.
-      size: width and height in pixels, both even; that of the quality by default, and half of it for a GIF.
+      size: width and height in pixels, both even; that of the quality by default, and half of it for a GIF, but
+        not less than 480 x 270.
       fps: frames a second, whatever the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
       speed: seconds of the run in a second of the video.
       progress: called after each frame with the number of frames done and of all frames.
@@ -67,14 +70,17 @@ def render(
       InputError: an argument is wrong, the file can not be written, or there is no OpenGL.
     """
     path = _named(path, ".mp4", ".gif")
+    check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)
     animated = path.suffix.lower() == ".gif"
-    fps = check_number("fps", (15 if animated else 30) if fps is None else fps, above=0, at_most=240)
+    fps = check_number("fps", (15 if animated else 30) if fps is None else fps, at_least=0.1, at_most=240)
     rate = Fraction(fps).limit_denominator(1001)
-    speed = check_number("speed", speed, above=0, at_most=1000)
+    speed = check_number("speed", speed, at_least=1e-3, at_most=1000)
     size = size if size is not None or not animated else _half(quality)
     options = (trial, camera, insets, titles, overlays, solution, quality, size, speed)
     with replacing(path) as unfinished, picture(runs, *options) as drawn:
         count = int(drawn.end / speed * rate + 1e-9) + 1
+        if count > MOST:
+            raise InputError(f"speed, fps: got {speed:g} and {fps:g}, which are {count} frames, want at most {MOST}")
         if animated:
             samples = [drawn.draw(time) for time in np.linspace(0, drawn.end, min(SAMPLES, count))]
             writer = gif(unfinished, rate, samples)
@@ -127,12 +133,12 @@ def _multiples(every: float, time: float, drawn: Picture) -> list[float]:
 
 
 def _half(quality: Quality) -> tuple[int, int]:
-    width, height = QUALITIES[quality].size if quality in QUALITIES else (2, 2)
-    return width // 2, height // 2
+    width, height = QUALITIES[check_name("quality", quality, QUALITIES)].size  # pyright: ignore[reportArgumentType]
+    return max(width // 2, SMALLEST[0]), max(height // 2, SMALLEST[1])
 
 
 def _named(path: str | os.PathLike[str], *suffixes: str) -> Path:
-    path = Path(path)
+    path = check_path("path", path)
     if path.suffix.lower() not in suffixes:
-        raise InputError(f"path: got {str(path)!r}, want a name that ends in {' or '.join(suffixes)}")
+        raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in {' or '.join(suffixes)}")
     return path

@@ -3,7 +3,6 @@
 import base64
 import json
 import os
-import shlex
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +16,7 @@ import jinja2
 import numpy as np
 from PIL import Image
 
-from lqrsim.errors import InputError, check_count
+from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path
 from lqrsim.files import replacing
 from lqrsim.scenarios import Scenario
 from lqrsim.simulation.disturbances import Disturbance
@@ -33,6 +32,7 @@ BELOW = 0.95  # success below which a policy counts as broken
 LARGEST = 1_500_000  # bytes of a video
 SIZES = (640, 360), (480, 270), (320, 180)  # the first with which a video is small enough
 FPS = 15
+MOST_VIDEOS = 100  # a page with more is too large for a browser
 EACH = 3  # worst trials that are listed of each policy and sweep
 
 
@@ -62,7 +62,10 @@ def report(
       InputError: nothing has been run yet; something is damaged; the scenario is one of yours, and `results` was not
         given it; or the page cannot be written.
     """
-    check_count("videos", videos, at_least=0)
+    check_kind("results", results, Results, "Results, such as run_campaign(...) returns")
+    check_count("videos", videos, at_least=0, at_most=MOST_VIDEOS)
+    check_function("progress", progress, "a function of how many parts are done, of how many", arguments=2)
+    path = check_path("out", out, "the path of a page")
     scenario, missing = results.trials.scenario, Counter[Cell]()
     for cell, _, count in results.missing:
         missing[cell] += count
@@ -88,10 +91,10 @@ def report(
             tell(3 + number, parts)
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string(packaged("lqrsim.view").joinpath("report.html.j2").read_text(encoding="utf-8"))
-    with replacing(Path(out)) as unfinished:
+    with replacing(path) as unfinished:
         unfinished.write_text(template.render(page), encoding="utf-8")
     tell(parts, parts)
-    return Path(out)
+    return path
 
 
 def _page(results: Results, table: analysis.Table, scenario: Scenario) -> dict[str, Any]:
@@ -103,8 +106,10 @@ def _page(results: Results, table: analysis.Table, scenario: Scenario) -> dict[s
     warnings = [] if done == all_trials else [f"Not finished: {done} of {all_trials} trials have been run."]
     if erred:
         warnings.append(f"{erred} trials did not run through; they count as failures.")
-    folder = shlex.quote(str(results.folder))
-    commands = {"To go on with the campaign, or to repair it": results.command, "This page": f"lqrsim report {folder}"}
+    commands = {
+        "To go on with the campaign, or to repair it": results.command,
+        "This page": results.command_of("report"),
+    }
     return {
         "title": f"Stress test of {scenario.name}",
         "warnings": warnings,
@@ -120,9 +125,9 @@ def _page(results: Results, table: analysis.Table, scenario: Scenario) -> dict[s
         "compared": _compared(whole),
         "compared_note": "Trials of the same number have the same random numbers, whatever the policy. What tells"
         " policies apart are the trials that only one of them reached: p is McNemar's exact test, raised for the number"
-        " of comparisons on this page (Holm). Differences are the first less the second, with a paired bootstrap's 95 %"
-        " interval; that of rms is among the trials that both reached. Where nothing is random there is nothing to"
-        " compare.",
+        " of comparisons on this page (Holm). Differences are the first less the second, with 95 % intervals: of"
+        " success Tango's score interval, of rms Student's, among the trials that both reached. Where nothing is random"
+        " there is nothing to compare.",
         "modes": _modes(table),
         "measures": _measures(table, scenario),
         "measures_note": "Median, and from 5 to 95 % of the trials in parentheses. Until a trial collides or is lost;"
@@ -144,7 +149,7 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
             f"{name}: {_words(disturbances, scenario)}" for name, disturbances in campaign.sweeps.items()
         ],
         "Strengths": [", ".join(f"{strength:g}" for strength in sorted({cell.strength for cell in table}))],
-        "Policies": [", ".join(_policies(table))],
+        "Policies": [", ".join(_policies(table)), *([manifest["left_out"]] if manifest.get("left_out") else [])],
         "Trials": [
             f"{campaign.trials} of each combination, {sum(map(len, table.values()))} in all, with the same random"
             f" numbers in each, of seed {campaign.seed}."
@@ -361,7 +366,12 @@ def _films(results: Results, table: analysis.Table, count: int, folder: Path) ->
             " the plan; trace: what was driven, coloured by tracking error."
         )
     for one in chosen:
-        film = {"label": _label(one), "command": _replay_command(results.folder, one), "data": "", "problem": problem}
+        film = {
+            "label": _label(one),
+            "command": results.command_of("replay", "--cell", str(one.cell), "--trial", str(one.trial)),
+            "data": "",
+            "problem": problem,
+        }
         yield film if problem else film | _film(results, one, folder)
 
 
@@ -371,10 +381,6 @@ def _label(one: analysis.Trial) -> str:
         f"{one.cell.policy}, {one.cell.sweep} at strength {one.cell.strength:g}, trial {one.trial}:"
         f" {one.outcome}{what} after {one.ended:.2f} s, least clearance {one.clearance:.3f} m."
     )
-
-
-def _replay_command(folder: Path, one: analysis.Trial) -> str:
-    return shlex.join(["lqrsim", "replay", str(folder), "--cell", str(one.cell), "--trial", str(one.trial)])
 
 
 def _film(results: Results, one: analysis.Trial, folder: Path) -> dict[str, Any]:

@@ -34,7 +34,8 @@ def draw_in_plane(axes: Axes, world: World, low: Array, high: Array, radius: flo
         for axis in (0, 1)
     )
     distance = compiled.signed_distance(flat, np.stack(np.meshgrid(x, y), axis=-1))
-    axes.contourf(x, y, distance, levels=[-np.inf, 0, radius], colors=[SOLID, MARGIN])
+    levels = [-np.inf, 0, radius] if radius > 0 else [-np.inf, 0]
+    axes.contourf(x, y, distance, levels=levels, colors=[SOLID, MARGIN][: len(levels) - 1])
     axes.contour(x, y, distance, levels=[0], colors=[EDGE], linewidths=0.8)
 
 

@@ -3,7 +3,6 @@
 import contextlib
 import os
 from collections.abc import Iterator
-from pathlib import Path
 
 import matplotlib.style
 from matplotlib.axis import Axis
@@ -11,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from lqrsim.errors import InputError
+from lqrsim.errors import InputError, check_path, excerpt
 from lqrsim.files import replacing
 
 PLAN = "#222222"
@@ -31,6 +30,7 @@ STYLE = {
     "pdf.fonttype": 42,  # text in the file is text, which journals ask for
     "savefig.dpi": 150,
     "svg.fonttype": "none",
+    "text.parse_math": False,  # names are names, dollars and all
     "svg.hashsalt": "lqrsim",
 }
 
@@ -44,10 +44,10 @@ def figure(*paths: str | os.PathLike[str], size: tuple[float, float]) -> Iterato
     Raises:
       InputError: a name ends otherwise, or a file can not be written.
     """
-    places = [Path(path) for path in paths]
+    places = [check_path("path", path) for path in paths]
     for place in places:
         if place.suffix.lower() not in METADATA:
-            raise InputError(f"path: got {str(place)!r}, want a name that ends in one of: {', '.join(METADATA)}")
+            raise InputError(f"path: got {excerpt(place.name)}, want a name that ends in one of: {', '.join(METADATA)}")
     with contextlib.ExitStack() as stack:
         unfinished = [(place.suffix.lower(), stack.enter_context(replacing(place))) for place in places]
         stack.enter_context(matplotlib.style.context(["default", STYLE]))

@@ -10,6 +10,7 @@ from lqrsim.view.overlays import Overlays, Scale
 from lqrsim.view.stage import Box
 from lqrsim.view.track import Track
 
+SHARES = 0.4, 0.75  # of the height of a picture, that what disturbs may take: above the picture, and over it
 LETTERS = 44, 54  # heights of a letter in the height of a picture, and in the width of a narrow one
 
 
@@ -30,16 +31,27 @@ class Caption:
         which = f", trial {run.first_trial + track.trial}" if run.trials > 1 else ""
         title = title or f"{run.robot} in {run.scene}{which}".replace("_", " ")
         self.width = box.width // 4 if over else box.width
-        what = list(run.disturbances) or ["undisturbed"]
-        lines = [title]
-        for words in what if over else ["; ".join(what)]:
-            lines += caption.fit(words, self.letters, self.width - round(1.4 * self.letters))
-        self.paper = caption.text(tuple(lines), self.letters, width=box.width // 5 if over else self.width)
+        self.paper = self._paper(title, list(run.disturbances) or ["undisturbed"], box)
         # Where they are, numbers stay: beside the title in a strip that is wide enough, else in a line of their own.
         longest = caption.text((self._line(track.end),), self.letters, width=0, bold=False).shape[1] + 3 * self.letters
         beside = not over and caption.text((title,), self.letters, width=0).shape[1] + longest < self.width
         self.place = (self.width - longest, 0) if beside else (0, self.paper.shape[0])
         self.height = self.paper.shape[0] + (0 if beside else self._numbers(0.0).shape[0])
+
+    def _paper(self, title: str, what: list[str], box: Box) -> Pixels:
+        """The title and as much of what disturbs as leaves most of the picture free, and how many more there are."""
+        paper = np.empty((0, 0, 4), dtype=np.uint8)
+        for count in range(len(what), -1, -1):
+            left = len(what) - count
+            words = what[:count] + ([f"{left} more disturbances" if count else f"{left} disturbances"] if left else [])
+            lines = [title]
+            for line in words if self.over else ["; ".join(words)]:
+                lines += caption.fit(line, self.letters, self.width - round(1.4 * self.letters))
+            width = box.width // 5 if self.over else self.width
+            paper = caption.text(tuple(lines), self.letters, width=width)
+            if paper.shape[0] <= SHARES[self.over] * box.height:
+                break
+        return paper
 
     def draw(self, area: Pixels, time: float) -> None:
         """Writes it into the run's part of the picture, in place."""

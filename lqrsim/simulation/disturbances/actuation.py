@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from mujoco import batch
 
-from lqrsim.errors import Array, InputError, check_count, check_name, check_number
+from lqrsim.errors import Array, InputError, check_count, check_name, check_number, excerpt
 from lqrsim.results import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
@@ -192,7 +192,7 @@ class ActuatorLoss(Disturbance):
 
     def __post_init__(self) -> None:
         if self.actuator is not None and not isinstance(self.actuator, str):
-            raise InputError(f"ActuatorLoss: actuator: got {self.actuator!r}, want a name, or None to draw one")
+            raise InputError(f"ActuatorLoss: actuator: got {excerpt(self.actuator)}, want a name, or None to draw one")
         object.__setattr__(self, "at", check_number("ActuatorLoss: at", self.at, at_least=0.0))
         remaining = check_number("ActuatorLoss: remaining", self.remaining, at_least=0.0, at_most=1.0)
         object.__setattr__(self, "remaining", remaining)

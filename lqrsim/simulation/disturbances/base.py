@@ -16,7 +16,7 @@ import numpy.typing as npt
 from mujoco import batch
 
 from lqrsim.coordinates import Coordinates
-from lqrsim.errors import Array, InputError, check_array, check_number
+from lqrsim.errors import Array, InputError, check_array, check_function, check_number, excerpt, real, shaped
 from lqrsim.results import Trajectory
 from lqrsim.simulation.plant import Plant
 
@@ -49,6 +49,14 @@ class Effect:
     torque: Hook | None = None
     displaced: Array | None = None
 
+    def __post_init__(self) -> None:
+        for name, count in (("begin", 1), ("alter", 1), ("measure", 2), ("actuate", 2), ("force", 2), ("torque", 2)):
+            given = "the step and an array" if count == 2 else "one thing"
+            check_function(f"Effect: {name}", getattr(self, name), f"a function of {given}, or None", arguments=count)
+        if self.displaced is not None:
+            displaced = shaped("Effect: displaced", self.displaced, (None, None, 3))
+            object.__setattr__(self, "displaced", displaced)
+
 
 class Disturbance(abc.ABC):
     """Base class of all disturbances."""
@@ -63,7 +71,9 @@ class Disturbance(abc.ABC):
         Raises:
           InputError: nothing says what this is, or that much of it means nothing.
         """
-        raise InputError(f"{type(self).__name__}: got strength {strength}, want a disturbance that overrides `scaled`")
+        raise InputError(
+            f"{type(self).__name__}: got strength {excerpt(strength)}, want a disturbance that overrides `scaled`"
+        )
 
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
         """Raise InputError if the plant can not have this disturbance."""
@@ -115,7 +125,7 @@ def uniform(generators: Sequence[np.random.Generator], steps: int, size: int) ->
 def check_numbers(disturbance: Disturbance, name: str, numbers: Numbers, *, at_least: float = -np.inf) -> Numbers:
     """A field as it is kept: a number, or a tuple of them. Raises InputError for what is too small or not finite."""
     field = f"{type(disturbance).__name__}: {name}"
-    if np.ndim(numbers) == 0:
+    if real(field, numbers).ndim == 0:
         return check_number(field, numbers, at_least=at_least if np.isfinite(at_least) else None)
     values = check_array(field, numbers, (None,))
     if (values < at_least).any():
@@ -130,7 +140,10 @@ def check_strength(disturbance: Disturbance, strength: float) -> float:
 
 def times(disturbance: Disturbance, numbers: Numbers, strength: float) -> Any:
     """A number or a tuple of them, so many times as large. Raises InputError for a negative strength."""
-    product = check_strength(disturbance, strength) * np.asarray(numbers, dtype=np.float64)
+    with np.errstate(over="ignore"):
+        product = check_strength(disturbance, strength) * np.asarray(numbers, dtype=np.float64)
+    if not np.isfinite(product).all():
+        raise InputError(f"{type(disturbance).__name__}: strength: got {strength:g}, want less: it leaves all numbers")
     return float(product) if product.ndim == 0 else tuple(product.tolist())
 
 

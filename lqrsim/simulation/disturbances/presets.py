@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_name
+from lqrsim.errors import InputError, check_kind, check_name
 from lqrsim.simulation.disturbances.actuation import MotorLag
 from lqrsim.simulation.disturbances.base import Disturbance
 from lqrsim.simulation.disturbances.mismatch import (
@@ -38,6 +38,7 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
     Raises:
       InputError: there is none of that name.
     """
+    check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
     strength = PRESETS[check_name("preset", name, PRESETS)]
     return [one.scaled(strength) for one in _light(plant) if _can_have(plant, one)]
 

@@ -1,0 +1,136 @@
+"""How often intervals hold what they are of: differences of two policies on the same trials, and rare failures.
+
+    python experiments/benchmark_intervals.py            # everything, some minutes
+    python experiments/benchmark_intervals.py --quick    # bounded, and coarse
+
+differences  Success of two policies on the same n trials. The coverage is exact: the sum of the probabilities of all
+             outcomes whose interval holds the difference, over a grid of the shares in which only one succeeds.
+rare         `split` of a standard normal number beyond a threshold, whose probability is known, again and again.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from functools import cache
+from itertools import product
+from typing import Any
+
+import numpy as np
+import tyro
+from scipy import stats
+
+from lqrsim.stress.splitting import NoFailure, split
+from lqrsim.stress.statistics import CONFIDENCE, Estimate, paired_difference
+from lqrsim.versions import versions
+
+TRIALS = 20, 50, 200, 500
+SHARES = 0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4
+# Probability, numbers, particles, repetitions: those of `lqrsim rare`, and less.
+RARE = (
+    (1e-2, 3, 250, 10),
+    (1e-4, 3, 250, 10),
+    (1e-6, 3, 250, 10),
+    (1e-4, 100, 250, 10),
+    (1e-4, 3, 250, 3),
+    (1e-4, 3, 50, 10),
+    (1e-3, 3, 20, 10),
+)
+
+
+@dataclass(frozen=True)
+class Config:
+    """What is measured."""
+
+    studies: int = 2000
+    """Of each rare failure."""
+    quick: bool = False
+    """A small part."""
+    json: bool = False
+    """Print all numbers as JSON."""
+
+
+@cache
+def interval(only_first: int, only_second: int, trials: int) -> Estimate:
+    return paired_difference(only_first, only_second, trials)
+
+
+def covered(trials: int, first: float, second: float) -> float:
+    """The probability that the interval holds the difference, less that of outcomes rarer than 1e-9 each."""
+    outcomes = np.array(list(product(_likely(trials, first), _likely(trials, second))))
+    outcomes = np.column_stack([outcomes, trials - outcomes.sum(axis=1)])
+    outcomes = outcomes[outcomes[:, 2] >= 0]
+    weights = stats.multinomial.pmf(outcomes, trials, [first, second, 1 - first - second])
+    total = 0.0
+    for (one, other, _), weight in zip(outcomes[weights > 1e-9].tolist(), weights[weights > 1e-9], strict=True):
+        found = interval(one, other, trials)
+        total += float(weight) * (found.low <= first - second <= found.high)
+    return total
+
+
+def _likely(trials: int, share: float) -> range:
+    low, high = stats.binom.ppf([1e-9, 1 - 1e-9], trials, share)
+    return range(int(low), int(high) + 1)
+
+
+def differences(config: Config) -> list[dict[str, Any]]:
+    found = []
+    for trials in TRIALS[:2] if config.quick else TRIALS:
+        grid = [(one, other) for one, other in product(SHARES, SHARES) if one >= other and 0 < one + other < 1]
+        of_grid = {pair: covered(trials, *pair) for pair in (grid[::4] if config.quick else grid)}
+        worst = min(of_grid, key=of_grid.__getitem__)
+        found.append({"trials": trials, "pairs": len(of_grid), "mean": float(np.mean(list(of_grid.values()))),
+                      "least": of_grid[worst], "at": worst})  # fmt: skip
+    return found
+
+
+def rare(config: Config) -> list[dict[str, Any]]:
+    found = []
+    for probability, size, particles, repetitions in RARE[::3] if config.quick else RARE:
+        threshold = stats.norm.isf(probability)
+        below = above = none = 0
+        widths = []
+        studies = min(config.studies, 40) if config.quick else config.studies
+        for seed in range(studies):
+            try:
+                one = split(
+                    lambda z, least=threshold: z[:, 0] - least,
+                    size, particles=particles, repetitions=repetitions, seed=seed,
+                ).probability  # fmt: skip
+            except NoFailure:
+                none += 1
+                continue
+            below += one.high < probability
+            above += one.low > probability
+            widths.append(one.high / one.low)
+        given = studies - none
+        found.append({"probability": probability, "size": size, "particles": particles, "repetitions": repetitions,
+                      "studies": studies, "none": none, "covered": 1 - (below + above) / given, "below": below / given,
+                      "above": above / given, "width": float(np.median(widths))})  # fmt: skip
+    return found
+
+
+def main(config: Config) -> dict[str, Any]:
+    measured = {"differences": differences(config), "rare": rare(config)}
+    return {"config": asdict(config), "versions": versions(), **measured}
+
+
+def report(result: dict[str, Any]) -> str:
+    lines = [f"differences of success, {100 * CONFIDENCE:g} % intervals; coverage, exact",
+             f"{'trials':>6} {'pairs of shares':>16} {'mean':>7} {'least':>7}  at"]  # fmt: skip
+    for one in result["differences"]:
+        lines.append(f"{one['trials']:>6} {one['pairs']:>16} {one['mean']:>7.3f} {one['least']:>7.3f}  {one['at']}")
+    lines += ["", f"rare failures, {100 * CONFIDENCE:g} % intervals; coverage, of studies that found a failure",
+              f"{'probability':>11} {'numbers':>8} {'particles':>9} {'repetitions':>11} {'studies':>7} {'none':>5}"
+              f" {'covered':>7} {'too low':>7} {'too high':>8} {'high/low':>8}"]  # fmt: skip
+    for one in result["rare"]:
+        lines.append(
+            f"{one['probability']:>11g} {one['size']:>8} {one['particles']:>9} {one['repetitions']:>11}"
+            f" {one['studies']:>7} {one['none']:>5} {one['covered']:>7.3f} {one['below']:>7.3f} {one['above']:>8.3f}"
+            f" {one['width']:>8.1f}"
+        )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    settings = tyro.cli(Config, description=__doc__)
+    outcome = main(settings)
+    print(json.dumps(outcome) if settings.json else report(outcome))

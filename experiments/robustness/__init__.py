@@ -1,0 +1,1 @@
+"""How lqrsim takes hostile input: files, and the arguments of every public signature."""

@@ -1,0 +1,250 @@
+"""Arguments that public callables accept: what states problems, solves them, and comes of it. See `subjects.py`."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+import lqrsim as ls
+from robustness.place import Place
+
+
+def rate(x: Any, u: Any, p: Any) -> list[Any]:
+    return [x[1], u[0] / p.mass]
+
+
+def jacobian(x: Any, u: Any, p: Any, fx: Any, fu: Any) -> None:
+    fx[0, 1], fu[1, 0] = 1.0, 1.0 / p.mass
+
+
+def bowl(x: Any, u: Any, p: Any) -> Any:
+    return x[0] ** 2 + 0.1 * u[0] ** 2
+
+
+def slope(x: Any, u: Any, p: Any, gradient: Any, hessian: Any) -> None:
+    gradient[0], gradient[2], hessian[0, 0], hessian[2, 2] = 2 * x[0], 0.2 * u[0], 2.0, 0.2
+
+
+def check_functions(
+    f: Any, jacobian: Any, function: Any, derivatives: Any, depends_on: Any, formula: Any, parameters: Any
+) -> list[ls.DerivativeCheck]:
+    """A problem of a user's own functions, each of which is called."""
+    dynamics = ls.Dynamics(
+        f,
+        states={"x": "m", "v": "m/s"},
+        controls={"force": "N"},
+        parameters=parameters,
+        jacobian=jacobian,
+        level="plain",
+    )
+    own = ls.FunctionCost(function, derivatives=derivatives, depends_on=depends_on, parameters=parameters)
+    end = ls.QuadraticCost([1.0, 1.0], about=[0.0, 0.0])
+    cost = own + ls.SymbolicCost(formula, parameters=parameters)
+    problem = ls.Problem(dynamics=dynamics, dt=0.1, steps=2, initial=end, stage_cost=cost, final_cost=end)
+    return ls.check_derivatives(problem, samples=1)
+
+
+def smooth_stated(**stated: Any) -> ls.Solution:
+    """A problem, and two iterations."""
+    return ls.smooth(ls.Problem(**stated), starts=1, max_iterations=2)
+
+
+def ilqr_stated(**stated: Any) -> ls.Solution:
+    """A problem, and two iterations of the other solver."""
+    return ls.ilqr(ls.Problem(**stated), max_iterations=2)
+
+
+def problems(place: Place) -> dict[str, tuple[Any, ...]]:
+    cart = ls.Dynamics(
+        rate, states={"x": "m", "v": "m/s"}, controls={"force": "N"}, parameters={"mass": 1.0}, level="plain"
+    )
+    world, box = place.scenario.scene.world, ls.Obstacle("box", "box", np.zeros(3), np.eye(3), np.ones(3))
+    term = ls.QuadraticCost([1.0, 1.0], about=[0.0, 0.0]).bind(cart)
+    limits = ls.Coordinates(
+        names=("x", "y", "angle"),
+        units=("m", "m", "rad"),
+        position=(0, 1),
+        angles=(2,),
+        low=(-1.0,) * 3,
+        high=(1.0,) * 3,
+    )
+    cost = ls.QuadraticCost([1.0, 1.0, 1.0], about=[0.0, 0.0, 0.0])
+    at, there = {"state": [0.1, 0.2], "control": [0.3]}, {"vector": [0.1, 0.2, 9.0], "near": [0.0, 0.0, 0.0]}
+    source = "def value(x, u, t, row, data):\n    return x[0]\n\n\ndef slope(x, u, t, row, data, gradient):\n    pass\n"
+    known: dict[str, ls.Robot] = {
+        "Robot": ls.Quadrotor(), "Quadrotor": ls.Quadrotor(), "DifferentialDrive": ls.DifferentialDrive()
+    }  # fmt: skip
+    rests = {kind: np.zeros(len(robot.dynamics.state_coordinates)) for kind, robot in known.items()}
+    robots = [(kind, robot, rests[kind], robot.configuration(rests[kind])) for kind, robot in known.items()]
+    stated = {
+        name: getattr(place.problem, name)
+        for name in ("dynamics", "dt", "steps", "initial", "stage_cost", "final_cost")
+    }
+    return {
+        "Dynamics": ({
+            "f": rate, "states": {"x": "m", "v": "m/s"}, "controls": {"force": "N"}, "parameters": {"mass": 1.0},
+            "position": (), "angles": ("x",), "rotation_vectors": (), "control_limits": (-1.0, 1.0),
+            "jacobian": jacobian, "level": "plain",
+        },),
+        "Dynamics.rate": ({"self": cart, **at},),
+        "Dynamics.rate_jacobian": ({"self": cart, **at},),
+        "Dynamics.step": ({"self": cart, **at, "dt": 0.1},),
+        "Dynamics.linearize": ({"self": cart, **at, "dt": 0.1},),
+        "Coordinates": ({field.name: getattr(limits, field.name) for field in dataclasses.fields(limits)},),
+        "Coordinates.nearest": ({"self": limits, **there},),
+        "Coordinates.difference": ({"self": limits, **there},),
+        "Coordinates.limited": ({"self": limits, "low": -1.0, "high": (1.0, 2.0, 3.0)},),
+        "Coordinates.within": ({"self": limits, "other": limits},),
+        "Coordinates.clip": ({"self": limits, "vector": [2.0, 0.0, 0.0]},),
+        "QuadraticCost": ({"weight": [1.0, 2.0], "about": [0.0, 0.0]},),
+        "ControlCost": ({"weight": [[1.0]], "about": [0.0]},),
+        "ObstacleCost": ({"world": world, "radius": 0.2, "sharpness": 10.0, "weight": 1.0},),
+        "SymbolicCost": ({"function": bowl, "parameters": {"a": 1.0}, "convex": True},),
+        "FunctionCost": ({
+            "function": bowl, "derivatives": slope, "depends_on": ("x", "force"), "parameters": {"a": 1.0},
+            "convex": True, "level": "plain",
+        },),
+        **{
+            f"{kind}.__add__": ({"self": one, "other": cost},)
+            for kind, one in {
+                "Cost": cost, "QuadraticCost": cost, "ControlCost": ls.ControlCost([1.0], about=[0.0]),
+                "ObstacleCost": ls.ObstacleCost(world, radius=0.2), "SymbolicCost": ls.SymbolicCost(bowl),
+                "FunctionCost": ls.FunctionCost(bowl),
+            }.items()
+        },
+        "Term": ({field.name: getattr(term, field.name) for field in dataclasses.fields(term)},),
+        "Clearance": ({"world": world, "radius": 0.2, "margin": 0.1},),
+        "Inequalities": ({"source": source, "data": [1.0], "rows": 1, "says": str, "uses_control": False},),
+        "FixedState": ({"state": [0.0, 1.0]},),
+        "Problem": (stated | {"control_limits": (-0.4, 0.4), "constraints": []},),
+        "smooth of a Problem": (stated | {"call": smooth_stated, "control_limits": (-0.4, 0.4)},),
+        "ilqr of a Problem": (stated | {"call": ilqr_stated, "control_limits": (-0.4, 0.4)},),
+        "check_derivatives of functions": ({
+            "call": check_functions, "f": rate, "jacobian": jacobian, "function": bowl, "derivatives": slope,
+            "depends_on": ("x", "force"), "formula": bowl, "parameters": {"mass": 1.0},
+        },),
+        "Problem.terms": ({"self": place.problem, "which": "initial"},),
+        "Obstacle": ({
+            "name": "box", "kind": "box", "position": np.zeros(3), "rotation": np.eye(3), "size": np.ones(3)
+        },),
+        "World": ({"obstacles": [box]},),
+        "World.seen_by": ({"self": world, "dimension": 2},),
+        "World.distances": ({"self": world, "point": [0.0, 1.0, 2.0]},),
+        "World.distance": ({"self": world, "points": [[0.0, 1.0, 2.0]]},),
+        "World.nearest": ({"self": world, "points": [[0.0, 1.0, 2.0]]},),
+        "load_scene": ({"name_or_path": "arena"}, 0.3),
+        "Scene": ({
+            field.name: getattr(place.scenario.scene, field.name) for field in dataclasses.fields(place.scenario.scene)
+        },),
+        "Scenario": ({field.name: getattr(place.scenario, field.name) for field in dataclasses.fields(ls.Scenario)},),
+        "scenarios.get": ({"name": "differential_drive"}, 0.3),
+        "scenarios.quadrotor": ({"query": 1, "seed": 2}, 0.3),
+        "scenarios.quadrotor_queries": ({"count": 2, "seed": 0},),
+        "scenarios.differential_drive": ({}, 0.1),
+        "scenarios.names": ({}, 0.1),
+        "robots.names": ({}, 0.1),
+        "robots.get": ({"name": "quadrotor"},),
+        "rotations.rotate": ({"r": [0.1, 0.2, 0.3], "v": [1.0, 0.0, 0.0]},),
+        "rotations.vector_rate": ({"r": [0.1, 0.2, 0.3], "w": [1.0, 0.0, 0.0]},),
+        "DifferentialDrive": (dataclasses.asdict(ls.DifferentialDrive()),),
+        "Quadrotor": (dataclasses.asdict(ls.Quadrotor()),),
+        **{
+            f"{kind}.state": ({"self": robot, "qpos": qpos, "qvel": qvel, "near": at_rest},)
+            for kind, robot, at_rest, (qpos, qvel) in robots
+        },
+        **{f"{kind}.configuration": ({"self": robot, "state": at_rest},) for kind, robot, at_rest, _ in robots},
+        "check_derivatives": ({"subject": cart, "samples": 2, "spread": 0.3, "tolerance": 1e-5, "seed": 0}, 0.5),
+    }  # fmt: skip
+
+
+def solving(place: Place) -> dict[str, tuple[Any, ...]]:
+    eye, n = np.eye(2), 3
+    stages = ls.Stage(A=np.tile(eye, (4, 1, 1)), B=np.ones((2, 1)), R=[[1.0]], Q=eye)
+    stage = ls.Stage(A=-eye, B=np.ones((2, 1)), R=[[1.0]], Q=eye)
+    end = ls.Quadratic(eye, np.ones(2), 0.0)
+    tests = {"stop": "cost", "tolerance": 1e-3, "max_iterations": 2}
+    both = tests | {
+        "form": "dual", "first_pass": "forward", "safeguard": False, "gap_tolerance": 1e-3, "starts": 1,
+        "constraint_tolerance": 1e-3, "threads": 1,
+    }  # fmt: skip
+    prior = ls.InitialPrior(np.ones(n), about=np.zeros(n))
+    made: dict[str, tuple[Any, ...]] = {
+        "smooth": ({"problem": place.problem, **both, "callback": print_nothing}, 2.0),
+        "smooth_many": ({"problems": [place.problem, place.second], **both, "progress": print_nothing}, 2.0),
+        "ilqr": ({"problem": place.problem, **tests, "callback": print_nothing}, 2.0),
+        "ilqr_many": ({"problems": [place.problem], "threads": 1, **tests, "progress": print_nothing}, 2.0),
+        "smooth_lq": ({"stage": stages, "initial": end, "final": end, "form": "dual", "dt": 0.1},),
+        "smooth_lq_continuous": (
+            {"stage": stage, "horizon": 0.1, "initial": end, "final": end, "rtol": 1e-4, "atol": 1e-4},
+        ),
+        "smooth_continuous": (
+            {
+                "problem": place.problem,
+                "tolerance": 1.0,
+                "gap_tolerance": 1.0,
+                "max_iterations": 1,
+                "start": [0.2, 0.2],
+                "rtol": 1e-3,
+                "atol": 1e-3,
+                "callback": print_nothing,
+            },
+            0.1,
+        ),
+        "InitialPrior": (
+            {"weight": np.ones(n), "about": np.zeros(n), "iterations": 1, "obstacles": (0.5,), "controls": [0.1, 0.1]},
+        ),
+        "InitialPrior.at": ({"self": ls.InitialPrior(np.ones(n), about=np.zeros((5, n))), "step": 1.5},),
+        "Stage": ({field.name: getattr(stages, field.name) for field in dataclasses.fields(stages)},),
+    }
+    for name in ("smooth", "ilqr"):
+        made[name][0]["start"] = place.solution if name == "smooth" else [0.25, 0.25]
+        made[f"{name}_many"][0]["start"] = prior if name == "smooth" else place.solution.trajectory
+    return made
+
+
+def print_nothing(*_: object) -> None:
+    """A callback."""
+
+
+def results(place: Place) -> dict[str, tuple[Any, ...]]:
+    solution, rollout = place.solution, place.rollout
+    policy, plan, total = solution.policy, solution.trajectory, solution.total_cost
+    go, come = solution.cost_to_go, solution.cost_to_come
+    eye = np.eye(2)
+    flowing = ls.smooth_lq_continuous(
+        ls.Stage(A=-eye, B=np.ones((2, 1)), R=[[1.0]], Q=eye), horizon=0.1, initial=ls.Quadratic(eye, np.ones(2), 0.0),
+        final=ls.Quadratic(eye, np.ones(2), 0.0), rtol=1e-4, atol=1e-4,
+    )  # fmt: skip
+    candidate = ls.Candidate("straight", 1.0, 3, ls.Status.CONVERGED, plan)
+    checks = {
+        "DerivativeCheck": ls.check_derivatives(place.problem.dynamics, samples=1)[0],
+        "PlantCheck": ls.check_plant(ls.DifferentialDrive(), ls.load_scene("arena"), samples=1),
+    }
+    built: dict[str, Any] = {
+        "AffinePolicy": policy, "Trajectory": plan, "Quadratic": go, "Moments": come, "TotalCost": total,
+        "Candidate": candidate, "Iteration": solution.iterations[-1], "Rollout": rollout,
+        "Multipliers": ls.Multipliers(np.zeros((5, 2)), 1.0), "ContinuousSolution": flowing,
+        "Solution": dataclasses.replace(solution, candidates=(candidate,)),
+        "Outcomes": ls.outcomes(rollout, place.plant), **checks,
+    }  # fmt: skip
+    at = {"x": np.zeros(2), "t": 0.05}
+    return {
+        **{
+            name: ({field.name: getattr(one, field.name) for field in dataclasses.fields(one) if field.init},)
+            for name, one in built.items()
+        },
+        "AffinePolicy.control": ({"self": policy, "state": np.zeros(3), "step": 0},),
+        "AffinePolicy.__call__": ({"self": policy, "state": np.zeros(3), "t": 0.3, "interpolate": True},),
+        "Quadratic.__add__": ({"self": go, "other": go},),
+        "Quadratic.__call__": ({"self": go, "states": plan.states},),
+        "Iteration.row": ({"self": solution.iterations[-1], "number": 3},),
+        "Solution.shifted": ({"self": solution, "steps": 1},),
+        **{f"ContinuousSolution.{name}": ({"self": flowing, **at},) for name in ("policy", "inverse_policy")},
+        **{
+            f"ContinuousSolution.{name}": ({"self": flowing, "t": [0.0, 0.1]},)
+            for name in ("cost_to_go", "cost_to_come", "total_cost", "x_hat", "u_hat")
+        },
+        "save": ({"result": solution, "path": place.folder / "saved.npz"},),
+        "load_solution": ({"path": ls.save(solution, place.folder / "solution.npz")},),
+        "load_rollout": ({"path": ls.save(rollout, place.folder / "rollout.npz")},),
+    }  # fmt: skip

@@ -1,0 +1,250 @@
+"""Arguments that public callables accept: what runs policies, counts how they fail, and draws it. See `subjects.py`."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+
+import lqrsim as ls
+from robustness.of_problems import print_nothing
+from robustness.place import Place
+
+DISTURBANCES: dict[str, dict[str, Any]] = {
+    "ActuatorLoss": {"actuator": "create_wheel_left", "at": 0.2}, "CommandDropouts": {"loss": 0.1},
+    "ControlDelay": {"periods": 1}, "Dryden": {}, "Gusts": {}, "InitialStateError": {"std": (0.1, 0.1, 0.1)},
+    "MeanWind": {"velocity": (1.0, 0.0, 0.0)}, "MeasurementDropouts": {"loss": 0.1},
+    "MeasurementLatency": {"periods": 1}, "MotorLag": {"time_constant": 0.1},
+    "Push": {"impulse": (1.0, 0.0, 0.0), "at": 0.1}, "Saturation": {"share": 0.5},
+    **{
+        kind: {"std": 0.1}
+        for kind in (
+            "AxleMismatch", "ControlNoise", "DisplacedObstacles", "ForceNoise", "FrictionMismatch", "InertiaMismatch",
+            "MassMismatch", "MeasurementBias", "MeasurementNoise", "ThrustMismatch", "TorqueNoise",
+            "WheelRadiusMismatch",
+        )
+    },
+}  # fmt: skip
+
+
+class Hooked(ls.Disturbance):
+    """A user's own disturbance, whose effect is spoilt."""
+
+    def __init__(self, effect: Any) -> None:
+        self.effect = effect
+
+    def scaled(self, strength: float) -> "Hooked":
+        return self
+
+    def start(self, plant: Any, plan: Any, generators: Any) -> Any:
+        return self.effect
+
+
+def simulate_effect(plant: ls.Plant, solution: ls.Solution, **effects: Any) -> ls.Rollout:
+    """One trial of a user's own disturbance with that effect."""
+    return ls.simulate(plant, solution, disturbances=[Hooked(ls.Effect(**effects))])
+
+
+def simulate_kind(kind: Any, plant: ls.Plant, solution: ls.Solution, **settings: Any) -> ls.Rollout:
+    """Two trials of a packaged disturbance with those settings."""
+    return ls.simulate(plant, solution, disturbances=[kind(**settings)], trials=2)
+
+
+class Steering(ls.Controller):
+    """A user's own controller, whose answers are spoilt."""
+
+    def __init__(self, control: Any, digest: Any, spaces: Any) -> None:
+        self._parts = control, digest, spaces
+
+    def start(self, trials: int) -> Any:
+        return self._parts[0]
+
+    @property
+    def digest(self) -> Any:
+        return self._parts[1]
+
+    @property
+    def spaces(self) -> Any:
+        return self._parts[2]
+
+
+def simulate_controller(plant: ls.Plant, solution: ls.Solution, control: Any, digest: Any, spaces: Any) -> ls.Rollout:
+    """One trial of a user's own controller."""
+    return ls.simulate(plant, solution, controller=Steering(control, digest, spaces))
+
+
+def steering(step: int, shown: Any) -> Any:
+    return np.full((len(shown), 2), 0.1)
+
+
+def hook(step: int, values: Any) -> Any:
+    return values
+
+
+def nothing_of_three(step: int, states: Any) -> Any:
+    return np.zeros((len(states), 3))
+
+
+def fits(disturbance: ls.Disturbance, place: Place) -> bool:
+    """Whether the robot can have it: wind takes drag, for example."""
+    try:
+        ls.simulate(place.plant, place.solution, disturbances=[disturbance], trials=2)
+    except ls.InputError:
+        return False
+    return True
+
+
+def running(place: Place) -> dict[str, tuple[Any, ...]]:
+    plant, solution, rollout = place.plant, place.solution, place.rollout
+    effect = {"begin": lambda states: states, "alter": print_nothing, "measure": hook, "actuate": hook,
+              "force": nothing_of_three, "torque": nothing_of_three,
+              "displaced": np.zeros((1, len(plant.world), 3))}  # fmt: skip
+    disturbances = {name: getattr(ls, name)(**arguments) for name, arguments in DISTURBANCES.items()}
+    for name, one in disturbances.items():  # those whose arguments are all optional
+        DISTURBANCES[name] = {field.name: getattr(one, field.name) for field in dataclasses.fields(one) if field.init}
+    noise, robot = disturbances["ControlNoise"], place.scenario.robot
+    return {
+        **{name: (dict(DISTURBANCES[name]), 0.5) for name in DISTURBANCES},
+        **{f"{name}.scaled": ({"self": one, "strength": 2.0}, 0.5) for name, one in disturbances.items()},
+        "Disturbance.scaled": ({"self": noise, "strength": 2.0}, 0.5),
+        "GilbertElliott": (dataclasses.asdict(ls.GilbertElliott(0.1, 0.5)), 0.5),
+        **{
+            f"simulate {name}": (
+                {"call": functools.partial(simulate_kind, getattr(ls, name)), "plant": plant, "solution": solution}
+                | DISTURBANCES[name],
+                0.3,
+            )
+            for name in DISTURBANCES
+            if fits(disturbances[name], place)
+        },
+        "preset": ({"name": "light", "plant": plant},),
+        "Effect": (effect,),
+        "Plant": ({"robot": robot, "scene": place.scenario.scene}, 0.3),
+        "Plant.substeps": ({"self": plant, "period": 1 / 6},),
+        "Plant.clearance": ({"self": plant, "states": np.zeros((1, 5, 3)),
+                             "displaced": np.zeros((1, len(plant.world), 3))},),
+        "Feedback": ({"policy": solution.policy},),
+        "Replanning": ({"problem": place.problem, "solution": solution, "every": 1 / 3},),
+        "simulate": ({
+            "plant": plant, "solution": solution, "disturbances": [noise], "controller": ls.Feedback(solution.policy),
+            "seed": 0, "trials": 1, "first_trial": 0, "goal_radius": 0.1, "frames": True, "contacts": True,
+            "threads": 1, "generators": lambda trial, stream: np.random.default_rng(trial), "progress": print_nothing,
+            "watch": print_nothing,
+        }, 2.0),
+        "simulate an Effect": ({"call": simulate_effect, "plant": plant, "solution": solution, **effect},),
+        "simulate a Controller": ({
+            "call": simulate_controller, "plant": plant, "solution": solution, "control": steering, "digest": "mine",
+            "spaces": (place.space, place.controls),
+        },),
+        "outcomes": ({"rollout": rollout, "plant": plant, "problem": place.problem},),
+        "check_plant": ({
+            "robot": robot, "scene": place.scenario.scene, "period": 1 / 60, "around": np.zeros(3), "spread": 0.3,
+            "controls": ([-0.1, -0.1], [0.1, 0.1]), "settle": 0.0, "samples": 1, "tolerance": 0.1, "seed": 0,
+        }, 0.3),
+    }  # fmt: skip
+
+
+def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
+    reference = "tiny.py:tiny"
+    asked = {
+        "scenario": reference, "sweeps": {"noise": (ls.ControlNoise(0.1),)}, "strengths": (0.0, 1.0),
+        "policies": ("open_loop",), "trials": 2, "seed": 0, "replan_every": 0.5, "shard": 2, "time_limit": 60.0,
+    }  # fmt: skip
+    campaign = ls.Campaign(**asked)
+    results = ls.run_campaign(campaign, place.folder / "campaign", workers=0)
+    score = ls.TrialScore(place.plant, place.solution, [ls.ControlNoise(0.5)], threads=1)
+    cell = results.cells[0]
+    fields = (
+        "plant",
+        "solution",
+        "disturbances",
+        "controller",
+        "failure",
+        "contacts",
+        "batch",
+        "threads",
+        "simulations",
+    )
+    searching = {"score": line, "size": 3, "seed": 0}
+    return {
+        "Campaign": (asked,),
+        "Campaign.disturbances": ({"self": campaign, "cell": cell},),
+        "Campaign.from_json": ({"fields": campaign.as_json()},),
+        "Cell": ({"policy": "smooth", "sweep": "noise", "strength": 1.0},),
+        "Cell.named": ({"text": "0", "cells": results.cells},),
+        "run_campaign": ({
+            "campaign": campaign, "folder": place.folder / "campaign", "workers": 0, "batch": 4, "scheduler": None,
+            "progress": print_nothing,
+        }, 0.1),
+        "Results": ({"folder": place.folder / "campaign", "scenario": reference},),
+        "replay": ({"results": results, "cell": cell, "trial": 0, "frames": False, "contacts": True},),
+        **{
+            f"Results.{name}": ({"self": results, "cell": cell, **more},)
+            for name, more in {
+                "outcomes": {"partial": True}, "tally": {"partial": True}, "reasons": {}, "shards": {}, "number": {},
+                "tables": {"partial": True},
+            }.items()
+        },
+        "Results.command_of": ({"self": results, "command": "replay"},),
+        "Results.solution": ({"self": results, "policy": "open_loop"},),
+        **{
+            f"Results.{name}": ({"self": results, "shard": next(results.shards())},)
+            for name in ("path", "read", "table")
+        },
+        "TrialScore": ({field: getattr(score, field) for field in fields}, 0.5),
+        "TrialScore.__call__": ({"self": score, "numbers": np.zeros((2, score.size))},),
+        "TrialScore.rollout": ({"self": score, "numbers": np.zeros((2, score.size)), "frames": False},),
+        "collision": ({"rollout": place.rollout},),
+        "miss": ({"rollout": place.rollout},),
+        "split": (searching | {
+            "particles": 20, "keep": 0.25, "moves": 1, "repetitions": 2, "confidence": 0.9, "most_levels": 5,
+            "level": print_nothing, "progress": print_nothing,
+        },),
+        "smallest_failure": (searching | {
+            "failures": [[2.0, 0.0, 0.0]], "rounds": 1, "pairs": 4, "spread": 0.5, "tolerance": 1e-3,
+            "progress": print_nothing,
+        },),
+        "report": ({
+            "results": results, "out": place.folder / "report.html", "videos": 0, "progress": print_nothing
+        }, 0.05),
+    }  # fmt: skip
+
+
+def line(vectors: Any) -> Any:
+    """A score: failure beyond a line."""
+    return np.asarray(vectors)[:, 0] - 0.5
+
+
+def pictures(place: Place) -> dict[str, tuple[Any, ...]]:
+    world, rollout, solution = place.scenario.scene.world, place.rollout, place.solution
+    options = {
+        "runs": rollout, "trial": 0, "camera": "top", "insets": (), "titles": ("a title",), "overlays": ("plan",),
+        "solution": solution, "quality": "draft", "size": (128, 96),
+    }  # fmt: skip
+    video = place.folder / "video.mp4"
+    made: dict[str, tuple[Any, ...]] = {
+        "plot_run": (
+            {
+                "solution": solution,
+                "rollouts": {"run": rollout},
+                "path": place.folder / "run.png",
+                "world": world,
+                "trial": 0,
+            },
+            0.1,
+        ),
+        "plot_policy": ({"solution": solution, "path": place.folder / "p.png", "world": world, "radius": 0.2}, 0.1),
+    }
+    ls.render(rollout, video, camera="top", size=(128, 96), fps=6, overlays=())
+    shown = ls.verify_run(rollout)
+    return made | {
+        "render": (options | {
+            "path": video.with_name("v.gif"), "fps": 5.0, "speed": 1.0, "progress": print_nothing
+        }, 0.1),
+        "still": (options | {"path": place.folder / "still.png", "time": 0.1, "every": 0.2}, 0.15),
+        "verify_run": ({"rollout": rollout, "trial": 0, "solution": solution, "progress": print_nothing}, 0.15),
+        "verify_video": ({
+            "path": video, "rollout": rollout, "trial": 0, "solution": solution, "progress": print_nothing
+        }, 0.15),
+        "Verification": ({field.name: getattr(shown, field.name) for field in dataclasses.fields(shown)},),
+    }  # fmt: skip

@@ -1,0 +1,92 @@
+"""Every public callable of lqrsim with arguments that it accepts, small and cheap, for `api.py` to spoil.
+
+`public()` finds them by introspection: what `lqrsim.__all__` lists, the functions of its modules, the public methods of
+its classes that take arguments. `subjects()` has arguments for each; a test fails where one has none.
+"""
+
+import enum
+import inspect
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import lqrsim as ls
+from lqrsim.stress.shards import Damaged
+from robustness.of_problems import problems, results, solving
+from robustness.of_runs import campaigns, pictures, running
+from robustness.place import Place
+
+# Called by lqrsim itself, with what it has checked: what one overrides to add a cost, a disturbance or a controller.
+HOOKS = {"bind", "start", "check", "describe", "blow", "fitting", "actuation", "multiply", "parts", "draw", "limits"}
+HOOKS |= {"displace"}
+# Text that compiled cores contain: numbers in, numbers out.
+KERNELS = {f"{ratio}{order}" for ratio in ls.rotations.RATIOS for order in ("", "_d1", "_d2")}
+
+RAISES = {"Results.read": (Damaged,)}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A callable and arguments that it accepts.
+
+    Attributes:
+      weight: how often it is called beside the others, 1 being often: what takes longer is called less.
+      raises: what it may raise besides InputError, as its docstring says.
+    """
+
+    call: Callable[..., Any]
+    arguments: Mapping[str, Any]
+    weight: float = 1.0
+    raises: tuple[type[Exception], ...] = ()
+
+
+def public() -> Iterator[tuple[str, Any]]:
+    """Each public callable by its name: `smooth`, `Problem`, `AffinePolicy.control`, `rotations.rotate`."""
+    for name in ls.__all__:
+        item = getattr(ls, name)
+        if isinstance(item, ModuleType):
+            for key, one in vars(item).items():
+                if inspect.isfunction(one) and one.__module__ == item.__name__ and key[0] != "_" and key not in KERNELS:
+                    yield f"{name}.{key}", one
+        elif not inspect.isclass(item):
+            yield name, item
+        elif not issubclass(item, Exception | enum.Enum):
+            if not inspect.isabstract(item) and inspect.signature(item).parameters:
+                yield name, item
+            for key, method in inspect.getmembers(item, callable):
+                if method_of_users(item, key) and len(inspect.signature(method).parameters) > _own(item, key):
+                    yield f"{name}.{key}", method
+
+
+def method_of_users(item: type, key: str) -> bool:
+    """Whether it is a method that a user calls."""
+    if key[0] == "_" and key not in ("__call__", "__add__"):
+        return False
+    home = next(kind for kind in item.__mro__ if key in vars(kind))
+    return home.__module__.startswith("lqrsim.") and key not in HOOKS and not inspect.isclass(getattr(item, key))
+
+
+def _own(item: type, key: str) -> int:
+    """How many parameters of a method are not the caller's: self, unless it is a class method."""
+    return 0 if isinstance(inspect.getattr_static(item, key), classmethod | staticmethod) else 1
+
+
+def subjects(folder: Path) -> dict[str, Subject]:
+    """Arguments for every public callable; some of them are solved for and run, and files of them written."""
+    logging.getLogger("lqrsim").setLevel(logging.ERROR)
+    place = Place(folder)
+    found: dict[str, Subject] = {}
+    for make in (problems, solving, results, running, campaigns, pictures):
+        for name, (arguments, *weight) in make(place).items():
+            owner, _, method = name.partition(".")
+            if "call" in arguments:
+                call = arguments.pop("call")
+            elif method and not isinstance(getattr(ls, owner), ModuleType):
+                call = getattr(arguments.pop("self", getattr(ls, owner)), method)
+            else:
+                call = getattr(getattr(ls, owner), method) if method else getattr(ls, owner)
+            found[name] = Subject(call, arguments, *weight, raises=RAISES.get(name, ()))
+    return found

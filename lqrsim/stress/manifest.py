@@ -1,0 +1,124 @@
+"""What a campaign's folder says of itself, `manifest.json`: sealed when it is written, checked whenever it is read.
+
+It has two hashes. `sha256` is of all of it: whatever is edited is refused. `digest` is of what rows depend on, and each
+shard has it too: a manifest that is sealed anew, with other numbers, has shards that are not its own.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lqrsim import plain
+from lqrsim.archive import Other, blamed
+from lqrsim.errors import InputError, excerpt
+from lqrsim.results import Solution
+from lqrsim.stress.asked import POLICIES, Campaign, Cell
+from lqrsim.stress.shards import write
+
+FORMAT, VERSION, NAME = "lqrsim campaign", 2, "manifest.json"
+_LARGEST = 1 << 26  # bytes
+
+_HASH = plain.line
+_POLICY = plain.one_of(POLICIES)
+_STRENGTH = plain.number(at_least=0.0)
+_DISTURBANCE = plain.record({"kind": plain.line, "settings": plain.mapped(plain.anything)})
+_CAMPAIGN = plain.record(
+    {  # the fields of Campaign
+        "scenario": plain.line, "sweeps": plain.mapped(plain.listed(_DISTURBANCE)),
+        "strengths": plain.listed(_STRENGTH), "policies": plain.listed(_POLICY),
+        "trials": plain.count, "seed": plain.count, "replan_every": plain.optional(plain.number(above=0.0)),
+        "shard": plain.count, "time_limit": plain.number(above=0.0),
+    }
+)  # fmt: skip
+_MANIFEST = plain.record(
+    {
+        "format": plain.line, "version": plain.count, "campaign": _CAMPAIGN, "model": _HASH, "problem": _HASH,
+        "code": plain.mapped(plain.optional(_HASH)),
+        "policies": plain.mapped(plain.record({"digest": _HASH, "sha256": _HASH})),
+        "cells": plain.listed(plain.row(_POLICY, plain.line, _STRENGTH)), "versions": plain.mapped(plain.line),
+        "digest": _HASH, "machine": plain.line, "left_out": plain.line, "sha256": _HASH,
+    }
+)  # fmt: skip
+
+
+def write_manifest(folder: Path, contents: dict[str, Any]) -> None:
+    """Seal and write it: `contents` is all but its format, its cells and its hashes. Raises InputError."""
+    manifest = {"format": FORMAT, "version": VERSION, **contents, "cells": _cells(contents["campaign"])}
+    manifest["digest"] = digest_of_rows(manifest)
+    manifest["sha256"] = _seal(manifest)
+    _check(plain.parse(plain.canonical(manifest)))
+    write(json.dumps(manifest, indent=1).encode(), folder / NAME)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """What a campaign's folder says of itself. Raises InputError unless it is, in content, what was written."""
+    path = folder / NAME
+    if not os.path.isfile(path):
+        raise InputError(f"folder: got {excerpt(str(folder))}, want one that `lqrsim stress` wrote, with a {NAME}")
+    with blamed(path, "folder"):
+        if path.stat().st_size > _LARGEST:
+            raise InputError(f"size: got {path.stat().st_size:,} bytes, want at most {_LARGEST:,}")
+        manifest = plain.parse(path.read_text(encoding="utf-8"))
+        if not isinstance(manifest, dict):
+            raise InputError(f"manifest: got {excerpt(manifest)}, want an object")
+        if (manifest.get("format"), manifest.get("version")) != (FORMAT, VERSION):
+            was = f"a {excerpt(manifest.get('format'))} {excerpt(manifest.get('version'))}"
+            raise Other(f"folder: got {path}, {was}, want a {FORMAT!r} {VERSION}")
+        _check(manifest)
+    return manifest
+
+
+def _check(manifest: dict[str, Any]) -> None:
+    """Raise InputError unless it is whole, and its hashes are those of what it says."""
+    _MANIFEST("manifest", manifest)
+    if manifest["sha256"] != _seal(manifest):
+        raise InputError("sha256: got another than that of the content, want a file that has not been changed")
+    asked = manifest["campaign"]
+    if plain.canonical(manifest["cells"]) != plain.canonical(_cells(asked)):
+        raise InputError("cells: got others than those of the campaign, want each sweep, strength and policy")
+    if set(manifest["policies"]) != set(asked["policies"]):
+        raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(asked['policies'])}")
+    if manifest["digest"] != digest_of_rows(manifest):
+        raise InputError("digest: got another than that of the campaign, want a file that has not been changed")
+
+
+def _cells(asked: Mapping[str, Any]) -> list[list[Any]]:
+    """Each policy, sweep and strength, in the order of their numbers. Raises InputError if it is no campaign."""
+    # Its disturbances may be a user's, and are made only where that user's file was named.
+    plainly = Campaign(**{**asked, "sweeps": dict.fromkeys(asked["sweeps"], ())})
+    return [[cell.policy, cell.sweep, cell.strength] for cell in plainly.cells]
+
+
+def cells_of(manifest: Mapping[str, Any]) -> list[Cell]:
+    """Its cells."""
+    return [Cell(*cell) for cell in manifest["cells"]]
+
+
+def _seal(manifest: Mapping[str, Any]) -> str:
+    return digest_of(plain.canonical({name: one for name, one in manifest.items() if name != "sha256"}).encode())
+
+
+def digest_of_rows(manifest: Mapping[str, Any]) -> str:
+    """Hash of all that rows depend on, and of nothing that differs where the same is begun again."""
+    lasting = {name: manifest[name] for name in ("cells", "model", "problem", "code", "versions")} | {
+        "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},
+        "policies": {policy: hashes["digest"] for policy, hashes in manifest["policies"].items()},
+    }
+    return digest_of(plain.canonical(lasting).encode())
+
+
+def digest_of(contents: bytes) -> str:
+    """Hash of a file's contents."""
+    return hashlib.sha256(contents).hexdigest()
+
+
+def digest_of_solution(solution: Solution) -> str:
+    """Hash of what running it depends on: not of how long it took to find."""
+    plan, policy = solution.trajectory, solution.policy
+    arrays = plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt])
+    return digest_of(b"".join(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes() for array in arrays))

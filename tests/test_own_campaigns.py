@@ -1,0 +1,103 @@
+"""Stress tests of scenarios of one's own: the commands that are printed run as they are, and constraints are kept."""
+
+import html
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import lqrsim as ls
+from lqrsim.cli import main
+from lqrsim.references import resolve
+from lqrsim.stress.asked import Campaign
+from lqrsim.stress.campaign import run_campaign
+from lqrsim.stress.results import Results
+
+OWN = """
+import dataclasses
+
+import lqrsim as ls
+
+given = ls.scenarios.differential_drive()
+
+
+def shorter(steps: int = 150) -> ls.Scenario:
+    problem = dataclasses.replace(given.problem, steps=steps)
+    return dataclasses.replace(given, name="my arena", problem=problem)
+
+
+def walled() -> ls.Scenario:
+    clearance = ls.Clearance(given.scene.world, radius=given.robot.radius, margin=0.05)
+    problem = dataclasses.replace(given.problem, constraints=[clearance])
+    return dataclasses.replace(given, name="walled", problem=problem)
+"""
+FEW = ["--strengths", "1", "--trials", "3", "--workers", "0", "--sweep", "scenario"]
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The scenarios are in the working directory, which has a space and a quote in its name."""
+    folder = tmp_path / "my robot's"
+    folder.mkdir()
+    (folder / "own file.py").write_text(OWN, encoding="utf-8")
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def test_printed_commands_run_as_printed(
+    elsewhere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reference = "own file.py:shorter,steps=24"
+    assert main(["stress", reference, "--policies", "smooth", "open_loop", *FEW]) == 0
+    folder = Path("runs") / "stress" / "my_arena"
+    assert f"wrote {folder}" in capsys.readouterr().out
+    assert main(["report", str(folder), "--scenario", reference, "--videos", "1"]) == 0
+    page = html.unescape((folder / "report.html").read_text(encoding="utf-8"))
+    printed = sorted(set(re.findall(r"<code>(lqrsim .*?)</code>", page)))
+    results = Results(folder, scenario=reference)
+    assert results.command in printed
+    assert {shlex.split(line)[1] for line in printed} == {"stress", "report", "replay"}
+
+    (tmp_path / "another place").mkdir()
+    monkeypatch.chdir(tmp_path / "another place")
+    with pytest.raises(ls.InputError, match="code"):  # a file never chooses code to run
+        _ = Results(elsewhere / folder).trials
+    for line in printed:
+        program, *words = shlex.split(line)
+        assert program == "lqrsim"
+        assert main(words) == 0, line
+    assert Path("rollout.npz").is_file()
+
+
+def test_what_cannot_keep_constraints_is_left_out_and_said_so(
+    elsewhere: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["stress", "own file.py:walled", *FEW]) == 0
+    says = "left out: ilqr, which cannot keep the scenario's constraints"
+    assert says in capsys.readouterr().out
+    folder = elsewhere / "runs" / "stress" / "walled"
+    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    assert manifest["campaign"]["policies"] == ["smooth", "open_loop", "replan"]
+    assert manifest["left_out"] == says
+    assert main(["report", str(folder), "--scenario", "own file.py:walled", "--videos", "0"]) == 0
+    assert html.escape(says) in (folder / "report.html").read_text(encoding="utf-8").replace("&#39;", "&#x27;")
+
+
+def test_asked_by_name_it_is_refused(elsewhere: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wanted = "policies: got ilqr, which cannot keep the scenario's constraints, want some of smooth, open_loop, replan"
+    assert main(["stress", "own file.py:walled", "--policies", "ilqr", "smooth", *FEW]) == 2
+    assert capsys.readouterr().err == f"lqrsim: error: {wanted}\n"
+    assert not (elsewhere / "runs").exists()
+    disturbances = resolve("own file.py:walled").disturbances
+    with pytest.raises(ls.InputError, match="got ilqr, which cannot keep"):
+        run_campaign(Campaign(scenario="own file.py:walled", sweeps={"own": disturbances}), "runs")
+
+
+def test_a_campaign_knows_where_its_scenario_is(elsewhere: Path) -> None:
+    """Workers and whoever reads the report may be in another folder."""
+    found = Campaign(scenario="own file.py:shorter,steps=9", sweeps={"calm": ()}).scenario
+    assert found == f"{elsewhere / 'own file.py'}:shorter,steps=9"
+    assert Campaign(scenario="quadrotor,query=2", sweeps={"calm": ()}).scenario == "quadrotor,query=2"
+    assert Campaign(scenario="package.robots:hallway", sweeps={"calm": ()}).scenario == "package.robots:hallway"

@@ -1,0 +1,216 @@
+"""Real signals to real commands, at many moments, and streams that are full, closed or read by nobody."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import lqrsim as ls
+from lqrsim.view import gl
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals to other processes are POSIX's")
+
+STOPPED = "lqrsim: stopped\n"
+COMMAND = [sys.executable, "-m", "lqrsim.cli"]
+PICTURE = """
+import sys, time
+from pathlib import Path
+from lqrsim.files import replacing
+with replacing(Path(sys.argv[sys.argv.index("--out") + 1]) / "figures" / "a.png") as unfinished:
+    unfinished.write_bytes(b"half")
+    time.sleep(60)
+"""
+REPRODUCE = """
+import pathlib, sys
+from lqrsim import cli, reproduce
+reproduce.EXPERIMENTS = pathlib.Path(sys.argv.pop(1))
+sys.exit(cli.main())
+"""
+
+
+@pytest.fixture(autouse=True)
+def heard() -> Iterator[None]:
+    """Whatever started the tests may ignore Ctrl-C, as shells have what runs in the background do."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def start(*command: str | Path, **options: object) -> subprocess.Popen[str]:
+    """In a group of its own."""
+    words = [str(word) for word in command]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    return subprocess.Popen(words, **(pipes | options))  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+def wait_for(found: Path, pattern: str, process: subprocess.Popen[str]) -> None:
+    until = time.monotonic() + 120
+    while not list(found.glob(pattern)):
+        assert time.monotonic() < until
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("module", ["tyro", "numpy", "lqrsim.costs", "mujoco"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_it_starts_is_one_line(module: str, number: int) -> None:
+    """As soon as it says that a module has been imported; it goes on for a while."""
+    with start(sys.executable, "-X", "importtime", *COMMAND[1:], "list") as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if line.split("|")[-1].strip() == module:
+                break
+        else:
+            pytest.fail(f"{module} was not imported")
+        process.send_signal(number)
+        error = "".join(line for line in process.stderr if not line.startswith("import time:"))
+    assert (process.returncode, error) == (128 + number, STOPPED)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory, quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> Path:
+    folder = tmp_path_factory.mktemp("flown")
+    rollout = ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[ls.ForceNoise(0.1)])
+    return ls.save(rollout, folder / "rollout.npz")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize("suffix", ["mp4", "gif"])
+def test_a_signal_while_it_films_leaves_nothing(flown: Path, number: int, suffix: str, tmp_path: Path) -> None:
+    if not gl.available():
+        pytest.skip("no OpenGL here")
+    out = tmp_path / f"a.{suffix}"
+    with start(*COMMAND, "render", flown, "--out", out, "--fps", "240", "--size", "1280", "720") as process:
+        wait_for(tmp_path, ".unfinished-*", process)
+        time.sleep(random.Random(f"{number} {suffix}").uniform(0, 1))
+        process.send_signal(number)
+        time.sleep(0.05)
+        process.send_signal(number)  # whoever is impatient does not keep it from tidying up
+        _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (128 + number, STOPPED)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "everyone"), [(signal.SIGINT, True), (signal.SIGINT, False), (signal.SIGTERM, False)]
+)
+def test_a_signal_while_it_reproduces_leaves_nothing(number: int, everyone: bool, tmp_path: Path) -> None:
+    """To the whole group, as Ctrl-C in a terminal, or to the command alone."""
+    folder, out = tmp_path / "experiments", tmp_path / "out"
+    folder.mkdir()
+    (folder / "table_1.py").write_text(PICTURE)
+    with start(sys.executable, "-c", REPRODUCE, folder, "reproduce", "table_1", "--out", out) as process:
+        wait_for(tmp_path, "out/figures/.unfinished-*", process)
+        (os.killpg if everyone else os.kill)(process.pid, number)
+        _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (128 + number, STOPPED)
+    assert [path for path in out.rglob("*") if path.is_file()] == []
+    with pytest.raises(ProcessLookupError):
+        os.killpg(process.pid, 0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux")
+def test_no_worker_can_be_interrupted_while_it_starts(tmp_path: Path) -> None:
+    """Neither the first, with which Python starts another process, nor the second: the kernel holds SIGINT back."""
+    code = tmp_path / "start.py"
+    code.write_text(
+        "import time\nfrom pathlib import Path\nfrom lqrsim.stress import executors\n"
+        "if __name__ == '__main__':\n"
+        "    for _ in range(2):\n"
+        "        process = executors._context.Process(target=time.sleep, args=(60,))\n"
+        "        with executors._without_ctrl_c():\n"
+        "            process.start()\n"
+        "        status = Path(f'/proc/{process.pid}/status').read_text()\n"
+        "        blocked = next(line for line in status.splitlines() if line.startswith('SigBlk'))\n"
+        "        print(bool(int(blocked.split()[1], 16) & 2))\n"
+        "        process.kill()\n"
+    )
+    done = subprocess.run([sys.executable, code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "True"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="where MuJoCo comes with GLFW, which starts a process to be found")
+def test_a_worker_starts_no_other_process(tmp_path: Path) -> None:
+    """It would go on when the worker is killed, and complain that nobody reads what it says."""
+    code = tmp_path / "start.py"
+    code.write_text(
+        "import sys\n"
+        "if __name__ == '__mp_main__':\n"
+        "    sys.addaudithook(lambda event, _: print(event, flush=True) if event == 'subprocess.Popen' else None)\n"
+        "import mujoco\nfrom lqrsim.stress import executors\n"
+        "def work():\n"
+        "    print('glfw.library' in sys.modules)\n"
+        "if __name__ == '__main__':\n"
+        "    process = executors._context.Process(target=work)\n"
+        "    with executors._surroundings():\n"
+        "        process.start()\n"
+        "    process.join()\n"
+    )
+    surroundings = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYGLFW_LIBRARY")}
+    done = subprocess.run([sys.executable, code], capture_output=True, text=True, check=True, env=surroundings)
+    assert done.stdout.split() == ["True"]
+
+
+@pytest.mark.parametrize("ready", ["manifest.json", "shards/*.parquet"])
+def test_ctrl_c_in_a_stress_test_is_one_line(ready: str, tmp_path: Path) -> None:
+    """To all processes at once, as a terminal does: while workers start, and while they work."""
+    asked = "--policies smooth --trials 2000 --shard 20 --strengths 1 --workers 2 --out"
+    with start(*COMMAND, "stress", "quadrotor", *asked.split(), tmp_path / "run") as process:
+        wait_for(tmp_path / "run", ready, process)
+        time.sleep(random.Random(ready).uniform(0, 0.5))
+        os.killpg(process.pid, signal.SIGINT)
+        _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (130, STOPPED)
+    assert not list((tmp_path / "run").rglob(".unfinished-*"))
+
+
+HELP = ["--help", "solve --help", "list", "--version", "cache"]
+
+
+@pytest.mark.parametrize("command", HELP)
+def test_nobody_reads_it(command: str) -> None:
+    """The pipe is closed before anything is written."""
+    with start(*COMMAND, *command.split()) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no device that is always full")
+@pytest.mark.parametrize("command", HELP)
+def test_a_full_device_is_one_line(command: str) -> None:
+    with open("/dev/full", "w") as full, start(*COMMAND, *command.split(), stdout=full) as process:
+        _, error = process.communicate(timeout=60)
+    says = "lqrsim: error: standard output: got No space left on device, want one that can be written\n"
+    assert (process.returncode, error) == (2, says)
+
+
+@pytest.mark.parametrize("command", HELP)
+def test_closed_streams_are_no_error(command: str, tmp_path: Path) -> None:
+    """And the first file that is opened does not take their place."""
+    line = f'exec "$0" -m lqrsim.cli {command} <&- >&- 2>"$1"'
+    told = tmp_path / "told"
+    done = subprocess.run(["sh", "-c", line, sys.executable, told], check=False)
+    assert (done.returncode, told.read_text()) == (0, "")
+
+
+def test_what_is_printed_while_a_file_is_written(flown: Path, tmp_path: Path) -> None:
+    """That nobody reads it is no error of the file."""
+    if not gl.available():
+        pytest.skip("no OpenGL here")
+    options = ["--out", tmp_path / "a.mp4", "--fps", "240", "--size", "1280", "720"]
+    with start(*COMMAND, "render", flown, *options) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,350 @@
+"""Hostile calls of the public API: one clear line of InputError, whatever is passed; a sample of what
+experiments/benchmark_robustness.py tries, and the cases that once were not refused."""
+
+import ast
+import dataclasses
+import itertools
+import math
+import signal
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim.costs import Term
+from lqrsim.errors import (
+    LONGEST,
+    InputError,
+    check_array,
+    check_count,
+    check_function,
+    check_items,
+    check_memory,
+    check_number,
+    check_path,
+    check_text,
+    excerpt,
+)
+from lqrsim.machine import memory
+
+api: Any = import_module("robustness.api")  # of experiments/
+of_runs: Any = import_module("robustness.of_runs")
+subjects: Any = import_module("robustness.subjects")
+lq: Any = ls  # whose types nobody checks
+
+
+def refusal(call: Callable[[], object]) -> str:
+    """The one line with which a call is refused."""
+    with pytest.raises(InputError) as caught:
+        call()
+    line = str(caught.value)
+    assert len(line.splitlines()) == 1
+    assert len(line) <= LONGEST
+    return line
+
+
+@pytest.mark.timeout(900)  # on a machine that has compiled nothing yet
+def test_a_sample_of_hostile_calls() -> None:
+    verdicts = list(api.calls(400, seed=1))
+    assert len(verdicts) == 400
+    assert not [verdict for verdict in verdicts if verdict.failed]
+    kinds = {verdict.kind for verdict in verdicts}
+    assert {"accepted", "refused"} <= kinds
+
+
+def test_every_public_callable_is_tried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What __all__ lists has arguments that are accepted as they are."""
+    monkeypatch.chdir(tmp_path)
+    tried = subjects.subjects(tmp_path)
+    assert {name for name, _ in subjects.public()} <= tried.keys()
+    for name in ("smooth", "simulate", "Problem", "AffinePolicy.__call__", "Campaign", "render", "rotations.rotate"):
+        assert name in tried
+    for name, subject in tried.items():
+        try:
+            api.exercise(subject.call(**subject.arguments))
+        except InputError as error:
+            raise AssertionError(name) from error
+
+
+class TestTheFuzzer:
+    """It sees what it is there to see."""
+
+    def verdict(self, call: Callable[..., object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+        monkeypatch.setattr(api, "subjects", lambda folder: {"f": subjects.Subject(call, {"a": 1})})
+        monkeypatch.chdir(tmp_path)
+        return api.Caller(tmp_path, seed=0)(0)
+
+    @pytest.mark.parametrize(
+        ("error", "kind"),
+        [(InputError("a: got 1, want 2"), "refused"), (InputError(""), "raw"), (KeyError("a"), "raw")],
+    )
+    def test_what_is_raised(self, error: Exception, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        # Raised from elsewhere than the folder of the fuzzer's own functions.
+        namespace: dict[str, Any] = {"error": error}
+        exec(compile("def call(a):\n    raise error", "/elsewhere/call.py", "exec"), namespace)
+        assert self.verdict(namespace["call"], tmp_path, monkeypatch).kind == kind
+
+    def test_what_hangs(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(api, "PATIENCE", 0.2)
+
+        def call(a: object) -> None:
+            while True:
+                pass
+
+        assert self.verdict(call, tmp_path, monkeypatch).kind == "hang"
+        assert signal.getitimer(signal.ITIMER_PROF) == (0.0, 0.0)
+
+    def test_the_same_number_is_the_same_call(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        seen = []
+        for _ in range(2):
+            self.verdict(lambda a: seen.append(repr(type(a))), tmp_path, monkeypatch)
+        assert seen[0] == seen[1]
+
+
+class Raising:
+    """Whatever it is asked, it raises."""
+
+    def __repr__(self) -> str:
+        raise RuntimeError("no")
+
+    __len__ = __iter__ = __float__ = __array__ = __fspath__ = __index__ = __repr__  # type: ignore[assignment]
+
+
+class TestChecks:
+    @pytest.mark.parametrize(
+        "value",
+        ["1", b"1", 1j, np.array([1j]), np.array("1"), ["1", "2"], {"a": 1}, (i for i in range(3)), [[1], [1, 2]], None,
+         np.zeros(3, "datetime64[s]"), Raising(), [Raising()], object],
+    )  # fmt: skip
+    def test_what_is_no_array(self, value: Any) -> None:
+        assert refusal(lambda: check_array("weight", value, (3,))).startswith("weight: got ")
+
+    @pytest.mark.parametrize("value", ["1", True, [1.0], np.array([1.0]), 1j, 10**400, math.nan, math.inf, Raising()])
+    def test_what_is_no_number(self, value: Any) -> None:
+        assert "want a finite number" in refusal(lambda: check_number("dt", value))
+
+    @pytest.mark.parametrize("value", [1.0, "1", True, 0, -1, 10**20, 10**400, 2**31, np.float64(3), None])
+    def test_what_is_no_count(self, value: Any) -> None:
+        assert refusal(lambda: check_count("trials", value, at_most=2**31 - 1)).startswith("trials: got ")
+
+    def test_numbers_of_numpy_are_numbers(self) -> None:
+        assert check_number("dt", np.float32(0.5)) == check_number("dt", np.array(0.5)) == 0.5
+        assert check_count("steps", np.int32(3)) == 3
+
+    def test_an_endless_collection(self) -> None:
+        assert "more than 5" in refusal(lambda: check_items("problems", itertools.count(), int, "numbers", at_most=5))
+
+    @pytest.mark.parametrize("value", ["", "\0", "x" * 300, "\ud800", b"a", None, 3, Raising()])
+    def test_what_is_no_path(self, value: Any) -> None:
+        assert refusal(lambda: check_path("out", value)).startswith("out: got ")
+
+    @pytest.mark.parametrize("value", ["two\nlines", "", "x" * 300, "\0", 3])
+    def test_what_is_no_line_of_text(self, value: Any) -> None:
+        assert refusal(lambda: check_text("title", value)).startswith("title: got ")
+
+    def test_a_function_of_other_arguments(self) -> None:
+        assert "does not take 2" in refusal(lambda: check_function("progress", lambda a: a, "one of two", arguments=2))
+
+    def test_an_excerpt_is_one_short_line(self) -> None:
+        nested: list[Any] = []
+        for _ in range(100_000):
+            nested = [nested]
+        for value in (nested, Raising(), "x\n" * 10**6, 10**10_000, list(range(10**6)), np.zeros((50, 50)), "\x1b[2J"):
+            assert len(excerpt(value)) <= 60
+            assert excerpt(value).isprintable()
+
+    def test_memory_is_that_of_the_machine_and_its_limits(self) -> None:
+        assert memory() > 2**28
+        line = refusal(lambda: check_memory("steps", 2**31, memory() // 2**20))
+        assert line.startswith("steps: got 2147483648, whose arrays would take ")
+        assert "want at most 1048" in line
+
+
+COUNTS = (2**31, 10**20)
+
+
+class TestCounts:
+    """Each has a limit, or is refused where the machine has not the memory."""
+
+    @pytest.mark.parametrize("count", COUNTS)
+    def test_of_solvers(self, count: int, differential_drive: ls.Scenario) -> None:
+        problem = differential_drive.problem
+        assert "steps: got" in refusal(lambda: dataclasses.replace(problem, steps=count))
+        for options in ({"starts": count}, {"threads": count}, {"max_iterations": count}):
+            name = next(iter(options))
+            assert refusal(lambda o=options: lq.smooth(problem, **o)).startswith(f"{name}: got {count}, want a whole")
+
+    @pytest.mark.parametrize("count", COUNTS)
+    def test_of_runs(self, count: int, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
+        plant = differential_drive.plant()
+        assert refusal(lambda: ls.simulate(plant, drive_solution, trials=count)).startswith(f"trials: got {count}, ")
+        assert "16" not in refusal(lambda: ls.simulate(plant, drive_solution, trials=10**8)).split(", want")[1][:3]
+        assert "threads" in refusal(lambda: ls.simulate(plant, drive_solution, threads=count))
+        robot, scene = differential_drive.robot, differential_drive.scene
+        assert "samples" in refusal(lambda: ls.check_plant(robot, scene, samples=count))
+        assert "samples" in refusal(lambda: ls.check_derivatives(robot.dynamics, samples=count))
+
+    @pytest.mark.parametrize("count", COUNTS)
+    @pytest.mark.parametrize("name", ["size", "particles", "moves", "repetitions", "most_levels"])
+    def test_of_splitting(self, name: str, count: int) -> None:
+        options = {"size": 2, name: count}
+        assert refusal(lambda: lq.split(lambda z: z[:, 0], **options)).startswith(f"{name}: got {count}, ")
+
+    def test_of_campaigns(self, tmp_path: Path) -> None:
+        campaign = ls.Campaign(scenario="quadrotor", sweeps={"noise": (ls.ControlNoise(0.1),)}, trials=1)
+        assert "workers" in refusal(lambda: ls.run_campaign(campaign, tmp_path / "a", workers=2**31))
+        assert "trials" in refusal(lambda: dataclasses.replace(campaign, trials=10**20))
+
+    def test_a_control_period_that_the_physics_never_ends(
+        self, differential_drive: ls.Scenario, drive_solution: ls.Solution
+    ) -> None:
+        slow = dataclasses.replace(drive_solution.trajectory, dt=1e9)
+        line = refusal(
+            lambda: ls.simulate(differential_drive.plant(), dataclasses.replace(drive_solution, trajectory=slow))
+        )
+        assert "physics steps" in line
+        # Each period is short enough, and all of them are not.
+        long = dataclasses.replace(drive_solution.trajectory, dt=1e4)
+        line = refusal(
+            lambda: ls.simulate(differential_drive.plant(), dataclasses.replace(drive_solution, trajectory=long))
+        )
+        assert "150 control periods of 10000 s, which are 180000000 physics steps, want at most 100000000" in line
+
+
+class TestDataThatUsersBuild:
+    def test_a_policy(self, drive_solution: ls.Solution) -> None:
+        policy = drive_solution.policy
+        for field, value in (
+            ("dt", 0), ("gain", {"a": 1}), ("gain", policy.gain[:-1]), ("offset", "text"),
+            ("nominal", policy.nominal.T), ("state_coordinates", None), ("gain", np.zeros((0, 2, 3))),
+        ):  # fmt: skip
+            assert refusal(lambda f=field, v=value: dataclasses.replace(policy, **{f: v})).startswith("AffinePolicy: ")
+        assert refusal(lambda: lq.AffinePolicy.__call__(policy, np.zeros(3), "soon")).startswith(
+            "t: got 'soon', want a finite number >= 0"
+        )
+        assert policy(np.zeros(3), 1e300).shape == (2,)  # the last law stays in force
+
+    def test_parts_of_several_problems(self, drive_solution: ls.Solution, quadrotor_solution: ls.Solution) -> None:
+        for field in ("policy", "trajectory", "cost_to_go", "cost_to_come"):
+            other = getattr(quadrotor_solution, field)
+            line = refusal(lambda f=field, o=other: dataclasses.replace(drive_solution, **{f: o}))
+            assert line.startswith("Solution: ")
+
+    def test_a_rollout(self, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
+        rollout = ls.simulate(differential_drive.plant(), drive_solution, frames=False)
+        for field, value in (
+            ("states", rollout.states[:, :-1]), ("clearance", [0.0]), ("radius", "wide"), ("robot", "two\nlines"),
+            ("forces", rollout.forces.transpose(0, 2, 1)), ("contacts", [-1]), ("diverged", [2]), ("seed", 1.5),
+            ("plan", None), ("versions", {"a": 1}), ("disturbances", "wind"),
+        ):  # fmt: skip
+            assert refusal(lambda f=field, v=value: dataclasses.replace(rollout, **{f: v})).startswith("Rollout: ")
+
+    def test_one_that_is_lost_from_the_start_has_a_summary(
+        self, differential_drive: ls.Scenario, drive_solution: ls.Solution
+    ) -> None:
+        rollout = ls.simulate(differential_drive.plant(), drive_solution, frames=False)
+        states = np.full_like(rollout.states, np.nan)
+        lost = dataclasses.replace(rollout, states=states, diverged=np.array([True]))
+        assert "diverged at once" in lost.summary()
+
+    def test_effects(self, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
+        plant = differential_drive.plant()
+        for hook, answer in (
+            ("measure", [1.0]), ("measure", "text"), ("actuate", np.zeros((2, 2))), ("force", None),
+            ("torque", np.zeros(3)), ("begin", np.zeros((1, 4))), ("displaced", np.zeros((1, 2, 3))), ("measure", 1j),
+        ):  # fmt: skip
+            effect = {hook: answer if hook == "displaced" else (lambda *_, answer=answer: answer)}
+            line = refusal(lambda e=effect: of_runs.simulate_effect(plant, drive_solution, **e))
+            assert line.startswith(f"Hooked: {hook}")
+        assert refusal(lambda: ls.Effect(force=3)).startswith("Effect: force: got 3, want a function")  # pyright: ignore
+
+    def test_a_list_of_lists_does_for_an_array(
+        self, differential_drive: ls.Scenario, drive_solution: ls.Solution
+    ) -> None:
+        plant = differential_drive.plant()
+        as_list = of_runs.simulate_effect(plant, drive_solution, measure=lambda step, states: states.tolist())
+        np.testing.assert_array_equal(as_list.states, ls.simulate(plant, drive_solution).states)
+
+    def test_objects_of_the_wrong_kind(self, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
+        plant, problem = differential_drive.plant(), differential_drive.problem
+        for call in (
+            lambda: lq.smooth("problem"), lambda: lq.ilqr([problem]), lambda: lq.simulate(plant, [drive_solution]),
+            lambda: lq.simulate("plant", drive_solution), lambda: lq.simulate(plant, drive_solution, controller="none"),
+            lambda: lq.Feedback(drive_solution), lambda: lq.Replanning("problem", drive_solution, every=1.0),
+            lambda: lq.plot_run("solution", {}, "a.png", world=differential_drive.scene.world),
+            lambda: lq.report("results", "a.html"), lambda: lq.verify_run("run"), lambda: lq.outcomes("run", plant),
+            lambda: lq.render("run", "a.mp4"), lambda: lq.Plant("robot", differential_drive.scene),
+            lambda: lq.save("solution", "a.npz"), lambda: lq.World(["box"]), lambda: lq.preset("light", "plant"),
+            lambda: lq.smooth(problem, start=lambda: 0), lambda: lq.smooth_many(itertools.repeat(3)),
+        ):  # fmt: skip
+            assert ": got " in refusal(call)
+
+    def test_names_are_one_short_line(
+        self, differential_drive: ls.Scenario, drive_solution: ls.Solution, tmp_path: Path
+    ) -> None:
+        rollout, world = lq.simulate(differential_drive.plant(), drive_solution), differential_drive.scene.world
+        path = tmp_path / "run.png"
+        for label in ("x" * 5000, "two\nlines", "", 3):
+            call = lambda name=label: lq.plot_run(drive_solution, {name: rollout}, path, world=world)  # noqa: E731
+            assert refusal(call).startswith("rollouts: label: got ")
+        assert "titles" in refusal(lambda: lq.render(rollout, tmp_path / "a.mp4", titles=["two\nlines"]))
+        assert "sweeps: name" in refusal(lambda: lq.Campaign(scenario="quadrotor", sweeps={"a\nb": ()}))
+        lq.plot_run(drive_solution, {"a run for $5, or $x^": rollout}, path, world=world)
+        assert path.is_file()
+
+
+class TestFunctions:
+    def test_a_cost_of_nothing(self) -> None:
+        line = refusal(lambda: ls.FunctionCost(lambda x, u, p: 0.0, depends_on=[]))
+        assert line.startswith("FunctionCost: depends_on: got none, want a tuple of names")
+
+    @pytest.mark.parametrize("said", ["math.cos(x[0])", "np.cos(x[0])"])
+    def test_functions_of_modules_are_named(self, said: str) -> None:
+        value = f"def value(x, u, t, row, data):\n    return {said}\n\n\n"
+        slope = "def slope(x, u, t, row, data, gradient):\n    gradient[0] += 1.0\n"
+        line = refusal(lambda: ls.Inequalities(value + slope, np.zeros(0), 1, str))
+        assert line == f"Inequalities: source: got {said[:-6]} in line 2, want cos: modules are not at hand"
+        term = value.replace("row, ", "") + slope.replace(
+            "def slope(x, u, t, row, data, gradient)", "def derivatives(x, u, t, data, hessian, gradient)"
+        )
+        assert "want cos" in refusal(lambda: Term(term, np.zeros(0)))
+        ast.parse(value)
+
+    @pytest.mark.parametrize(
+        ("source", "wanted"),
+        [
+            ("x = 1", "want it to define value"), ("def value(", "which is no Python"), (3, "got 3, want text"),
+            ("def value(x):\n    pass\n", "got value of 1 arguments, want 5"), ("import os\n" * 2, "value"),
+        ],
+    )  # fmt: skip
+    def test_sources_that_are_none(self, source: Any, wanted: str) -> None:
+        assert wanted in refusal(lambda: ls.Inequalities(source, np.zeros(0), 1, str))
+
+    def test_what_a_function_of_ones_own_raises_is_its_own(self, differential_drive: ls.Scenario) -> None:
+        class Mine(Exception):
+            pass
+
+        def callback(iteration: ls.Iteration) -> None:
+            raise Mine
+
+        with pytest.raises(Mine):
+            ls.smooth(differential_drive.problem, starts=1, callback=callback)
+
+
+def test_a_robot_at_rest_has_a_state() -> None:
+    """A single configuration, not a batch of them, of a quadrotor that is not turned."""
+    robot = ls.Quadrotor()
+    np.testing.assert_array_equal(robot.state(*robot.configuration(np.zeros(12))), np.zeros(12))
+
+
+@pytest.mark.parametrize("robot", [ls.Quadrotor, ls.DifferentialDrive])
+def test_robots_have_lengths_and_masses(robot: type) -> None:
+    for field in dataclasses.fields(robot):
+        for value in (-1.0, math.nan, "heavy"):
+            assert refusal(lambda f=field, v=value: robot(**{f.name: v})).startswith(
+                f"{robot.name}: {field.name}: got "
+            )
