@@ -23,6 +23,7 @@ from lqrsim.files import replacing
 
 LIMIT = 256 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about one megabyte
 _SUFFIX = ".item"
+_DURATIONS = "durations.json"
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,26 @@ def save(name: str, contents: bytes, what: str) -> None:
         _shrink()
 
 
+def note(name: str, seconds: float) -> None:
+    """Keep how long something took on this machine, if that is possible; the last time counts."""
+    with contextlib.suppress(OSError, InputError, ValueError), replacing(folder() / _DURATIONS) as unfinished:
+        unfinished.write_text(json.dumps(_durations() | {name: seconds}), encoding="utf-8")
+
+
+def noted(name: str) -> float | None:
+    """How many seconds that took the last time; None if that is not known."""
+    seconds = _durations().get(name)
+    return seconds if isinstance(seconds, float) and 0 < seconds < 1e5 else None
+
+
+def _durations() -> dict[str, object]:
+    try:
+        found = json.loads((folder() / _DURATIONS).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def items() -> list[Item]:
     """What there is, the last used first."""
     found = []
@@ -95,6 +116,8 @@ def clear() -> int:
     removed = items()
     for path in [*(item.path for item in removed), *_unfinished(0.0)]:
         path.unlink(missing_ok=True)
+    with contextlib.suppress(NotADirectoryError):
+        (folder() / _DURATIONS).unlink(missing_ok=True)
     return len(removed)
 
 

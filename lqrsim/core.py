@@ -11,6 +11,7 @@ import logging
 import platform
 import re
 import threading
+import time
 from collections.abc import Callable, Iterator
 from functools import cache
 from importlib.metadata import version
@@ -82,10 +83,15 @@ class Core:
             compilations.append(what)
             # A warning is what a script shows that has not set up logging, and half a minute of silence is worse.
             log = logger.warning if name in LONG else logger.debug
-            log(f"compiling {what}: some 10 seconds, once for this kind of problem ...")
+            last = disk.noted(name)
+            took = "which can take a minute" if last is None else f"which took {last:.0f} s the last time"
+            log(f"compiling {what}, once for this kind of problem, {took} ...")
+            clock = time.perf_counter()
             namespace.update(self._namespace())
             with _uncollected(), _as_one():
                 dispatcher.compile(_signature(kinds))
+            if name in LONG:
+                disk.note(name, time.perf_counter() - clock)
             if _lasting(dispatcher):
                 _keep(key, dispatcher, what)
         dispatcher.disable_compile()

@@ -4,6 +4,7 @@ What must be so of any plan, whatever the status; what a success claims besides;
 """
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 import lqrsim as ls
 from lqrsim.costs import terms_of
@@ -51,7 +52,9 @@ def _of_any_plan(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | No
     if not residual < MOTION * max(1.0, float(np.abs(plan.states).max())):
         found.append(f"a state is {residual:.2g} off the dynamics")
     # Of a cost of zero, squares of rounding errors remain, each weighed by what the problem weighs it with.
-    if not abs(cost - solution.cost) <= COST * abs(cost) + 1e-20 * _size(problem, plan):
+    # Where one is beyond all numbers, so is the other, but for what overflows on the way.
+    beyond = not abs(cost) < 1e250 and not abs(solution.cost) < 1e250
+    if not (beyond or abs(cost - solution.cost) <= COST * abs(cost) + 1e-20 * _size(problem, plan)):
         found.append(f"costs {cost:.9g}, not {solution.cost:.9g}")
     violation = _violation(problem, plan)
     if not abs(violation - solution.violation) <= 1e-9:
@@ -117,8 +120,8 @@ def _violation(problem: ls.Problem, plan: ls.Trajectory) -> float:
 def _decrease(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | None) -> float:
     """`1/2 sum e' H^-1 e`: with the slopes e of the Lagrangian in the offsets of the policy, later controls responding.
 
-    H is the curvature of the cost in one offset, all others held. A control at a limit that would go beyond it does not
-    count, and does not respond. Multipliers are the solution's.
+    H is the curvature of the cost in one offset, all others held. Controls go no further than their limits, and at one
+    they do not respond. Multipliers are the solution's.
     """
     plan, gain = solution.trajectory, solution.policy.gain
     n, m = plan.states.shape[1], plan.controls.shape[1]
@@ -138,11 +141,8 @@ def _decrease(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | None)
     for t in range(len(A) - 1, -1, -1):
         slope = gradient[t, n:] + B[t].T @ costate
         u, H = plan.controls[t], hessian[t, n:, n:] + B[t].T @ curve @ B[t]
-        counts = ~(((u == low) & (slope >= 0)) | ((u == high) & (slope <= 0)))
         free = (u > low) & (u < high)
-        if counts.any():
-            e = slope[counts]
-            total += 0.5 * float(e @ np.linalg.pinv(H[np.ix_(counts, counts)], hermitian=True) @ e)
+        total += _least_within(H, slope, low - u, high - u)
         law = np.where(free[:, None], gain[t], 0.0)
         closed, both = A[t] + B[t] @ law, np.vstack([np.eye(n), law])
         costate = closed.T @ costate + both.T @ gradient[t] + pull[t]
@@ -153,3 +153,14 @@ def _decrease(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | None)
         total += 0.5 * float(e @ np.linalg.pinv(own[0] + curve, hermitian=True) @ e)
     assert m == len(low)
     return total
+
+
+def _least_within(H: Array, slope: Array, low: Array, high: Array) -> float:
+    """By how much `1/2 x'Hx + slope'x` can be lowered within a box about zero. SciPy's bounded least squares."""
+    step = -np.linalg.pinv(H, hermitian=True) @ slope
+    if not ((low <= step) & (step <= high)).all():
+        values, vectors = np.linalg.eigh(H)
+        root = np.sqrt(np.maximum(values, 1e-14 * values.max()))[:, None] * vectors.T  # H = root' root
+        low, high = np.minimum(low, -1e-300), np.maximum(high, 1e-300)  # it takes no empty box
+        step = lsq_linear(root, -np.linalg.solve(root.T, slope), bounds=(low, high), tol=1e-12).x
+    return max(0.0, -float(0.5 * step @ H @ step + slope @ step))

@@ -51,7 +51,16 @@ def world() -> ls.World:
     )
 
 
-def problem(start: Any, goal: Any, *, steps: int = 200, clearance: bool = True) -> ls.Problem:
+def problem(
+    start: Any,
+    goal: Any,
+    *,
+    steps: int = 200,
+    clearance: bool = True,
+    effort: float = 1.0,
+    weight: float = 500.0,
+    sharpness: float = 20.0,
+) -> ls.Problem:
     """From rest to rest. `start` and `goal` are places (2,) in metres."""
     hover = MASS * GRAVITY / 2
     obstacles = world()
@@ -60,9 +69,9 @@ def problem(start: Any, goal: Any, *, steps: int = 200, clearance: bool = True) 
         dt=DT,
         steps=steps,
         initial=ls.FixedState([*start, 0.0, 0.0, 0.0, 0.0]),
-        stage_cost=ls.ControlCost((1.0, 1.0), about=(hover, hover))
-        + ls.ObstacleCost(obstacles, radius=RADIUS, sharpness=20.0),
-        final_cost=ls.QuadraticCost(np.full(6, 500.0), about=[*goal, 0.0, 0.0, 0.0, 0.0]),
+        stage_cost=ls.ControlCost((effort, effort), about=(hover, hover))
+        + ls.ObstacleCost(obstacles, radius=RADIUS, sharpness=sharpness),
+        final_cost=ls.QuadraticCost(np.full(6, weight), about=[*goal, 0.0, 0.0, 0.0, 0.0]),
         constraints=[ls.Clearance(obstacles, radius=RADIUS, margin=MARGIN)] if clearance else [],
     )
 

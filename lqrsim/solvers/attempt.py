@@ -9,7 +9,7 @@ from lqrsim.errors import Array
 from lqrsim.problem import Problem
 from lqrsim.results import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers import interface
-from lqrsim.solvers.certify import REST, certificate_of, faults
+from lqrsim.solvers.certify import certified
 from lqrsim.solvers.common import LOG_COLUMNS, Callback, Ending, SmootherSettings, Stop, check_outcome, iterate
 from lqrsim.solvers.start import Start
 from lqrsim.solvers.workspace import Workspace
@@ -224,21 +224,16 @@ class Attempt:
 
     def certified(self, found: Found) -> Found:
         """With its certificate; a success that fails it is none."""
-        log = np.zeros((1, LOG_COLUMNS))
-        self._loop(*self._certificate_arguments(found, log))
         violation = self._violation_of((found.states, found.controls))
-        certificate = certificate_of(self.problem, log[0], found.states, violation=violation)
-        if "cost_to_go" not in found.values:
-            certificate = replace(certificate, optimality=np.inf)
-        found = replace(found, certificate=certificate, cost=certificate.cost, violation=violation)
-        if not np.isfinite(found.cost):
-            found = replace(found, cost=np.inf)
-        if not found.success:
-            return found
-        wrong = faults(
-            certificate, claimed=found.iterations[-1].cost, rest=REST * float(log[0, 1]),
+        value = found.values.get("cost_to_go")
+        certificate, wrong = certified(
+            self.problem, lambda task, hessians, out: self._loop(*self._check_arguments(task, found, hessians, out)),
+            found.states, None if value is None else value.hessian, violation=violation,
+            claimed=found.iterations[-1].cost if found.success else None,
             tolerance=self.settings.tolerance if found.status is Status.CONVERGED else None,
         )  # fmt: skip
+        cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
+        found = replace(found, certificate=certificate, cost=cost, violation=violation)
         if not wrong:
             return found
         return replace(found, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
@@ -301,12 +296,14 @@ class Attempt:
             *work.guess, *work.plan, *trial, *work.kept, work.memory, log,
         )  # fmt: skip
 
-    def _certificate_arguments(self, found: Found, log: Array) -> tuple[Any, ...]:
+    def _check_arguments(self, task: int, found: Found, hessians: Array, log: Array) -> tuple[Any, ...]:
+        """What it takes to certify a plan and its policy, with these Hessians of a cost-to-go."""
         settings, work = self.settings, self.work
+        start, x_hat, x_hats, L, l, _, *rest = work.passes
         return (
-            interface.CERTIFY, self.problem.steps, 0, 0, 0, settings.tolerance, settings.gap_tolerance, True,
-            work.fixed, False, *work.passes, work.eased(1.0), *work.no_prior, 0, *work.guess, *work.plan,
-            found.states, found.controls, *found.law, work.memory, log,
+            task, self.problem.steps, 0, 0, 0, settings.tolerance, settings.gap_tolerance, True,
+            work.fixed, False, start, x_hat, x_hats, L, l, hessians, *rest, work.eased(1.0), *work.no_prior, 0,
+            *work.guess, *work.plan, found.states, found.controls, *found.law, work.memory, log,
         )  # fmt: skip
 
     def _share(self, iteration: int) -> float:

@@ -4,6 +4,8 @@ Nothing of the passes, rollouts and line searches that found the plan is used: o
 derivatives, and a Cholesky factor. `certify.py` compares with what a solver claims.
 """
 
+from math import nan
+
 from lqrsim.integration import step_jacobian
 from lqrsim.solvers.interface import (
     LIMITS,
@@ -21,7 +23,7 @@ from lqrsim.solvers.interface import (
 from lqrsim.solvers.kernels import cholesky, cholesky_solve, clear
 
 
-def certify(steps, fixed, states, controls, gain, offset, hessians, p, dt, initial, stage, final, found):
+def certify(steps, fixed, own, states, controls, gain, offset, hessians, p, dt, initial, stage, final, found):
     """Write to `found` (6,): cost, its scale, motion, law, limits, and the decrease of cost that is still promised.
 
     The scale is what the curved part of the cost would be if nothing in it cancelled: rounding is a share of it.
@@ -31,13 +33,16 @@ def certify(steps, fixed, states, controls, gain, offset, hessians, p, dt, initi
 
     The promised decrease is `1/2 sum e' E^-1 e` with the slopes e of the cost in the offsets of the policy, later
     controls responding with its gains, and E = R + B'SB with the Hessians S (T+1, N, N) of the cost-to-go. It is what
-    a Riccati pass predicts where the gains are that pass's, about the plan. Controls at a limit that would go beyond it
-    do not count. The cost includes no augmented Lagrangian, the decrease does.
+    a Riccati pass predicts where the gains are that pass's, about the plan. Controls go no further than their limits.
+    With `own`, the Hessians are worked out here, of the policy as it is with controls at their limits, and written to
+    `hessians`: those of a Riccati pass take controls to respond that cannot. The cost includes no augmented Lagrangian,
+    the decrease does.
     """
     hessian, gradient, jacobian = stack(W, W), stack(W), stack(N, W)
     fx, fu, arrived, none = stack(N, N), stack(N, M), stack(N), stack(M)
     ahead, costate, size, beyond = stack(N), stack(N), stack(N), stack(N)
     slope, curve, factor, moved = stack(M), stack(M, N), stack(M, M), stack(M)
+    lowest, highest, response = stack(M), stack(M), stack(M, N)
     start_factor = stack(N, N)
     clear(fx, N, N)
     clear(fu, N, M)
@@ -55,6 +60,8 @@ def certify(steps, fixed, states, controls, gain, offset, hessians, p, dt, initi
         costate[i] = gradient[i]
         for j in range(N):
             scale += 0.5 * abs(states[steps, i] * hessian[i, j] * states[steps, j])
+            if own:
+                hessians[steps, i, j] = hessian[i, j]
     for t in range(steps - 1, -1, -1):
         x, u = states[t], controls[t]
         cost += stage_value(x, u, t, stage)
@@ -97,19 +104,16 @@ def certify(steps, fixed, states, controls, gain, offset, hessians, p, dt, initi
                 ahead[i] += jacobian[j, i] * costate[j]
         for i in range(M):
             low, high = stage[LIMITS][i], stage[LIMITS][M + i]
-            at_limit = u[i] == low or u[i] == high
-            if (u[i] == low and slope[i] >= 0) or (u[i] == high and slope[i] <= 0):
-                for j in range(M):
-                    factor[i, j] = factor[j, i] = 0.0
-                factor[i, i], slope[i] = 1.0, 0.0
-            if not at_limit:  # at a limit a control does not respond
+            if low < u[i] < high:  # at a limit a control does not respond
                 for j in range(N):
                     ahead[j] += gain[t, i, j] * slope[i]
-            moved[i] = slope[i]
-        good = cholesky(factor, M)
-        cholesky_solve(factor, M, moved)
-        for i in range(M):
-            decrease += 0.5 * slope[i] * moved[i] if good else abs(slope[i]) * 1e300
+            lowest[i], highest[i] = low - u[i], high - u[i]
+        decrease += within_box(factor, slope, lowest, highest, moved)
+        if own:
+            for i in range(M):
+                for j in range(N):
+                    response[i, j] = gain[t, i, j] if lowest[i] < 0 < highest[i] else 0.0
+            closed_loop_hessian(jacobian, hessian, response, hessians[t + 1], hessians[t])
         for i in range(N):
             costate[i] = ahead[i]
     if not fixed:
@@ -131,3 +135,70 @@ def certify(steps, fixed, states, controls, gain, offset, hessians, p, dt, initi
         if not beyond[i] <= motion * size[i]:
             motion = beyond[i] / size[i]
     found[0], found[1], found[2], found[3], found[4], found[5] = cost, scale, motion, law, limits, decrease
+
+
+def closed_loop_hessian(jacobian, cost, gain, ahead, out):
+    """Write the Hessian of what the policy costs from here on, given that from the next step on."""
+    closed, both, product = stack(N, N), stack(W, N), stack(W, N)
+    for j in range(N):
+        for i in range(N):
+            both[i, j] = 1.0 if i == j else 0.0
+            closed[i, j] = jacobian[i, j]
+            for k in range(M):
+                closed[i, j] += jacobian[i, N + k] * gain[k, j]
+        for i in range(M):
+            both[N + i, j] = gain[i, j]
+    for i in range(W):
+        for j in range(N):
+            product[i, j] = 0.0
+            for k in range(W):
+                product[i, j] += cost[i, k] * both[k, j]
+    for i in range(N):
+        for j in range(N):
+            out[i, j] = 0.0
+            for k in range(W):
+                out[i, j] += both[k, i] * product[k, j]
+    for i in range(N):
+        for j in range(N):
+            product[i, j] = 0.0
+            for k in range(N):
+                product[i, j] += ahead[i, k] * closed[k, j]
+    for i in range(N):
+        for j in range(N):
+            for k in range(N):
+                out[i, j] += closed[k, i] * product[k, j]
+
+
+def within_box(matrix, slope, lowest, highest, best):
+    """The decrease of `1/2 x'E x + e'x` at its minimiser `best` (M,) within a box about zero; NaN unless E > 0."""
+    factor = stack(M, M)
+    inside = True
+    for i in range(M):
+        best[i] = -slope[i]
+        for j in range(M):
+            factor[i, j] = matrix[i, j]
+    if not cholesky(factor, M):
+        return nan
+    cholesky_solve(factor, M, best)
+    for i in range(M):
+        inside = inside and lowest[i] <= best[i] <= highest[i]
+    if not inside:  # one entry after the other, until none moves
+        for i in range(M):
+            best[i] = 0.0
+        for _ in range(1000):
+            moved, size = 0.0, 0.0
+            for i in range(M):
+                left = slope[i]
+                for j in range(M):
+                    left += matrix[i, j] * best[j]
+                new = min(max(best[i] - left / matrix[i, i], lowest[i]), highest[i])
+                moved, size = max(moved, abs(new - best[i])), max(size, abs(new))
+                best[i] = new
+            if not moved > 1e-12 * size:
+                break
+    decrease = 0.0
+    for i in range(M):
+        decrease -= slope[i] * best[i]
+        for j in range(M):
+            decrease -= 0.5 * best[i] * matrix[i, j] * best[j]
+    return decrease

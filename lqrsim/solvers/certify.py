@@ -3,11 +3,15 @@
 `certificate.py` works the numbers out, on a path of its own; here they are held against what is claimed.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.problem import FixedState, Problem
 from lqrsim.results import Certificate
+from lqrsim.solvers import interface
 
 # What rounding may do. A policy's control is a sum of a few terms, and a step of the dynamics some hundred operations,
 # of which one amplifies what another has rounded.
@@ -17,6 +21,44 @@ REST = 1e-13
 # The optimality is worked out otherwise than by the method, with gains and Hessians about states that are within the
 # gap's tolerance of the plan: it may come out a little larger.
 SLACK = 2.0
+
+
+Work = Callable[[int, Array, Array], object]
+
+
+def certified(
+    problem: Problem,
+    work: Work,
+    states: Array,
+    hessians: Array | None,
+    *,
+    violation: float,
+    claimed: float | None,
+    tolerance: float | None,
+) -> tuple[Certificate, str]:
+    """The certificate of a plan, and what of it contradicts a solver that says it converged.
+
+    Args:
+      work: runs the compiled `certify`: of a task, Hessians (T+1, n, n) of the cost-to-go, and where to write (1, 6).
+      states: (T+1, n) of the plan. hessians: None where there are none.
+      violation: by how much the worst constraint is missed.
+      claimed: the cost that the log ends with; None where success is not claimed, and nothing can contradict it.
+      tolerance: of the optimality; None where only the cost was asked for.
+    """
+    numbers, n = np.zeros((1, 6)), states.shape[1]
+    given = np.zeros((len(states), n, n)) if hessians is None else hessians
+    work(interface.CERTIFY, given, numbers)
+    certificate = certificate_of(problem, numbers[0], states, violation=violation)
+    if hessians is None:
+        certificate = replace(certificate, optimality=np.inf)
+    if claimed is None:
+        return certificate, ""
+    if tolerance is not None and not certificate.optimality < SLACK * tolerance:
+        # Where controls stand at their limits, the Hessians of the Riccati pass are not those of the policy.
+        work(interface.EVALUATE, np.zeros_like(given), numbers)
+        certificate = certificate_of(problem, numbers[0], states, violation=violation)
+    rest = REST * float(numbers[0, 1])
+    return certificate, faults(certificate, claimed=claimed, rest=rest, tolerance=tolerance)
 
 
 def certificate_of(problem: Problem, found: Array, states: Array, *, violation: float) -> Certificate:

@@ -4,7 +4,7 @@ All that a solve can need is compiled at once, before it begins, and what its pa
 """
 
 from lqrsim.solvers.certificate import certify
-from lqrsim.solvers.interface import CERTIFY, DAMP
+from lqrsim.solvers.interface import CERTIFY, DAMP, EVALUATE
 from lqrsim.solvers.loops import ilqr_iterations, smoother_iterations
 from lqrsim.solvers.safeguard import damped_iterations
 
@@ -15,9 +15,13 @@ def smoother(
     eased, prior_weight, prior_about, prior_iterations, guess_x, guess_u, plan_x, plan_u,
     states, controls, kept_L, kept_l, memory, log,
 ):  # fmt: skip
-    """Undamped or damped iterations; or the certificate of `states`, `controls`, `kept_L` and `kept_l`, in log[0]."""
-    if task == CERTIFY:
-        certify(steps, fixed, states, controls, kept_L, kept_l, S, p, dt, initial, stage, final, log[0])
+    """Undamped or damped iterations; or the certificate of `states`, `controls`, `kept_L` and `kept_l`, in log[0].
+
+    To evaluate is to certify with Hessians of the policy's own, which take the place of S.
+    """
+    if task >= CERTIFY:
+        own = task == EVALUATE
+        certify(steps, fixed, own, states, controls, kept_L, kept_l, S, p, dt, initial, stage, final, log[0])
         return 0, 0, False, -1
     if task == DAMP:
         return damped_iterations(
@@ -38,9 +42,10 @@ def ilqr(
     x0, L, l, S, s, k, p, dt, initial, stage, final,
     states, controls, new_states, new_controls, damping, log,
 ):  # fmt: skip
-    """Iterations of iLQR; or the certificate of `states`, `controls`, `L` and `l`, in log[0]."""
-    if task == CERTIFY:
-        certify(steps, True, states, controls, L, l, S, p, dt, initial, stage, final, log[0])
+    """Iterations of iLQR; or the certificate of `states`, `controls`, `L` and `l`, in log[0]; see `smoother`."""
+    if task >= CERTIFY:
+        own = task == EVALUATE
+        certify(steps, True, own, states, controls, L, l, S, p, dt, initial, stage, final, log[0])
         return 0, 0, False, -1
     return ilqr_iterations(
         steps, first, last, max_iterations, tolerance, optimal,

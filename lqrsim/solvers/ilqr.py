@@ -6,11 +6,11 @@ import numpy as np
 
 from lqrsim import compiled
 from lqrsim.checks import check_functions
-from lqrsim.errors import InputError
+from lqrsim.errors import Array, InputError
 from lqrsim.problem import Problem
 from lqrsim.results import Solution, Status
 from lqrsim.solvers import interface
-from lqrsim.solvers.certify import REST, certificate_of, faults
+from lqrsim.solvers.certify import certified
 from lqrsim.solvers.common import (
     LOG_COLUMNS,
     Callback,
@@ -138,15 +138,18 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     if not whole:
         L[:] = 0  # without a pass about the trajectory there is no feedback; what is left is to play the controls
     offset = controls - np.einsum("tij,tj->ti", L, states[:-1]) if whole else controls.copy()
-    numbers = np.zeros((1, LOG_COLUMNS))
-    loop(interface.CERTIFY, steps, 0, 0, *options, start, L, offset, *arrays[3:-1], numbers)
-    certificate = certificate_of(problem, numbers[0], states, violation=0.0)
     status, detail = ending.status, ending.detail(problem.steps)
-    if status.success:
-        tolerance = settings.tolerance if status is Status.CONVERGED else None
-        rest = REST * numbers[0, 1]
-        if wrong := faults(certificate, claimed=ending.iterations[-1].cost, rest=rest, tolerance=tolerance):
-            status, detail = Status.NOT_CERTIFIED, f"of the plan that converged: {wrong}"
+
+    def work(task: int, hessians: Array, out: Array) -> None:
+        loop(task, steps, 0, 0, *options, start, L, offset, hessians, *arrays[4:-1], out)
+
+    certificate, wrong = certified(
+        problem, work, states, go[0] if whole else None, violation=0.0,
+        claimed=ending.iterations[-1].cost if status.success else None,
+        tolerance=settings.tolerance if status is Status.CONVERGED else None,
+    )  # fmt: skip
+    if wrong:
+        status, detail = Status.NOT_CERTIFIED, f"of the plan that converged: {wrong}"
     solution = assemble(
         problem, solver="ilqr", options=settings.options(begin), status=status, detail=detail,
         iterations=ending.iterations, states=states, controls=controls, law=(L, offset), certificate=certificate,

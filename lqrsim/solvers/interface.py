@@ -27,7 +27,7 @@ NO_FALL, SLOW_FALL = 12, 30
 HEADER = 4  # numbers that come before the multipliers; see `augmented.py`
 
 # What an entry is to do; see `entries.py`.
-ITERATE, DAMP, CERTIFY = 0, 1, 2
+ITERATE, DAMP, CERTIFY, EVALUATE = 0, 1, 2, 3
 
 # What an iteration was; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3

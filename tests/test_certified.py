@@ -1,0 +1,221 @@
+"""What a solve may say, and when it ends: certificates, limits of iterations and time, exceptions on the way."""
+
+import dataclasses
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from whole_problems import planar_quadrotor
+from whole_problems.claims import contradictions
+
+import lqrsim as ls
+from lqrsim import core
+from lqrsim.results import Certificate, Iteration, Status
+from lqrsim.solvers import certify
+from lqrsim.solvers.certify import faults
+
+pytestmark = pytest.mark.timeout(900)  # what is not cached is compiled first
+
+GOOD = Certificate(cost=36.0, start=0.0, motion=1e-15, law=1e-15, limits=0.0, violation=0.0, optimality=1e-6)
+
+
+class TestCertificate:
+    @pytest.mark.parametrize(
+        ("field", "value", "says"),
+        [
+            ("start", 1e-15, "begins 1e-15 off the fixed start"),
+            ("motion", 1e-7, "1e-07 off the dynamics"),
+            ("law", 1e-10, "1e-10 off the policy's"),
+            ("limits", 1e-15, "1e-15 beyond its limit"),
+            ("violation", 1e-15, "a constraint is missed by 1e-15"),
+            ("cost", 36.00001, "it costs 36.00001, not 36"),
+            ("optimality", 3e-4, "its optimality is 0.0003, not below 0.0001"),
+            ("motion", float("nan"), "nan off the dynamics"),
+            ("optimality", float("nan"), "its optimality is nan"),
+        ],
+    )
+    def test_each_of_its_numbers_can_fail(self, field: str, value: float, says: str) -> None:
+        assert faults(GOOD, claimed=36.0, rest=0.0, tolerance=1e-4) == ""
+        bad = dataclasses.replace(GOOD, **{field: value})
+        assert says in faults(bad, claimed=36.0, rest=0.0, tolerance=1e-4)
+
+    @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+    def test_a_plan_that_fails_it_is_no_success(
+        self, monkeypatch: pytest.MonkeyPatch, drive: ls.Problem, solver
+    ) -> None:
+        """A fault is injected between the method and its certificate: the policy is another one."""
+        assert solver(drive).status is Status.CONVERGED
+        honest = certify.certificate_of
+
+        def spoilt(*arguments: Any, **named: Any) -> Certificate:
+            return dataclasses.replace(honest(*arguments, **named), law=1e-6)
+
+        monkeypatch.setattr(certify, "certificate_of", spoilt)
+        solution = solver(drive)
+        assert solution.status is Status.NOT_CERTIFIED
+        assert not solution.success
+        assert "its controls are 1e-06 off the policy's" in solution.detail
+        assert solution.status.remedy in solution.summary()
+
+    def test_its_numbers_are_those_of_the_plan(self, drive: ls.Problem) -> None:
+        """Cost and motion against plain Python: the dynamics' own step, and the terms of the cost summed up."""
+        solution = ls.smooth(drive)
+        plan = solution.trajectory
+        steps = [drive.dynamics.step(x, u, drive.dt) for x, u in zip(plan.states[:-1], plan.controls, strict=True)]
+        np.testing.assert_allclose(steps, plan.states[1:], atol=1e-12)
+        assert solution.certificate.motion < 1e-12
+        assert solution.certificate.optimality == pytest.approx(solution.iterations[-1].optimality, rel=0.05)
+        assert contradictions(drive, solution) == []
+
+
+@pytest.fixture(scope="module")
+def drive() -> ls.Problem:
+    problem = ls.scenarios.differential_drive().problem
+    assert problem.start is not None
+    return dataclasses.replace(problem, initial=ls.FixedState(problem.start))
+
+
+class TestPlanarQuadrotor:
+    """A robot of somebody's own, on which solves once said what was not so."""
+
+    def test_a_fixed_start_is_kept(self) -> None:
+        """After a damped phase, the iterations with the constraint began where the forward pass had ended."""
+        problem = planar_quadrotor.problem(
+            (-1.42, 0.16), (1.94, 0.04), steps=257, effort=10.0, weight=1000.0, sharpness=20.0
+        )
+        solution = ls.smooth(problem)
+        np.testing.assert_array_equal(solution.trajectory.states[0], problem.start)
+        assert solution.status is Status.CONVERGED
+        assert contradictions(problem, solution) == []
+
+    def test_where_the_search_ends_before_the_wall_another_way_is_found(self) -> None:
+        """The seven starts end 2.3 m short of the goal, at a cost of 1,362; over the wall it costs a twentieth."""
+        problem = planar_quadrotor.problem(
+            (-1.02, 0.62), (1.92, 0.63), steps=247, effort=10.0, weight=500.0, sharpness=5.0
+        )
+        short = ls.smooth(problem, starts=7)
+        solution = ls.smooth(problem)
+        for one in (short, solution):
+            assert one.status is Status.CONVERGED
+            assert contradictions(problem, one) == []
+        assert short.cost > 1000
+        assert solution.cost < short.cost / 10
+        assert np.linalg.norm(solution.trajectory.states[-1][:2] - (1.92, 0.63)) < planar_quadrotor.RADIUS
+        assert "times the weight of obstacles and goal" in solution.summary()
+
+    def test_what_does_not_get_anywhere_hands_over(self) -> None:
+        """Undamped, it swings about until the limit of 500 iterations comes."""
+        problem = planar_quadrotor.problem((-1.42, 0.16), (1.94, 0.04), steps=257, clearance=False, effort=10.0)
+        bare = ls.smooth(problem, safeguard=False)
+        assert bare.status is Status.MAX_ITERATIONS
+        solution = ls.smooth(problem)
+        assert solution.status is Status.CONVERGED
+        assert len(solution.iterations) < 100
+
+
+class TestLimits:
+    @pytest.mark.parametrize("most", [1, 2, 3, 10, 60])
+    @pytest.mark.parametrize("clearance", [False, True])
+    def test_max_iterations_bounds_all_of_them(self, most: int, clearance: bool) -> None:
+        problem = planar_quadrotor.problem(
+            (-1.42, 0.16), (1.94, 0.04), steps=257, clearance=clearance, effort=10.0, weight=1000.0
+        )
+        solution = ls.smooth(problem, max_iterations=most)
+        assert len(solution.iterations) <= most
+        assert contradictions(problem, solution) == []
+        if not solution.success:
+            assert solution.status in (Status.MAX_ITERATIONS, Status.INFEASIBLE)
+
+    def test_a_slack_constraint_behind_a_solve_that_fails_ends(self) -> None:
+        """Once it called itself until Python gave up."""
+        scenario = ls.scenarios.quadrotor()
+        slack = ls.Clearance(scenario.scene.world, radius=scenario.robot.radius, margin=-1.0)
+        problem = dataclasses.replace(scenario.problem, constraints=[slack])
+        solution = ls.smooth(problem, max_iterations=3)
+        assert solution.status is Status.MAX_ITERATIONS
+        assert len(solution.iterations) <= 3
+
+    @pytest.mark.parametrize("clearance", [False, True])
+    def test_the_cost_is_that_of_the_plan_when_the_iterations_run_out(self, clearance: bool) -> None:
+        for most in range(4, 40, 3):
+            problem = planar_quadrotor.problem((-1.42, 0.16), (1.94, 0.04), clearance=clearance, effort=10.0)
+            solution = ls.smooth(problem, max_iterations=most, starts=1)
+            assert contradictions(problem, solution) == []
+
+    @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+    def test_the_time_limit_leaves_the_best_plan(self, drive: ls.Problem, solver) -> None:
+        solver(drive)  # so that everything is compiled
+        solution = solver(drive, time_limit=1e-9)
+        assert solution.status is Status.TIME_LIMIT
+        assert solution.iterations == ()
+        assert contradictions(drive, solution) == []
+        # The clock stops in the third iteration.
+        late = solver(drive, start=drive.nominal_control, time_limit=0.5, callback=Sleepy(0.3))
+        assert late.status is Status.TIME_LIMIT
+        assert 1 <= len(late.iterations) <= 2
+        assert late.cost <= min(iteration.cost for iteration in late.iterations) * (1 + 1e-12)
+        assert contradictions(drive, late) == []
+
+    @pytest.mark.parametrize("bad", [0, -1, "1", float("nan"), float("inf")])
+    def test_a_time_limit_is_a_number_of_seconds(self, drive: ls.Problem, bad: object) -> None:
+        for solver in (ls.smooth, ls.ilqr):
+            with pytest.raises(ls.InputError, match="time_limit: got"):
+                solver(drive, time_limit=bad)
+
+
+class Sleepy:
+    """A callback that takes its time, so that a limit of time is met however fast the machine is."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+
+    def __call__(self, iteration: Iteration) -> None:
+        time.sleep(self.seconds)
+
+
+class TestExceptionsOnTheWay:
+    @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+    @pytest.mark.parametrize("error", [RuntimeError("enough"), KeyboardInterrupt()])
+    def test_what_the_callback_raises_has_the_plan(self, drive: ls.Problem, solver, error: BaseException) -> None:
+        seen: list[Iteration] = []
+
+        def callback(iteration: Iteration) -> None:
+            seen.append(iteration)
+            if len(seen) == 3:
+                raise error
+
+        with pytest.raises(type(error)) as caught:
+            solver(drive, start=drive.nominal_control, callback=callback)
+        solution = caught.value.solution  # pyright: ignore[reportAttributeAccessIssue]
+        assert solution.status is Status.INTERRUPTED
+        assert len(solution.iterations) == 3
+        assert solution.cost <= min(iteration.cost for iteration in seen) * (1 + 1e-12)
+        assert contradictions(drive, solution) == []
+
+    @pytest.mark.parametrize("when", [1, 5, 20, 40])
+    def test_with_constraints_too(self, when: int) -> None:
+        problem = planar_quadrotor.problem((-1.42, 0.16), (1.94, 0.04), steps=257, effort=10.0, weight=1000.0)
+        seen: list[Iteration] = []
+
+        def callback(iteration: Iteration) -> None:
+            seen.append(iteration)
+            if len(seen) == when:
+                raise RuntimeError("enough")
+
+        with pytest.raises(RuntimeError, match="enough") as caught:
+            ls.smooth(problem, callback=callback)
+        solution = caught.value.solution  # pyright: ignore[reportAttributeAccessIssue]
+        assert solution.status is Status.INTERRUPTED
+        assert contradictions(problem, solution) == []
+
+
+def test_nothing_is_compiled_in_mid_solve() -> None:
+    """The damped iterations once were, where the first solve came to need them."""
+    easy = planar_quadrotor.problem((-1.2, 0.1), (1.6, 0.3), steps=150)
+    ls.smooth(easy)
+    before = len(core.compilations)
+    hard = planar_quadrotor.problem((-1.42, 0.16), (1.94, 0.04), steps=257, effort=10.0, weight=1000.0)
+    solution = ls.smooth(hard)
+    assert "damped" in {iteration.method for iteration in solution.iterations}
+    assert core.compilations[before:] == []
