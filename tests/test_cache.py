@@ -111,7 +111,7 @@ def test_a_cache_that_can_only_be_read_is_read(monkeypatch: pytest.MonkeyPatch, 
         raise PermissionError("read-only")
 
     monkeypatch.setattr(os, "utime", refuse)
-    monkeypatch.setattr("tempfile.mkstemp", refuse)
+    monkeypatch.setattr(Path, "touch", refuse)
     cache.save("lost", b"contents", "a test")
     assert cache.load("kept") == b"contents"
     assert cache.load("lost") is None
