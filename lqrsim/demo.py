@@ -46,7 +46,7 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
     for reference, scenario in scenarios.items():
         folder = out / short_name(reference)
         console.say(f"\n== {reference}: {scenario.summary}")
-        solution = replace(console.solve(scenario.problem, "smooth"), scenario=reference)
+        solution = replace(console.solve(scenario.problem, "smooth", reach=scenario.reach()), scenario=reference)
         console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
         if solution.cost_to_go is not None:
             drawn = plot_policy(

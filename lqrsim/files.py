@@ -24,7 +24,7 @@ from lqrsim.results import Candidate, Iteration, Multipliers, Solution, Status, 
 from lqrsim.rollout import Rollout
 from lqrsim.value_functions import Moments, Quadratic
 
-VERSIONS = {"solution": 3, "rollout": 2}
+VERSIONS = {"solution": 4, "rollout": 3}
 
 
 def save(result: Solution | Rollout, path: str | os.PathLike[str]) -> Path:
@@ -126,6 +126,8 @@ def load_solution(path: str | os.PathLike[str]) -> Solution:
             versions=meta["versions"],
             scenario=meta["scenario"],
             candidates=tuple(candidate(i, *one) for i, one in enumerate(meta["candidates"])),
+            goal=_array(arrays, "goal", (n,)) if "goal" in arrays else None,
+            goal_radius=meta["goal_radius"],
             multipliers=tuple(
                 Multipliers(_array(arrays, f"multipliers.{i}", (steps + 1, None)), float(penalty))
                 for i, penalty in enumerate(meta["penalties"])
@@ -144,12 +146,15 @@ def load_rollout(path: str | os.PathLike[str]) -> Rollout:
             "states": (trials, knots, n), "measured": (trials, knots, n), "commanded": (trials, knots - 1, m),
             "applied": (trials, knots - 1, m), "forces": (trials, knots - 1, 3), "torques": (trials, knots - 1, 3),
             "displaced": (trials, None, 3), "clearance": (trials, knots),
+            "collided_at": (trials,), "diverged_at": (trials,), "failed_at": (trials,),
             "frame_times": (None,), "frames": (trials, len(arrays["frame_times"]), None),
         }  # fmt: skip
         return Rollout(
             **{name: _array(arrays, name, shape) for name, shape in shapes.items()},
             contacts=_array(arrays, "contacts", (trials,)).astype(np.int64),
-            diverged=_array(arrays, "diverged", (trials,)).astype(bool),
+            goal=_array(arrays, "goal", (n,)) if "goal" in arrays else None,
+            obstacles=tuple(meta["obstacles"]),
+            reasons=tuple(meta["reasons"]),
             plan=_trajectory(arrays, knots - 1, n, m, float(meta["dt"])),
             state_coordinates=states,
             control_coordinates=controls,
@@ -159,8 +164,8 @@ def load_rollout(path: str | os.PathLike[str]) -> Rollout:
 
 
 _ROLLOUT_ARRAYS = (
-    "states", "measured", "commanded", "applied", "forces", "torques", "displaced", "clearance", "contacts", "diverged",
-    "frame_times", "frames",
+    "states", "measured", "commanded", "applied", "forces", "torques", "displaced", "clearance", "contacts",
+    "collided_at", "diverged_at", "failed_at", "frame_times", "frames",
 )  # fmt: skip
 _ROLLOUT_TEXTS = (
     "robot", "scene", "model", "policy_digest", "radius", "goal_radius", "seed", "first_trial", "versions",
@@ -181,6 +186,8 @@ def _solution_parts(solution: Solution) -> tuple[str, dict[str, npt.NDArray[Any]
             arrays |= {f"{name}.{field.name}": getattr(value, field.name) for field in fields(value)}
     if solution.clearance is not None:
         arrays["clearance"] = solution.clearance
+    if solution.goal is not None:
+        arrays["goal"] = solution.goal
     if solution.candidates:
         plans = [candidate.trajectory for candidate in solution.candidates]
         arrays["candidates.states"] = np.array([plan.states for plan in plans])
@@ -196,7 +203,7 @@ def _solution_parts(solution: Solution) -> tuple[str, dict[str, npt.NDArray[Any]
             (one.start, one.cost, one.iterations, None if one.status is None else one.status.value)
             for one in solution.candidates
         ],
-        "penalties": [one.penalty for one in solution.multipliers],
+        "penalties": [one.penalty for one in solution.multipliers], "goal_radius": solution.goal_radius,
     }  # fmt: skip
     return "solution", arrays, texts
 
@@ -204,9 +211,11 @@ def _solution_parts(solution: Solution) -> tuple[str, dict[str, npt.NDArray[Any]
 def _rollout_parts(rollout: Rollout) -> tuple[str, dict[str, npt.NDArray[Any]], dict[str, Any]]:
     arrays = {name: getattr(rollout, name) for name in _ROLLOUT_ARRAYS}
     arrays |= {"trajectory.states": rollout.plan.states, "trajectory.controls": rollout.plan.controls}
+    arrays |= {} if rollout.goal is None else {"goal": rollout.goal}
     texts = {key: getattr(rollout, key) for key in _ROLLOUT_TEXTS}
     texts |= {
         "versions": dict(rollout.versions), "dt": rollout.plan.dt, "disturbances": list(rollout.disturbances),
+        "obstacles": list(rollout.obstacles), "reasons": list(rollout.reasons),
         "states": asdict(rollout.state_coordinates), "controls": asdict(rollout.control_coordinates),
     }  # fmt: skip
     return "rollout", arrays, texts

@@ -112,6 +112,14 @@ class Problem:
         return abouts[0] if len(abouts) == 1 else None
 
     @property
+    def weighed_goal(self) -> Array | None:
+        """The goal, NaN in the states to which the final cost gives no weight; None where it names no state."""
+        abouts = [cost for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
+        if len(abouts) != 1 or not abouts[0].weight.any():
+            return None
+        return np.where(abouts[0].weight.any(axis=1), abouts[0].about, np.nan)
+
+    @property
     def control_coordinates(self) -> Coordinates:
         """Names, units and limits of the controls, as they are planned with."""
         coordinates = self.dynamics.control_coordinates

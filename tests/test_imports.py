@@ -15,7 +15,7 @@ PACKAGE = Path(lqrsim.__file__).parent
 ROOMS = (
     ("errors", "machine", "versions", "solvers.interface"),
     ("coordinates", "value_functions"),
-    ("policy",),
+    ("policy", "target"),
     ("results",),
     ("rollout",),
     ("files",),

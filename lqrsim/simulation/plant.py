@@ -23,7 +23,9 @@ class Plant:
 
     Attributes:
       robot, scene: what it is made of.
-      world: the obstacles that bound the robot. model: the compiled scene, with a contact sensor for each of them.
+      world: the obstacles that bound the robot's position; none without one.
+      obstacles: names of what the robot can collide with: those; without a position all but level planes.
+      model: the compiled scene, with a contact sensor for each obstacle.
       body: id of the robot's body. qpos, qvel, ctrl: where its joints' and actuators' numbers are in MuJoCo's arrays.
       contact: where the contact sensors are in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
       timestep: of the physics, in seconds.
@@ -49,13 +51,14 @@ class Plant:
         dimension = len(robot.dynamics.state_coordinates.position)
         self.robot, self.scene = robot, scene
         self.world = scene.world.seen_by(dimension) if dimension else World()
+        self.obstacles = self.world.names if dimension else _upright(scene.world)
         self.model = self._compile()
         joints = [self.model.joint(name) for name in robot.joints]
         self.body = int(self.model.body(robot.body).id)
         self.qpos = _ranges((joint.qposadr[0], joint.qpos0.size) for joint in joints)
         self.qvel = _ranges((joint.dofadr[0], joint.damping.size) for joint in joints)
         self.ctrl = np.array([self.model.actuator(name).id for name in robot.actuators], dtype=np.intp)
-        self.contact = np.arange(self.model.nsensordata - len(self.world), self.model.nsensordata)
+        self.contact = np.arange(self.model.nsensordata - len(self.obstacles), self.model.nsensordata)
 
     @property
     def timestep(self) -> float:
@@ -76,6 +79,11 @@ class Plant:
         """The same model, but that the robot goes through the obstacles, and nothing says whether it touches them."""
         return self._compile(contacts=False)
 
+    @cached_property
+    def enclosed(self) -> bool:
+        """Whether the robot touches nothing at a clearance above 0: all of it that collides is within its radius."""
+        return not self.obstacles or (len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9))
+
     def clearance(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
         """Signed distance to the nearest obstacle minus the robot's radius in metres, (...), at states (..., n).
 
@@ -83,9 +91,12 @@ class Plant:
           displaced: (K, obstacles, 3), by how much obstacles are elsewhere in each trial; states are then (K, k, n).
         """
         states = np.asarray(states, dtype=np.float64)
+        return self.clearance_at(states[..., list(self.robot.dynamics.state_coordinates.position)], displaced)
+
+    def clearance_at(self, position: Array, displaced: Array | None = None) -> Array:
+        """The same at positions (..., 2 or 3)."""
         if not len(self.world):
-            return np.full(states.shape[:-1], np.inf)
-        position = states[..., list(self.robot.dynamics.state_coordinates.position)]
+            return np.full(position.shape[:-1], np.inf)
         if displaced is None or not displaced.any():
             return compiled.signed_distance(self.world, position) - self.robot.radius
         return compiled.signed_distance_displaced(self.world, position, displaced) - self.robot.radius
@@ -105,7 +116,7 @@ class Plant:
         geoms = {geom.id: geom for geom in spec.geoms}
         for geom, obstacle in zip(obstacle_geoms(self.scene.model), self.scene.world.obstacles, strict=True):
             geoms[geom].name = obstacle.name
-        for name in self.world.names:
+        for name in self.obstacles:
             if not contacts:
                 geom = next(geom for geom in spec.geoms if geom.name == name)
                 geom.contype = geom.conaffinity = 0
@@ -260,6 +271,55 @@ def check_plant(
     at = int(errors[:, check.names.index(check.worst)].argmax())
     state, control, simulated, predicted = found[at]
     return replace(check, state=state, control=control, simulated=simulated, predicted=predicted)
+
+
+def extent(plant: Plant) -> float:
+    """How far from its position the robot can touch something, at most, in metres; a bound, and exact for balls.
+
+    Seen from above by robots in the plane. Parts that move count wherever they can get, whatever their joints' limits.
+    """
+    model, data, dynamics = plant.model, mujoco.MjData(plant.model), plant.robot.dynamics
+    place, rng = list(dynamics.state_coordinates.position), np.random.default_rng(0)
+    axes = slice(0, len(place))  # of the world, along which the position is
+    off, states = 0.0, rng.standard_normal((9, len(dynamics.state_coordinates)))
+    states[-1] = 0.0  # the last, in which the geoms are looked at below
+    for state in states:
+        data.qpos[plant.qpos], data.qvel[plant.qvel] = plant.robot.configuration(state)
+        mujoco.mj_kinematics(model, data)
+        off = max(off, float(np.linalg.norm(data.xpos[plant.body, axes] - state[place])))
+    obstacles = [model.geom(name).id for name in plant.obstacles]
+    thick = model.geom_margin + model.geom_gap  # at which MuJoCo sees a contact
+    thickest = max(thick[obstacles].max(initial=0.0), (model.pair_margin + model.pair_gap).max(initial=0.0))
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    collides[model.pair_geom1], collides[model.pair_geom2] = True, True
+    reach = 0.0
+    for geom in np.flatnonzero(collides):
+        path = [int(model.geom_bodyid[geom])]
+        while path[-1] not in (0, plant.body):
+            path.append(int(model.body_parentid[path[-1]]))
+        if path[-1] != plant.body:
+            continue
+        size, kind = float(model.geom_rbound[geom]) or np.inf, model.geom_type[geom]
+        if kind == mujoco.mjtGeom.mjGEOM_CYLINDER and len(place) == 2 and abs(data.geom_xmat[geom][8]) > 1 - 1e-9:
+            size = float(model.geom_size[geom, 0])  # upright: its outline from above
+        own, jointed = np.linalg.norm(model.geom_pos[geom]), False
+        for body in path[:-1]:
+            first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+            jointed |= count > 0
+            own += np.linalg.norm(model.body_pos[body])
+            for joint in range(first, first + count):
+                slides = model.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
+                own += np.inf if slides else 2 * np.linalg.norm(model.jnt_pos[joint])
+        if not jointed:
+            own = np.linalg.norm((data.geom_xpos[geom] - data.xpos[plant.body])[axes])
+        reach = max(reach, float(own) + size + float(thick[geom]))
+    return off + reach + float(thickest)
+
+
+def _upright(world: World) -> tuple[str, ...]:
+    """Names of the obstacles but for level planes, on which what has no position may stand."""
+    level = [one.kind == "plane" and abs(one.rotation[2, 2]) > 1 - 1e-9 for one in world.obstacles]
+    return tuple(name for name, lies in zip(world.names, level, strict=True) if not lies)
 
 
 def _ranges(starts_and_sizes: Iterable[tuple[int, int]]) -> Indices:

@@ -319,7 +319,18 @@ def assemble(
         candidates=candidates,
         problem_digest=problem.digest,
         versions=versions(),
+        goal=problem.weighed_goal,
+        goal_radius=_radius(problem),
     )
+
+
+def _radius(problem: Problem) -> float | None:
+    """The robot's radius, where the goal has a position, and the problem obstacles that know it."""
+    goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
+    if not position or (goal is not None and np.isnan(goal[position]).all()):
+        return None
+    constraints = [constraint for constraint in problem.constraints if isinstance(constraint, Clearance)]
+    return max((one.radius for one in (*problem.obstacle_costs, *constraints)), default=None)
 
 
 def model(problem: Problem, multipliers: Sequence[Array] = ()) -> tuple[Any, ...]:
