@@ -200,8 +200,8 @@ class Solution:
       multipliers: of each of the problem's constraints; none where the plan keeps them all without being made to.
       goal: (n,) the state that the final cost asks for, NaN in the states to which it gives no weight; None where it
         names no state.
-      goal_radius: within which the plan's end counts as at the goal, in `target.unit`: by default the robot's radius, in
-        metres, where it is known, and else None; for goals without a position see `target.py`.
+      goal_radius: within which the plan's end counts as at the goal, in `target.unit`; None where that is not known. By
+        default the robot's radius, in metres; for goals without a position see `target.py`.
     """
 
     status: Status

@@ -24,7 +24,7 @@ from lqrsim.simulation.disturbances import ControlNoise, Disturbance, Effect, Fo
 from lqrsim.simulation.plant import Plant
 
 NOISE = (ControlNoise(0.02), ForceNoise(0.1), MeasurementNoise(0.005))
-RECORDS = ("states", "measured", "commanded", "applied", "forces", "clearance", "contacts", "diverged", "frames")
+RECORDS = ("states", "measured", "commanded", "applied", "forces", "clearance", "contacts", "collided_at", "frames")
 
 
 @pytest.fixture(scope="module")
@@ -247,13 +247,14 @@ def test_a_trial_that_blows_up_is_lost_and_the_others_are_not(sled, tmp_path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["ice.xml"]  # and no log of MuJoCo's
 
 
-def test_a_policy_that_returns_nan_is_lost_not_taken_for_zero(sled):
+def test_a_policy_that_returns_nan_fails_and_is_not_taken_for_zero(sled):
     solution = track(sled.robot, (0.0, 1.0, 0.0, 0.0), np.zeros((10, 2)), 0.1)
     offset = solution.policy.offset.copy()
     offset[4] = np.nan
     rollout = simulate(sled, replace(solution, policy=replace(solution.policy, offset=offset)))
-    assert rollout.outcome == ("diverged",)
-    assert np.isfinite(rollout.states[0, :4]).all()
+    assert rollout.outcome == ("error",)
+    assert rollout.reasons == ("controller at 0.4 s: got nan for steer, want a finite number",)
+    assert np.isfinite(rollout.states[0, :5]).all()
     assert np.isnan(rollout.states[0, 5:]).all()
 
 

@@ -18,7 +18,8 @@ from lqrsim.stress.statistics import CONFIDENCE, Estimate, Pairs, bootstrap, com
 Table = Mapping[Cell, Outcomes]
 
 MEASURES = {
-    "worst": "m", "rms": "m", "final": "m", "goal": "m", "clearance": "m", "effort": "unit² s", "saturated": "", "cost": "",
+    "worst": "m", "rms": "m", "final": "m", "goal": "m", "clearance": "m", "effort": "unit² s",
+    "saturated": "", "cost": "",
 }  # fmt: skip
 LEVELS = (0.05, 0.5, 0.95)
 

@@ -130,7 +130,7 @@ class TrialScore:
     A trial fails if its score is positive. Numbers that are standard normal give the trials that `simulate` gives.
 
     Args:
-      failure: scores a rollout's trials, (K,). goal_radius, goal_tolerance: as in `simulate`. contacts: whether obstacles stop the robot; as in `simulate`.
+      failure: scores a rollout's trials, (K,). goal_radius, goal_tolerance, contacts: as in `simulate`.
       batch: how many trials are run at once.
 
     Attributes:
