@@ -261,7 +261,7 @@ def test_what_hangs_or_kills_its_worker_costs_its_shard(own: Path, tmp_path: Pat
     assert 0 < results.tally(cell)["error"] < 24
 
 
-def test_a_policy_that_returns_nan_is_diverged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_policy_that_returns_nan_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Mad(Feedback):
         def start(self, trials: int) -> Control:
             sane = super().start(trials)
@@ -272,7 +272,10 @@ def test_a_policy_that_returns_nan_is_diverged(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(trials.Trials, "_controller", mad)
     results = run_campaign(CAMPAIGN, tmp_path, workers=0)
-    assert results.tally(Cell("open_loop", "scenario", 1.0)) == {"diverged": 60}
+    nan = Cell("open_loop", "scenario", 1.0)
+    assert results.tally(nan)["error"] > 55  # the others collide before
+    assert results.tally(nan)["error"] + results.tally(nan)["collided"] == 60
+    assert set(results.reasons(nan).values()) == {"controller at 0.6667 s: got nan for rotor_1, want a finite number"}
     assert results.tally(Cell("smooth", "scenario", 1.0))["reached"] > 50
 
 

@@ -211,7 +211,7 @@ def test_a_plan_that_stops_short_of_its_goal_does_not_reach_it_and_says_so(cage:
     assert near.outcome == ("reached",)
     assert "MISSES" not in near.summary()
     assert ls.simulate(cage, short(0.2), goal_radius=0.1).outcome == ("timed out",)
-    with pytest.raises(InputError, match="^goal_tolerance: got 0.1, want goal_radius, in metres"):
+    with pytest.raises(InputError, match=r"^goal_tolerance: got 0\.1, want goal_radius, in metres"):
         ls.simulate(cage, solution, goal_tolerance=0.1)
 
 
@@ -274,7 +274,7 @@ def test_what_hits_something_and_then_blows_up_has_collided_everywhere(cage: Pla
 def test_a_collision_between_two_knots_is_one(cage: Plant) -> None:
     """At 20 m/s over a bar: no knot is within it, the line between two is, along a chord that is worked out by hand."""
     speed, plan = 20.0, hover(3)
-    # Bar x1 lies along x at y = z = -1.25, with radius 0.4; the robot's is 0.3. It flies along y, 0.69 m above the axis.
+    # Bar x1 lies along x at y = z = -1.25, radius 0.4; the robot's is 0.3. It flies along y, 0.69 m above its axis.
     start = np.array([0.0, -1.25 - 1.5 * speed / 30, -1.25 + 0.69, 0.0, speed, *np.zeros(7)])
     states = np.array([start + np.array([0.0, speed * t, *np.zeros(10)]) for t in plan.trajectory.times])
     plan = replace(plan, trajectory=replace(plan.trajectory, states=states)).open_loop()

@@ -43,7 +43,7 @@ class Case:
         frames = (self.run.frames if frames is None else frames[None]).copy()
         states = self.run.states.copy()
         frames[:, self.run.frame_times > self.run.times[HALF] + 1e-9], states[:, HALF + 1 :] = np.nan, np.nan
-        return dataclasses.replace(self.run, states=states, frames=frames, diverged=np.array([True]))
+        return dataclasses.replace(self.run, states=states, frames=frames, diverged_at=self.run.times[[HALF + 1]])
 
 
 @pytest.fixture(scope="module", params=ROBOTS)

@@ -17,7 +17,7 @@ from lqrsim.stress.statistics import CONFIDENCE, Estimate, Pairs, bootstrap, com
 
 Table = Mapping[Cell, Outcomes]
 
-MEASURES = {
+MEASURES = {  # with units; those of tracking errors and of the goal's distance are of robots with a position
     "worst": "m", "rms": "m", "final": "m", "goal": "m", "clearance": "m", "effort": "unit² s",
     "saturated": "", "cost": "",
 }  # fmt: skip
@@ -111,7 +111,7 @@ class Comparison:
 
     Attributes:
       pairs: in how many trials only one of them succeeded, and the exact test of that.
-      success: of the first less that of the second. rms: the same of the mean tracking error in metres, among the
+      success: of the first less that of the second. rms: the same of the mean tracking error, among the
         `both` trials in which both succeeded; None if there are fewer than two.
       adjusted: the p-value, for as many comparisons as were made.
     """

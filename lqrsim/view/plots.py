@@ -102,7 +102,8 @@ def _tracking_error(axes: Axes, rollouts: Mapping[str, Rollout], trial: int) -> 
     worst = np.array([np.nanmax(error) for error in errors.values()])
     # Runs that differ by decades need a logarithmic axis, which has no place for the zero that they start from.
     decades = bool(worst.max() > 30 * worst.min())
-    factor, unit = (1e3, "mm") if worst.max() < 1 and not decades else (1.0, "m")
+    of = next(iter(rollouts.values())).tracking_unit
+    factor, unit = (1e3, "mm") if of == "m" and worst.max() < 1 and not decades else (1.0, of)
     for (name, error), color in zip(errors.items(), RUNS, strict=False):
         shown = np.where(error > 0, error, np.nan) if decades else error
         axes.plot(rollouts[name].times, factor * shown, color=color)

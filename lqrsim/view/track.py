@@ -75,9 +75,12 @@ class Track:
         """One of `error` and `clearance` at a time."""
         return float(np.interp(time, self.times, values))
 
-    def lost(self, time: float) -> bool:
-        """Whether the trial had diverged by then."""
-        return bool(self.rollout.diverged[self.trial]) and time > self.times[-1]
+    def over(self, time: float) -> str:
+        """What had ended the trial by then, in words; empty if nothing had."""
+        run, k = self.rollout, self.trial
+        if run.outcome[k] not in ("collided", "diverged", "error") or time < run.ended[k]:
+            return ""
+        return f"collided with {run.obstacles[k]}" if run.collided[k] else run.outcome[k]
 
 
 def _recent(forces: Array, dt: float) -> Array:
