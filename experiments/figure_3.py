@@ -30,9 +30,9 @@ from paper.common import (
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
-from lqrsim.target import OUTCOMES
 from lqrsim.errors import Array
 from lqrsim.stress.statistics import rate
+from lqrsim.target import OUTCOMES
 from lqrsim.view import scenery
 from lqrsim.view.style import MARGIN, PLAN, RUNS, SOLID
 
