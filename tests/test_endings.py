@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -12,12 +13,14 @@ from hypothesis import strategies as st
 from tracking import hover, track
 
 import lqrsim as ls
+from lqrsim.cli import main
 from lqrsim.errors import InputError
 from lqrsim.robots.base import Robot
 from lqrsim.scenes import scene_from_xml
 from lqrsim.simulation.controllers import Control, Controller, Feedback
 from lqrsim.simulation.outcomes import OUTCOMES, Outcomes, outcomes
 from lqrsim.simulation.plant import Plant
+from lqrsim.stress import trials
 from lqrsim.stress.campaign import Campaign, run_campaign
 from lqrsim.stress.results import Results, differences, replay
 from lqrsim.target import OF_RANGE, Target, endings
@@ -454,3 +457,47 @@ def test_a_controller_that_fails_ends_its_trials_and_says_why(cage: Plant, how, 
             assert np.isnan(rollout.applied[k, 7:]).all()
     assert outcomes(rollout).outcome.tolist() == list(rollout.outcome)
     assert len(rollout.frame_times) == rollout.frames.shape[1]
+
+
+def some(shown: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """Fails, whatever runs beside it, where a trial is to one side; a batch with such a trial fails as a whole."""
+    if (shown[:, 0] > FAR).any():
+        raise ValueError("too far to the side")
+    return command
+
+
+FAR = -2.2  # m; about half of the trials are beyond it at the seventh step
+
+
+def test_in_a_campaign_only_those_trials_fail_that_fail_alone(
+    rough: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = replace(ROUGH, strengths=(1.4,), trials=12)
+    alone = rough.trials.run(rough.cells[1], 0, 12, frames=False, contacts=False)
+    beyond = alone.measured[:, 7, 0] > np.median(alone.measured[:, 7, 0])
+    monkeypatch.setitem(globals(), "FAR", float(np.median(alone.measured[:, 7, 0])))
+    monkeypatch.setattr(trials.Trials, "_controller", lambda own, policy: Failing(own.solutions[policy], some))
+    files = []
+    for batch in (12, 5):
+        results = run_campaign(campaign, tmp_path / str(batch), workers=0, batch=batch)
+        table = results.outcomes(results.cells[0])
+        np.testing.assert_array_equal(table.outcome == "error", beyond)
+        assert set(results.reasons(results.cells[0]).values()) == {
+            "controller at 0.2333 s: ValueError: too far to the side"
+        }
+        files.append([path.read_bytes() for path in sorted((tmp_path / str(batch) / "shards").iterdir())])
+    assert files[0] == files[1]
+
+
+def test_simulate_says_how_many_reached_the_goal_and_that_a_plan_misses_it(
+    quadrotor_solution: ls.Solution, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = str(ls.save(replace(quadrotor_solution, scenario="quadrotor"), tmp_path / "solution.npz"))
+    assert main(["simulate", path, "--trials", "3"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "3 of 3 trials reached the goal"
+    assert main(["simulate", path, "--trials", "3", "--goal-radius", "0.01"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "0 of 3 trials reached the goal"
+    assert "  the plan MISSES the goal: it ends 0.0554 m outside 0.01" in lines
+    assert main(["simulate", path, "--goal-tolerance", "0.1"]) == 2
+    assert "want goal_radius, in metres" in capsys.readouterr().err
