@@ -4,6 +4,7 @@ import inspect
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -45,9 +46,7 @@ class Scenario:
     goal_radius: float | None = None
     goal_tolerance: float | None = None
 
-    def near_enough(
-        self, goal_radius: float | None = None, goal_tolerance: float | None = None
-    ) -> dict[str, float | None]:
+    def near_enough(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> dict[str, Any]:
         """These options of `simulate`, or the scenario's own where neither is given."""
         if goal_radius is None and goal_tolerance is None:
             goal_radius, goal_tolerance = self.goal_radius, self.goal_tolerance

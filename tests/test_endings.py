@@ -65,7 +65,8 @@ class Jointed(Robot):
         return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
 
     def configuration(self, state):
-        return np.split(np.asarray(state, dtype=float), 2, axis=-1)
+        qpos, qvel = np.split(np.asarray(state, dtype=float), 2, axis=-1)
+        return qpos, qvel
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ def test_an_arm_that_gets_there_has_reached_it_and_one_that_does_not_has_not(arm
     assert rollout.goal_distance[0] == pytest.approx(abs(angle - plan[-1]) / np.ptp(plan), rel=1e-12)
     assert rollout.outcome == ("reached",)
     # Whole turns are taken out; so is what the plan is told of how near counts.
-    turned = replace(swing, goal=swing.goal + 2 * np.pi)
+    turned = replace(swing, goal=np.array([plan[-1] + 2 * np.pi, np.nan]))
     assert ls.simulate(clear, turned).goal_distance[0] == pytest.approx(rollout.goal_distance[0], abs=1e-12)
     strict = ls.simulate(clear, swing, goal_tolerance=0.5 * rollout.goal_distance[0])
     assert strict.outcome == ("timed out",)
@@ -241,6 +242,7 @@ def test_what_the_final_cost_gives_no_weight_does_not_count(quadrotor: ls.Scenar
 
 def test_a_solution_and_its_files_keep_the_goal(quadrotor_solution: ls.Solution, cage: Plant, tmp_path) -> None:
     solution = quadrotor_solution
+    assert solution.goal is not None
     away = np.linalg.norm(solution.trajectory.states[-1, :3] - solution.goal[:3])
     assert f"the plan ends {away:.3g} m from the goal" in solution.summary()
     again = ls.load_solution(ls.save(solution, tmp_path / "solution.npz"))
@@ -406,7 +408,7 @@ def test_at_strength_0_there_is_one_run_and_no_interval(rough: Results) -> None:
 class Failing(Controller):
     """Follows the policy, and fails at step 7 in a way of its own, wherever a trial is further left than another."""
 
-    def __init__(self, solution: ls.Solution, how: Callable[[np.ndarray, np.ndarray], object]) -> None:
+    def __init__(self, solution: ls.Solution, how: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
         self.policy, self.how = Feedback(solution.policy), how
 
     def start(self, trials: int) -> Control:

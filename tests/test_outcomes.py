@@ -26,7 +26,8 @@ def test_each_row_is_what_happened(plant: Plant, quadrotor: ls.Scenario, rough: 
     table = outcomes(rough, quadrotor.problem)
     assert table.trial.tolist() == list(range(20))
     assert {"reached", "collided"} <= set(table.outcome) <= set(OUTCOMES)
-    plan, dt = rough.plan, rough.plan.dt
+    plan, dt, goal = rough.plan, rough.plan.dt, quadrotor.problem.goal
+    assert goal is not None
     for k in range(20):
         distances = np.array([plant.world.distances(state[:3]) for state in rough.states[k]]) - rough.radius
         hits = np.flatnonzero(distances.min(axis=1) < 0)
@@ -47,7 +48,7 @@ def test_each_row_is_what_happened(plant: Plant, quadrotor: ls.Scenario, rough: 
         else:
             assert table.ended[k] == plan.horizon
             assert table.clearance[k] == pytest.approx(distances.min(), abs=1e-12)
-            away = np.linalg.norm(rough.states[k, -1, :3] - quadrotor.problem.goal[:3])
+            away = np.linalg.norm(rough.states[k, -1, :3] - goal[:3])
             assert table.outcome[k] == ("reached" if away <= rough.goal_radius else "timed out")
             assert table.obstacle[k] == ""
             assert table.final[k] == error[-1]

@@ -161,15 +161,16 @@ def simulate(
             if frames:
                 pictures = physics.drawn(period)
                 seen += pictures
-                for picture in pictures if watch is not None else ():
+                for picture in pictures:
                     watched += 1
-                    watch(watched * plan.dt / physics.drawn_parts, picture, physics.unstable)
+                    if watch is not None:
+                        watch(watched * plan.dt / physics.drawn_parts, picture, physics.unstable)
             if progress is not None:
                 progress(step + 1, steps)
         if physics.feels:
             touching = physics.felt()
             for row in np.flatnonzero(touching.any(axis=1) & np.isinf(collisions.at) & (lost_since > steps)):
-                collisions.feel(row, plan.horizon, touching[row])
+                collisions.feel(int(row), plan.horizon, touching[row])
 
     missing = (steps * physics.drawn_parts + 1 - len(seen)) if frames else 0
     seen += [np.full_like(seen[0], np.nan)] * missing

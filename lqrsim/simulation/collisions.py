@@ -38,7 +38,7 @@ class Collisions:
         self._last = states[:, self._place]
         self.clearance = self._clear(self._last)
         for row in np.flatnonzero(self.clearance < 0):
-            self._hit(row, 0.0, self._last[row])
+            self._hit(int(row), 0.0, self._last[row])
 
     def look(self, step: int, period: Period, *, ignored: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
         """The trials that collide for the first time in a period, by their rows.
@@ -51,7 +51,7 @@ class Collisions:
             open_ = np.isinf(self.at) & ~ignored & (part < period.stable)
             start = (step + part / parts) * self.dt
             for row in np.flatnonzero(open_ & felt.any(axis=1)) if len(felt) else ():
-                self.feel(row, start, felt[row])
+                self.feel(int(row), start, felt[row])
             if len(self.plant.world):
                 self._along(step, part, parts, states[:, self._place], open_)
         found = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
@@ -89,7 +89,7 @@ class Collisions:
             places = np.where(at_end[:, None], there[rows], last[rows] + share * (there[rows] - last[rows]))
             clear = self._clear(places, rows)
             for k in np.flatnonzero(looking & (clear < 0)):
-                self._hit(rows[k], (step + (part + float(share[k, 0])) / parts) * self.dt, places[k])
+                self._hit(int(rows[k]), (step + (part + float(share[k, 0])) / parts) * self.dt, places[k])
             looking &= (clear >= 0) & ~at_end
 
     def _clear(self, places: Array, rows: npt.NDArray[np.intp] | None = None) -> Array:
