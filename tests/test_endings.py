@@ -503,3 +503,26 @@ def test_simulate_says_how_many_reached_the_goal_and_that_a_plan_misses_it(
     assert "  the plan MISSES the goal: it ends 0.0554 m outside 0.01" in lines
     assert main(["simulate", path, "--goal-tolerance", "0.1"]) == 2
     assert "want goal_radius, in metres" in capsys.readouterr().err
+
+
+def test_parts_that_stick_out_of_the_radius_collide_too(cage: Plant) -> None:
+    """The packaged ball of 0.3 m with a radius of 0.2: contacts are felt, at the states at which MuJoCo has them."""
+    assert cage.enclosed
+    plant = Plant(ls.Quadrotor(radius=0.2), cage.scene)
+    assert not plant.enclosed
+    noise = [ls.ForceNoise(10.0), ls.DisplacedObstacles(0.05), ls.MassMismatch(0.05)]
+    runs = {c: ls.simulate(plant, hover(), disturbances=noise, trials=8, contacts=c) for c in (True, False)}
+    free, solid = runs[False], runs[True]
+    assert free.collided.sum() >= 4
+    for name, column in outcomes(solid).columns().items():
+        assert column.tobytes() == outcomes(free).columns()[name].tobytes(), name
+    np.testing.assert_array_equal(free.states[free.counts], solid.states[free.counts])
+    for k in np.flatnonzero(free.collided):
+        # Each bar, wall and floor by its own distance, where the trial has it; a period is one physics step.
+        moved = free.displaced[k]
+        near = [
+            min(plant.world.distances(place - moved[i])[i] for i in range(len(moved))) - 0.3
+            for place in free.states[k, :, :3]
+        ]
+        assert free.collided_at[k] == free.times[np.argmax(np.array(near) < 0)]
+        assert solid.contacts[k] > 0
