@@ -247,6 +247,23 @@ def test_a_trial_that_blows_up_is_lost_and_the_others_are_not(sled, tmp_path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["ice.xml"]  # and no log of MuJoCo's
 
 
+class Weightless(Disturbance):
+    """Takes nearly all mass away, of which MuJoCo warns as it works out what follows from the masses."""
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        def alter(simulations):
+            simulations.expand("body_mass")[:] = 1e-300
+
+        return Effect(alter=alter)
+
+
+def test_what_mujoco_warns_of_while_a_model_is_altered_leaves_no_file(sled, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(path.name for path in tmp_path.iterdir())
+    simulate(sled, track(sled.robot, (0.0, 1.0, 0.0, 0.0), np.zeros((5, 2)), 0.1), disturbances=[Weightless()])
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
 def test_a_policy_that_returns_nan_is_lost_not_taken_for_zero(sled):
     solution = track(sled.robot, (0.0, 1.0, 0.0, 0.0), np.zeros((10, 2)), 0.1)
     offset = solution.policy.offset.copy()

@@ -86,7 +86,8 @@ def simulate(
     if displaced.any():
         plant.displace(physics.simulations, displaced)
     if any(effect.alter for effect in effects) or displaced.any():
-        physics.simulations.set_const()
+        with unlogged():
+            physics.simulations.set_const()
 
     measures = [effect.measure for effect in effects if effect.measure is not None]
     actuations = [effect.actuate for effect in effects if effect.actuate is not None]
