@@ -5,7 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, excerpt
+from lqrsim.errors import Array, InputError, check_array, check_name, check_number, excerpt
+
+SPACE = "xyz"
+PLANES = tuple(a + b for a in SPACE for b in SPACE if a != b)
+_FROM_ABOVE = ("xy", "yx")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,6 +20,12 @@ class Coordinates:
       names: one name an entry.
       units: one unit an entry ("" where there is none).
       position: indices of the 2 (planar) or 3 (spatial) entries that are the position in the world, in metres; or none.
+      plane: the world's axes along which the position is measured, in its order: "xyz" for one in space, "" without
+        one. Of a planar one two of x, y and z; where it is not given, it follows from the names that end in these
+        letters, as (x, z) or (p_x, p_z) do, and is "xy" where the names end in none of them.
+      offset: where the plane is along the third axis, in metres: the y of "xz". Vertical planes have one, 0 unless it
+        is given. Horizontal ones have none unless it is given: without it the world is seen from above. See
+        `World.seen_by`.
       angles: indices of the entries that are angles in radians, equal up to whole turns.
       rotation_vectors: index of the first of each three entries that are a rotation vector, axis times angle in rad.
       low, high: limits of each entry, (len(names),); infinite where there is none.
@@ -28,6 +38,8 @@ class Coordinates:
     rotation_vectors: tuple[int, ...] = ()
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
+    plane: str = ""
+    offset: float | None = None
 
     def __post_init__(self) -> None:
         size = len(self.names)
@@ -44,6 +56,16 @@ class Coordinates:
             width = 3 if field == "rotation_vectors" else 1
             if any(not 0 <= index <= size - width for index in indices):
                 raise InputError(f"{field}: got indices {indices}, want them between 0 and {size - width}")
+        if len(set(self.position)) != len(self.position):
+            raise InputError(f"position: got indices {self.position}, want different ones")
+        plane = self._plane()
+        if len(plane) != 2 and self.offset is not None:
+            raise InputError(
+                f"offset: got {excerpt(self.offset)} without a plane, want it with a position of two entries"
+            )
+        offset = 0.0 if self.offset is None and len(plane) == 2 and plane not in _FROM_ABOVE else self.offset
+        object.__setattr__(self, "plane", plane)
+        object.__setattr__(self, "offset", None if offset is None else check_number("offset", offset))
         if not self.low and not self.high:
             object.__setattr__(self, "low", (-np.inf,) * size)
             object.__setattr__(self, "high", (np.inf,) * size)
@@ -59,6 +81,64 @@ class Coordinates:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def _plane(self) -> str:
+        """What `plane` is: as given, from the names, or the default. Raises InputError where these contradict."""
+        names = tuple(self.names[index] for index in self.position)
+        letters = [str(name)[-1:].lower() for name in names]
+        said = "".join(letter if letter in tuple(SPACE) else "?" for letter in letters)
+        listed = ", ".join(names)
+        if len(names) == 3:
+            if self.plane not in ("", SPACE):
+                raise InputError(
+                    f"plane: got {excerpt(self.plane)} for the position ({listed}), want none: it is in space"
+                )
+            if sorted(said) == sorted(SPACE) and said != SPACE:
+                want = ", ".join(names[said.index(letter)] for letter in SPACE)
+                raise InputError(f"position: got ({listed}), want it along x, y and z in this order: ({want})")
+            return SPACE
+        if not names:
+            if self.plane:
+                raise InputError(f"plane: got {excerpt(self.plane)} without a position, want position=(names) with it")
+            return ""
+        if self.plane:
+            plane = check_name("plane", self.plane, PLANES)
+            if said in PLANES and plane != said:
+                raise InputError(f"plane: got {plane!r} for the position ({listed}), want {said!r}, or other names")
+            return plane
+        if said in PLANES:
+            return said
+        if any(letter not in ("?", default) for letter, default in zip(said, "xy", strict=True)):
+            raise InputError(
+                f"plane: got none for the position ({listed}), whose names do not tell it, want one of:"
+                f" {', '.join(PLANES)}"
+            )
+        return "xy"
+
+    @property
+    def world_axes(self) -> tuple[int, ...]:
+        """Along which of the world's axes, 0 to 2, each entry of the position is."""
+        return tuple(SPACE.index(letter) for letter in self.plane)
+
+    @property
+    def from_above(self) -> bool:
+        """Whether the position is in a horizontal plane of no certain height: on whatever the robot stands on."""
+        return len(self.position) == 2 and self.offset is None
+
+    def in_world(self, places: npt.ArrayLike, *, height: float = 0.0) -> Array:
+        """Points (..., 3) in the world of positions (..., 2 or 3).
+
+        Args:
+          height: in metres, of those that are seen from above; the rest have their own.
+        """
+        places = np.asarray(places, dtype=np.float64)
+        points = np.full((*places.shape[:-1], 3), height if self.offset is None else self.offset)
+        points[..., list(self.world_axes)] = places
+        return points
+
+    def of_world(self, points: npt.ArrayLike) -> Array:
+        """Positions (..., 2 or 3) of points (..., 3) in the world; what is across the plane is left out."""
+        return np.asarray(points, dtype=np.float64)[..., list(self.world_axes)]
 
     @property
     def labels(self) -> tuple[str, ...]:

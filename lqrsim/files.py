@@ -24,7 +24,7 @@ from lqrsim.results import Candidate, Iteration, Multipliers, Solution, Status, 
 from lqrsim.rollout import Rollout
 from lqrsim.value_functions import Moments, Quadratic
 
-VERSIONS = {"solution": 3, "rollout": 2}
+VERSIONS = {"solution": 4, "rollout": 3}
 
 
 def save(result: Solution | Rollout, path: str | os.PathLike[str]) -> Path:
@@ -163,7 +163,7 @@ _ROLLOUT_ARRAYS = (
     "frame_times", "frames",
 )  # fmt: skip
 _ROLLOUT_TEXTS = (
-    "robot", "scene", "model", "policy_digest", "radius", "goal_radius", "seed", "first_trial", "versions",
+    "robot", "body", "scene", "model", "policy_digest", "radius", "goal_radius", "seed", "first_trial", "versions",
 )  # fmt: skip
 
 
@@ -257,4 +257,4 @@ def _trajectory(arrays: Mapping[str, npt.NDArray[Any]], steps: int, n: int, m: i
 
 
 def _coordinates(fields: Mapping[str, Any]) -> Coordinates:
-    return Coordinates(**{key: tuple(value) for key, value in fields.items()})
+    return Coordinates(**{key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()})

@@ -18,7 +18,7 @@ class Rollout:
     K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, to the last bit.
 
     Attributes:
-      robot, scene: their names. model: the MJCF that was run, as text.
+      robot, scene: their names. body: the robot's in the MJCF. model: the MJCF that was run, as text.
       plan: what the policy meant to do. policy_digest: hash of the policy.
       goal_radius: distance in metres from the plan's end within which a trial has reached its goal.
       radius: of the robot's collision circle or sphere, in metres.
@@ -36,6 +36,7 @@ class Rollout:
     """
 
     robot: str
+    body: str
     scene: str
     model: str
     plan: Trajectory

@@ -50,7 +50,7 @@ def test_a_policy_is_read_with_numpy_alone(saved: Path, drive_solution: ls.Solut
     with np.load(saved) as archive:
         gain, offset, nominal = (archive[f"policy.{name}"] for name in ("gain", "offset", "nominal"))
         meta = json.loads(str(archive["meta"]))
-    assert (meta["format"], meta["version"]) == ("lqrsim solution", 3)
+    assert (meta["format"], meta["version"]) == ("lqrsim solution", 4)
     state, t = drive_solution.trajectory.states[7] + [0.01, 0.02, 2 * np.pi], 7 / 6
     step = min(int(t / meta["dt"] + 1e-9), len(gain) - 1)
     for i in meta["states"]["angles"]:
@@ -84,7 +84,7 @@ def _save_bare_array(path: Path) -> None:
         (lambda path: _save_bare_array(path), "which is damaged"),
         (lambda path: path.write_bytes(pickle.dumps({"gain": 1})), "which is damaged"),
         (lambda path: np.savez(path, meta=np.array([{}], dtype=object)), "which is damaged"),
-        (lambda path: rewrite(path, version=1), "of version 1, want version 3"),
+        (lambda path: rewrite(path, version=1), "of version 1, want version 4"),
         (lambda path: rewrite(path, format="lqrsim rollout"), "holds a 'lqrsim rollout', want a 'lqrsim solution'"),
         (lambda path: rewrite(path, status="great"), "which is damaged .*'great' is not a valid Status"),
         (lambda path: rewrite(path, **{"policy.offset": np.zeros((150, 3))}), r"policy.offset: got shape \(150, 3\)"),

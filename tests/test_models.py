@@ -10,7 +10,8 @@ from lqrsim.errors import InputError
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenes import load_scene, names
-from lqrsim.simulation.plant import Plant, check_plant
+from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.plant_check import check_plant
 
 OPEN_FLOOR = """<mujoco>
   <include file="create.xml"/>

@@ -48,7 +48,7 @@ def test_distances_in_the_arena_are_those_of_circles_and_a_rectangle():
     points = np.random.default_rng(0).uniform([-2, -3], [2, 3], (300, 2))
     to_pillars = np.linalg.norm(points[:, None] - np.array(PILLARS), axis=2).min(axis=1) - 0.2
     to_walls = np.minimum(2 - np.abs(points[:, 0]), 3 - np.abs(points[:, 1]))
-    distance = load_scene("arena").world.seen_by(2).distance(points)
+    distance = load_scene("arena").world.seen_by("xy").distance(points)
     np.testing.assert_allclose(distance, np.minimum(to_pillars, to_walls), atol=1e-12)
 
 
@@ -59,7 +59,7 @@ def test_distances_in_the_cage_are_those_of_twelve_infinite_bars_and_a_cube():
         across = np.delete(points, axis, axis=1)
         # The nearest of the four bars along this axis is the one of the same signs.
         distances.append(np.linalg.norm(np.abs(across) - 1.25, axis=1) - 0.4)
-    world = load_scene("cage").world.seen_by(3)
+    world = load_scene("cage").world.seen_by("xyz")
     assert len(world) == 12 + 6
     np.testing.assert_allclose(world.distance(points), np.min(distances, axis=0), atol=1e-12)
 

@@ -10,9 +10,10 @@ from lqrsim import compiled
 from lqrsim.errors import Array, InputError, check_count, check_number
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
+from lqrsim.scenes import unlogged
 from lqrsim.simulation.controllers import Controller, Feedback
 from lqrsim.simulation.disturbances import Disturbance, Effect
-from lqrsim.simulation.physics import Physics, unlogged
+from lqrsim.simulation.physics import Physics
 from lqrsim.simulation.plant import Plant
 from lqrsim.versions import versions
 
@@ -145,6 +146,7 @@ def simulate(
             array[knots >= lost_since[:, None]] = np.nan
     return Rollout(
         robot=plant.robot.name,
+        body=plant.robot.body,
         scene=plant.scene.name,
         model=plant.scene.xml,
         plan=plan,

@@ -101,7 +101,7 @@ def _obstacles(
     for trial in np.flatnonzero(collided):
         point = np.zeros(3)
         point[: len(place)] = rollout.states[trial, last[trial], place]
-        there = (point - rollout.displaced[trial]).tolist()  # seen from where each obstacle is
+        there = (point - plant.across(rollout.displaced[trial])).tolist()  # seen from where each obstacle is
         distances = [signed_distance(table, ROW * number, *seen) for number, seen in enumerate(there)]
         names[trial] = plant.world.names[int(np.argmin(distances))]
     return np.array(names, dtype=np.str_)

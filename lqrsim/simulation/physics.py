@@ -1,7 +1,6 @@
 """MuJoCo's side of the loop: all trials' states, and how to advance them by a control period."""
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -103,15 +102,3 @@ def _span(indices: Indices) -> slice | Indices:
     """The same place in an array; as a slice, which copies nothing, where they follow each other."""
     first, last = int(indices.min(initial=0)), int(indices.max(initial=-1))
     return slice(first, last + 1) if np.array_equal(indices, np.arange(first, last + 1)) else indices
-
-
-@contextlib.contextmanager
-def unlogged() -> Iterator[None]:
-    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder when a trial becomes unstable; we record it."""
-    before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-    quiet.logto_file = quiet.logto_console = False
-    quiet.set()
-    try:
-        yield
-    finally:
-        before.set()

@@ -17,19 +17,15 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
         model = mujoco.MjModel.from_xml_string(rollout.model)
     except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"rollout.model: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
+    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, rollout.body) < 0:
+        raise InputError(f"rollout.body: got {rollout.body!r}, want a body of its model")
     if model.nq != rollout.frames.shape[-1]:
         raise InputError(f"rollout.frames: got {rollout.frames.shape[-1]} numbers each, want the model's {model.nq}")
     return model
 
 
-def robot_body(model: mujoco.MjModel) -> int:
-    """The number of the robot's body: the first that moves."""
-    return int(np.argmax(model.body_weldid != 0))
-
-
-def floor_below(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """The height of what is below the robot, in metres; its own where there is nothing."""
-    robot = robot_body(model)
+def floor_below(model: mujoco.MjModel, data: mujoco.MjData, robot: int) -> float:
+    """The height of what is below that body, in metres; its own where there is nothing."""
     centre, drop = data.xpos[robot], np.array([0.0, 0.0, -1.0])
     hit = mujoco.mj_ray(model, data, centre, drop, None, True, robot, np.zeros(1, np.int32))
     return float(centre[2] - max(hit, 0.0))
