@@ -1,5 +1,6 @@
 """Running policies in MuJoCo: tracking, repeatability, what is recorded, and what bad input is told."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -296,6 +297,73 @@ def test_a_control_period_that_is_no_multiple_of_the_physics_step_is_told_both(c
     with pytest.raises(InputError, match=r"^control period: got 0.01 s, .*timestep=\"0.01"):
         cage.substeps(0.01)
     assert cage.substeps(1 / 10) == 3
+
+
+def test_what_the_plant_adds_has_names_of_its_own(tmp_path):
+    """Sensors and geoms that are called as the plant would call its own."""
+    text = SLED.replace(
+        "</mujoco>", '<sensor><clock name="contact with wall"/><clock name="contact with box 0"/></sensor></mujoco>'
+    )
+    (tmp_path / "ice.xml").write_text(text)
+    plant = Plant(Sled(), load_scene(tmp_path / "ice.xml"))
+    named = [plant.model.sensor(number).name for number in range(plant.model.nsensor)]
+    assert named[:2] == ["contact with wall", "contact with box 0"]
+    assert len(named) == len(set(named)) == 2 + len(plant.world)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (
+            "joint",
+            r"want its joint 'across'; it has: along, 1 without a name \(joint \d has none, counted from 0: name",
+        ),
+        (
+            "actuator",
+            r"want its actuator 'steer'; it has: push, 1 without a name \(actuator \d has none, counted from 0",
+        ),
+    ],
+)
+def test_what_has_no_name_is_told_by_its_number(tmp_path, kind, message):
+    (tmp_path / "ice.xml").write_text(SLED.replace(' name="across"' if kind == "joint" else ' name="steer"', ""))
+    if kind == "joint":
+        text = (tmp_path / "ice.xml").read_text()
+        (tmp_path / "ice.xml").write_text(re.sub(r'<(\w+) [^<]*joint="across"[^<]*/>', "", text))
+    with pytest.raises(InputError, match=message):
+        Plant(Sled(), load_scene(tmp_path / "ice.xml"))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"joints": "across"}, "robot sled: joints: got 'across', want names of the MJCF in a tuple"),
+        ({"joints": ("across", "")}, r"robot sled: joints: got \('across', ''\), want names"),
+        ({"joints": ("across", "across")}, "robot sled: joints: got a name twice in across, across"),
+        ({"actuators": ()}, r"robot sled: actuation: got shape \(2,\), want \(0,\) for no actuators"),
+    ],
+)
+def test_a_robot_whose_names_are_none_is_told(tmp_path, fields, message):
+    (tmp_path / "ice.xml").write_text(SLED)
+    robot = type("Odd", (Sled,), fields)()
+    with pytest.raises(InputError, match=message):
+        Plant(robot, load_scene(tmp_path / "ice.xml"))
+
+
+def test_a_model_that_sleeps_is_told(tmp_path):
+    (tmp_path / "ice.xml").write_text(
+        SLED.replace("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>', 1)
+    )
+    with pytest.raises(InputError, match="scene ice: got an MJCF that cannot be run in batches: sleep and IPC"):
+        Plant(Sled(), load_scene(tmp_path / "ice.xml"))
+
+
+def test_a_physics_step_that_takes_for_ever_is_told(tmp_path):
+    (tmp_path / "ice.xml").write_text(re.sub(r'timestep="[^"]*"', 'timestep="3e-8"', SLED))
+    plant = Plant(Sled(), load_scene(tmp_path / "ice.xml"))
+    with pytest.raises(
+        InputError, match=r"control period: got 0.09 s, 3,000,000 physics steps of scene ice, want at most 20,000"
+    ):
+        plant.substeps(0.09)
 
 
 def test_a_policy_for_another_robot_is_refused(cage):

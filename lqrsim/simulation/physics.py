@@ -13,7 +13,13 @@ from lqrsim.simulation.plant import Indices, Plant
 FRAME_PERIOD = 1 / 30  # s; positions for drawing are recorded at least this often, if the physics step is not longer
 
 _WARNINGS = mujoco.mjtWarning
-_UNSTABLE = [int(warning) for warning in (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)]
+# What MuJoCo does not go on with: it resets the state, or the controls, and only warns.
+UNSTABLE = [
+    int(warning)
+    for warning in (
+        _WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC, _WARNINGS.mjWARN_BADCTRL
+    )
+]  # fmt: skip
 
 
 class Physics:
@@ -94,7 +100,7 @@ class Physics:
         # MuJoCo resets an unstable simulation and goes on; only its warnings tell.
         warned = self.simulations.warning[..., 1]
         if warned.any():
-            self.unstable |= (warned[:, _UNSTABLE] > 0).any(axis=1)
+            self.unstable |= (warned[:, UNSTABLE] > 0).any(axis=1)
         return touched, frames
 
 

@@ -9,11 +9,11 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt
 from lqrsim.robots.base import Robot
-from lqrsim.scenes import Scene, obstacle_geoms
+from lqrsim.scenes import Scene, obstacle_geoms, unlogged
+from lqrsim.simulation.physics import UNSTABLE
 from lqrsim.simulation.plant import Plant
 
 SHOWN = 8  # pairs of geoms in contact that are printed
-UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
 
 @dataclass(frozen=True)
@@ -142,28 +142,30 @@ def check_plant(
         settle = 0.5 if 2 * len(plant.qvel) > n else 0.0
     waiting = round(check_number("settle", settle, at_least=0.0) / plant.timestep)
     found, touching = [], Counter[tuple[str, str]]()
-    for _ in range(check_count("samples", samples)):
-        state, control = middle + spread * rng.normal(size=n), rng.uniform(low, high)
-        mujoco.mj_resetData(plant.model, data)
-        data.qpos[plant.qpos], data.qvel[plant.qvel] = robot.configuration(state)
-        data.ctrl[plant.ctrl] = robot.actuation(control)
-        for _ in range(waiting):
-            mujoco.mj_step(plant.model, data)
-        before = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=state)
-        touched: set[tuple[str, str]] = set()
-        for _ in range(substeps):
-            mujoco.mj_step(plant.model, data)
-            touched |= _touching(plant.model, data)
-        touching.update(touched)
-        if any(data.warning[kind].number for kind in UNSTABLE):
-            raise InputError(
-                f"scene {scene.name}: got a simulation that becomes unstable from"
-                f" x = {np.array2string(state, precision=3)}, u = {np.array2string(control, precision=3)},"
-                " want a smaller timestep, other states (around, spread) or other controls"
-            )
-        predicted = dynamics.step(before, control, period)
-        simulated = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=predicted)
-        found.append((before, control, simulated, predicted))
+    count = check_count("samples", samples)
+    with unlogged():
+        for _ in range(count):
+            state, control = middle + spread * rng.normal(size=n), rng.uniform(low, high)
+            mujoco.mj_resetData(plant.model, data)
+            data.qpos[plant.qpos], data.qvel[plant.qvel] = robot.configuration(state)
+            data.ctrl[plant.ctrl] = robot.actuation(control)
+            for _ in range(waiting):
+                mujoco.mj_step(plant.model, data)
+            before = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=state)
+            touched: set[tuple[str, str]] = set()
+            for _ in range(substeps):
+                mujoco.mj_step(plant.model, data)
+                touched |= _touching(plant, data)
+            touching.update(touched)
+            if any(data.warning[kind].number for kind in UNSTABLE):
+                raise InputError(
+                    f"scene {scene.name}: got a simulation that becomes unstable from"
+                    f" x = {np.array2string(state, precision=3)}, u = {np.array2string(control, precision=3)},"
+                    " want a smaller timestep, other states (around, spread) or other controls"
+                )
+            predicted = dynamics.step(before, control, period)
+            simulated = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=predicted)
+            found.append((before, control, simulated, predicted))
     errors = np.array([np.abs(simulated - predicted) for _, _, simulated, predicted in found])
     changes = np.array([np.abs(predicted - before) for before, _, _, predicted in found])
     state, control, simulated, predicted = found[0]
@@ -191,10 +193,12 @@ def _taken_away(plant: Plant) -> list[int]:
     return [geom for geom in obstacle_geoms(model) if not (stands and floor[geom])]
 
 
-def _touching(model: mujoco.MjModel, data: mujoco.MjData) -> set[tuple[str, str]]:
-    """The pairs of geoms between which there is a force of contact or could be one."""
+def _touching(plant: Plant, data: mujoco.MjData) -> set[tuple[str, str]]:
+    """The pairs of geoms that touch, of which one is the robot's or of what it is attached to."""
+    model = plant.model
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[plant.body]
     pairs = {tuple(sorted(contact.geom.tolist())) for contact in data.contact if contact.efc_address >= 0}
-    return {(_name(model, a), _name(model, b)) for a, b in pairs}
+    return {(_name(model, a), _name(model, b)) for a, b in pairs if own[a] or own[b]}
 
 
 def _name(model: mujoco.MjModel, geom: int) -> str:
