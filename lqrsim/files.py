@@ -257,4 +257,5 @@ def _trajectory(arrays: Mapping[str, npt.NDArray[Any]], steps: int, n: int, m: i
 
 
 def _coordinates(fields: Mapping[str, Any]) -> Coordinates:
-    return Coordinates(**{key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()})
+    parts: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()}
+    return Coordinates(**parts)

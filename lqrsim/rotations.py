@@ -22,10 +22,12 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, excerpt
 
+Vector = Sequence[Any] | npt.NDArray[Any]
+
 RATIOS = ("sine_ratio", "cosine_ratio", "cotangent_ratio")
 
 
-def rotate(r: Sequence[Any], v: Sequence[Any]) -> list[Any]:
+def rotate(r: Vector, v: Vector) -> list[Any]:
     """The vector `exp([r]) v`: v turned by the rotation vector r; three expressions of SymPy, or three numbers."""
     sine, cosine, _ = (_ratio(name, _dot(r, r)) for name in RATIOS)
     once = _cross(r, v)
@@ -33,7 +35,7 @@ def rotate(r: Sequence[Any], v: Sequence[Any]) -> list[Any]:
     return [v[i] + sine * once[i] + cosine * twice[i] for i in range(3)]
 
 
-def vector_rate(r: Sequence[Any], w: Sequence[Any]) -> list[Any]:
+def vector_rate(r: Vector, w: Vector) -> list[Any]:
     """The rate of the rotation vector r of a body that turns with w rad/s, in body axes.
 
     Three expressions of SymPy, or three numbers if r and w are numbers.
@@ -88,11 +90,11 @@ def _rows(field: str, value: npt.ArrayLike, size: int) -> Array:
     return rows
 
 
-def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+def _dot(a: Vector, b: Vector) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _cross(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
+def _cross(a: Vector, b: Vector) -> list[Any]:
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 

@@ -18,6 +18,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -88,15 +89,28 @@ def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
     return scene_from_xml(xml, path.stem)
 
 
-def scene_from_xml(xml: str, name: str) -> Scene:
-    """The scene of an MJCF given as text, without includes. Raises InputError as `load_scene` does."""
-    _check_elements(xml, name)
+def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
+    """The model of an MJCF given as text, without includes.
+
+    Args:
+      what: it is, for messages.
+
+    Raises:
+      InputError: MuJoCo refuses it, or would not survive it, or it has a NaN.
+    """
+    _check_elements(xml, what)
     try:
         with unlogged():
             model = mujoco.MjModel.from_xml_string(xml)
     except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
-        raise InputError(f"scene {name}: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
-    _check_numbers(model, name)
+        raise InputError(f"{what}: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
+    _check_numbers(model, what)
+    return model
+
+
+def scene_from_xml(xml: str, name: str) -> Scene:
+    """The scene of an MJCF given as text, without includes. Raises InputError as `load_scene` does."""
+    model = model_from_xml(xml, f"scene {name}")
     if mujoco.mj_isSparse(model) and mujoco.__version__ == "4.0.0":
         # Newton on a sparse Jacobian gives wrong forces in 4.0.0 (fixed in 4.0.1).
         raise InputError(
@@ -132,35 +146,34 @@ def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
     return np.flatnonzero(fixed & collides).tolist()
 
 
-def _check_elements(xml: str, scene: str) -> None:
+def _check_elements(xml: str, what: str) -> None:
     """Raises InputError for what would end the process: too deep elements, too large height fields."""
     reader, depth = ElementTree.XMLPullParser(["start", "end"]), 0
     try:
         reader.feed(xml)
-        for event, element in reader.read_events():
+        events: Any = reader.read_events()
+        for event, element in events:
             depth += 1 if event == "start" else -1
             if depth > DEEPEST:
-                raise InputError(
-                    f"scene {scene}: got elements nested deeper than {DEEPEST}, want fewer bodies in bodies"
-                )
+                raise InputError(f"{what}: got elements nested deeper than {DEEPEST}, want fewer bodies in bodies")
             if event == "start" and element.tag == "hfield":
                 sizes = [element.attrib.get(key, "") for key in ("nrow", "ncol")]
                 cells = int(sizes[0]) * int(sizes[1]) if all(size.strip().isdecimal() for size in sizes) else 0
                 if cells > MOST_CELLS:
                     got = f"{sizes[0]} x {sizes[1]} heights in the height field {element.attrib.get('name', '')!r}"
-                    raise InputError(f"scene {scene}: got {got}, want {MOST_CELLS:,} at most")
+                    raise InputError(f"{what}: got {got}, want {MOST_CELLS:,} at most")
     except (ElementTree.ParseError, ValueError) as error:
         if isinstance(error, InputError):
             raise  # the rest is for MuJoCo to say
 
 
-def _check_numbers(model: mujoco.MjModel, scene: str) -> None:
+def _check_numbers(model: mujoco.MjModel, what: str) -> None:
     """Raises InputError if the model has a NaN, which MuJoCo only warns about."""
     for field in (name for name in dir(model) if not name.startswith("_")):
         array = getattr(model, field)
         if isinstance(array, np.ndarray) and array.dtype.kind == "f" and np.isnan(array).any():
             element = int(np.argwhere(np.isnan(array))[0][0])
-            raise InputError(f"scene {scene}: got NaN in the MJCF (MuJoCo's {field}[{element}]), want numbers")
+            raise InputError(f"{what}: got NaN in the MJCF (MuJoCo's {field}[{element}]), want numbers")
 
 
 def _obstacles(model: mujoco.MjModel, scene: str) -> list[Obstacle]:

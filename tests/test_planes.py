@@ -199,7 +199,7 @@ def test_the_figures_show_the_cut(flown, tmp_path: Path) -> None:
     axes = figure.axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (m)", "z (m)")
     # The block's outline in it has the lower corners of the cut: half sizes 0.15 and 0.8 about (0, 0.2).
-    outlines = np.vstack([path.vertices for one in axes.collections for path in one.get_paths() if len(path.vertices)])
+    outlines = np.vstack([np.asarray(path.vertices) for one in axes.collections for path in one.get_paths()])
     block = outlines[(np.abs(outlines[:, 0]) < 0.5) & (np.abs(outlines[:, 1] - 0.2) < 1.0)]
     for corner in ((0.15, -0.6), (-0.15, -0.6)):
         assert np.linalg.norm(block - corner, axis=1).min() < 0.05

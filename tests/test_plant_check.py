@@ -45,7 +45,7 @@ class Arm(ls.Robot):
         return np.concatenate([qpos, qvel], axis=-1)
 
     def configuration(self, state):
-        return np.split(np.asarray(state), 2, axis=-1)
+        return np.asarray(state)[..., :1], np.asarray(state)[..., 1:]
 
 
 def arm(things: str) -> ls.Scene:

@@ -93,8 +93,9 @@ def side(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
     """From the side, level, so that the longer way lies across; the rest is as for `top`."""
     low, high = _bounds(rollout)
     plane = rollout.state_coordinates.plane
-    level = set(plane) & set("xy") if len(plane) == 2 and "z" in plane else ()
-    right = np.eye(3)["xyz".index(*level)] if level else _right(high - low, 1.0)  # a vertical plane is seen from across
+    level = plane.replace("z", "")
+    # A vertical plane is seen from across.
+    right = np.eye(3)["xyz".index(level)] if len(level) == 1 else _right(high - low, 1.0)
     return _camera("side", low, high, right, np.array([0.0, 0.0, 1.0]), aspect)
 
 

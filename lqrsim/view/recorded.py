@@ -5,6 +5,7 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_count
 from lqrsim.rollout import Rollout
+from lqrsim.scenes import model_from_xml
 
 
 def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
@@ -13,10 +14,7 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
         raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
     if len(rollout.state_coordinates.position) not in (2, 3):
         raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
-    try:
-        model = mujoco.MjModel.from_xml_string(rollout.model)
-    except (ValueError, mujoco.FatalError) as error:
-        raise InputError(f"rollout.model: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
+    model = model_from_xml(rollout.model, "rollout.model")
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, rollout.body) < 0:
         raise InputError(f"rollout.body: got {rollout.body!r}, want a body of its model")
     if model.nq != rollout.frames.shape[-1]:
