@@ -1,5 +1,6 @@
 """What the numbers of a state or control vector mean: names, units, limits, and which of them wrap."""
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from lqrsim.errors import Array, InputError, check_array, check_name, check_numb
 SPACE = "xyz"
 PLANES = tuple(a + b for a in SPACE for b in SPACE if a != b)
 _FROM_ABOVE = ("xy", "yx")
+_UPWARD = ("height", "altitude", "elevation", "vertical")  # names of what is hardly a plane from above
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +24,8 @@ class Coordinates:
       position: indices of the 2 (planar) or 3 (spatial) entries that are the position in the world, in metres; or none.
       plane: the world's axes along which the position is measured, in its order: "xyz" for one in space, "" without
         one. Of a planar one two of x, y and z; where it is not given, it follows from the names that end in these
-        letters, as (x, z) or (p_x, p_z) do, and is "xy" where the names end in none of them.
+        letters or have one on its own, as (x, z), (p_x, p_z) or (x_tip, z_tip), and is "xy" where no name says
+        anything.
       offset: where the plane is along the third axis, in metres: the y of "xz". Vertical planes have one, 0 unless it
         is given. Horizontal ones have none unless it is given: without it the world is seen from above. See
         `World.seen_by`.
@@ -85,8 +88,7 @@ class Coordinates:
     def _plane(self) -> str:
         """What `plane` is: as given, from the names, or the default. Raises InputError where these contradict."""
         names = tuple(self.names[index] for index in self.position)
-        letters = [str(name)[-1:].lower() for name in names]
-        said = "".join(letter if letter in tuple(SPACE) else "?" for letter in letters)
+        said = "".join(_letter(str(name)) for name in names)
         listed = ", ".join(names)
         if len(names) == 3:
             if self.plane not in ("", SPACE):
@@ -108,7 +110,7 @@ class Coordinates:
             return plane
         if said in PLANES:
             return said
-        if any(letter not in ("?", default) for letter, default in zip(said, "xy", strict=True)):
+        if said != "??" or any(word in name.lower() for word in _UPWARD for name in names):
             raise InputError(
                 f"plane: got none for the position ({listed}), whose names do not tell it, want one of:"
                 f" {', '.join(PLANES)}"
@@ -190,6 +192,14 @@ class Coordinates:
     def clip(self, vector: npt.ArrayLike) -> Array:
         """`vector` (..., n) held within the limits."""
         return np.clip(np.asarray(vector, dtype=np.float64), self.low, self.high)
+
+
+def _letter(name: str) -> str:
+    """Which of the world's axes a name says: the letter in which it ends, or the one that is on its own; or `?`."""
+    if name[-1:].lower() in tuple(SPACE):
+        return name[-1].lower()
+    alone = set(re.findall(r"(?<![a-z])[xyz](?![a-z])", name.lower()))
+    return alone.pop() if len(alone) == 1 else "?"
 
 
 def _nearest_rotation_vector(vector: Array, near: Array) -> Array:

@@ -48,7 +48,7 @@ class Dynamics:
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
         x, y and z, in this order.
       plane, offset: in which plane a position of 2 states is, as "xz", and where that is along the third axis, in
-        metres: see `Coordinates`. By default the plane is that of the names, if they end in two of x, y and z.
+        metres: see `Coordinates`. By default the plane is that of the names, if they say two of x, y and z.
       angles: names of the states that are angles in radians, equal up to whole turns.
       rotation_vectors: names, by threes, of the states that are rotation vectors.
       control_limits: lowest and highest control, numbers or (m,); what the actuators can do, for execution.

@@ -275,6 +275,27 @@ def test_a_policy_that_returns_nan_is_lost_not_taken_for_zero(sled):
     assert np.isnan(rollout.states[0, 5:]).all()
 
 
+def test_controls_that_mujoco_ignores_lose_the_trial(tmp_path):
+    """Beyond 1e10 MuJoCo sets all controls to zero, and only warns; the record would say that they were applied."""
+
+    class Strong(Sled):
+        @cached_property
+        def dynamics(self):
+            return Dynamics(
+                super().dynamics.f,
+                states=dict.fromkeys(("y", "x"), "m") | dict.fromkeys(("vy", "vx"), "m/s"),
+                controls={"steer": "N", "push": "N"},
+                parameters={"mass": 2.0},
+                position=("x", "y"),
+            )
+
+    robot = Strong()
+    solution = track(robot, (0.0, 1.0, 0.0, 0.0), np.zeros((5, 2)), 0.1, feedback=False)
+    strong = replace(solution, policy=replace(solution.policy, offset=np.full((5, 2), 1e12)))
+    (tmp_path / "ice.xml").write_text(SLED.replace(' ctrlrange="-5 5"', ""))
+    assert simulate(Plant(robot, load_scene(tmp_path / "ice.xml")), strong).outcome == ("diverged",)
+
+
 # Bad input
 
 

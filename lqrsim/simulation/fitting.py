@@ -105,7 +105,7 @@ def _check_position(plant: "Plant") -> None:
             )
         raise InputError(
             f"{who}: got {_point(place)} m in {_of(space)}, where MuJoCo has the origin of body {robot.body!r} at"
-            f" {_point(there)} m; want the position to be that of the body's origin"
+            f" {_point(there)} m; want configuration() to put it there (slides count from the body's pos in the MJCF)"
         )
 
 

@@ -15,7 +15,7 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
     if len(rollout.state_coordinates.position) not in (2, 3):
         raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
     model = model_from_xml(rollout.model, "rollout.model")
-    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, rollout.body) < 0:
+    if not isinstance(rollout.body, str) or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, rollout.body) < 0:
         raise InputError(f"rollout.body: got {rollout.body!r}, want a body of its model")
     if model.nq != rollout.frames.shape[-1]:
         raise InputError(f"rollout.frames: got {rollout.frames.shape[-1]} numbers each, want the model's {model.nq}")
