@@ -360,6 +360,7 @@ def test_what_has_no_name_is_told_by_its_number(tmp_path, kind, message):
         ({"joints": "across"}, "robot sled: joints: got 'across', want names of the MJCF in a tuple"),
         ({"joints": ("across", "")}, r"robot sled: joints: got \('across', ''\), want names"),
         ({"joints": ("across", "across")}, "robot sled: joints: got a name twice in across, across"),
+        ({"drag": -1.0}, "robot sled: drag: got -1.0, want a finite number >= 0"),
         ({"actuators": ()}, r"robot sled: actuation: got shape \(2,\), want \(0,\) for no actuators"),
     ],
 )

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from lqrsim.coordinates import PLANES, SPACE, Coordinates
-from lqrsim.errors import Array, InputError, excerpt
+from lqrsim.errors import Array, InputError, check_number, excerpt
 from lqrsim.robots.base import Robot
 from lqrsim.scenes import Scene
 
@@ -17,7 +17,12 @@ OFF = 1e-4  # metres, or of a metre's move, by which the body may be elsewhere: 
 
 
 def check_names(robot: Robot, scene: Scene) -> None:
-    """Raises InputError unless the robot's body, joints, actuators and wheels are in the scene by their names."""
+    """Raises InputError unless the robot's body, joints, actuators and wheels are in the scene by their names.
+
+    Its radius and its drag must be numbers that are not negative.
+    """
+    check_number(f"robot {robot.name}: radius", getattr(robot, "radius", None), at_least=0.0)
+    check_number(f"robot {robot.name}: drag", robot.drag, at_least=0.0)
     model = scene.model
     wanted = {
         "body": ("body", [robot.body], model.nbody),

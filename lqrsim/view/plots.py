@@ -33,11 +33,12 @@ def plot_run(
     _check(solution, rollouts, trial)
     with style.figure(path, size=(11, 7.5)) as figure:
         strips = len(solution.policy.control_coordinates)
-        left = figure.add_gridspec(1, 1, left=0.06, right=0.455, bottom=0.13, top=0.95)[0]
+        in_space = len(solution.policy.state_coordinates.position) == 3
+        left = figure.add_gridspec(1, 1, left=0.05 if in_space else 0.075, right=0.455, bottom=0.13, top=0.95)[0]
         right = figure.add_gridspec(
             3, 1, left=0.57, right=0.92, bottom=0.13, top=0.95, hspace=0.42, height_ratios=(1, 0.7 + 0.3 * strips, 1)
         )
-        if len(solution.policy.state_coordinates.position) == 3:
+        if in_space:
             path_axes = figure.add_subplot(left, projection="3d")
             assert isinstance(path_axes, Axes3D)
             _path_in_space(path_axes, solution, rollouts, world, trial)
