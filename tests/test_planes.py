@@ -280,6 +280,15 @@ def test_a_robot_of_another_plane_is_refused_with_the_remedy(robot, scene, messa
     assert "\n" not in str(refused.value)
 
 
+def test_a_plan_for_another_plane_is_not_run() -> None:
+    below = PlanarQuadrotor(names=("a", "b"), plane="xz", offset=0.7)
+    solution = track(PlanarQuadrotor(names=("a", "b")), np.zeros(6), np.full((5, 2), 2.45), 0.02)
+    with pytest.raises(
+        ls.InputError, match=r"\(a, b\) in the plane 'xy', want that .*: \(a, b\) in the plane 'xz' at 0.7 m"
+    ):
+        ls.simulate(fitted(below, y=0.7), solution)
+
+
 class Mirrored(PlanarQuadrotor):
     """With the height downward, as in aviation."""
 

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import compiled
+from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_count, check_number
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
@@ -230,5 +231,18 @@ def _check_solution(solution: Solution, controller: Controller, plant: Plant) ->
                 f"solution: got a policy with {field} {', '.join(space.names)}, want those of robot"
                 f" {plant.robot.name}: {', '.join(want)}"
             )
+    meant, moves = controller.spaces[0], dynamics.state_coordinates
+    if (meant.position, meant.plane, meant.offset) != (moves.position, moves.plane, moves.offset):
+        raise InputError(
+            f"solution: got a policy for a position {_place(meant)}, want that of robot {plant.robot.name}:"
+            f" {_place(moves)}"
+        )
     if not np.isfinite(solution.trajectory.states).all():
         raise InputError(f"solution: got a plan that is not finite ({solution.status.name}), want one that can be run")
+
+
+def _place(space: Coordinates) -> str:
+    """What the position is, for a message."""
+    names = ", ".join(space.names[index] for index in space.position) or "of no states"
+    plane = f" in the plane {space.plane!r}" if len(space.plane) == 2 else ""
+    return f"({names}){plane}" + ("" if space.offset is None else f" at {space.offset:g} m")
