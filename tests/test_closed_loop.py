@@ -283,7 +283,7 @@ def test_controls_that_mujoco_ignores_lose_the_trial(tmp_path):
         def dynamics(self):
             return Dynamics(
                 super().dynamics.f,
-                states=dict.fromkeys(("y", "x"), "m") | dict.fromkeys(("vy", "vx"), "m/s"),
+                states={"y": "m", "x": "m", "vy": "m/s", "vx": "m/s"},
                 controls={"steer": "N", "push": "N"},
                 parameters={"mass": 2.0},
                 position=("x", "y"),
