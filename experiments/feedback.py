@@ -154,7 +154,7 @@ def draw_paths(
                 axes.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2), zticks=(-2, 0, 2))
             else:
                 axes = drawn.add_subplot(grid[number])
-                scenery.draw_in_plane(axes, scenario.scene.world, low, high, scenario.robot.radius)
+                scenery.draw_in_plane(axes, scenario.scene.world.seen_by("xy"), low, high, scenario.robot.radius)
             for name in (OPEN_LOOP, FEEDBACK):
                 draw_runs(axes, rollouts[scenario.name][name], config.paths, name)
             axes.plot(*plan.T, color=PLAN, label="plan")

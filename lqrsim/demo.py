@@ -103,10 +103,10 @@ def _execute(scenario: Scenario, solution: Solution, path: Path, seed: int, *, d
 
 def _film(rollout: Rollout, solution: Solution, path: Path, *, quick: bool) -> None:
     """With the calibrated panes from which the robot's position can be measured."""
+    from lqrsim.view import cameras
     from lqrsim.view.render import render
 
-    # From the side, all that moves on a floor does so along a line.
-    insets = ("top", "side") if len(rollout.state_coordinates.position) == 3 else ("top",)
+    insets = cameras.measuring(rollout)
     quality, fps = ("draft", 5) if quick else ("standard", 30)
     with console.progress("rendering", "frame") as progress:
         render(rollout, path, insets=insets, solution=solution, quality=quality, fps=fps, progress=progress)

@@ -168,7 +168,7 @@ _ROLLOUT_ARRAYS = (
     "collided_at", "diverged_at", "failed_at", "frame_times", "frames",
 )  # fmt: skip
 _ROLLOUT_TEXTS = (
-    "robot", "scene", "model", "policy_digest", "radius", "goal_radius", "seed", "first_trial", "versions",
+    "robot", "body", "scene", "model", "policy_digest", "radius", "goal_radius", "seed", "first_trial", "versions",
 )  # fmt: skip
 
 
@@ -266,4 +266,5 @@ def _trajectory(arrays: Mapping[str, npt.NDArray[Any]], steps: int, n: int, m: i
 
 
 def _coordinates(fields: Mapping[str, Any]) -> Coordinates:
-    return Coordinates(**{key: tuple(value) for key, value in fields.items()})
+    parts: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()}
+    return Coordinates(**parts)

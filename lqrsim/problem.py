@@ -164,14 +164,14 @@ class Problem:
         return hasher.hexdigest()[:16]
 
     def _check_start_clear(self) -> None:
-        position = list(self.dynamics.state_coordinates.position)
-        if self.start is None or not position:
+        space = self.dynamics.state_coordinates
+        if self.start is None or not space.position:
             return
         for cost in self.obstacle_costs:
-            world = cost.world.seen_by(len(position))
+            world = cost.world.seen_by(space.plane, space.offset)
             if not len(world):
                 continue
-            place = self.start[position]
+            place = self.start[list(space.position)]
             distances = world.distances(place) - cost.radius
             if distances.min() < 0:
                 where = ", ".join(f"{value:g}" for value in place)

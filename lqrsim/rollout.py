@@ -20,7 +20,7 @@ class Rollout:
     K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, to the last bit.
 
     Attributes:
-      robot, scene: their names. model: the MJCF that was run, as text.
+      robot, scene: their names. body: the robot's in the MJCF. model: the MJCF that was run, as text.
       plan: what the policy meant to do. policy_digest: hash of the policy.
       goal: (n,) the state that the plan was to reach, NaN in states that do not count; None where it is the plan's end.
       goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: metres, or of the
@@ -46,6 +46,7 @@ class Rollout:
     """
 
     robot: str
+    body: str
     scene: str
     model: str
     plan: Trajectory

@@ -179,8 +179,8 @@ def test_an_arm_that_gets_there_has_reached_it_and_one_that_does_not_has_not(arm
 
 
 def test_a_cart_pole_that_has_fallen_has_not_reached_its_goal() -> None:
-    plant = Plant(CartPole(), scene_from_xml(CART_POLE, "rail"))
-    plan = track(plant.robot, np.zeros(4), np.zeros((60, 1)), 0.05)
+    plant = Plant(CartPole(), scene_from_xml(CART_POLE.replace("0 0 -0.2", "0 0 -0.7"), "rail"))  # out of reach
+    plan = track(plant.robot, np.zeros(4), np.zeros((25, 1)), 0.05)
     plan = replace(plan, goal=np.zeros(4))
     held = ls.simulate(plant, plan, disturbances=[ls.InitialStateError((0, 0.02, 0, 0))])
     assert held.outcome == ("reached",)
@@ -189,6 +189,42 @@ def test_a_cart_pole_that_has_fallen_has_not_reached_its_goal() -> None:
     assert fallen.outcome == ("timed out",)
     assert fallen.tracking_error.max() > 1
     assert "0 of 1 trials reached the goal" in fallen.tally()
+
+
+@pytest.mark.parametrize("contacts", [True, False])
+def test_the_floor_is_an_obstacle_of_what_cannot_stand_on_it(contacts: bool) -> None:
+    plant = Plant(CartPole(), scene_from_xml(CART_POLE, "rail"))
+    assert plant.obstacles == ("floor",)
+    plan = track(plant.robot, np.zeros(4), np.zeros((60, 1)), 0.05)
+    fallen = ls.simulate(
+        plant, plan.open_loop(), disturbances=[ls.InitialStateError((0, 0.02, 0, 0))], contacts=contacts
+    )
+    assert (fallen.outcome, fallen.obstacles) == (("collided",), ("floor",))
+    # The pole's tip, 0.6 m from the hinge and 2 cm thick, is then on the floor, 0.2 m below the hinge.
+    touch, at = np.arccos(-0.18 / 0.6), round(fallen.collided_at[0] / 0.05 - 0.5)
+    assert (np.abs(fallen.states[0, : at + 1, 1]) < touch).all()
+    if contacts:
+        assert abs(fallen.states[0, -1, 1]) == pytest.approx(touch, abs=1e-3)  # it lies there
+    else:
+        assert abs(fallen.states[0, at + 1, 1]) > touch
+
+
+def test_what_can_sink_to_the_floor_stands_on_it() -> None:
+    slide = '<joint name="slide" type="slide" axis="1 0 0"/>'
+    lifted = CART_POLE.replace(slide, slide + '<joint name="up" type="slide" axis="0 0 1"/>')
+
+    @dataclass(frozen=True)
+    class Lifted(CartPole):
+        joints = ("slide", "up", "hinge")
+
+        def state(self, qpos, qvel, near=None):
+            return super().state(qpos[..., [0, 2]], qvel[..., [0, 2]], near)
+
+        def configuration(self, state):
+            qpos, qvel = (np.insert(part, 1, 0.0, axis=-1) for part in super().configuration(state))
+            return qpos, qvel
+
+    assert Plant(Lifted(), scene_from_xml(lifted, "rail")).obstacles == ()
 
 
 # Judged by the goal.

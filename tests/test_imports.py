@@ -44,7 +44,7 @@ ROOMS = (
     ("solvers",),
     ("robots",),
     ("scenes",),
-    ("simulation.plant",),
+    ("simulation.fitting", "simulation.plant"),
     ("simulation.disturbances",),
     ("simulation",),
     ("scenarios",),

@@ -30,6 +30,9 @@ class DifferentialDrive(Robot):
     actuators: ClassVar[tuple[str, ...]] = ("create_wheel_left", "create_wheel_right")
     wheels: ClassVar[tuple[str, ...]] = ("create_tread_left", "create_tread_right")
 
+    def __post_init__(self) -> None:
+        self._check(above_zero=("axle_length", "radius", "max_speed", "wheel_radius"))
+
     @property
     def dynamics(self) -> Dynamics:
         return _dynamics(self)

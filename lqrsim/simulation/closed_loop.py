@@ -7,13 +7,15 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import compiled
+from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_count, excerpt
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
+from lqrsim.scenes import unlogged
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.controllers import Controller, Feedback
 from lqrsim.simulation.disturbances import Disturbance, Effect
-from lqrsim.simulation.physics import Physics, unlogged
+from lqrsim.simulation.physics import Physics
 from lqrsim.simulation.plant import Plant
 from lqrsim.target import Target
 from lqrsim.versions import versions
@@ -95,7 +97,8 @@ def simulate(
             effect.alter(physics.simulations)
     if displaced.any():
         plant.displace(physics.simulations, displaced)
-    physics.begin(altered=bool(displaced.any()) or any(effect.alter for effect in effects))
+    with unlogged():
+        physics.begin(altered=bool(displaced.any()) or any(effect.alter for effect in effects))
 
     measures = [effect.measure for effect in effects if effect.measure is not None]
     actuations = [effect.actuate for effect in effects if effect.actuate is not None]
@@ -190,6 +193,7 @@ def simulate(
             array[knots >= until[:, None]] = np.nan
     return Rollout(
         robot=plant.robot.name,
+        body=plant.robot.body,
         scene=plant.scene.name,
         model=plant.scene.xml,
         plan=plan,
@@ -294,5 +298,18 @@ def _check_solution(solution: Solution, controller: Controller, plant: Plant) ->
                 f"solution: got a policy with {field} {', '.join(space.names)}, want those of robot"
                 f" {plant.robot.name}: {', '.join(want)}"
             )
+    meant, moves = controller.spaces[0], dynamics.state_coordinates
+    if (meant.position, meant.plane, meant.offset) != (moves.position, moves.plane, moves.offset):
+        raise InputError(
+            f"solution: got a policy for a position {_place(meant)}, want that of robot {plant.robot.name}:"
+            f" {_place(moves)}"
+        )
     if not np.isfinite(solution.trajectory.states).all():
         raise InputError(f"solution: got a plan that is not finite ({solution.status.name}), want one that can be run")
+
+
+def _place(space: Coordinates) -> str:
+    """What the position is, for a message."""
+    names = ", ".join(space.names[index] for index in space.position) or "of no states"
+    plane = f" in the plane {space.plane!r}" if len(space.plane) == 2 else ""
+    return f"({names}){plane}" + ("" if space.offset is None else f" at {space.offset:g} m")

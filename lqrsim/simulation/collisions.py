@@ -102,7 +102,7 @@ class Collisions:
         self.at[row] = time
         world, point = self.plant.world, np.zeros(3)
         point[: len(place)] = place
-        there = (point - self.displaced[row]).tolist()  # seen from where each obstacle is
+        there = (point - self.plant.across(self.displaced[row])).tolist()  # seen from where each obstacle is
         table = world.table.ravel()
         distances = [signed_distance(table, ROW * number, *seen) for number, seen in enumerate(there)]
         self.obstacles[row] = world.names[int(np.argmin(distances))]

@@ -1,7 +1,6 @@
 """MuJoCo's side of the loop: all trials' states, and how to advance them by a control period."""
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -17,7 +16,13 @@ FRAME_PERIOD = 1 / 30  # s; positions are looked at and recorded at least this o
 AWAY = 2.0**20  # m; how deep a robot must be within an obstacle that is only felt, before it is pushed
 
 _WARNINGS = mujoco.mjtWarning
-_UNSTABLE = [int(warning) for warning in (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)]
+# What MuJoCo does not go on with: it resets the state, or the controls, and only warns.
+UNSTABLE = [
+    int(warning)
+    for warning in (
+        _WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC, _WARNINGS.mjWARN_BADCTRL
+    )
+]  # fmt: skip
 
 
 @dataclass
@@ -83,6 +88,9 @@ class Physics:
     def begin(self, *, altered: bool) -> None:
         """Have obstacles without effect; and what follows from fields that were `altered` worked out."""
         model = self.simulations.model
+        if altered:
+            # While obstacles are still such: MuJoCo works out here, too, which bodies can collide at all.
+            self.simulations.set_const()
         geoms = np.array([model.geom(name).id for name in self.plant.obstacles], dtype=np.intp)
         if self.feels:
             # MuJoCo detects a contact below margin + gap, and pushes below the margin.
@@ -92,11 +100,10 @@ class Physics:
             ):  # fmt: skip
                 if len(ids):
                     self._disarm(field, ids, lambda values, sign=sign: values + sign * AWAY)
+            self.simulations.set_const()
         elif self._contacts and len(geoms):
             for field in ("geom_contype", "geom_conaffinity"):
                 self._disarm(field, geoms, np.zeros_like)
-        if altered or self.feels:
-            self.simulations.set_const()
 
     def _disarm(self, field: str, ids: npt.NDArray[np.intp], change: Callable[[Array], Array]) -> None:
         values = self.simulations.expand(field)
@@ -163,7 +170,7 @@ class Physics:
             # MuJoCo resets an unstable simulation and goes on; only its warnings tell.
             warned = self.simulations.warning[..., 1]
             if warned.any():
-                self.unstable |= (warned[:, _UNSTABLE] > 0).any(axis=1)
+                self.unstable |= (warned[:, UNSTABLE] > 0).any(axis=1)
             if self.unstable.any():
                 period.stable[self.unstable] = np.minimum(period.stable[self.unstable], part)
             period.states.append(self.state())
@@ -179,15 +186,3 @@ def _span(indices: Indices) -> slice | Indices:
     """The same place in an array; as a slice, which copies nothing, where they follow each other."""
     first, last = int(indices.min(initial=0)), int(indices.max(initial=-1))
     return slice(first, last + 1) if np.array_equal(indices, np.arange(first, last + 1)) else indices
-
-
-@contextlib.contextmanager
-def unlogged() -> Iterator[None]:
-    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder when a trial becomes unstable; we record it."""
-    before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-    quiet.logto_file = quiet.logto_console = False
-    quiet.set()
-    try:
-        yield
-    finally:
-        before.set()

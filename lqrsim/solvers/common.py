@@ -340,12 +340,12 @@ def model(problem: Problem, multipliers: Sequence[Array] = ()) -> tuple[Any, ...
 
 
 def _clearance(problem: Problem, states: Array) -> Array | None:
-    position = list(problem.dynamics.state_coordinates.position)
+    space = problem.dynamics.state_coordinates
     constraints = [constraint for constraint in problem.constraints if isinstance(constraint, Clearance)]
     worlds = {(id(one.world), one.radius): one.world for one in (*problem.obstacle_costs, *constraints)}
-    place = states[:, position]
+    place = states[:, list(space.position)]
     found = [
-        compiled.signed_distance(world.seen_by(len(position)), place) - radius
+        compiled.signed_distance(world.seen_by(space.plane, space.offset), place) - radius
         for (_, radius), world in worlds.items()
         if len(world)
     ]
