@@ -7,6 +7,7 @@ import contextlib
 import json
 import os
 import tempfile
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -233,7 +234,10 @@ def _read(path: Path, kind: str) -> tuple[dict[str, npt.NDArray[Any]], dict[str,
         found, version = meta["format"], meta["version"]
     except OSError as error:
         raise InputError(f"{kind}: got {path}, want a file that can be read ({error.strerror or error})") from None
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, AttributeError):
+    except (  # of the archive, of the header of an array, which is Python's, or of the JSON
+        ValueError, KeyError, TypeError, EOFError, AttributeError, SyntaxError, tokenize.TokenError,
+        zipfile.BadZipFile, zlib.error,
+    ):  # fmt: skip
         raise InputError(f"{kind}: got {path}, which is damaged, want a file that lqrsim wrote") from None
     if found != f"lqrsim {kind}":
         raise InputError(f"{kind}: got {path}, which holds a {found!r}, want a {f'lqrsim {kind}'!r}")

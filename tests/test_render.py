@@ -328,7 +328,7 @@ def test_bad_input_for_a_still(options: dict, message: str, drive: ls.Rollout, t
 
 @pytest.mark.parametrize("model", ["<mujoco><worldbody>", "<mujoco/>"])
 def test_model_that_does_not_fit(model: str, drive: ls.Rollout, tmp_path: Path) -> None:
-    with pytest.raises(ls.InputError, match=r"rollout\.(model|frames): got") as caught:
+    with pytest.raises(ls.InputError, match=r"rollout\.(model|body|frames): got") as caught:
         render(dataclasses.replace(drive, model=model), tmp_path / "run.mp4")
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
