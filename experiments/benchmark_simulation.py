@@ -73,7 +73,7 @@ class Contest:
             contacts=False,
             threads=threads,
         )
-        outcomes(rollout, self.plant, self.scenario.problem)
+        outcomes(rollout, self.scenario.problem)
         return rollout
 
     def raw(self, rollout: ls.Rollout, threads: int) -> Callable[[], None]:

@@ -84,8 +84,8 @@ def main(config: Config) -> Result:
 
 
 def measured(rollout: ls.Rollout) -> dict[str, Any]:
-    """Trial by trial: how far from the plan in metres, and how it ended. A lost trial counts until it was lost."""
-    error = rollout.tracking_error
+    """Trial by trial: how far from the plan in metres, until it ended, and how it ended."""
+    error = np.where(rollout.counts, rollout.tracking_error, np.nan)
     return {
         "rms": numbers(np.sqrt(np.nanmean(error**2, axis=1))),
         "worst": numbers(np.nanmax(error, axis=1)),
@@ -107,7 +107,7 @@ def draw(config: Config, result: Result) -> None:
             draw_errors(over_time, robot)
             over_time.set_title(f"{NAMES[name]}, disturbances as in the demo: median, 5 to 95 %")
             draw_success(success, robot)
-            success.set_title(f"{NAMES[name]}: plan's end reached")
+            success.set_title(f"{NAMES[name]}: goal reached")
         drawn.tight_layout(w_pad=3)
 
 
@@ -154,7 +154,7 @@ def draw_paths(
                 axes.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2), zticks=(-2, 0, 2))
             else:
                 axes = drawn.add_subplot(grid[number])
-                scenery.draw_in_plane(axes, scenario.scene.world, low, high, scenario.robot.radius)
+                scenery.draw_in_plane(axes, scenario.scene.world.seen_by("xy"), low, high, scenario.robot.radius)
             for name in (OPEN_LOOP, FEEDBACK):
                 draw_runs(axes, rollouts[scenario.name][name], config.paths, name)
             axes.plot(*plan.T, color=PLAN, label="plan")
@@ -174,8 +174,7 @@ def draw_runs(axes: Axes, rollout: ls.Rollout, count: int, name: str) -> None:
     """The first trials, each to its end or to where it first collides."""
     colour, line, _ = LOOK[name]
     states = rollout.states[:count, :, list(rollout.state_coordinates.position)]
-    hit = rollout.clearance[:count] < 0
-    ends = [np.argmax(one) if one.any() else len(one) for one in hit]
+    ends = [int(counted.sum()) for counted in rollout.counts[:count]]
     for number, (path, end) in enumerate(zip(states, ends, strict=True)):
         axes.plot(*path[: end + 1].T, line, color=colour, linewidth=0.7, alpha=0.8, label=None if number else name)
     crosses = np.array([path[end] for path, end in zip(states, ends, strict=True) if end < len(path)])
@@ -201,14 +200,14 @@ def report(result: Result) -> str:
         parts += [
             f"{NAMES[name].capitalize()}, {result['trials']} trials of each; at strength 1:"
             f" {'; '.join(robot['disturbances'])}. A trial has reached its goal if it ends within"
-            f" {robot['goal_radius']:g} m of the plan's end and never collided.",
+            f" {robot['goal_radius']:g} m of the goal and never collided.",
             cells(robot),
         ]
     return "\n\n".join(
         [
             *parts,
-            "Errors are distances from the plan in metres: root mean square over time, the largest, and the last one. A"
-            " trial goes on after a collision, and so do its errors."
+            "Errors are distances from the plan in metres: root mean square over time, the largest, and the last one;"
+            " they count until a trial collides or is lost."
             " Intervals are exact, of 95 %; p is McNemar's exact test of the same trials with feedback and without."
             " Undisturbed, all trials are the same, so there is one.",
         ]
@@ -251,7 +250,7 @@ def statements(result: Result) -> list[Statement]:
                 where="Sec. VI-A",
                 paper="the control policy can account for disturbances"
                 + ("" if name == "differential_drive" else f", said of the drive; here the {NAMES[name]}"),
-                test="the plan's end reached more often than without feedback, the 95 % intervals apart",
+                test="the goal reached more often than without feedback, the 95 % intervals apart",
                 ours=f"{100 * value:.1f} % ({100 * low:.1f} to {100 * high:.1f}) with feedback,"
                 f" {100 * bare:.1f} % ({100 * bare_low:.1f} to {100 * bare_high:.1f}) without",
                 holds=low > bare_high,

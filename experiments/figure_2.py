@@ -137,9 +137,10 @@ def executed(config: Config, scenario: ls.Scenario, result: Result, plan: ls.Sol
     }
     result["runs"] = {}
     for name, rollout in rollouts.items():
-        error, reached = rollout.tracking_error, int(rollout.reached.sum())
+        error = np.where(rollout.counts, rollout.tracking_error, np.nan)
+        reached, least = int(rollout.reached.sum()), rollout.least_clearance().min()
         turned = np.abs(rollout.states[:, -1, 2] - rollout.plan.states[-1, 2])
-        most = (np.sqrt(np.nanmean(error**2)), np.nanmax(error), np.nanmin(rollout.clearance), np.degrees(turned).max())
+        most = (np.sqrt(np.nanmean(error**2)), np.nanmax(error), least, np.degrees(turned).max())
         rms, worst, nearest, heading = numbers(map(float, most), 4)
         result["runs"][name] = {
             "disturbances": list(rollout.disturbances), "trials": rollout.trials, "reached": reached,
@@ -239,7 +240,7 @@ def report(result: Result) -> str:
             picture(result, "figure_2_executed", "Runs of the policy in MuJoCo, their tracking error and clearance"),
             f"The policy from {NOMINAL} in MuJoCo, on a model with wheels that roll on the floor and turn at no more"
             f" than 0.5 m/s; disturbed: {'; '.join(runs[DISTURBED]['disturbances'])}. Reached is a run that ends within"
-            f" {runs[DISTURBED]['goal']:g} m of the plan's end and touches nothing.",
+            f" {runs[DISTURBED]['goal']:g} m of the goal and touches nothing.",
             table(executed_head, executions),
             picture(result, "figure_2_rendered", "A disturbed run, the robot every two seconds"),
             picture(result, "figure_2_sensitivity", "Which way plans go, by the weights of obstacles and controls"),

@@ -32,6 +32,7 @@ from scipy.spatial.transform import Rotation
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.stress.statistics import rate
+from lqrsim.target import OUTCOMES
 from lqrsim.view import scenery
 from lqrsim.view.style import MARGIN, PLAN, RUNS, SOLID
 
@@ -70,17 +71,17 @@ def main(config: Config) -> Result:
     trials = 10 if config.quick else config.trials
     calm = ls.simulate(scenario.plant(), solution)
     runs = ls.simulate(scenario.plant(), solution, disturbances=scenario.disturbances, seed=config.seed, trials=trials)
-    error = runs.tracking_error
+    error = runs.tracking_error[runs.counts]
     result["executed"] = {
         "undisturbed": float(calm.tracking_error.max()),
         "bound": scenario.tracking_bound,
         "disturbances": list(runs.disturbances),
         "trials": trials,
-        "outcomes": {name: runs.outcome.count(name) for name in ("reached", "timed out", "collided", "diverged")},
+        "outcomes": {name: runs.outcome.count(name) for name in OUTCOMES},
         "reached": interval(rate(int(runs.reached.sum()), trials)),
         "rms": float(np.sqrt(np.mean(error**2))),
         "worst": float(error.max()),
-        "clearance": float(runs.clearance.min()),
+        "clearance": float(runs.least_clearance().min()),
     }
     draw(config, result, scenario, solution, runs)
     still(config, result, "figure_3_rendered", calm, every=EVERY)

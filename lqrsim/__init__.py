@@ -88,8 +88,8 @@ if TYPE_CHECKING:
     from lqrsim.simulation.outcomes import Outcomes as Outcomes
     from lqrsim.simulation.outcomes import outcomes as outcomes
     from lqrsim.simulation.plant import Plant as Plant
-    from lqrsim.simulation.plant import PlantCheck as PlantCheck
-    from lqrsim.simulation.plant import check_plant as check_plant
+    from lqrsim.simulation.plant_check import PlantCheck as PlantCheck
+    from lqrsim.simulation.plant_check import check_plant as check_plant
     from lqrsim.solvers.continuous import ContinuousSolution as ContinuousSolution
     from lqrsim.solvers.continuous import smooth_continuous as smooth_continuous
     from lqrsim.solvers.continuous import smooth_lq_continuous as smooth_lq_continuous
@@ -175,7 +175,8 @@ _HOME = {
         "preset",
     ],
     "simulation.outcomes": ["Outcomes", "outcomes"],
-    "simulation.plant": ["Plant", "PlantCheck", "check_plant"],
+    "simulation.plant": ["Plant"],
+    "simulation.plant_check": ["PlantCheck", "check_plant"],
     "solvers.continuous": ["ContinuousSolution", "smooth_continuous", "smooth_lq_continuous"],
     "solvers.ilqr": ["ilqr", "ilqr_many"],
     "solvers.linear_quadratic": ["smooth_lq"],

@@ -6,6 +6,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -52,8 +53,12 @@ def check_output(field: str, folder: Path, name: str = "") -> None:
         raise InputError(f"{field}: got {place}, want a {what} that can be written ({reason})") from None
 
 
-def solve(problem: "Problem", solver: str, **options: object) -> "Solution":
-    """Call `lqrsim.smooth` or `lqrsim.ilqr`; print each iteration as it ends, then the status."""
+def solve(problem: "Problem", solver: str, *, reach: float | None = None, **options: object) -> "Solution":
+    """Call `lqrsim.smooth` or `lqrsim.ilqr`; print each iteration as it ends, then the status.
+
+    Args:
+      reach: the solution's `goal_radius`.
+    """
     from lqrsim.results import Iteration
     from lqrsim.solvers.ilqr import ilqr
     from lqrsim.solvers.smoother import smooth
@@ -67,6 +72,7 @@ def solve(problem: "Problem", solver: str, **options: object) -> "Solution":
 
     say(Iteration.HEADER)
     solution = {"smooth": smooth, "ilqr": ilqr}[solver](problem, callback=show, **options)
+    solution = solution if reach is None else replace(solution, goal_radius=reach)
     say(solution.summary())
     return solution
 

@@ -61,7 +61,7 @@ class Clearance(Constraint):
     weight, and the search has something to go by.
 
     Args:
-      world: the obstacles; a robot in the plane sees it from above, as for an ObstacleCost.
+      world: the obstacles; a robot in the plane sees them as for an ObstacleCost.
       radius: of the robot, in metres. margin: what is to be left beyond that, in metres.
     """
 
@@ -73,10 +73,11 @@ class Clearance(Constraint):
         self.margin = check_number("Clearance: margin", margin)
 
     def bind(self, dynamics: Dynamics) -> Inequalities:
-        position = dynamics.state_coordinates.position
+        space = dynamics.state_coordinates
+        position = space.position
         if not position:
             raise InputError("Clearance: got dynamics without a position, want Dynamics(..., position=(names))")
-        world = self.world.seen_by(len(position))
+        world = self.world.seen_by(space.plane, space.offset)
         place = [f"x[{i}]" for i in position] + (["0.0"] if len(position) == 2 else [])
         return Inequalities(
             source=_CLEARANCE.format(place=", ".join(place), axes=repr(position), size=len(position), row=ROW),

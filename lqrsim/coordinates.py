@@ -1,5 +1,6 @@
 """What the numbers of a state or control vector mean: names, units, limits, and which of them wrap."""
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,11 +13,18 @@ from lqrsim.errors import (
     check_count,
     check_items,
     check_kind,
+    check_name,
+    check_number,
     check_text,
     excerpt,
     numbers_of,
     vectors_of,
 )
+
+SPACE = "xyz"
+PLANES = tuple(a + b for a in SPACE for b in SPACE if a != b)
+_FROM_ABOVE = ("xy", "yx")
+_UPWARD = ("height", "altitude", "elevation", "vertical")  # names of what is hardly a plane from above
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +35,13 @@ class Coordinates:
       names: one name an entry.
       units: one unit an entry ("" where there is none).
       position: indices of the 2 (planar) or 3 (spatial) entries that are the position in the world, in metres; or none.
+      plane: the world's axes along which the position is measured, in its order: "xyz" for one in space, "" without
+        one. Of a planar one two of x, y and z; where it is not given, it follows from the names that end in these
+        letters or have one on its own, as (x, z), (p_x, p_z) or (x_tip, z_tip), and is "xy" where no name says
+        anything.
+      offset: where the plane is along the third axis, in metres: the y of "xz". Vertical planes have one, 0 unless it
+        is given. Horizontal ones have none unless it is given: without it the world is seen from above. See
+        `World.seen_by`.
       angles: indices of the entries that are angles in radians, equal up to whole turns.
       rotation_vectors: index of the first of each three entries that are a rotation vector, axis times angle in rad.
       low, high: limits of each entry, (len(names),); infinite where there is none.
@@ -39,6 +54,8 @@ class Coordinates:
     rotation_vectors: tuple[int, ...] = ()
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
+    plane: str = ""
+    offset: float | None = None
 
     def __post_init__(self) -> None:
         for field, least in (("names", False), ("units", True)):
@@ -67,6 +84,14 @@ class Coordinates:
             width = 3 if field == "rotation_vectors" else 1
             if any(not 0 <= index <= size - width for index in indices):
                 raise InputError(f"{field}: got indices {indices}, want them between 0 and {size - width}")
+        plane = self._plane()
+        if len(plane) != 2 and self.offset is not None:
+            raise InputError(
+                f"offset: got {excerpt(self.offset)} without a plane, want it with a position of two entries"
+            )
+        offset = 0.0 if self.offset is None and len(plane) == 2 and plane not in _FROM_ABOVE else self.offset
+        object.__setattr__(self, "plane", plane)
+        object.__setattr__(self, "offset", None if offset is None else check_number("offset", offset))
         for field, endless in (("low", -np.inf), ("high", np.inf)):
             if isinstance(getattr(self, field), tuple) and not getattr(self, field):
                 object.__setattr__(self, field, (endless,) * size)
@@ -82,6 +107,74 @@ class Coordinates:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def _plane(self) -> str:
+        """What `plane` is: as given, from the names, or the default. Raises InputError where these contradict."""
+        check_kind("plane", self.plane, str, f"one of: {', '.join(PLANES)}")
+        names = tuple(self.names[index] for index in self.position)
+        said = "".join(_letter(name) for name in names)
+        listed = ", ".join(names)
+        if len(names) == 3:
+            if self.plane not in ("", SPACE):
+                raise InputError(
+                    f"plane: got {excerpt(self.plane)} for the position ({listed}), want none: it is in space"
+                )
+            if sorted(said) == sorted(SPACE) and said != SPACE:
+                want = ", ".join(names[said.index(letter)] for letter in SPACE)
+                raise InputError(f"position: got ({listed}), want it along x, y and z in this order: ({want})")
+            return SPACE
+        if not names:
+            if self.plane:
+                raise InputError(f"plane: got {excerpt(self.plane)} without a position, want position=(names) with it")
+            return ""
+        if self.plane:
+            plane = check_name("plane", self.plane, PLANES)
+            if said in PLANES and plane != said:
+                raise InputError(f"plane: got {plane!r} for the position ({listed}), want {said!r}, or other names")
+            return plane
+        if said in PLANES:
+            return said
+        if said != "??" or any(word in name.lower() for word in _UPWARD for name in names):
+            raise InputError(
+                f"plane: got none for the position ({listed}), whose names do not tell it, want one of:"
+                f" {', '.join(PLANES)}"
+            )
+        return "xy"
+
+    @property
+    def world_axes(self) -> tuple[int, ...]:
+        """Along which of the world's axes, 0 to 2, each entry of the position is."""
+        return tuple(SPACE.index(letter) for letter in self.plane)
+
+    @property
+    def from_above(self) -> bool:
+        """Whether the position is in a horizontal plane of no certain height: on whatever the robot stands on."""
+        return len(self.position) == 2 and self.offset is None
+
+    def in_world(self, places: npt.ArrayLike, *, height: float = 0.0) -> Array:
+        """Points (..., 3) in the world of positions (..., 2 or 3).
+
+        Args:
+          height: in metres, of those that are seen from above; the rest have their own.
+
+        Raises:
+          InputError: not numbers of such a shape, or there is no position.
+        """
+        height = check_number("height", height)
+        if not self.position:
+            raise InputError("places: got them for coordinates without a position, want position=(names) with these")
+        places = vectors_of("places", places, len(self.position))
+        points = np.full((*places.shape[:-1], 3), height if self.offset is None else self.offset)
+        points[..., list(self.world_axes)] = places
+        return points
+
+    def of_world(self, points: npt.ArrayLike) -> Array:
+        """Positions (..., 2 or 3) of points (..., 3) in the world; what is across the plane is left out.
+
+        Raises:
+          InputError: not numbers of such a shape.
+        """
+        return vectors_of("points", points, 3)[..., list(self.world_axes)]
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -143,6 +236,14 @@ class Coordinates:
     def clip(self, vector: npt.ArrayLike) -> Array:
         """`vector` (..., n) held within the limits."""
         return np.clip(vectors_of("vector", vector, len(self)), self.low, self.high)
+
+
+def _letter(name: str) -> str:
+    """Which of the world's axes a name says: the letter in which it ends, or the one that is on its own; or `?`."""
+    if name[-1:].lower() in tuple(SPACE):
+        return name[-1].lower()
+    alone = set(re.findall(r"(?<![a-z])[xyz](?![a-z])", name.lower()))
+    return alone.pop() if len(alone) == 1 else "?"
 
 
 def _nearest_rotation_vector(vector: Array, near: Array) -> Array:

@@ -129,11 +129,13 @@ class ControlCost(Cost):
 
     Args:
       weight: (m, m) symmetric positive definite, or its diagonal (m,).
-      about: (m,) the nominal control, where it is zero; the solvers start from it unless told otherwise.
+      about: (m,) the nominal control, where it is zero; the solvers start from it unless told otherwise. By default no
+        control at all, (0, ..., 0).
     """
 
-    def __init__(self, weight: npt.ArrayLike, *, about: npt.ArrayLike) -> None:
+    def __init__(self, weight: npt.ArrayLike, *, about: npt.ArrayLike | None = None) -> None:
         self.weight = check_weight("ControlCost: weight", weight, definite=True)
+        about = np.zeros(len(self.weight)) if about is None else about
         self.about = check_array("ControlCost: about", about, (len(self.weight),))
 
     def bind(self, dynamics: Dynamics) -> Term:
@@ -146,7 +148,7 @@ class ObstacleCost(Cost):
     """`weight * sum over obstacles of exp(-sharpness * (distance - radius))`, from the first step on.
 
     Paper: Sec. VI-A, with the sharpness made explicit. At t = 0, where the state is given, it does not act. A robot in
-    the plane (two position coordinates) sees the world from above; see `World.seen_by`.
+    the plane (two position coordinates) sees the world from above, or cut by its plane; see `World.seen_by`.
 
     Args:
       world: the obstacles. radius: of the robot, in metres.
@@ -162,10 +164,11 @@ class ObstacleCost(Cost):
         self.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
 
     def bind(self, dynamics: Dynamics) -> Term:
-        position = dynamics.state_coordinates.position
+        space = dynamics.state_coordinates
+        position = space.position
         if not position:
             raise InputError("ObstacleCost: got dynamics without a position, want Dynamics(..., position=(names))")
-        world = self.world.seen_by(len(position))
+        world = self.world.seen_by(space.plane, space.offset)
         place = [f"x[{i}]" for i in position] + (["0.0"] if len(position) == 2 else [])
         source = _OBSTACLES.format(place=", ".join(place), axes=repr(position), size=len(position), row=ROW)
         data = np.concatenate([[self.radius, self.sharpness, self.weight, len(world)], world.table.ravel()])

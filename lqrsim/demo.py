@@ -19,7 +19,7 @@ from lqrsim.view.policy_plot import plot_policy
 
 TABLE = (
     f"{'scenario':<20} {'run':<12} {'iterations':>10} {'cost':>10} {'gap':>9} {'clearance m':>12}"
-    f" {'rms m':>9} {'max m':>9} {'final m':>9} {'outcome':>9}"
+    f" {'rms m':>9} {'max m':>9} {'final m':>9} {'goal m':>9} {'outcome':>9}"
 )
 
 
@@ -43,10 +43,12 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
     video = video and _can_film()
     rows: list[str] = []
     failures: list[str] = []
+    misses: list[str] = []
     for reference, scenario in scenarios.items():
         folder = out / folder_name(scenario)
         console.say(f"\n== {reference}: {scenario.summary}")
-        solution = replace(console.solve(scenario.problem, "smooth"), scenario=from_anywhere(reference))
+        solved = console.solve(scenario.problem, "smooth", reach=scenario.reach())
+        solution = replace(solved, scenario=from_anywhere(reference))
         console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
         if solution.cost_to_go is not None:
             drawn = plot_policy(
@@ -59,16 +61,20 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
             "undisturbed": _execute(scenario, solution, folder / "undisturbed.npz", seed, disturbed=False),
             "disturbed": _execute(scenario, solution, folder / "disturbed.npz", seed, disturbed=True),
         }
-        worst = float(runs["undisturbed"].tracking_error.max())
+        worst, unit = float(runs["undisturbed"].tracking_error.max()), runs["undisturbed"].tracking_unit
         if not worst <= scenario.tracking_bound:  # a diverged run is NaN
-            bound = f"want <= {scenario.tracking_bound:g} m"
-            failures.append(f"{reference}: undisturbed up to {worst:.3g} m off its plan, {bound}")
+            bound = f"want <= {scenario.tracking_bound:g} {unit}"
+            failures.append(f"{reference}: undisturbed up to {worst:.3g} {unit} off its plan, {bound}")
         figure = plot_run(solution, runs, folder / "figure.png", world=scenario.scene.world)
         console.say(f"wrote {figure}")
+        plan, reach = runs["undisturbed"].target, runs["undisturbed"].goal_radius
+        misses += [f"{reference}: {line}" for line in plan.of_plan(reach)[1:]]
         if video:
             _film(runs["disturbed"], solution, folder / "video.mp4", quick=quick)
         rows += [_row(reference, name, solution, rollout) for name, rollout in runs.items()]
     console.say("\n" + "\n".join([TABLE, *rows]))
+    for miss in misses:
+        console.say(miss)
     for failure in failures:
         console.say(f"FAILED {failure}")
     return 1 if failures else 0
@@ -87,7 +93,10 @@ def _execute(scenario: Scenario, solution: Solution, path: Path, seed: int, *, d
     """One closed-loop run, saved and summed up in a line."""
     disturbances = scenario.disturbances if disturbed else ()
     with console.progress("simulating", "step") as progress:
-        rollout = simulate(scenario.plant(), solution, disturbances=disturbances, seed=seed, progress=progress)
+        rollout = simulate(
+            scenario.plant(), solution, disturbances=disturbances, seed=seed, progress=progress,
+            **scenario.near_enough(),
+        )  # fmt: skip
     console.say(rollout.summary())
     console.say(f"wrote {files.save(rollout, path)}")
     return rollout
@@ -95,10 +104,10 @@ def _execute(scenario: Scenario, solution: Solution, path: Path, seed: int, *, d
 
 def _film(rollout: Rollout, solution: Solution, path: Path, *, quick: bool) -> None:
     """With the calibrated panes from which the robot's position can be measured."""
+    from lqrsim.view import cameras
     from lqrsim.view.render import render
 
-    # From the side, all that moves on a floor does so along a line.
-    insets = ("top", "side") if len(rollout.state_coordinates.position) == 3 else ("top",)
+    insets = cameras.measuring(rollout)
     quality, fps = ("draft", 5) if quick else ("standard", 30)
     with console.progress("rendering", "frame") as progress:
         render(rollout, path, insets=insets, solution=solution, quality=quality, fps=fps, progress=progress)
@@ -106,9 +115,10 @@ def _film(rollout: Rollout, solution: Solution, path: Path, *, quick: bool) -> N
 
 
 def _row(reference: str, run: str, solution: Solution, rollout: Rollout) -> str:
-    error = rollout.tracking_error[0]
+    error = rollout.tracking_error[0, rollout.counts[0]]
+    final, away = (np.nan, np.nan) if not rollout.counts[0, -1] else (error[-1], rollout.goal_distance[0])
     return (
         f"{reference:<20} {run:<12} {len(solution.iterations):>10} {solution.cost:>10.4f} {solution.gap:>9.1e}"
-        f" {rollout.clearance.min():>12.3f} {np.sqrt(np.mean(error**2)):>9.2e} {error.max():>9.2e} {error[-1]:>9.2e}"
-        f" {rollout.outcome[0]:>9}"
+        f" {rollout.least_clearance()[0]:>12.3f} {np.sqrt(np.mean(error**2)):>9.2e} {error.max():>9.2e} {final:>9.2e}"
+        f" {away if rollout.target.unit == 'm' else np.nan:>9.2e} {rollout.outcome[0]:>9}"
     )

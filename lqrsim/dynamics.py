@@ -1,5 +1,6 @@
 """The dynamics of a system, stated as a function: of symbols, of arrays for numba, or of NumPy arrays."""
 
+import copy
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -54,7 +55,10 @@ class Dynamics:
         attributes.
       states, controls: name -> unit, in order.
       parameters: name -> value. Values are data: changing one compiles nothing.
-      position: names of the 2 or 3 states that are the robot's position in the world, in metres.
+      position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
+        x, y and z, in this order.
+      plane, offset: in which plane a position of 2 states is, as "xz", and where that is along the third axis, in
+        metres: see `Coordinates`. By default the plane is that of the names, if they say two of x, y and z.
       angles: names of the states that are angles in radians, equal up to whole turns.
       rotation_vectors: names, by threes, of the states that are rotation vectors.
       control_limits: lowest and highest control, numbers or (m,); what the actuators can do, for execution.
@@ -75,6 +79,8 @@ class Dynamics:
         controls: Mapping[str, str],
         parameters: Mapping[str, float] | None = None,
         position: Sequence[str] = (),
+        plane: str = "",
+        offset: float | None = None,
         angles: Sequence[str] = (),
         rotation_vectors: Sequence[Sequence[str]] = (),
         control_limits: Limits | None = None,
@@ -133,6 +139,8 @@ class Dynamics:
             names=names,
             units=tuple(states.values()),
             position=tuple(index("position", name) for name in position),
+            plane=plane,
+            offset=offset,
             angles=tuple(index("angles", name) for name in angles),
             rotation_vectors=tuple(starts),
         )
@@ -153,6 +161,18 @@ class Dynamics:
     def name(self) -> str:
         """What messages call the dynamics: the name of `f`."""
         return name_of(self.f)
+
+    def with_parameters(self, **values: float) -> "Dynamics":
+        """The same with other values of some parameters: `dynamics.with_parameters(mass=0.6)`. Nothing compiles again.
+
+        Raises:
+          InputError: there is no such parameter, or the value is not finite.
+        """
+        for name in values:
+            check_name("parameters", name, self.parameters)
+        other = copy.copy(self)  # without `_plain`, which has the old values
+        other.parameters = self.parameters | tracing.check_parameters(values)
+        return other
 
     @property
     def data(self) -> Array:

@@ -319,3 +319,13 @@ def excerpt(value: object) -> str:
         return f"a {type(value).__name__}"
     text = "".join(letter if letter.isprintable() else "?" for letter in text[:200])
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def told(error: BaseException) -> str:
+    """What an exception says, for a message: its kind, and its text as one printable line, whatever that is."""
+    try:
+        text = " ".join(str(error).split())
+    except Exception:  # of its own __str__
+        text = ""
+    text = "".join(letter if letter.isprintable() else "?" for letter in text[:500])
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -23,7 +23,7 @@ from lqrsim.results import Candidate, Certificate, Iteration, Multipliers, Solut
 from lqrsim.rollout import Rollout
 from lqrsim.value_functions import Moments, Quadratic
 
-VERSIONS = {"solution": 4, "rollout": 3}
+VERSIONS = {"solution": 5, "rollout": 4}
 
 # Shapes in letters: T steps, n states, m controls; the others stand for whatever it is, but the same in all of a file.
 Shapes = Mapping[str, str]
@@ -40,20 +40,23 @@ _SOLUTION_OPTIONAL: tuple[dict[str, str], ...] = (
     {"cost_to_come.hessian": "T+1 n n", "cost_to_come.gradient": "T+1 n", "cost_to_come.constant": "T+1"},
     {"cost_to_come.covariance": "T+1 n n", "cost_to_come.mean": "T+1 n", "cost_to_come.constant": "T+1"},
     {"clearance": "T+1"},
+    {"goal": "n"},
     {"candidates.states": "candidates T+1 n", "candidates.controls": "candidates T m"},
 )
 _ROLLOUT_ARRAYS = {  # of the same names in a Rollout
     "states": "K T+1 n", "measured": "K T+1 n", "commanded": "K T m", "applied": "K T m", "forces": "K T 3",
-    "torques": "K T 3", "displaced": "K obstacles 3", "clearance": "K T+1", "contacts": "K", "diverged": "K",
-    "frame_times": "F", "frames": "K F nq",
+    "torques": "K T 3", "displaced": "K obstacles 3", "clearance": "K T+1", "contacts": "K",
+    "collided_at": "K", "diverged_at": "K", "failed_at": "K", "frame_times": "F", "frames": "K F nq",
 }  # fmt: skip
+_ROLLOUT_OPTIONAL: tuple[dict[str, str], ...] = ({"goal": "n"},)
 _CERTIFICATE = tuple(field.name for field in fields(Certificate))  # before the gap, in the array of that name
-_DTYPES = {"contacts": "<i8", "diverged": "|b1"}  # all others are <f8
+_DTYPES = {"contacts": "<i8"}  # all others are <f8
 
 _COORDINATES = {  # of the same names in Coordinates
     "names": plain.listed(plain.line), "units": plain.listed(plain.line), "position": plain.listed(plain.count),
     "angles": plain.listed(plain.count), "rotation_vectors": plain.listed(plain.count),
     "low": plain.listed(plain.any_number), "high": plain.listed(plain.any_number),
+    "plane": plain.line, "offset": plain.optional(plain.number()),
 }  # fmt: skip
 _COMMON = {
     "format": plain.line, "version": plain.count, "sha256": plain.line,
@@ -64,15 +67,17 @@ _STATUS = plain.one_of(Status)
 _SOLUTION_TEXTS: dict[str, plain.Check] = {  # of the same names in a Solution
     "detail": plain.text, "solver": plain.line, "options": plain.mapped(plain.anything), "problem_digest": plain.line,
     "versions": plain.mapped(plain.line), "scenario": plain.line,
+    "goal_radius": plain.optional(plain.number(above=0.0)),
 }  # fmt: skip
 _SOLUTION_LISTS: dict[str, plain.Check] = {
     "status": _STATUS, "methods": plain.listed(plain.line), "penalties": plain.listed(plain.number(at_least=0.0)),
     "candidates": plain.listed(plain.row(plain.line, plain.any_number, plain.count, plain.optional(_STATUS))),
 }  # fmt: skip
 _ROLLOUT_TEXTS: dict[str, plain.Check] = {  # of the same names in a Rollout
-    "robot": plain.line, "scene": plain.line, "model": plain.text, "policy_digest": plain.line,
+    "robot": plain.line, "body": plain.line, "scene": plain.line, "model": plain.text, "policy_digest": plain.line,
     "radius": plain.number(at_least=0.0), "goal_radius": plain.number(above=0.0), "seed": plain.count,
     "first_trial": plain.count, "versions": plain.mapped(plain.line), "disturbances": plain.listed(plain.text),
+    "obstacles": plain.listed(plain.line), "reasons": plain.listed(plain.line),
 }  # fmt: skip
 
 
@@ -126,13 +131,15 @@ def _check(kind: str, headers: Mapping[str, Header], meta: dict[str, Any]) -> No
     plain.record(_COMMON | own)("meta", meta)
     sizes = {"n": len(meta["states"]["names"]), "m": len(meta["controls"]["names"])}
     if kind == "rollout":
-        wanted = _PLAN | _ROLLOUT_ARRAYS
+        wanted, groups = _PLAN | _ROLLOUT_ARRAYS, _ROLLOUT_OPTIONAL
     else:
         sizes |= {"iterations": len(meta["methods"]), "candidates": len(meta["candidates"])}
         wanted = _SOLUTION_ARRAYS | {f"multipliers.{i}": f"T+1 rows{i}" for i in range(len(meta["penalties"]))}
-        for group in _SOLUTION_OPTIONAL:
-            if group.keys() <= headers.keys() - wanted.keys():
-                wanted |= group
+        groups = _SOLUTION_OPTIONAL
+    for group in groups:
+        if group.keys() <= headers.keys() - wanted.keys():
+            wanted |= group
+    if kind == "solution":
         ended = [status for _, _, _, status in meta["candidates"] if status is not None]
         if bool(meta["candidates"]) != ("candidates.states" in wanted) or (meta["candidates"] and not ended):
             raise InputError("meta.candidates: got some without plans, plans without them, or none that ended")
@@ -175,6 +182,8 @@ def _solution_parts(solution: Solution) -> tuple[Arrays, dict[str, Any]]:
             arrays |= {f"{name}.{field.name}": getattr(value, field.name) for field in fields(value)}
     if solution.clearance is not None:
         arrays["clearance"] = solution.clearance
+    if solution.goal is not None:
+        arrays["goal"] = solution.goal
     if solution.candidates:
         plans = [candidate.trajectory for candidate in solution.candidates]
         arrays["candidates.states"] = np.array([plan.states for plan in plans])
@@ -235,6 +244,7 @@ def _solution(arrays: Arrays, meta: dict[str, Any]) -> Solution:
         trajectory=Trajectory(arrays["trajectory.states"], arrays["trajectory.controls"], dt),
         iterations=tuple(Iteration(*numbers, method=method) for numbers, method in rows),
         clearance=arrays.get("clearance"),
+        goal=arrays.get("goal"),
         certificate=Certificate(**dict(zip(_CERTIFICATE, arrays["certificate"].tolist(), strict=False))),
         gap=float(arrays["certificate"][-1]),
         candidates=tuple(candidates),
@@ -246,6 +256,8 @@ def _solution(arrays: Arrays, meta: dict[str, Any]) -> Solution:
 def _rollout_parts(rollout: Rollout) -> tuple[Arrays, dict[str, Any]]:
     arrays: dict[str, npt.NDArray[Any]] = {name: getattr(rollout, name) for name in _ROLLOUT_ARRAYS}
     arrays |= {"trajectory.states": rollout.plan.states, "trajectory.controls": rollout.plan.controls}
+    if rollout.goal is not None:
+        arrays["goal"] = rollout.goal
     texts = {name: getattr(rollout, name) for name in _ROLLOUT_TEXTS}
     texts |= {
         "versions": dict(rollout.versions), "dt": rollout.plan.dt,
@@ -260,6 +272,7 @@ def _rollout(arrays: Arrays, meta: dict[str, Any]) -> Rollout:
         raise InputError("frame_times: got times that are not in order, want each after the one before")
     return Rollout(
         **{name: arrays[name] for name in _ROLLOUT_ARRAYS},
+        goal=arrays.get("goal"),
         plan=Trajectory(arrays["trajectory.states"], arrays["trajectory.controls"], float(meta["dt"])),
         state_coordinates=_coordinates(meta["states"]),
         control_coordinates=_coordinates(meta["controls"]),
@@ -271,4 +284,5 @@ _MAKERS = {"solution": _solution, "rollout": _rollout}
 
 
 def _coordinates(texts: Mapping[str, Any]) -> Coordinates:
-    return Coordinates(**{name: tuple(value) if isinstance(value, list) else value for name, value in texts.items()})
+    given: dict[str, Any] = {name: tuple(one) if isinstance(one, list) else one for name, one in texts.items()}
+    return Coordinates(**given)

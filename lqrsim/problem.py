@@ -128,6 +128,14 @@ class Problem:
         return abouts[0] if len(abouts) == 1 else None
 
     @property
+    def weighed_goal(self) -> Array | None:
+        """The goal, NaN in the states to which the final cost gives no weight; None where it names no state."""
+        abouts = [cost for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
+        if len(abouts) != 1 or not abouts[0].weight.any():
+            return None
+        return np.where(abouts[0].weight.any(axis=1), abouts[0].about, np.nan)
+
+    @property
     def control_coordinates(self) -> Coordinates:
         """Names, units and limits of the controls, as they are planned with."""
         coordinates = self.dynamics.control_coordinates
@@ -172,14 +180,14 @@ class Problem:
         return hasher.hexdigest()[:16]
 
     def _check_start_clear(self) -> None:
-        position = list(self.dynamics.state_coordinates.position)
-        if self.start is None or not position:
+        space = self.dynamics.state_coordinates
+        if self.start is None or not space.position:
             return
         for cost in self.obstacle_costs:
-            world = cost.world.seen_by(len(position))
+            world = cost.world.seen_by(space.plane, space.offset)
             if not len(world):
                 continue
-            place = self.start[position]
+            place = self.start[list(space.position)]
             distances = world.distances(place) - cost.radius
             if distances.min() < 0:
                 where = ", ".join(f"{value:g}" for value in place)

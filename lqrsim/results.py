@@ -24,6 +24,7 @@ from lqrsim.errors import (
     shaped,
 )
 from lqrsim.policy import AffinePolicy
+from lqrsim.target import Target
 from lqrsim.value_functions import Moments, Quadratic, TotalCost
 
 
@@ -299,6 +300,10 @@ class Solution:
       scenario: what the command line was asked for; empty where a program called the solver.
       candidates: the starts that were tried, where there were several.
       multipliers: of each of the problem's constraints; none where the plan keeps them all without being made to.
+      goal: (n,) the state that the final cost asks for, NaN in the states to which it gives no weight; None where it
+        names no state.
+      goal_radius: within which the plan's end counts as at the goal, in `target.unit`; None where that is not known. By
+        default the robot's radius, in metres; for goals without a position see `target.py`.
     """
 
     status: Status
@@ -319,6 +324,13 @@ class Solution:
     scenario: str = ""
     candidates: tuple[Candidate, ...] = ()
     multipliers: tuple[Multipliers, ...] = ()
+    goal: Array | None = None
+    goal_radius: float | None = None
+
+    @property
+    def target(self) -> Target:
+        """What a run of the policy is to reach: the goal, or the plan's end where there is none."""
+        return Target(self.policy.state_coordinates, self.goal, self.trajectory.states)
 
     def __post_init__(self) -> None:
         check_kind("Solution: status", self.status, Status, f"a Status, one of {', '.join(Status.__members__)}")
@@ -357,9 +369,16 @@ class Solution:
         if self.clearance is not None:
             arrays["clearance"] = real("Solution: clearance", self.clearance), states[:1]
             object.__setattr__(self, "clearance", arrays["clearance"][0])
+        if self.goal is not None:
+            arrays["goal"] = real("Solution: goal", self.goal), states[1:]
+            object.__setattr__(self, "goal", arrays["goal"][0])
         arrays |= {f"multipliers[{i}]": (one.values, (steps + 1, None)) for i, one in enumerate(self.multipliers)}
         for name, (array, shape) in arrays.items():
             check_shape(f"Solution: {name}", array, shape)
+        _ = self.target  # which refuses what is no goal
+        if self.goal_radius is not None:
+            radius = check_number("Solution: goal_radius", self.goal_radius, above=0.0)
+            object.__setattr__(self, "goal_radius", radius)
 
     @property
     def success(self) -> bool:
@@ -454,9 +473,19 @@ class Solution:
             knot = int(np.argmin(self.clearance))
             verdict = "collides" if self.clearance[knot] < 0 else "clear"
             lines.append(f"  clearance: {self.clearance[knot]:.3f} m at {knot * self.trajectory.dt:.2f} s ({verdict})")
+        lines += [f"  goal:      {line}" for line in self._at_goal()]
         lines += [f"  limits:    {line}" for line in self._beyond_limits()]
         lines += [f"  starts:    {line}" for line in self._search()]
         return "\n".join(lines)
+
+    def _at_goal(self) -> list[str]:
+        """How far from the goal the plan ends, and whether it misses it."""
+        if not np.isfinite(self.trajectory.states).all():
+            return []
+        target, radius = self.target, self.goal_radius
+        if radius is None and not target.places:
+            radius = target.radius(None, None, None)
+        return target.of_plan(radius)
 
     def _beyond_limits(self) -> list[str]:
         """One line for each control that the plan takes beyond its limits."""

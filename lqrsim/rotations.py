@@ -1,4 +1,5 @@
-"""Rotation vectors: the functions of them that are smooth at zero, for dynamics and costs written in SymPy.
+"""Rotation vectors: the functions of them that are smooth at zero, for dynamics and costs written in SymPy, and the
+maps to and from the quaternions that MuJoCo's free and ball joints have.
 
 A rotation vector r turns by |r| radians about its axis. What the formulas need of the angle are three ratios that are
 analytic in s = |r|^2, although written with |r| they read 0/0 at the identity:
@@ -16,39 +17,79 @@ from functools import cache
 from math import cos, sin, sqrt
 from typing import Any
 
-from lqrsim.errors import InputError, check_items, excerpt
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array, InputError, check_items, excerpt, vectors_of
+
+Vector = Sequence[Any] | npt.NDArray[Any]
 
 RATIOS = ("sine_ratio", "cosine_ratio", "cotangent_ratio")
 
 
-def rotate(r: Sequence[Any], v: Sequence[Any]) -> list[Any]:
-    """The vector `exp([r]) v`: v turned by the rotation vector r; SymPy expressions in, three of them out."""
+def rotate(r: Vector, v: Vector) -> list[Any]:
+    """The vector `exp([r]) v`: v turned by the rotation vector r; three expressions of SymPy, or three numbers."""
     r, v = _three("r", r), _three("v", v)
-    sine, cosine, _ = (_symbolic(name)(_dot(r, r)) for name in RATIOS)
+    sine, cosine, _ = (_ratio(name, _dot(r, r)) for name in RATIOS)
     once = _cross(r, v)
     twice = _cross(r, once)
     return [v[i] + sine * once[i] + cosine * twice[i] for i in range(3)]
 
 
-def vector_rate(r: Sequence[Any], w: Sequence[Any]) -> list[Any]:
-    """The rate of the rotation vector r of a body that turns with w rad/s (in body axes); SymPy expressions.
+def vector_rate(r: Vector, w: Vector) -> list[Any]:
+    """The rate of the rotation vector r of a body that turns with w rad/s, in body axes.
+
+    Three expressions of SymPy, or three numbers if r and w are numbers.
 
     Paper: Sec. VI-B, `rdot = w + 1/2 [r] w + (1 - 1/2 |r| / tan(1/2 |r|)) [r]^2 w / |r|^2`.
     """
     r, w = _three("r", r), _three("w", w)
-    cotangent = _symbolic("cotangent_ratio")(_dot(r, r))
+    cotangent = _ratio("cotangent_ratio", _dot(r, r))
     once = _cross(r, w)
     twice = _cross(r, once)
     return [w[i] + once[i] / 2 + cotangent * twice[i] for i in range(3)]
 
 
-def _three(field: str, vector: Sequence[Any]) -> tuple[Any, ...]:
-    """The vector's three expressions. Raises InputError for anything else."""
-    import sympy
+def quaternion(rotation_vector: npt.ArrayLike) -> Array:
+    """Unit quaternions (..., 4), scalar first as MuJoCo has them, of rotation vectors (..., 3).
 
+    Raises:
+      InputError: not numbers of that shape.
+    """
+    rotation = vectors_of("rotation_vector", rotation_vector, 3)
+    angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
+    # np.sinc(t) is sin(pi t) / (pi t), and 1 at 0: here sin(angle / 2) / angle.
+    return np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * rotation], axis=-1)
+
+
+def rotation_vector(quaternion: npt.ArrayLike) -> Array:
+    """Rotation vectors (..., 3) of at most half a turn, of quaternions (..., 4), scalar first, of any length and sign.
+
+    Raises:
+      InputError: not numbers of that shape.
+    """
+    rows = vectors_of("quaternion", quaternion, 4)
+    # q and -q are one rotation: the one with scalar part >= 0 is its half turn or less.
+    scalar, x, y, z = (rows[..., i] for i in range(4))
+    sine = np.sqrt(x * x + y * y + z * z)
+    # atan2 is exact at both ends, unlike acos near no turn and asin near half a turn.
+    angle = 2 * np.arctan2(sine, np.abs(scalar))
+    # Without a turn the ratio is 2 / scalar, whatever the length; there the division is by zero.
+    small = np.asarray(sine < 1e-12)
+    limit = np.asarray(2.0 / np.abs(scalar)) if small.any() else None
+    ratio = angle / sine if limit is None else np.divide(angle, sine, out=limit, where=~small)
+    return np.copysign(ratio, scalar)[..., None] * rows[..., 1:]
+
+
+def _three(field: str, vector: Vector) -> tuple[Any, ...]:
+    """The vector's three entries: numbers, arrays of them, or expressions. Raises InputError for anything else."""
     found = check_items(field, vector, object, "three expressions or numbers", at_most=3)
     if len(found) != 3 or any(isinstance(one, str) for one in found):
         raise InputError(f"{field}: got {excerpt(vector)}, want three expressions or numbers")
+    if all(_numeric(one) for one in found):
+        return found
+    import sympy
+
     try:
         expressions = [sympy.sympify(one, strict=True) for one in found]
     except Exception:  # SympifyError, or whatever an object raises when it is asked
@@ -58,12 +99,28 @@ def _three(field: str, vector: Sequence[Any]) -> tuple[Any, ...]:
     return tuple(expressions)
 
 
-def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+def _numeric(one: object) -> bool:
+    """Whether it is a number of Python or NumPy, or an array of them."""
+    if isinstance(one, np.ndarray | np.generic):
+        return one.dtype.kind in "iuf"
+    return isinstance(one, float | int) and not isinstance(one, bool)
+
+
+def _dot(a: Vector, b: Vector) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _cross(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
+def _cross(a: Vector, b: Vector) -> list[Any]:
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def _ratio(name: str, s: Any) -> Any:
+    """That ratio at s: a number at a number, numbers at an array of them, and SymPy's function of the rest."""
+    if isinstance(s, float | int | np.number):
+        return _NUMERIC[name](float(s))
+    if isinstance(s, np.ndarray) and s.dtype != object:
+        return np.vectorize(_NUMERIC[name], otypes=[np.float64])(s)
+    return _symbolic(name)(s)
 
 
 @cache
@@ -151,3 +208,6 @@ def _half_cotangent_d1(s: float) -> float:
     """Derivative in s of |r|/2 cot(|r|/2) = sine_ratio / (2 cosine_ratio)."""
     a, b = sine_ratio(s), cosine_ratio(s)
     return (sine_ratio_d1(s) * b - a * cosine_ratio_d1(s)) / (2 * b * b)
+
+
+_NUMERIC = {"sine_ratio": sine_ratio, "cosine_ratio": cosine_ratio, "cotangent_ratio": cotangent_ratio}

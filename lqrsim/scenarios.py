@@ -4,6 +4,7 @@ import inspect
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from lqrsim.scenes import Scene, load_scene
 from lqrsim.simulation.disturbances import ControlNoise, Disturbance, ForceNoise, MeasurementNoise, Push
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.start import InitialPrior
+from lqrsim.target import Target
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +30,8 @@ class Scenario:
       problem: what to solve; ready to change with `dataclasses.replace(scenario.problem, ...)`.
       tracking_bound: how far in metres an undisturbed run may be from its plan, at any time.
       disturbances: what the demo's disturbed run meets: plain to see, and no more than the policy copes with.
+      goal_radius: how near the goal counts as having reached it, in metres; by default the robot's radius.
+      goal_tolerance: the same for goals without a position; both as in `simulate`.
       paper_start: how the paper begins, for `smooth(problem, start=...)`; by default several starts are tried.
     """
 
@@ -39,6 +43,20 @@ class Scenario:
     tracking_bound: float
     disturbances: tuple[Disturbance, ...] = ()
     paper_start: InitialPrior | None = None
+    goal_radius: float | None = None
+    goal_tolerance: float | None = None
+
+    def near_enough(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> dict[str, Any]:
+        """These options of `simulate`, or the scenario's own where neither is given."""
+        if goal_radius is None and goal_tolerance is None:
+            goal_radius, goal_tolerance = self.goal_radius, self.goal_tolerance
+        return {"goal_radius": goal_radius, "goal_tolerance": goal_tolerance}
+
+    def reach(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> float:
+        """Within which distance the goal counts as reached, in `Target.unit`. Raises InputError as `simulate` does."""
+        dynamics, goal = self.problem.dynamics, self.problem.weighed_goal
+        target = Target(dynamics.state_coordinates, goal, np.zeros((1, len(dynamics.state_coordinates))))
+        return target.radius(self.robot.radius, **self.near_enough(goal_radius, goal_tolerance))
 
     def __post_init__(self) -> None:
         check_text("Scenario: name", self.name, "a name")
@@ -47,6 +65,9 @@ class Scenario:
         check_kind("Scenario: scene", self.scene, Scene, "a Scene, such as load_scene('cage')")
         check_kind("Scenario: problem", self.problem, Problem, "a Problem")
         check_number("Scenario: tracking_bound", self.tracking_bound, above=0.0)
+        for name in ("goal_radius", "goal_tolerance"):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, check_number(f"Scenario: {name}", value, above=0.0))
         wanted = "disturbances, such as ControlNoise(0.05)"
         found = check_items("Scenario: disturbances", self.disturbances, Disturbance, wanted)
         object.__setattr__(self, "disturbances", found)

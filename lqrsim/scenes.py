@@ -5,17 +5,20 @@ collide is an obstacle.** Fixed to the world: no joint and no mocap between the 
 contype or conaffinity is not zero. So
 
 - geoms that are only drawn (both zero) are no obstacles, nor is anything that can move, the robot included;
-- planes are walls, floors and ceilings, infinite whatever size they are drawn with, solid behind. A horizontal one does
-  not bound a robot that moves in the plane (`World.seen_by`);
+- planes are walls, floors and ceilings, infinite whatever size they are drawn with, solid behind. One that is parallel
+  to the plane in which a robot moves does not bound it: the floor that it drives on, for one (`World.seen_by`);
 - plane, sphere, capsule, cylinder and box have a distance. Any other type is refused by name, not left out;
 - a cylinder or capsule whose ends both lie on or behind planes has no ends that anything can reach, and is infinite.
 """
 
+import contextlib
 import os
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +38,9 @@ except Exception as error:
 
 # In the wheel models/ lies inside the package, in the repository beside it.
 _PACKAGED = [Path(__file__).parent / "models", Path(__file__).parent.parent / "models"]
+DEEPEST = 490  # MuJoCo's reader refuses a little more
+MOST_CELLS = 4096**2  # of a height field; MuJoCo crashes with far more
+
 MODELS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
 
 
@@ -84,15 +90,35 @@ def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
     elif not os.path.isfile(path):
         packaged = ", ".join(names())
         raise InputError(f"scene: got {os.fspath(name_or_path)!r}, want a file that exists, or one of: {packaged}")
-    return scene_from_xml(_flatten(path), path.stem)
+    try:
+        xml = _flatten(path)
+    except RecursionError:
+        raise InputError(f"scene: got {path.name} with elements nested deeper than {DEEPEST}, want fewer") from None
+    return scene_from_xml(xml, path.stem)
+
+
+def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
+    """The model of an MJCF given as text, without includes.
+
+    Args:
+      what: it is, for messages.
+
+    Raises:
+      InputError: MuJoCo refuses it, or would not survive it, or it has a NaN.
+    """
+    _check_elements(xml, what)
+    try:
+        with unlogged():
+            model = mujoco.MjModel.from_xml_string(xml)
+    except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
+        raise InputError(f"{what}: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
+    _check_numbers(model, what)
+    return model
 
 
 def scene_from_xml(xml: str, name: str) -> Scene:
     """The scene of an MJCF given as text, without includes. Raises InputError as `load_scene` does."""
-    try:
-        model = mujoco.MjModel.from_xml_string(xml)
-    except (ValueError, mujoco.FatalError) as error:
-        raise InputError(f"scene {name}: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
+    model = model_from_xml(xml, f"scene {name}")
     if mujoco.mj_isSparse(model) and mujoco.__version__ == "4.0.0":
         # Newton on a sparse Jacobian gives wrong forces in 4.0.0 (fixed in 4.0.1).
         raise InputError(
@@ -102,6 +128,25 @@ def scene_from_xml(xml: str, name: str) -> Scene:
     return Scene(name, xml, model, World(_obstacles(model, name)))
 
 
+@contextlib.contextmanager
+def unlogged() -> Iterator[None]:
+    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder about what is told or recorded otherwise."""
+    before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    quiet.logto_file = quiet.logto_console = False
+    quiet.set()
+    try:
+        yield
+    finally:
+        before.set()
+
+
+def free_name(name: str, taken: Collection[str]) -> str:
+    """The name, with underscores after it if it is taken: for what has none in the MJCF."""
+    while name in taken:
+        name += "_"
+    return name
+
+
 def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
     """Ids of the geoms that are obstacles by the module's rule, in the order of `Scene.world`."""
     fixed = model.body_weldid[model.geom_bodyid] == 0
@@ -109,13 +154,44 @@ def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
     return np.flatnonzero(fixed & collides).tolist()
 
 
+def _check_elements(xml: str, what: str) -> None:
+    """Raises InputError for what would end the process: too deep elements, too large height fields."""
+    reader, depth = ElementTree.XMLPullParser(["start", "end"]), 0
+    try:
+        reader.feed(xml)
+        events: Any = reader.read_events()
+        for event, element in events:
+            depth += 1 if event == "start" else -1
+            if depth > DEEPEST:
+                raise InputError(f"{what}: got elements nested deeper than {DEEPEST}, want fewer bodies in bodies")
+            if event == "start" and element.tag == "hfield":
+                sizes = [element.attrib.get(key, "") for key in ("nrow", "ncol")]
+                cells = int(sizes[0]) * int(sizes[1]) if all(size.strip().isdecimal() for size in sizes) else 0
+                if cells > MOST_CELLS:
+                    got = f"{sizes[0]} x {sizes[1]} heights in the height field {element.attrib.get('name', '')!r}"
+                    raise InputError(f"{what}: got {got}, want {MOST_CELLS:,} at most")
+    except (ElementTree.ParseError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise  # the rest is for MuJoCo to say
+
+
+def _check_numbers(model: mujoco.MjModel, what: str) -> None:
+    """Raises InputError if the model has a NaN, which MuJoCo only warns about."""
+    for field in (name for name in dir(model) if not name.startswith("_")):
+        array = getattr(model, field)
+        if isinstance(array, np.ndarray) and array.dtype.kind == "f" and np.isnan(array).any():
+            element = int(np.argwhere(np.isnan(array))[0][0])
+            raise InputError(f"{what}: got NaN in the MJCF (MuJoCo's {field}[{element}]), want numbers")
+
+
 def _obstacles(model: mujoco.MjModel, scene: str) -> list[Obstacle]:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    taken = {model.geom(geom).name for geom in range(model.ngeom)}
     found: list[Obstacle] = []
     for geom in obstacle_geoms(model):
         kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
-        name = model.geom(geom).name or f"{kind} {geom}"
+        name = model.geom(geom).name or free_name(f"{kind} {geom}", taken)
         if kind not in KINDS:
             raise InputError(
                 f"scene {scene}: got the obstacle {name!r} of type {kind}, want one of: {', '.join(KINDS)};"

@@ -12,7 +12,8 @@ from math import inf, sqrt
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, check_text, real
+from lqrsim.coordinates import PLANES, SPACE
+from lqrsim.errors import Array, InputError, check_array, check_items, check_name, check_number, check_text, real
 from lqrsim.solvers.interface import stack
 
 KINDS = ("plane", "sphere", "capsule", "cylinder", "box")
@@ -78,21 +79,52 @@ class World:
         """The obstacles as numbers, (len(self), ROW)."""
         return np.array([obstacle.row for obstacle in self.obstacles]).reshape(len(self), ROW)
 
-    def seen_by(self, dimension: int) -> "World":
-        """The world of a robot whose position has `dimension` coordinates.
+    def seen_by(self, plane: str, offset: float | None = None) -> "World":
+        """The world of a robot whose position is in that plane, in the plane's coordinates: see `Coordinates`.
 
-        In space (3) it is this one. In the plane (2) it is this one seen from above: upright obstacles reach from the
-        floor to the sky, a sphere counts with its equator, and horizontal planes, the floor first, bound nothing.
+        In space ("xyz") it is this one. A plane has its two axes as x and y, in their order; its third axis is across.
+
+        With an offset it is this world cut there: distances are those in space, from the points of the plane. The robot
+        is a ball, obstacles beside the plane are beside it, and a floor is a wall. Without one, in a horizontal plane,
+        it is this world seen from above: the robot is as high as everything, upright obstacles reach from the floor to
+        the sky, and a sphere counts with its equator. Either way planes parallel to the robot's bound nothing: in the
+        horizontal one that is the floor.
 
         Raises:
-          InputError: an obstacle is tilted, so that it has no outline from above among the primitives.
+          InputError: there is no such plane, a vertical one has no offset; or, seen from above, an obstacle is tilted,
+            so that it has no outline among the primitives.
         """
-        if check_count("dimension", dimension, at_least=2, at_most=3) == 3:
+        check_name("plane", plane, (SPACE, *PLANES))
+        offset = None if offset is None else check_number("offset", offset)
+        if plane == SPACE:
             return self
-        return World([flat for obstacle in self.obstacles if (flat := _from_above(obstacle)) is not None])
+        if offset is None and plane not in ("xy", "yx"):
+            raise InputError(
+                f"offset: got none for the plane {plane!r}, want where it is along its third axis, in metres"
+            )
+        seen = self.obstacles if offset is not None else [_from_above(obstacle) for obstacle in self.obstacles]
+        if plane == "xy" and offset is None:
+            return World([obstacle for obstacle in seen if not _parallel(obstacle, 2)])
+        first, second = (SPACE.index(letter) for letter in plane)
+        across = 3 - first - second
+        turn = np.zeros((3, 3))  # to the plane's axes: a rotation, which only exchanges the world's axes
+        turn[0, first] = turn[1, second] = 1.0
+        turn[2] = np.cross(turn[0], turn[1])
+        origin = np.zeros(3)
+        origin[across] = 0.0 if offset is None else offset
+        return World(
+            [
+                replace(obstacle, position=turn @ (obstacle.position - origin), rotation=turn @ obstacle.rotation)
+                for obstacle in seen
+                if not _parallel(obstacle, across)
+            ]
+        )
 
     def distances(self, point: npt.ArrayLike) -> Array:
-        """Signed distances in metres to each obstacle, (len(self),), of one point (2,) or (3,); negative inside."""
+        """Signed distances in metres to each obstacle, (len(self),), of one point (2,) or (3,); negative inside.
+
+        Points (2,) are for a world that is seen by a robot in the plane, and in its coordinates.
+        """
         x, y, z = (*_places("point", point, one=True).tolist(), 0.0)[:3]
         data = self.table.ravel()
         return np.array([signed_distance(data, ROW * i, x, y, z) for i in range(len(self))])
@@ -120,16 +152,19 @@ def _places(field: str, points: npt.ArrayLike, *, one: bool = False) -> Array:
     return array
 
 
-def _from_above(obstacle: Obstacle) -> Obstacle | None:
-    """The obstacle with infinite height, or None for a horizontal plane. Raises InputError if it is tilted."""
+def _parallel(obstacle: Obstacle, across: int) -> bool:
+    """Whether it is a plane whose normal is along that axis of the world."""
+    return obstacle.kind == "plane" and bool(abs(abs(obstacle.rotation[across, 2]) - 1) < 1e-9)
+
+
+def _from_above(obstacle: Obstacle) -> Obstacle:
+    """The obstacle with infinite height; planes are as they are. Raises InputError if it is tilted."""
     upright = np.abs(np.abs(obstacle.rotation[2]) - 1) < 1e-9  # which local axis is vertical, if one is
     size = obstacle.size.copy()
     match obstacle.kind:
         case "sphere":
             return replace(obstacle, kind="cylinder", rotation=np.eye(3), size=np.array([size[0], np.inf, 0.0]))
-        case "plane" if upright[2]:
-            return None
-        case "plane" if abs(obstacle.rotation[2, 2]) < 1e-9:
+        case "plane" if upright[2] or abs(obstacle.rotation[2, 2]) < 1e-9:
             return obstacle
         case "capsule" | "cylinder" if upright[2]:
             return replace(obstacle, kind="cylinder", size=np.array([size[0], np.inf, 0.0]))

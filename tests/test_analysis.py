@@ -19,7 +19,7 @@ def table_of(outcome: Sequence[str], *, first: int = 0, **columns: ArrayLike) ->
         "obstacle": ["post" if one == "collided" else "" for one in outcome],
         "ended": np.where(over, 1.0, 5.0), "worst": 0.1 + 0.001 * np.arange(count), "rms": 0.05,
         "final": np.where(over, np.nan, 0.02), "clearance": np.where(over, -0.01, 0.3), "effort": 1.0,
-        "saturated": 0.0, "cost": np.where(over, np.nan, 2.0),
+        "goal": np.where(over, np.nan, 0.02), "saturated": 0.0, "cost": np.where(over, np.nan, 2.0),
     }  # fmt: skip
     filled = {name: np.broadcast_to(values, count).copy() for name, values in (given | columns).items()}
     return Outcomes(trial=np.arange(first, first + count), outcome=np.array(outcome), **filled)  # pyright: ignore[reportArgumentType]

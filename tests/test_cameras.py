@@ -14,7 +14,6 @@ import lqrsim as ls
 from lqrsim.view import cameras, gl, marker
 from lqrsim.view.cameras import Camera
 from lqrsim.view.footage import Footage, Pane, digest, read
-from lqrsim.view.recorded import robot_body
 from lqrsim.view.video import encoder
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
@@ -166,7 +165,7 @@ def test_mark_is_seen_where_the_robot_is_whatever_hides_it(kind: str, rollout: l
             data.qpos = frame
             mujoco.mj_forward(model, data)
             renderer.update_scene(data)
-            centre = data.xpos[robot_body(model)]
+            centre = data.body(rollout.body).xpos
             marker.draw(renderer.scene, camera, centre, marker.radius(rollout))
             camera.place(renderer.scene, size[0] / size[1])
             rows, columns = np.nonzero((renderer.render() == 255 * np.array(marker.COLOUR)).all(axis=2))

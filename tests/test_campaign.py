@@ -25,7 +25,7 @@ from lqrsim.simulation.controllers import Control, Controller, Feedback
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
 from lqrsim.stress import trials
 from lqrsim.stress.campaign import Campaign, Cell, run_campaign
-from lqrsim.stress.results import Results, agrees, replay
+from lqrsim.stress.results import Results, differences, replay
 from lqrsim.stress.shards import Damaged, unpack
 
 OWN = """
@@ -302,7 +302,7 @@ def test_what_hangs_or_kills_its_worker_costs_its_shard(own: Path, tmp_path: Pat
     assert 0 < results.tally(cell)["error"] < 24
 
 
-def test_a_policy_that_returns_nan_is_diverged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_policy_that_returns_nan_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Mad(Feedback):
         def start(self, trials: int) -> Control:
             sane = super().start(trials)
@@ -313,7 +313,10 @@ def test_a_policy_that_returns_nan_is_diverged(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(trials.Trials, "_controller", mad)
     results = run_campaign(CAMPAIGN, tmp_path, workers=0)
-    assert results.tally(Cell("open_loop", "scenario", 1.0)) == {"diverged": 60}
+    nan = Cell("open_loop", "scenario", 1.0)
+    assert results.tally(nan)["error"] > 55  # the others collide before
+    assert results.tally(nan)["error"] + results.tally(nan)["collided"] == 60
+    assert set(results.reasons(nan).values()) == {"controller at 0.6667 s: got nan for rotor_1, want a finite number"}
     assert results.tally(Cell("smooth", "scenario", 1.0))["reached"] > 50
 
 
@@ -525,13 +528,11 @@ def test_stress_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 def test_a_trial_again_is_the_same_until_it_collides(reference: Results) -> None:
     for cell in reference.cells:
         for trial in (0, 17, 59):
-            assert agrees(reference, cell, trial)
             free, solid = (
                 replay(reference, cell, trial, frames=contacts, contacts=contacts) for contacts in (False, True)
             )
-            hit = np.flatnonzero(free.clearance[0] < 0)
-            until = hit[0] if len(hit) else free.states.shape[1]
-            np.testing.assert_array_equal(free.states[0, :until], solid.states[0, :until])
+            assert differences(reference, cell, trial, free) == differences(reference, cell, trial, solid) == []
+            np.testing.assert_array_equal(free.states[free.counts], solid.states[solid.counts])
 
 
 def test_a_file_does_not_choose_what_code_runs(own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """Running policies in MuJoCo: tracking, repeatability, what is recorded, and what bad input is told."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,7 +25,7 @@ from lqrsim.simulation.disturbances import ControlNoise, Disturbance, Effect, Fo
 from lqrsim.simulation.plant import Plant
 
 NOISE = (ControlNoise(0.02), ForceNoise(0.1), MeasurementNoise(0.005))
-RECORDS = ("states", "measured", "commanded", "applied", "forces", "clearance", "contacts", "diverged", "frames")
+RECORDS = ("states", "measured", "commanded", "applied", "forces", "clearance", "contacts", "collided_at", "frames")
 
 
 @pytest.fixture(scope="module")
@@ -247,14 +248,53 @@ def test_a_trial_that_blows_up_is_lost_and_the_others_are_not(sled, tmp_path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["ice.xml"]  # and no log of MuJoCo's
 
 
-def test_a_policy_that_returns_nan_is_lost_not_taken_for_zero(sled):
+class Weightless(Disturbance):
+    """Takes nearly all mass away, of which MuJoCo warns as it works out what follows from the masses."""
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        def alter(simulations):
+            simulations.expand("body_mass")[:] = 1e-300
+
+        return Effect(alter=alter)
+
+
+def test_what_mujoco_warns_of_while_a_model_is_altered_leaves_no_file(sled, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(path.name for path in tmp_path.iterdir())
+    simulate(sled, track(sled.robot, (0.0, 1.0, 0.0, 0.0), np.zeros((5, 2)), 0.1), disturbances=[Weightless()])
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_a_policy_that_returns_nan_fails_and_is_not_taken_for_zero(sled):
     solution = track(sled.robot, (0.0, 1.0, 0.0, 0.0), np.zeros((10, 2)), 0.1)
     offset = solution.policy.offset.copy()
     offset[4] = np.nan
     rollout = simulate(sled, replace(solution, policy=replace(solution.policy, offset=offset)))
-    assert rollout.outcome == ("diverged",)
-    assert np.isfinite(rollout.states[0, :4]).all()
+    assert rollout.outcome == ("error",)
+    assert rollout.reasons == ("controller at 0.4 s: got nan for steer, want a finite number",)
+    assert np.isfinite(rollout.states[0, :5]).all()
     assert np.isnan(rollout.states[0, 5:]).all()
+
+
+def test_controls_that_mujoco_ignores_lose_the_trial(tmp_path):
+    """Beyond 1e10 MuJoCo sets all controls to zero, and only warns; the record would say that they were applied."""
+
+    class Strong(Sled):
+        @cached_property
+        def dynamics(self):
+            return Dynamics(
+                super().dynamics.f,
+                states={"y": "m", "x": "m", "vy": "m/s", "vx": "m/s"},
+                controls={"steer": "N", "push": "N"},
+                parameters={"mass": 2.0},
+                position=("x", "y"),
+            )
+
+    robot = Strong()
+    solution = track(robot, (0.0, 1.0, 0.0, 0.0), np.zeros((5, 2)), 0.1, feedback=False)
+    strong = replace(solution, policy=replace(solution.policy, offset=np.full((5, 2), 1e12)))
+    (tmp_path / "ice.xml").write_text(SLED.replace(' ctrlrange="-5 5"', ""))
+    assert simulate(Plant(robot, load_scene(tmp_path / "ice.xml")), strong).outcome == ("diverged",)
 
 
 # Bad input
@@ -279,6 +319,74 @@ def test_a_control_period_that_is_no_multiple_of_the_physics_step_is_told_both(c
     with pytest.raises(InputError, match=r"^control period: got 0.01 s, .*timestep=\"0.01"):
         cage.substeps(0.01)
     assert cage.substeps(1 / 10) == 3
+
+
+def test_what_the_plant_adds_has_names_of_its_own(tmp_path):
+    """Sensors and geoms that are called as the plant would call its own."""
+    text = SLED.replace(
+        "</mujoco>", '<sensor><clock name="contact with wall"/><clock name="contact with box 0"/></sensor></mujoco>'
+    )
+    (tmp_path / "ice.xml").write_text(text)
+    plant = Plant(Sled(), load_scene(tmp_path / "ice.xml"))
+    named = [plant.model.sensor(number).name for number in range(plant.model.nsensor)]
+    assert named[:2] == ["contact with wall", "contact with box 0"]
+    assert len(named) == len(set(named)) == 2 + len(plant.world)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (
+            "joint",
+            r"want its joint 'across'; it has: along, 1 without a name \(joint \d has none, counted from 0: name",
+        ),
+        (
+            "actuator",
+            r"want its actuator 'steer'; it has: push, 1 without a name \(actuator \d has none, counted from 0",
+        ),
+    ],
+)
+def test_what_has_no_name_is_told_by_its_number(tmp_path, kind, message):
+    (tmp_path / "ice.xml").write_text(SLED.replace(' name="across"' if kind == "joint" else ' name="steer"', ""))
+    if kind == "joint":
+        text = (tmp_path / "ice.xml").read_text()
+        (tmp_path / "ice.xml").write_text(re.sub(r'<(\w+) [^<]*joint="across"[^<]*/>', "", text))
+    with pytest.raises(InputError, match=message):
+        Plant(Sled(), load_scene(tmp_path / "ice.xml"))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"joints": "across"}, "robot sled: joints: got 'across', want names of the MJCF in a tuple"),
+        ({"joints": ("across", "")}, r"robot sled: joints: got \('across', ''\), want names"),
+        ({"joints": ("across", "across")}, "robot sled: joints: got a name twice in across, across"),
+        ({"drag": -1.0}, "robot sled: drag: got -1.0, want a finite number >= 0"),
+        ({"actuators": ()}, r"robot sled: actuation: got shape \(2,\), want \(0,\) for no actuators"),
+    ],
+)
+def test_a_robot_whose_names_are_none_is_told(tmp_path, fields, message):
+    (tmp_path / "ice.xml").write_text(SLED)
+    robot = type("Odd", (Sled,), fields)()
+    with pytest.raises(InputError, match=message):
+        Plant(robot, load_scene(tmp_path / "ice.xml"))
+
+
+def test_a_model_that_sleeps_is_told(tmp_path):
+    (tmp_path / "ice.xml").write_text(
+        SLED.replace("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>', 1)
+    )
+    with pytest.raises(InputError, match="scene ice: got an MJCF that cannot be run in batches: sleep and IPC"):
+        Plant(Sled(), load_scene(tmp_path / "ice.xml"))
+
+
+def test_a_physics_step_that_takes_for_ever_is_told(tmp_path):
+    (tmp_path / "ice.xml").write_text(re.sub(r'timestep="[^"]*"', 'timestep="3e-8"', SLED))
+    plant = Plant(Sled(), load_scene(tmp_path / "ice.xml"))
+    with pytest.raises(
+        InputError, match=r"control period: got 0.09 s, 3,000,000 physics steps of scene ice, want at most 20,000"
+    ):
+        plant.substeps(0.09)
 
 
 def test_a_policy_for_another_robot_is_refused(cage):

@@ -41,7 +41,7 @@ def cage():
 
 def altered(plant, mismatch, trials=400):
     """The simulations of a mismatch, without running them."""
-    physics = Physics(plant, trials, 1, frames=False, contacts=True, threads=1)
+    physics = Physics(plant, trials, 1, contacts=True, threads=1)
     effect = mismatch.start(plant, hover(1).trajectory, [np.random.default_rng(trial) for trial in range(trials)])
     effect.alter(physics.simulations)
     physics.simulations.set_const()

@@ -1,5 +1,7 @@
 """The analytic models: derivatives against finite differences, flows against SciPy and closed forms."""
 
+from dataclasses import replace
+
 import mpmath
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
-from lqrsim import compiled, rotations
+from lqrsim import compiled, core, rotations
 from lqrsim.errors import Array
 
 ROBOTS = [ls.DifferentialDrive(), ls.Quadrotor()]
@@ -39,12 +41,12 @@ def test_jacobians_are_those_of_the_step(robot: ls.Robot, dt: float) -> None:
 @pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
 def test_the_compiled_step_is_the_plain_one(robot: ls.Robot, request: pytest.FixtureRequest) -> None:
     scenario = request.getfixturevalue(robot.name)
-    core, rng = compiled.core(scenario.problem), np.random.default_rng(1)
+    built, rng = compiled.core(scenario.problem), np.random.default_rng(1)
     for _ in range(20):
         x, u = random_point(robot, rng)
         n, m = len(x), len(u)
         out, jacobian = np.zeros(n), np.zeros((n, n + m))
-        core.step_jacobian(x, u, robot.dynamics.data, 0.1, np.zeros((n, n)), np.zeros((n, m)), out, jacobian)
+        built.step_jacobian(x, u, robot.dynamics.data, 0.1, np.zeros((n, n)), np.zeros((n, m)), out, jacobian)
         a, b, _ = robot.dynamics.linearize(x, u, 0.1)
         # The same formulas, in an order that the compiler chose: rounding.
         np.testing.assert_allclose(out, robot.dynamics.step(x, u, 0.1), rtol=0, atol=1e-13)
@@ -99,6 +101,76 @@ def test_the_rate_of_a_rotation_vector_is_that_of_the_rotation() -> None:
             (Rotation.from_rotvec(vector) * Rotation.from_rotvec(s * dt * spin)).as_rotvec() for s in (1, -1)
         )
         np.testing.assert_allclose(rate(*vector, *spin), (ahead - behind) / (2 * dt), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 0.3, 3.0])
+def test_rotation_functions_of_numbers_are_numbers(size: float) -> None:
+    """1e-12: rounding of numbers of order one, against SciPy's rotations; 1e-5: of a difference of step 1e-6."""
+    rng = np.random.default_rng(4)
+    r, v, w = rng.normal(size=(3, 3))
+    r *= size / np.linalg.norm(r)
+    for convert in (np.array, lambda one: [float(number) for number in one]):
+        turned, rate = rotations.rotate(convert(r), convert(v)), rotations.vector_rate(convert(r), convert(w))
+        assert all(isinstance(number, float) for number in (*turned, *rate))
+        np.testing.assert_allclose(turned, Rotation.from_rotvec(r).apply(v), rtol=0, atol=1e-12)
+        if size == 3.0:  # the rate of R = exp([r]) in body axes is [w]: R(r + h rate) = R(r) exp(h [w])
+            ahead = Rotation.from_rotvec(r + 1e-6 * np.array(rate))
+            relative = (Rotation.from_rotvec(r).inv() * ahead).as_rotvec() / 1e-6
+            np.testing.assert_allclose(relative, w, rtol=0, atol=1e-5)
+    many = rotations.rotate(np.tile(r[:, None], 4), np.tile(v[:, None], 4))
+    np.testing.assert_allclose(np.array(many).T, [turned] * 4, rtol=0, atol=1e-12)
+
+
+def test_quaternions_and_rotation_vectors_are_scipys() -> None:
+    """1e-12 for rounding; lengths and signs of quaternions do not matter, and one alone is as good as many."""
+    found = Rotation.random(50, rng=np.random.default_rng(5))
+    there = rotations.quaternion(found.as_rotvec())
+    np.testing.assert_allclose(np.abs(np.sum(there * found.as_quat(scalar_first=True), axis=1)), 1, rtol=0, atol=1e-12)
+    for factor in (1.0, -1.0, 3.0):
+        np.testing.assert_allclose(rotations.rotation_vector(factor * there), found.as_rotvec(), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(rotations.rotation_vector(there[3]), rotations.rotation_vector(there)[3])
+    np.testing.assert_array_equal(rotations.rotation_vector([1, 0, 0, 0]), np.zeros(3))
+    np.testing.assert_array_equal(rotations.quaternion([0, 0, 0]), [1, 0, 0, 0])
+    for function, bad in (
+        (rotations.quaternion, np.zeros(4)),
+        (rotations.rotation_vector, "turn"),
+        (rotations.quaternion, 1),
+    ):
+        with pytest.raises(ls.InputError, match=r"(quaternion|rotation_vector): got .*, want .*\(\.\.\., [34]\)"):
+            function(bad)
+
+
+@pytest.mark.parametrize("level", ["symbolic", "compiled", "plain"])
+def test_other_parameters_compile_nothing_and_change_what_they_are_in(level: str) -> None:
+    def fall(x, u, p):
+        return [x[1], u[0] / p.mass - p.gravity]
+
+    fields: dict = {"states": {"z": "m", "vz": "m/s"}, "controls": {"push": "N"}}
+    dynamics = ls.Dynamics(fall, **fields, parameters={"mass": 0.5, "gravity": 9.8}, level=level)
+    assert dynamics.rate([1, 2], [3])[1] == pytest.approx(3 / 0.5 - 9.8, abs=1e-15)
+    heavy = dynamics.with_parameters(mass=0.6)
+    fresh = ls.Dynamics(fall, **fields, parameters={"mass": 0.6, "gravity": 9.8}, level=level)
+    assert (heavy.parameters, heavy.source, heavy.functions) == (fresh.parameters, fresh.source, fresh.functions)
+    np.testing.assert_array_equal(heavy.rate([1, 2], [3]), fresh.rate([1, 2], [3]))
+    assert dynamics.parameters == {"mass": 0.5, "gravity": 9.8}
+    assert dynamics.rate([1, 2], [3])[1] == pytest.approx(3 / 0.5 - 9.8, abs=1e-15)
+    with pytest.raises(
+        ls.InputError, match=r"parameters: got 'mas', want one of: mass, gravity \(did you mean mass\?\)"
+    ):
+        dynamics.with_parameters(mas=0.6)
+    with pytest.raises(ls.InputError, match="parameters: mass: got nan"):
+        dynamics.with_parameters(mass=np.nan)
+
+
+def test_a_solve_with_other_parameters_uses_the_solver_there_is(differential_drive: ls.Scenario) -> None:
+    problem = differential_drive.problem
+    first = ls.smooth(problem, max_iterations=3)
+    before = len(core.compilations)
+    wider = ls.smooth(replace(problem, dynamics=problem.dynamics.with_parameters(axle_length=0.3)), max_iterations=3)
+    assert len(core.compilations) == before
+    fresh = ls.smooth(replace(problem, dynamics=ls.DifferentialDrive(0.3).dynamics), max_iterations=3)
+    np.testing.assert_array_equal(wider.trajectory.states, fresh.trajectory.states)
+    assert (wider.trajectory.states != first.trajectory.states).any()
 
 
 @pytest.mark.parametrize("order", [0, 1, 2])

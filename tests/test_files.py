@@ -50,7 +50,7 @@ def test_a_policy_is_read_with_numpy_alone(saved: Path, drive_solution: ls.Solut
     with np.load(saved) as archive:
         gain, offset, nominal = (archive[f"policy.{name}"] for name in ("gain", "offset", "nominal"))
         meta = json.loads(str(archive["meta"]))
-    assert (meta["format"], meta["version"]) == ("lqrsim solution", 4)
+    assert (meta["format"], meta["version"]) == ("lqrsim solution", 5)
     state, t = drive_solution.trajectory.states[7] + [0.01, 0.02, 2 * np.pi], 7 / 6
     step = min(int(t / meta["dt"] + 1e-9), len(gain) - 1)
     for i in meta["states"]["angles"]:
@@ -112,7 +112,7 @@ def _save_bare_array(path: Path) -> None:
         (lambda path: _save_bare_array(path), "which is damaged"),
         (lambda path: path.write_bytes(pickle.dumps({"gain": 1})), "which is damaged"),
         (lambda path: np.savez(path, meta=np.array([{}], dtype=object)), "which is damaged"),
-        (lambda path: rewrite(path, version=1), "of version 1, want version 4"),
+        (lambda path: rewrite(path, version=1), "of version 1, want version 5"),
         (lambda path: rewrite(path, format="lqrsim rollout"), "holds a 'lqrsim rollout', want a 'lqrsim solution'"),
         (lambda path: rewrite(path, status="great"), r"meta\.status: got 'great', want one of: converged"),
         (lambda path: rewrite(path, **{"policy.offset": np.zeros((150, 3))}), r"policy.offset: got shape \(150, 3\)"),
@@ -194,7 +194,13 @@ def test_a_sample_of_what_a_fuzzer_makes(monkeypatch: pytest.MonkeyPatch) -> Non
         ({"states": lambda a: a.astype(">f8")}, "which is damaged"),
         ({"states": np.asfortranarray}, "which is damaged"),
         ({"contacts": lambda a: a.astype(float)}, "contacts: got numbers of type <f8, want <i8"),
-        ({"diverged": lambda a: a.view(np.uint8)}, "which is damaged"),
+        ({"contacts": lambda a: a.astype(np.uint8)}, "which is damaged"),
+        ({"diverged_at": lambda a: np.isfinite(a)}, r"diverged_at: got numbers of type \|b1, want <f8"),
+        ({"goal": lambda a: a[:2]}, r"goal: got shape \(2,\), want \(n\)"),
+        ({"goal": lambda a: a + np.inf}, "goal: got .* want finite numbers"),
+        ({"goal": lambda a: a * np.nan}, "goal: got NaN for every state"),
+        ({"obstacles": ["", "", ""]}, "obstacles: got 3, want one for each of the 2 trials"),
+        ({"reasons": ["", 1]}, r"reasons\[1\]: got 1, want text"),
         ({"forces": lambda a: a.transpose(0, 2, 1).copy()}, r"forces: got shape \(2, 3, 150\), want \(K, T, 3\)"),
         ({"frames": lambda a: a[..., :0]}, None),
         ({"frames": lambda a: a[:, :0], "frame_times": lambda a: a[:0]}, None),
@@ -243,6 +249,10 @@ def test_what_is_in_a_rollout_is_what_it_must_be(run: Path, changes: dict[str, A
         ({"states": lambda one: one | {"names": ["x", "x", "y"]}}, "a name twice"),
         ({"states": lambda one: one | {"position": [0, 7]}}, "position: got"),
         ({"states": lambda one: one | {"low": [np.nan] * 3}}, "low: got nan"),
+        ({"states": lambda one: one | {"plane": "xz"}}, "plane: got 'xz' for the position"),
+        ({"states": lambda one: one | {"offset": np.inf}}, "states.offset: got inf, want a finite number"),
+        ({"goal_radius": -1.0}, "goal_radius: got -1.0, want a finite number > 0"),
+        ({"goal": lambda a: a[:2]}, r"goal: got shape \(2,\), want \(n\)"),
         ({"controls": "none"}, "controls: got 'none', want an object"),
         ({"candidates": lambda one: [[*one[0][:2], np.inf, one[0][3]], *one[1:]]}, r"candidates\[0\]\[2\]: got inf"),
         ({"candidates": lambda one: [[*row[:3], None] for row in one]}, "candidates: got .* none that ended"),
@@ -253,7 +263,7 @@ def test_what_is_in_a_rollout_is_what_it_must_be(run: Path, changes: dict[str, A
         ({"status": None}, "status: got None, want one of: converged"),
         ({"options": {"a": [[[[[[[[1]]]]]]]]}}, "options.*got lists or objects in each other, want at most 6"),
         ({"scenario": ["quadrotor"]}, "scenario: got .*, want text"),
-        ({"version": 4.5}, "of version 4.5, want version 4"),
+        ({"version": 4.5}, "of version 4.5, want version 5"),
         ({"cost_to_go.gradient": None}, "cost_to_go.constant.*: got it, want only what belongs"),
         ({"inverse_policy.gain": lambda a: a * np.nan}, "inverse_policy.gain: got nan at index"),
         ({"iterations": lambda a: a[:, :6]}, r"iterations: got shape \(\d+, 6\), want \(iterations, 7\)"),
@@ -389,7 +399,9 @@ def test_what_compresses_too_well_can_be_read_again(
     calm = {name: np.zeros((400, *getattr(rollout, name).shape[1:])) for name in ("states", "measured", "commanded")}
     calm |= {name: np.zeros((400, *getattr(rollout, name).shape[1:])) for name in ("applied", "forces", "torques")}
     calm |= {name: np.zeros((400, *getattr(rollout, name).shape[1:])) for name in ("displaced", "clearance", "frames")}
-    whole = dataclasses.replace(rollout, **calm, contacts=np.zeros(400, np.int64), diverged=np.zeros(400, bool))
+    ends: dict[str, Any] = {name: np.full(400, np.inf) for name in ("collided_at", "diverged_at", "failed_at")}
+    ends |= {"obstacles": ("",) * 400, "reasons": ("",) * 400}
+    whole = dataclasses.replace(rollout, **calm, contacts=np.zeros(400, np.int64), **ends)
     path = ls.save(whole, tmp_path / "calm.npz")
     assert path.stat().st_size > 1 << 22
     assert same(ls.load_rollout(path), whole)

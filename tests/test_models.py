@@ -10,7 +10,8 @@ from lqrsim.errors import InputError
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenes import load_scene, names
-from lqrsim.simulation.plant import Plant, check_plant
+from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.plant_check import check_plant
 
 OPEN_FLOOR = """<mujoco>
   <include file="create.xml"/>
@@ -169,7 +170,7 @@ def test_check_plant_agrees_for_our_own_and_names_what_differs():
     assert quadrotor.good
     assert quadrotor.relative.max() < 1e-4  # one Runge-Kutta step each
     assert check_plant(DifferentialDrive(), load_scene("arena")).good
-    with pytest.raises(InputError, match="want a robot and a scene"):
+    with pytest.raises(InputError, match="want a Robot, such as"):
         check_plant(Quadrotor, "cage")  # pyright: ignore[reportArgumentType]
     heavy = check_plant(Quadrotor(mass=0.6), load_scene("cage"))
     assert not heavy.good
@@ -177,3 +178,20 @@ def test_check_plant_agrees_for_our_own_and_names_what_differs():
     assert f"DISAGREES (tolerance 0.02 of the change); worst state: {heavy.worst}, MuJoCo" in str(heavy)
     with pytest.raises(InputError, match="controls: lowest: got shape"):
         check_plant(Quadrotor(), load_scene("cage"), controls=((0,), (1,)))
+
+
+@pytest.mark.parametrize("value", [-1, 0, np.nan, np.inf, "heavy", None])
+@pytest.mark.parametrize(
+    ("robot", "field"),
+    [
+        (Quadrotor, field)
+        for field in ("mass", "inertia", "arm", "max_force", "radius", "drag", "gravity", "torque_ratio")
+    ]
+    + [(DifferentialDrive, field) for field in ("axle_length", "radius", "max_speed", "wheel_radius")],
+)
+def test_impossible_constants_are_refused(robot, field, value):
+    if value == 0 and field in ("drag", "gravity", "torque_ratio"):
+        assert getattr(robot(**{field: value}), field) == 0
+        return
+    with pytest.raises(InputError, match=f"{robot.__name__}: {field}: got .*, want a finite number >"):
+        robot(**{field: value})

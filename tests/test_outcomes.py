@@ -23,36 +23,43 @@ def rough(plant: Plant, quadrotor_solution: ls.Solution) -> Rollout:
 
 
 def test_each_row_is_what_happened(plant: Plant, quadrotor: ls.Scenario, rough: Rollout) -> None:
-    table = outcomes(rough, plant, quadrotor.problem)
+    table = outcomes(rough, quadrotor.problem)
     assert table.trial.tolist() == list(range(20))
     assert {"reached", "collided"} <= set(table.outcome) <= set(OUTCOMES)
-    plan, dt = rough.plan, rough.plan.dt
+    plan, dt, goal = rough.plan, rough.plan.dt, quadrotor.problem.goal
+    assert goal is not None
     for k in range(20):
         distances = np.array([plant.world.distances(state[:3]) for state in rough.states[k]]) - rough.radius
         hits = np.flatnonzero(distances.min(axis=1) < 0)
-        last = hits[0] if len(hits) else plan.steps
+        last = hits[0] - 1 if len(hits) else plan.steps  # the last knot before it
         error = np.linalg.norm(rough.states[k, : last + 1, :3] - plan.states[: last + 1, :3], axis=1)
         assert table.worst[k] == pytest.approx(error.max(), rel=1e-12)
         assert table.rms[k] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
-        assert table.ended[k] == pytest.approx(last * dt)
-        assert table.clearance[k] == pytest.approx(distances[: last + 1].min(), abs=1e-12)
-        assert table.effort[k] == pytest.approx(dt * np.sum(rough.applied[k, :last] ** 2), rel=1e-12)
+        spent = np.clip(table.ended[k] - dt * np.arange(plan.steps), 0, dt)
+        assert table.effort[k] == pytest.approx(np.sum(spent * np.sum(rough.applied[k] ** 2, axis=1)), rel=1e-12)
         if len(hits):
             assert table.outcome[k] == "collided"
-            assert table.obstacle[k] == plant.world.names[int(distances[last].argmin())]
+            assert last * dt < table.ended[k] <= (last + 1) * dt
+            assert table.obstacle[k] == plant.world.names[int(distances[last + 1].argmin())]
+            assert table.clearance[k] == 0
             assert np.isnan(table.cost[k])
             assert np.isnan(table.final[k])
+            assert np.isnan(table.goal[k])
         else:
-            assert table.outcome[k] == ("reached" if error[-1] <= rough.goal_radius else "timed out")
+            assert table.ended[k] == plan.horizon
+            assert table.clearance[k] == pytest.approx(distances.min(), abs=1e-12)
+            away = np.linalg.norm(rough.states[k, -1, :3] - goal[:3])
+            assert table.outcome[k] == ("reached" if away <= rough.goal_radius else "timed out")
             assert table.obstacle[k] == ""
             assert table.final[k] == error[-1]
+            assert table.goal[k] == pytest.approx(away, rel=1e-12)
 
 
 def test_cost_is_that_of_the_plan_where_nothing_disturbs(
     plant: Plant, quadrotor: ls.Scenario, quadrotor_solution: ls.Solution
 ) -> None:
     """The plan is followed to 1e-10 m; what the soft start costs is not of the trial."""
-    table = outcomes(ls.simulate(plant, quadrotor_solution, frames=False), plant, quadrotor.problem)
+    table = outcomes(ls.simulate(plant, quadrotor_solution, frames=False), quadrotor.problem)
     away = quadrotor_solution.trajectory.states[0] - quadrotor.problem.start
     initial = 0.5 * 500.0 * float(away @ away)
     assert table.cost[0] + initial == pytest.approx(quadrotor_solution.cost, rel=1e-6)
@@ -65,17 +72,16 @@ def test_contacts_change_nothing_before_the_first_collision(
     solid = ls.simulate(plant, quadrotor_solution, disturbances=noise, trials=20)
     collided = 0
     for k in range(20):
-        hits = np.flatnonzero(rough.clearance[k] < 0)
-        last = hits[0] if len(hits) else rough.plan.steps
-        collided += len(hits) > 0
-        # MuJoCo's contacts begin within the period before the knot at which the clearance is seen to be negative.
-        np.testing.assert_array_equal(solid.states[k, :last], rough.states[k, :last])
+        collided += bool(rough.collided[k])
+        counts = rough.counts[k]
+        np.testing.assert_array_equal(solid.counts[k], counts)
+        np.testing.assert_array_equal(solid.states[k, counts], rough.states[k, counts])
     assert collided
 
 
 def test_a_lost_trial_is_diverged_and_counts_until_then(plant: Plant, quadrotor_solution: ls.Solution) -> None:
     wild = ls.simulate(plant, quadrotor_solution, disturbances=[ls.ForceNoise(1e12)], trials=3, contacts=False)
-    table = outcomes(wild, plant)
+    table = outcomes(wild)
     assert set(table.outcome) <= {"diverged", "collided"}
     assert np.isfinite(table.worst).all()
     assert np.isnan(table.cost).all()
@@ -124,7 +130,7 @@ class TestReplanning:
                 frames=False,
             )  # fmt: skip
             assert set(run.outcome) == {"reached"}
-            costs.append(outcomes(run, plant, scenario.problem).cost)
+            costs.append(outcomes(run, scenario.problem).cost)
         np.testing.assert_allclose(costs[1], costs[0], rtol=0.03)
 
     def test_where_no_solve_succeeds_the_law_goes_on(

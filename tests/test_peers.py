@@ -78,7 +78,7 @@ def obstacle_cost(problem: ls.Problem, state: Array) -> tuple[float, Array, Arra
     (cost,) = problem.obstacle_costs
     place = state[list(problem.dynamics.state_coordinates.position)]
     x, y, z = (*place.tolist(), 0.0)[:3]
-    size, world = len(place), cost.world.seen_by(len(place))
+    size, world = len(place), cost.world.seen_by("xyz"[: len(place)])
     total, slopes, curves = 0.0, np.zeros(3), np.zeros((3, 3))
     for i in range(len(world)):
         slope, curve = np.zeros(3), np.zeros((3, 3))
@@ -106,7 +106,7 @@ def test_clearance_is_the_distance_to_the_nearest_of_all_kinds(peers: ModuleType
     (cost,) = problem.obstacle_costs
     states = np.array([state for state, _ in random_points(problem)])
     places = states[:, list(problem.dynamics.state_coordinates.position)]
-    world = cost.world.seen_by(places.shape[1])
+    world = cost.world.seen_by(problem.dynamics.state_coordinates.plane)
     np.testing.assert_allclose(peers.clearance_of(problem, states), world.distance(places) - cost.radius, atol=1e-12)
     for distances, place in zip(peers.truth.distances(world, places), places, strict=True):
         np.testing.assert_allclose(distances, world.distances(place), atol=1e-12)

@@ -25,7 +25,7 @@ def drawn(solution: ls.Solution, scenario: ls.Scenario) -> Figure:
 def cost_from(scenario: ls.Scenario, solution: ls.Solution, knot: int) -> float:
     """What is paid from a knot on, summed up by the definition of the costs: obstacles cost from the first step on."""
     states, controls = solution.trajectory.states, solution.trajectory.controls
-    world, radius = scenario.scene.world.seen_by(2), scenario.robot.radius
+    world, radius = scenario.scene.world.seen_by("xy"), scenario.robot.radius
     goal, weight = np.array([0.0, 2.5, np.pi]), np.array([5000.0, 5000.0, 50.0])
     obstacles = np.exp(-10.0 * (np.array([world.distances(state[:2]) for state in states[max(knot, 1) : -1]]) - radius))
     steering = 0.5 * 60.0 * ((controls[knot:] - 0.25) ** 2).sum()

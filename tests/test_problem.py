@@ -163,3 +163,7 @@ def test_a_prior_may_be_about_a_trajectory(differential_drive: ls.Scenario) -> N
     np.testing.assert_array_equal(one.policy.gain, other.policy.gain)
     np.testing.assert_allclose(ls.InitialPrior([1.0], about=[[0.0], [2.0], [6.0]]).at(1.25), [3.0], rtol=1e-15)
     np.testing.assert_array_equal(ls.InitialPrior([1.0], about=[[0.0], [2.0], [6.0]]).at(2.0), [6.0])
+
+
+def test_a_control_cost_is_about_no_control_unless_told() -> None:
+    np.testing.assert_array_equal(ls.ControlCost([[2.0, 0.1], [0.1, 1.0]]).about, np.zeros(2))

@@ -286,7 +286,7 @@ def test_picture_may_exceed_the_buffer_of_the_model(drive: ls.Rollout, tmp_path:
 def test_diverged_trial_stands_still(flight: ls.Rollout, tmp_path: Path) -> None:
     states, frames = flight.states.copy(), flight.frames.copy()
     states[:, 60:], frames[:, flight.frame_times > 2.0] = np.nan, np.nan
-    broken = dataclasses.replace(flight, states=states, frames=frames, diverged=np.array([True]))
+    broken = dataclasses.replace(flight, states=states, frames=frames, diverged_at=np.array([2.0]))
     images = [pixels(still(broken, tmp_path / "still.png", time=time, size=SMALL)) for time in (3.0, 5.0)]
     # The captions, upper left, tell the time; the marks of the plan move on.
     assert (np.abs(images[0] - images[1])[70:].max(axis=2) > 20).mean() < 0.02
@@ -342,7 +342,7 @@ def test_bad_input_for_a_still(options: dict, message: str, drive: ls.Rollout, t
 
 @pytest.mark.parametrize("model", ["<mujoco><worldbody>", "<mujoco/>"])
 def test_model_that_does_not_fit(model: str, drive: ls.Rollout, tmp_path: Path) -> None:
-    with pytest.raises(ls.InputError, match=r"rollout\.(model|frames): got") as caught:
+    with pytest.raises(ls.InputError, match=r"rollout\.(model|body|frames): got") as caught:
         render(dataclasses.replace(drive, model=model), tmp_path / "run.mp4")
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []

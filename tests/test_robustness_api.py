@@ -208,11 +208,21 @@ class TestCounts:
         )
         assert "physics steps" in line
         # Each period is short enough, and all of them are not.
-        long = dataclasses.replace(drive_solution.trajectory, dt=1e4)
-        line = refusal(
-            lambda: ls.simulate(differential_drive.plant(), dataclasses.replace(drive_solution, trajectory=long))
+        steps, n, m = 10_000, 3, 2
+        plan = ls.Trajectory(np.zeros((steps + 1, n)), np.zeros((steps, m)), dt=100.0)
+        policy = dataclasses.replace(
+            drive_solution.policy,
+            gain=np.zeros((steps, m, n)),
+            offset=plan.controls,
+            nominal=plan.states[:-1],
+            dt=100.0,
         )
-        assert "150 control periods of 10000 s, which are 180000000 physics steps, want at most 100000000" in line
+        endless = dataclasses.replace(
+            drive_solution, trajectory=plan, policy=policy, inverse_policy=None, cost_to_go=None, cost_to_come=None,
+            clearance=None, candidates=(), multipliers=(),
+        )  # fmt: skip
+        line = refusal(lambda: ls.simulate(differential_drive.plant(), endless))
+        assert "10000 control periods of 100 s, which are 120000000 physics steps, want at most 100000000" in line
 
 
 class TestDataThatUsersBuild:
@@ -238,17 +248,28 @@ class TestDataThatUsersBuild:
         rollout = ls.simulate(differential_drive.plant(), drive_solution, frames=False)
         for field, value in (
             ("states", rollout.states[:, :-1]), ("clearance", [0.0]), ("radius", "wide"), ("robot", "two\nlines"),
-            ("forces", rollout.forces.transpose(0, 2, 1)), ("contacts", [-1]), ("diverged", [2]), ("seed", 1.5),
-            ("plan", None), ("versions", {"a": 1}), ("disturbances", "wind"),
+            ("forces", rollout.forces.transpose(0, 2, 1)), ("contacts", [-1]), ("seed", 1.5),
+            ("plan", None), ("versions", {"a": 1}), ("disturbances", "wind"), ("body", None), ("goal_radius", 0.0),
+            ("goal", [0.0, 1.0]), ("goal", "home"), ("collided_at", [-1.0]), ("collided_at", [np.nan]),
+            ("collided_at", [1.0]), ("obstacles", ("pillar",)), ("obstacles", ()), ("obstacles", "pillar"),
+            ("diverged_at", [1e6]), ("diverged_at", [0.0, 0.0]), ("failed_at", ["soon"]), ("failed_at", [0.5]),
+            ("reasons", (1,)), ("reasons", ("none",)),
         ):  # fmt: skip
             assert refusal(lambda f=field, v=value: dataclasses.replace(rollout, **{f: v})).startswith("Rollout: ")
+        for goal in ([np.nan] * 3, [np.inf, 0.0, 0.0]):
+            for one in (rollout, drive_solution):
+                assert refusal(lambda o=one, g=goal: dataclasses.replace(o, goal=g)).startswith("goal: got ")
+        assert refusal(lambda: dataclasses.replace(drive_solution, goal_radius=0.0)).startswith("Solution: goal_radius")
+        for field in ("goal_radius", "goal_tolerance"):
+            line = refusal(lambda f=field: dataclasses.replace(differential_drive, **{f: "near"}))
+            assert line.startswith(f"Scenario: {field}: got 'near'")
 
     def test_one_that_is_lost_from_the_start_has_a_summary(
         self, differential_drive: ls.Scenario, drive_solution: ls.Solution
     ) -> None:
         rollout = ls.simulate(differential_drive.plant(), drive_solution, frames=False)
         states = np.full_like(rollout.states, np.nan)
-        lost = dataclasses.replace(rollout, states=states, diverged=np.array([True]))
+        lost = dataclasses.replace(rollout, states=states, diverged_at=np.array([0.0]))
         assert "diverged at once" in lost.summary()
 
     def test_effects(self, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
@@ -346,5 +367,5 @@ def test_robots_have_lengths_and_masses(robot: type) -> None:
     for field in dataclasses.fields(robot):
         for value in (-1.0, math.nan, "heavy"):
             assert refusal(lambda f=field, v=value: robot(**{f.name: v})).startswith(
-                f"{robot.name}: {field.name}: got "
+                f"{robot.__name__}: {field.name}: got "
             )

@@ -48,7 +48,7 @@ def test_distances_in_the_arena_are_those_of_circles_and_a_rectangle():
     points = np.random.default_rng(0).uniform([-2, -3], [2, 3], (300, 2))
     to_pillars = np.linalg.norm(points[:, None] - np.array(PILLARS), axis=2).min(axis=1) - 0.2
     to_walls = np.minimum(2 - np.abs(points[:, 0]), 3 - np.abs(points[:, 1]))
-    distance = load_scene("arena").world.seen_by(2).distance(points)
+    distance = load_scene("arena").world.seen_by("xy").distance(points)
     np.testing.assert_allclose(distance, np.minimum(to_pillars, to_walls), atol=1e-12)
 
 
@@ -59,7 +59,7 @@ def test_distances_in_the_cage_are_those_of_twelve_infinite_bars_and_a_cube():
         across = np.delete(points, axis, axis=1)
         # The nearest of the four bars along this axis is the one of the same signs.
         distances.append(np.linalg.norm(np.abs(across) - 1.25, axis=1) - 0.4)
-    world = load_scene("cage").world.seen_by(3)
+    world = load_scene("cage").world.seen_by("xyz")
     assert len(world) == 12 + 6
     np.testing.assert_allclose(world.distance(points), np.min(distances, axis=0), atol=1e-12)
 
@@ -195,3 +195,41 @@ def test_a_sparse_model_is_refused_where_mujoco_solves_it_wrongly(scene_of):
     text = '<mujoco><option jacobian="sparse"/><worldbody><body><joint/><geom size="1"/></body></worldbody></mujoco>'
     with pytest.raises(InputError, match=r"^scene mine: got a sparse constraint Jacobian, which MuJoCo 4.0.0"):
         scene_of(text=text)
+
+
+def test_elements_nested_by_the_thousand_get_one_line(tmp_path):
+    deep = "<mujoco><worldbody>" + "<body><geom size='1'/>" * 3000 + "</body>" * 3000 + "</worldbody></mujoco>"
+    (tmp_path / "deep.xml").write_text(deep)
+    with pytest.raises(InputError, match=r"^scene deep: got elements nested deeper than 490"):
+        scenes.scene_from_xml(deep, "deep")
+    with pytest.raises(InputError, match=r"^scene: got deep.xml with elements nested deeper than 490"):
+        load_scene(tmp_path / "deep.xml")
+
+
+def test_a_huge_height_field_gets_one_line(scene_of):
+    asset = '<asset><hfield name="land" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>'
+    with pytest.raises(
+        InputError, match="got 100000 x 100000 heights in the height field 'land', want 16,777,216 at most"
+    ):
+        scenes.scene_from_xml(f"<mujoco>{asset}<worldbody><geom size='1'/></worldbody></mujoco>", "hills")
+
+
+def test_a_nan_in_the_file_gets_one_line_and_leaves_no_log(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    body = '<body><joint name="j"/><geom size="1"/></body>'
+    with pytest.raises(
+        InputError, match=r"^scene odd: got NaN in the MJCF \(MuJoCo's actuator_\w+\[0\]\), want numbers"
+    ):
+        scenes.scene_from_xml(
+            f'<mujoco><worldbody>{body}</worldbody><actuator><motor joint="j" gear="nan"/></actuator></mujoco>', "odd"
+        )
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_that_obstacles_without_one_get_are_free(scene_of):
+    scene = scene_of("""
+        <geom size="0.1"/>
+        <geom name="sphere 0" size="0.2"/>
+        <geom name="sphere 0_" size="0.3"/>
+    """)
+    assert list(by_name(scene)) == ["sphere 0__", "sphere 0", "sphere 0_"]

@@ -43,7 +43,7 @@ class Case:
         frames = (self.run.frames if frames is None else frames[None]).copy()
         states = self.run.states.copy()
         frames[:, self.run.frame_times > self.run.times[HALF] + 1e-9], states[:, HALF + 1 :] = np.nan, np.nan
-        return dataclasses.replace(self.run, states=states, frames=frames, diverged=np.array([True]))
+        return dataclasses.replace(self.run, states=states, frames=frames, diverged_at=self.run.times[[HALF + 1]])
 
 
 @pytest.fixture(scope="module", params=ROBOTS)
@@ -303,11 +303,11 @@ def test_views_that_disagree_are_told_apart() -> None:
     side = Camera("side", (0.0, -10.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), 5.0)
     point = np.array([0.3, -0.2, 0.5])
     measured = np.array([[view.axes @ point for view in (top, side)]])
-    place, apart = pixels.place((top, side), measured, 3)
+    place, apart = pixels.place((top, side), measured, "xyz")
     np.testing.assert_allclose(place, [point], rtol=0, atol=1e-12)
     np.testing.assert_allclose(apart, 0, rtol=0, atol=1e-12)
     measured[0, 0, 0] += 0.01
-    place, apart = pixels.place((top, side), measured, 3)
+    place, apart = pixels.place((top, side), measured, "xyz")
     np.testing.assert_allclose(place, [point + np.array([0.005, 0, 0])], rtol=0, atol=1e-12)
     np.testing.assert_allclose(apart, 0.01, rtol=0, atol=1e-12)
 
@@ -333,4 +333,4 @@ def test_the_marks_middle_is_found_between_pixels(centre: tuple[float, float]) -
 def test_cameras_of_a_robot_in_the_plane_see_it_from_above(case: Case) -> None:
     views = [cameras.side(case.run)]
     with pytest.raises(ls.InputError, match="views: got side, want"):
-        pixels.place(views, np.zeros((0, 1, 2)), len(case.run.state_coordinates.position))
+        pixels.place(views, np.zeros((0, 1, 2)), case.run.state_coordinates.plane)

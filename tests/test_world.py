@@ -116,20 +116,20 @@ def test_seen_from_above() -> None:
             ls.Obstacle("crate", "box", np.array([-1.0, 0, 0]), level, np.array([0.1, 0.2, 0.3])),
         ]
     )
-    flat = world.seen_by(2)
+    flat = world.seen_by("xy")
     assert flat.names == ("wall", "pillar", "ball", "crate")
     # Closed forms in the plane: a half-plane, two circles, a rectangle with half sides of 0.3 along x and 0.2 along y.
     np.testing.assert_allclose(
         flat.distances((0.5, 0.5)), [1.5, np.hypot(0.5, 0.5) - 0.2, np.hypot(0.5, 1.5) - 0.3, np.hypot(1.2, 0.3)]
     )
-    assert world.seen_by(3) is world
+    assert world.seen_by("xyz") is world
 
 
 def test_what_has_no_outline_from_above_is_refused_by_name() -> None:
     tilted = Rotation.from_euler("x", 30, degrees=True).as_matrix()
     world = ls.World([ls.Obstacle("ramp", "box", np.zeros(3), tilted, np.ones(3))])
     with pytest.raises(ls.InputError, match="'ramp': got a tilted box, want it upright"):
-        world.seen_by(2)
+        world.seen_by("xy")
 
 
 def test_a_row_is_as_long_as_said() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.policy import AffinePolicy
-from lqrsim.results import Solution, Status, Trajectory
+from lqrsim.results import Certificate, Solution, Status, Trajectory
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
@@ -42,6 +42,11 @@ def track(robot: Robot, start: npt.ArrayLike, controls: npt.ArrayLike, dt: float
         trajectory=plan,
         iterations=(),
         clearance=None,
+        # There is no problem, so no cost of it; the plan is made by the dynamics, and by the law.
+        certificate=Certificate(
+            cost=np.nan, start=0.0, motion=0.0, law=0.0, limits=0.0, violation=0.0, optimality=np.inf
+        ),
+        gap=np.nan,
         solver="by hand",
         options={},
         problem_digest="",

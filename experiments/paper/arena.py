@@ -24,7 +24,7 @@ DISTURBED, UNDISTURBED = RUNS[0], RUNS[1]
 def arena(axes: Axes, scenario: ls.Scenario) -> None:
     """Pillars and walls from above, and the wished start and goal."""
     ends = np.array([scenario.problem.start, scenario.problem.goal])[:, :2]
-    world = scenario.scene.world.seen_by(2)
+    world = scenario.scene.world.seen_by("xy")
     scenery.draw_in_plane(axes, world, *scenery.bounds(ends, world, WALL), scenario.robot.radius)
     axes.spines[:].set_visible(False)
     axes.set(xticks=range(-2, 3), yticks=range(-3, 4))

@@ -148,8 +148,8 @@ def _level_sets(axes: Axes, scenario: ls.Scenario, solution: ls.Solution) -> Non
     of_go = np.linalg.pinv(go.hessian, hermitian=True)
     least_to_go = -np.einsum("tij,tj->ti", of_go, go.gradient)
     (cost,) = scenario.problem.obstacle_costs
-    world, plan = cost.world, solution.trajectory.states[:, :2]
-    low, high = scenery.bounds(plan, world.seen_by(2), 0.2)
+    world, plan = cost.world.seen_by("xy"), solution.trajectory.states[:, :2]
+    low, high = scenery.bounds(plan, world, 0.2)
     scenery.draw_in_plane(axes, world, low, high, cost.radius)
     axes.plot(*plan.T, color=LIMIT, linewidth=1, label="rollout")
     for name, colour, marker, centres, shapes in (

@@ -84,7 +84,7 @@ def parts(problem: ls.Problem) -> Parts:
         nominal=control.about,
         control_weight=control.weight,
         final_weight=arrival.weight,
-        world=obstacles.world.seen_by(len(problem.dynamics.state_coordinates.position)),
+        world=obstacles.world.seen_by(problem.dynamics.state_coordinates.plane),
         radius=obstacles.radius,
         sharpness=obstacles.sharpness,
         obstacle_weight=obstacles.weight,

@@ -69,9 +69,9 @@ def blocked_drive(rng: Generator) -> Drawn:
         places = [place for place in (*(left - away), *(right + away)) if abs(place) < 2 + thick]
         barrier = [_pillar(f"pillar{i}", place, middle[1], thick) for i, place in enumerate(places)]
     world = ls.World([*walls, *barrier])
-    for name, place, size in _things(rng, world.seen_by(2), half, robot.radius, int(rng.integers(3))):
+    for name, place, size in _things(rng, world.seen_by("xy"), half, robot.radius, int(rng.integers(3))):
         world = ls.World([*world.obstacles, _pillar(name, place[0], place[1], size)])
-    start, goal = _either_side(rng, world.seen_by(2), half - 0.3, middle, 1, thick, robot.radius + 0.05)
+    start, goal = _either_side(rng, world.seen_by("xy"), half - 0.3, middle, 1, thick, robot.radius + 0.05)
     by = np.linalg.norm(goal - middle) + np.linalg.norm(middle - start)
     ahead = np.arctan2(goal[1] - start[1], goal[0] - start[0])
     first, last = ([*place, ahead + rng.uniform(-np.pi, np.pi)] for place in (start, goal))

@@ -54,7 +54,7 @@ def drive(rng: Generator) -> ls.Problem:
         for i in range(rng.integers(3, 17))
     ]  # fmt: skip
     world = ls.World([*walls, *pillars])
-    start, goal = ends(rng, world.seen_by(2), np.array([1.7, 2.7]), robot.radius + 0.03, apart=2.0)
+    start, goal = ends(rng, world.seen_by("xy"), np.array([1.7, 2.7]), robot.radius + 0.03, apart=2.0)
     ahead = np.arctan2(goal[1] - start[1], goal[0] - start[0])
     # Of the headings that are the same, the ones nearest to the way ahead: that is how a user would write them.
     first, last = ([*place, ahead + rng.uniform(-np.pi, np.pi)] for place in (start, goal))

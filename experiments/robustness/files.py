@@ -197,7 +197,7 @@ def use_rollout(rollout: ls.Rollout) -> None:
     """What people do with a rollout, but for drawing it."""
     print(rollout, rollout.outcome, rollout.saturated.mean(), file=_Nowhere())
     track = Track(rollout, 0)
-    for look in (track.driven, track.planned, track.force_at, track.lost):
+    for look in (track.driven, track.planned, track.force_at, track.over):
         look(track.end / 2)
     track.number_at(track.error, track.end)
 

@@ -91,6 +91,9 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "Dynamics.step": ({"self": cart, **at, "dt": 0.1},),
         "Dynamics.linearize": ({"self": cart, **at, "dt": 0.1},),
         "Coordinates": ({field.name: getattr(limits, field.name) for field in dataclasses.fields(limits)},),
+        "Dynamics.with_parameters": ({"self": place.problem.dynamics, "axle_length": 0.3},),
+        "Coordinates.in_world": ({"self": place.space, "places": np.zeros((4, 2)), "height": 0.1},),
+        "Coordinates.of_world": ({"self": place.space, "points": np.zeros((4, 3))},),
         "Coordinates.nearest": ({"self": limits, **there},),
         "Coordinates.difference": ({"self": limits, **there},),
         "Coordinates.limited": ({"self": limits, "low": -1.0, "high": (1.0, 2.0, 3.0)},),
@@ -128,7 +131,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             "name": "box", "kind": "box", "position": np.zeros(3), "rotation": np.eye(3), "size": np.ones(3)
         },),
         "World": ({"obstacles": [box]},),
-        "World.seen_by": ({"self": world, "dimension": 2},),
+        "World.seen_by": ({"self": world, "plane": "xz", "offset": 0.5},),
         "World.distances": ({"self": world, "point": [0.0, 1.0, 2.0]},),
         "World.distance": ({"self": world, "points": [[0.0, 1.0, 2.0]]},),
         "World.nearest": ({"self": world, "points": [[0.0, 1.0, 2.0]]},),
@@ -144,6 +147,10 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "scenarios.names": ({}, 0.1),
         "robots.names": ({}, 0.1),
         "robots.get": ({"name": "quadrotor"},),
+        "Scenario.near_enough": ({"self": place.scenario, "goal_radius": 0.1, "goal_tolerance": None},),
+        "Scenario.reach": ({"self": place.scenario, "goal_radius": 0.1, "goal_tolerance": None},),
+        "rotations.quaternion": ({"rotation_vector": [0.1, 0.2, 0.3]},),
+        "rotations.rotation_vector": ({"quaternion": [1.0, 0.1, 0.2, 0.3]},),
         "rotations.rotate": ({"r": [0.1, 0.2, 0.3], "v": [1.0, 0.0, 0.0]},),
         "rotations.vector_rate": ({"r": [0.1, 0.2, 0.3], "w": [1.0, 0.0, 0.0]},),
         "DifferentialDrive": (dataclasses.asdict(ls.DifferentialDrive()),),
@@ -225,7 +232,7 @@ def results(place: Place) -> dict[str, tuple[Any, ...]]:
         "Candidate": candidate, "Iteration": solution.iterations[-1], "Rollout": rollout,
         "Multipliers": ls.Multipliers(np.zeros((5, 2)), 1.0), "ContinuousSolution": flowing,
         "Solution": dataclasses.replace(solution, candidates=(candidate,)),
-        "Outcomes": ls.outcomes(rollout, place.plant), **checks,
+        "Outcomes": ls.outcomes(rollout), **checks,
     }  # fmt: skip
     at = {"x": np.zeros(2), "t": 0.05}
     return {

@@ -136,7 +136,7 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
             "call": simulate_controller, "plant": plant, "solution": solution, "control": steering, "digest": "mine",
             "spaces": (place.space, place.controls),
         },),
-        "outcomes": ({"rollout": rollout, "plant": plant, "problem": place.problem},),
+        "outcomes": ({"rollout": rollout, "problem": place.problem, "goal_radius": 0.1},),
         "check_plant": ({
             "robot": robot, "scene": place.scenario.scene, "period": 1 / 60, "around": np.zeros(3), "spread": 0.3,
             "controls": ([-0.1, -0.1], [0.1, 0.1]), "settle": 0.0, "samples": 1, "tolerance": 0.1, "seed": 0,
@@ -148,7 +148,8 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
     reference = "tiny.py:tiny"
     asked = {
         "scenario": reference, "sweeps": {"noise": (ls.ControlNoise(0.1),)}, "strengths": (0.0, 1.0),
-        "policies": ("open_loop",), "trials": 2, "seed": 0, "replan_every": 0.5, "shard": 2, "time_limit": 60.0,
+        "policies": ("open_loop",), "trials": 2, "seed": 0, "replan_every": 0.5, "goal_radius": 0.1,
+        "goal_tolerance": None, "shard": 2, "time_limit": 60.0,
     }  # fmt: skip
     campaign = ls.Campaign(**asked)
     results = ls.run_campaign(campaign, place.folder / "campaign", workers=0)
@@ -160,6 +161,8 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
         "disturbances",
         "controller",
         "failure",
+        "goal_radius",
+        "goal_tolerance",
         "contacts",
         "batch",
         "threads",

@@ -21,7 +21,7 @@ from robustness.place import Place
 
 # Called by lqrsim itself, with what it has checked: what one overrides to add a cost, a disturbance or a controller.
 HOOKS = {"bind", "start", "check", "describe", "blow", "fitting", "actuation", "multiply", "parts", "draw", "limits"}
-HOOKS |= {"displace"}
+HOOKS |= {"displace", "across", "clearance_at"}
 # Text that compiled cores contain: numbers in, numbers out.
 KERNELS = {f"{ratio}{order}" for ratio in ls.rotations.RATIOS for order in ("", "_d1", "_d2")}
 

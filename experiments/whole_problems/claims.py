@@ -98,8 +98,9 @@ def _clearances(problem: ls.Problem) -> list[ls.Clearance]:
 
 def _spare(problem: ls.Problem, clearance: ls.Clearance, states: Array) -> Array:
     """What each obstacle's constraint has to spare (T+1, obstacles); complex states will do."""
-    place = states[..., list(problem.dynamics.state_coordinates.position)]
-    world = clearance.world.seen_by(len(problem.dynamics.state_coordinates.position))
+    space = problem.dynamics.state_coordinates
+    place = states[..., list(space.position)]
+    world = clearance.world.seen_by(space.plane, space.offset)
     if not world.obstacles:
         return np.full((len(states), 1), np.inf)
     away = [kkt.distance(obstacle, place) - clearance.radius - clearance.margin for obstacle in world.obstacles]

@@ -78,7 +78,7 @@ def problem(
 
 def draw(rng: Generator, *, clearance: bool) -> ls.Problem:
     """A random one; start and goal are drawn until both are clear by the margin."""
-    obstacles = world().seen_by(2)
+    obstacles = world().seen_by("xy")
 
     def place(low: float, high: float) -> np.ndarray:
         while True:

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Folder
+from lqrsim.commands.options import Folder, optional
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from lqrsim.errors import Array
     from lqrsim.stress.given import TrialScore
 
@@ -28,6 +30,10 @@ class Search:
     """As in `lqrsim stress`."""
     failure: Literal["collision", "miss"] = "collision"
     """collision: with an obstacle, or lost. miss: any trial that does not reach its goal."""
+    goal_radius: Annotated[float | None, optional("METRES")] = None
+    """How near the goal counts as having reached it. By default the robot's radius."""
+    goal_tolerance: Annotated[float | None, optional("SHARE")] = None
+    """The same for goals without a position, relative to the plan's range of each state. By default 0.1."""
     seed: int = 0
     """Of all random draws. The same seed gives the same output."""
 
@@ -54,13 +60,21 @@ class Search:
             solution,
             disturbances,
             controller=controller(self.policy, scenario, solution),
+            **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             failure={"collision": given.collision, "miss": given.miss}[self.failure],
         )
+        if self.failure == "collision" and not len(trials.plant.world):
+            raise InputError(
+                f"failure: got 'collision' for {self.scenario}, where nothing measures how near it is, want 'miss'"
+            )
         if trials.size == 0:
             raise InputError(f"sweep: got {self.sweep!r}, in which nothing is random, want one that draws numbers")
         words = [one.describe(trials.plant) for one in disturbances]
         console.say(f"{self.policy} on {self.scenario}, {self.sweep} at strength {self.strength:g}: {'; '.join(words)}")
         console.say(f"a trial draws {trials.size:,} numbers; failure: {self.failure}")
+        reach = scenario.reach(self.goal_radius, self.goal_tolerance)
+        for line in solution.target.of_plan(reach):
+            console.say(line)
         asked = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "out"}
         return trials, {
             "asked": asked,
@@ -135,7 +149,7 @@ class Rare(Search):
                     particles=self.particles,
                     repetitions=self.repetitions,
                     seed=self.seed,
-                    level=_say_level,
+                    level=_teller(trials),
                     progress=progress,
                 )
         except NoFailure as none:
@@ -197,7 +211,9 @@ class Break(Search):
         if trials(np.zeros((1, trials.size)))[0] > 0:
             raise InputError(f"scenario: got {self.scenario}, where {self.policy} fails with nothing random, want else")
         try:
-            begun = split(trials, trials.size, particles=200, keep=0.2, repetitions=2, seed=self.seed, level=_say_level)
+            begun = split(
+                trials, trials.size, particles=200, keep=0.2, repetitions=2, seed=self.seed, level=_teller(trials)
+            )
         except NoFailure as none:
             console.say(f"no failure was found ({none})")
             return 1
@@ -242,10 +258,16 @@ class Break(Search):
         return 0
 
 
-def _say_level(level: float) -> None:
+def _teller(trials: "TrialScore") -> "Callable[[float], None]":
+    """Says a level of the score, with its unit."""
     from lqrsim import console
 
-    console.say(f"level: {-level:.3g} m from failing" if level < 0 else "level: failing")
+    unit = "m" if len(trials.plant.world) else trials.solution.target.unit
+
+    def say(level: float) -> None:
+        console.say(f"level: {-level:.3g} {unit} from failing" if level < 0 else "level: failing")
+
+    return say
 
 
 def _rounded(number: float) -> str:

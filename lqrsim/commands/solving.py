@@ -91,7 +91,8 @@ class Solve:
             if scenario.paper_start is None:
                 raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario that the paper has")
             options["start"] = scenario.paper_start
-        solution = replace(console.solve(problem, self.solver, **options), scenario=from_anywhere(self.scenario))
+        solved = console.solve(problem, self.solver, reach=scenario.reach(), **options)
+        solution = replace(solved, scenario=from_anywhere(self.scenario))
         console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
         if self.figure is not None:
             from lqrsim.view.policy_plot import plot_policy
@@ -105,8 +106,8 @@ class Solve:
 class Simulate:
     """Execute a policy in MuJoCo, in closed loop.
 
-    Writes the runs to rollout.npz, and prints a line for each trial. Without a disturbance it is the plain closed loop.
-    The same seed gives the same bits on equal processors.
+    Writes the runs to rollout.npz. Prints where the plan ends, a line for each trial, and how many reached the goal.
+    Without a disturbance it is the plain closed loop. The same seed gives the same bits on equal processors.
 
       lqrsim simulate SOLUTION.npz --force-noise 0.1 --push 0.2 0 0 3.0 --trials 10
       lqrsim simulate SOLUTION.npz --disturbances severe --out runs/severe
@@ -142,6 +143,11 @@ class Simulate:
     first_trial: int = 0
     """Number of the first: trial 7 alone is --first-trial 7, and the same to the last bit as among others."""
 
+    goal_radius: Annotated[float | None, optional("METRES")] = None
+    """How near the goal counts as having reached it. By default the robot's radius."""
+    goal_tolerance: Annotated[float | None, optional("SHARE")] = None
+    """The same for goals without a position, relative to the plan's range of each state. By default 0.1."""
+
     def run(self) -> int:
         """Carry the command out; its exit code."""
         from lqrsim import console, files
@@ -168,9 +174,11 @@ class Simulate:
                 trials=self.trials,
                 first_trial=self.first_trial,
                 progress=progress,
+                **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             )
         console.say(rollout.summary())
         console.say(f"wrote {files.save(rollout, folder / 'rollout.npz')}")
+        console.say(rollout.tally())
         return 0
 
     def _own(self) -> "list[Disturbance]":

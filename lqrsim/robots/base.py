@@ -1,11 +1,12 @@
 """What a robot is: its constants, its analytic dynamics, its MJCF names, and the maps between the two."""
 
 import abc
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy.typing as npt
 
-from lqrsim.errors import Array
+from lqrsim.errors import Array, check_number
 
 if TYPE_CHECKING:
     from lqrsim.dynamics import Dynamics
@@ -16,12 +17,13 @@ class Robot(abc.ABC):
 
     Attributes:
       name: what the command line calls it.
-      body: the body in the MJCF that is the robot. Obstacles are everything else that is fixed to the world.
+      body: the body in the MJCF that is the robot; its origin is where the states say that its position is. Obstacles
+        are everything else that is fixed to the world.
       joints: its joints in the MJCF. `qpos` and `qvel` below are theirs alone, in this order.
       actuators: its actuators in the MJCF, in the order of `actuation`.
       wheels: the geoms in the MJCF that are the treads of its wheels, each on a body of its own; none by default.
       drag: linear, against its velocity through the air, in N s/m; wind acts through it. None by default.
-      radius: of its collision circle (planar) or sphere (spatial), in metres.
+      radius: of its collision circle (seen from above) or ball (the rest), in metres.
     """
 
     name: ClassVar[str]
@@ -53,3 +55,14 @@ class Robot(abc.ABC):
         import numpy as np
 
         return np.asarray(control, dtype=np.float64)
+
+    def _check(self, *, above_zero: Sequence[str] = (), at_least_zero: Sequence[str] = ()) -> None:
+        """For `__post_init__` of robots whose constants are fields: makes them floats, and refuses impossible ones.
+
+        Raises:
+          InputError: a constant is no finite number, or not above zero, or below zero.
+        """
+        for field in (*above_zero, *at_least_zero):
+            least = {"above": 0.0} if field in above_zero else {"at_least": 0.0}
+            number = check_number(f"{type(self).__name__}: {field}", getattr(self, field), **least)
+            object.__setattr__(self, field, number)  # robots are frozen

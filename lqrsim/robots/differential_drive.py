@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.dynamics import Dynamics
-from lqrsim.errors import Array, check_number, vectors_of
+from lqrsim.errors import Array, vectors_of
 from lqrsim.robots.base import Robot
 
 
@@ -31,8 +31,7 @@ class DifferentialDrive(Robot):
     wheels: ClassVar[tuple[str, ...]] = ("create_tread_left", "create_tread_right")
 
     def __post_init__(self) -> None:
-        for name in ("axle_length", "radius", "max_speed", "wheel_radius"):
-            object.__setattr__(self, name, check_number(f"{self.name}: {name}", getattr(self, name), above=0.0))
+        self._check(above_zero=("axle_length", "radius", "max_speed", "wheel_radius"))
 
     @property
     def dynamics(self) -> Dynamics:

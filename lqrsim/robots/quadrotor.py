@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lqrsim import rotations
 from lqrsim.dynamics import Dynamics
-from lqrsim.errors import Array, InputError, check_number, vectors_of
+from lqrsim.errors import Array, InputError, vectors_of
 from lqrsim.robots.base import Robot
 
 
@@ -40,11 +40,10 @@ class Quadrotor(Robot):
     )
 
     def __post_init__(self) -> None:
-        positive = ("mass", "inertia", "arm", "max_force", "radius")
-        for name in (*positive, "torque_ratio", "drag", "gravity"):
-            above, least = (0.0, None) if name in positive else (None, 0.0)
-            number = check_number(f"{self.name}: {name}", getattr(self, name), above=above, at_least=least)
-            object.__setattr__(self, name, number)
+        self._check(
+            above_zero=("mass", "inertia", "arm", "max_force", "radius"),
+            at_least_zero=("torque_ratio", "drag", "gravity"),
+        )
 
     @property
     def hover_force(self) -> float:
@@ -59,14 +58,14 @@ class Quadrotor(Robot):
         qpos, qvel = vectors_of("qpos", qpos, 7), vectors_of("qvel", qvel, 6)
         if qpos.shape[:-1] != qvel.shape[:-1]:
             raise InputError(f"qvel: got shape {qvel.shape}, want that of qpos, {qpos.shape}, with 6 numbers")
-        rotation = _rotation_vector(qpos[..., 3:7])
+        rotation = rotations.rotation_vector(qpos[..., 3:7])
         state = np.concatenate([qpos[..., :3], qvel[..., :3], rotation, qvel[..., 3:6]], axis=-1)
         return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
 
     def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
         state = vectors_of("state", state, 12)
         position, velocity, rotation, angular_velocity = np.split(state, 4, axis=-1)
-        qpos = np.concatenate([position, _quaternion(rotation)], axis=-1)
+        qpos = np.concatenate([position, rotations.quaternion(rotation)], axis=-1)
         return qpos, np.concatenate([velocity, angular_velocity], axis=-1)
 
 
@@ -93,23 +92,3 @@ def _rate(x: Any, u: Any, p: Any) -> list[Any]:
     # The inertia is the same about each axis, so the gyroscopic term w x J w is zero.
     torque = [p.arm * (u[1] - u[3]), p.arm * (u[2] - u[0]), p.torque_ratio * (u[0] - u[1] + u[2] - u[3])]
     return [*velocity, *acceleration, *rotations.vector_rate(rotation, w), *(t / p.inertia for t in torque)]
-
-
-def _quaternion(rotation: Array) -> Array:
-    """Unit quaternions (..., 4), scalar first, of rotation vectors (..., 3)."""
-    angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
-    # np.sinc(t) is sin(pi t) / (pi t), and 1 at 0: here sin(angle / 2) / angle.
-    return np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * rotation], axis=-1)
-
-
-def _rotation_vector(quaternion: Array) -> Array:
-    """Rotation vectors (..., 3) of at most half a turn, of quaternions (..., 4) of any length and sign."""
-    # q and -q are one rotation: the one with scalar part >= 0 is its half turn or less.
-    scalar, x, y, z = (quaternion[..., i] for i in range(4))
-    sine = np.sqrt(x * x + y * y + z * z)
-    # atan2 is exact at both ends, unlike acos near no turn and asin near half a turn.
-    angle = 2 * np.arctan2(sine, np.abs(scalar))
-    # Without a turn the ratio is 2 / scalar, whatever the length; there the division is by zero.
-    small = sine < 1e-12
-    ratio = np.divide(angle, sine, out=np.asarray(2.0 / np.abs(scalar)), where=~small) if small.any() else angle / sine
-    return np.copysign(ratio, scalar)[..., None] * quaternion[..., 1:]

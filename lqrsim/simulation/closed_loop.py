@@ -17,20 +17,23 @@ from lqrsim.errors import (
     check_items,
     check_kind,
     check_memory,
-    check_number,
     check_seed,
     check_text,
     excerpt,
     shaped,
+    told,
 )
 from lqrsim.results import Solution, Trajectory
 from lqrsim.rollout import Rollout
+from lqrsim.scenes import unlogged
+from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.controllers import Controller, Feedback
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.disturbances.base import Hook
-from lqrsim.simulation.physics import Physics, part_of, unlogged
+from lqrsim.simulation.physics import Physics, part_of
 from lqrsim.simulation.plant import MOST_STEPS, Plant
 from lqrsim.solvers.common import check_threads
+from lqrsim.target import Target
 from lqrsim.versions import versions
 
 
@@ -44,6 +47,7 @@ def simulate(
     trials: int = 1,
     first_trial: int = 0,
     goal_radius: float | None = None,
+    goal_tolerance: float | None = None,
     frames: bool = True,
     contacts: bool = True,
     threads: int | None = None,
@@ -55,15 +59,21 @@ def simulate(
 
     In each control period: read the true state, measure it, ask the policy, disturb its command, saturate, push, step.
 
+    A trial ends with the first collision, as `collisions.py` defines it, when it becomes unstable, or when the
+    controller fails: raises an exception, which ends all the trials that it was asked for, or returns what are no
+    controls of theirs. What is recorded after a collision does not count; after the others it is NaN.
+
     Args:
       disturbances: what goes wrong, in the order in which it happens. Each has its own stream of random numbers.
       controller: what decides on the controls; by default the solution's policy.
       seed: of all random numbers. trials: how many runs. first_trial: number of the first; trial `i` of a seed is the
         same to the last bit whatever runs beside it.
-      goal_radius: how near the plan's end counts as having reached it, in metres; by default the robot's radius.
+      goal_radius: how near the goal counts as having reached it, in metres; by default the robot's radius.
+      goal_tolerance: the same for goals without a position, relative to the plan's range; 0.1 by default. `target.py`
+        says of what.
       frames: whether to record what drawing needs, between the control periods too; without it there is no video.
-      contacts: whether obstacles stop the robot, or it goes through them, which takes a quarter less time and is the
-        same until the first collision.
+      contacts: whether obstacles stop the robot, from the control period of its first collision on; or it goes through
+        them, which takes a quarter less time and is the same to the bit until then, with the same outcome.
       threads: of MuJoCo's; by default as many as there are processors.
       generators: (trial, number of the disturbance) -> where its numbers come from, in place of the seed.
       progress: called after each control period with the number of periods done and of all.
@@ -85,10 +95,11 @@ def simulate(
     check_function("generators", generators, wanted, arguments=2)
     check_function("progress", progress, "a function of how many periods are done, of how many", arguments=2)
     check_function("watch", watch, "a function of the time, MuJoCo's qpos and who is unstable", arguments=3)
-    goal_radius = plant.robot.radius if goal_radius is None else check_number("goal_radius", goal_radius, above=0.0)
     controller = Feedback(solution.policy) if controller is None else controller
     plan, space = solution.trajectory, plant.robot.dynamics.control_coordinates
     states_space, controls_space = _check_solution(solution, controller, plant)
+    target = Target(states_space, solution.goal, plan.states)
+    radius = target.radius(plant.robot.radius, goal_radius, goal_tolerance)
     substeps = plant.substeps(plan.dt)
     _check_size(plant, plan, substeps, trials, frames=frames)
 
@@ -106,7 +117,7 @@ def simulate(
     if not np.isfinite(displaced).all():
         raise InputError("disturbances: got obstacles that are displaced infinitely far, want finite numbers")
 
-    physics = Physics(plant, trials, substeps, frames=frames, contacts=contacts, threads=threads, watch=watch)
+    physics = Physics(plant, trials, substeps, contacts=contacts, threads=threads)
     begun = np.tile(plan.states[0], (trials, 1))
     for name, effect in zip(named, effects, strict=True):
         if effect.begin is not None:
@@ -119,8 +130,8 @@ def simulate(
             effect.alter(physics.simulations)
     if displaced.any():
         plant.displace(physics.simulations, displaced)
-    if any(effect.alter for effect in effects) or displaced.any():
-        physics.simulations.set_const()
+    with unlogged():
+        physics.begin(altered=bool(displaced.any()) or any(effect.alter for effect in effects))
 
     def hooks(kind: str) -> list[tuple[str, Hook]]:
         """What is called in each period, and what messages call it."""
@@ -129,7 +140,6 @@ def simulate(
 
     measures, actuations = hooks("measure"), hooks("actuate")
     wrenches = [(slice(0, 3), *one) for one in hooks("force")] + [(slice(3, 6), *one) for one in hooks("torque")]
-    asked = f"{type(controller).__name__}: control: returned"
     control = controller.start(trials)
     check_function(
         f"{type(controller).__name__}.start", control, "a function of step and states", arguments=2, optional=False
@@ -139,60 +149,99 @@ def simulate(
     steps = plan.steps
     states, measured = _records(trials, steps + 1, n), _records(trials, steps + 1, n)
     commanded, applied, wrench = _records(trials, steps, m), _records(trials, steps, m), _records(trials, steps, 6)
+    clearance = _records(trials, steps + 1, 1)[..., 0]
     contact_periods = np.zeros(trials, dtype=np.int64)
-    lost = np.zeros(trials, dtype=bool)
     lost_since = np.full(trials, steps + 1)  # the knot from which on a trial's records mean nothing
+    failed_since, reasons = np.full(trials, steps + 1), [""] * trials
     seen = [physics.frame()]
+    state = physics.state()
+    collisions = Collisions(plant, state, displaced, plan.dt)
+    watched = 0
     with unlogged():
         for step in range(steps + 1):
-            state = physics.state()
             shown = state.copy()
             for name, measure in measures:
                 shown = shaped(name, measure(step, shown), shown.shape)
-            states[:, step], measured[:, step] = state, shown
-            lost |= physics.unstable | _not_finite(shown)
+            states[:, step], measured[:, step], clearance[:, step] = state, shown, collisions.clearance
+            lost = physics.unstable | _not_finite(shown)
             if lost.any():
                 lost_since[lost] = np.minimum(lost_since[lost], step)
-                shown[lost] = plan.states[step]  # a lost trial goes on with the plan's state, so that the others do
+            over = np.minimum(lost_since, failed_since) <= step
+            if over.any():
+                shown[over] = plan.states[step]  # a trial that is over goes on with the plan's state, for the others
             if step == steps:
                 break
-            command = shaped(asked, control(step, shown), (trials, m))
-            lost |= _not_finite(command)
-            applying = command.copy()
+            try:
+                command = _commands(control(step, shown), (trials, m))
+                wrong = _not_finite(command)
+                why = [_not_a_number(row, space.names) for row in command[wrong]]
+            except Exception as error:  # of a controller, whatever it is: these trials failed
+                command, wrong = np.zeros((trials, m)), np.ones(trials, dtype=bool)
+                why = [told(error)] * trials
+            for row, reason in zip(np.flatnonzero(wrong), why, strict=True):
+                if failed_since[row] > step:
+                    failed_since[row], reasons[row] = step, f"controller at {step * plan.dt:.4g} s: {reason}"
+            commanded[:, step] = command
+            applying = np.where(wrong[:, None], plan.controls[step], command)
             for name, actuate in actuations:
                 applying = shaped(name, actuate(step, applying), applying.shape)
             applying = np.clip(applying, low, high)
             for which, name, push in wrenches:
                 wrench[:, step, which] += shaped(name, push(step, state), (trials, 3))
-            commanded[:, step], applied[:, step] = command, applying
-            touched, pictures = physics.advance(applying, wrench[:, step])
-            contact_periods += touched & ~lost
-            seen += pictures
+            applied[:, step] = applying
+            over = np.minimum(lost_since, failed_since) <= step
+            if over.all():
+                break
+            period = physics.advance(applying, wrench[:, step])
+            collided = collisions.look(step, period, ignored=over)
+            if contacts and len(collided):
+                physics.collide(collided, period)
+                collisions.now(period.states[-1])
+            if contacts:
+                contact_periods += physics.touched(period) & ~over
+            state = period.states[-1]
+            if frames:
+                pictures = physics.drawn(period)
+                seen += pictures
+                for picture in pictures:
+                    watched += 1
+                    if watch is not None:
+                        watch(watched * plan.dt / physics.drawn_parts, picture, physics.unstable)
             if progress is not None:
                 progress(step + 1, steps)
+        if physics.feels:
+            touching = physics.felt()
+            for row in np.flatnonzero(touching.any(axis=1) & np.isinf(collisions.at) & (lost_since > steps)):
+                collisions.feel(int(row), plan.horizon, touching[row])
 
+    missing = (steps * physics.drawn_parts + 1 - len(seen)) if frames else 0
+    seen += [np.full_like(seen[0], np.nan)] * missing
     drawn = np.stack(seen, axis=1)
     for array in (states, measured):
         compiled.turn_to_nearest(states_space, array.transpose(1, 0, 2), plan.states)
-    if lost.any():
+    if (np.minimum(lost_since, failed_since) <= steps).any():
+        known_until = np.minimum(lost_since, failed_since + 1)  # the knot at which a controller fails is known
+        driven_until = np.minimum(lost_since, failed_since)
         # A frame belongs to the knot that ends its period: the trial was lost somewhere before that.
-        knot_of_frame = -(np.arange(len(seen)) // -max(physics.parts, 1))
-        for array, knots in (
-            *((array, np.arange(steps + 1)) for array in (states, measured)),
-            *((array, np.arange(steps)) for array in (commanded, applied, wrench)),
-            (drawn, knot_of_frame),
+        knot_of_frame = -(np.arange(len(seen)) // -physics.drawn_parts)
+        for array, knots, until in (
+            *((array, np.arange(steps + 1), known_until) for array in (states, measured, clearance)),
+            *((array, np.arange(steps), driven_until) for array in (commanded, applied, wrench)),
+            (drawn, knot_of_frame, known_until),
         ):
-            array[knots >= lost_since[:, None]] = np.nan
+            array[knots >= until[:, None]] = np.nan
     return Rollout(
         robot=plant.robot.name,
+        body=plant.robot.body,
         scene=plant.scene.name,
         model=plant.scene.xml,
         plan=plan,
         policy_digest=controller.digest,
         state_coordinates=states_space,
         control_coordinates=controls_space,
+        goal=solution.goal,
+        goal_radius=radius,
         radius=plant.robot.radius,
-        goal_radius=goal_radius,
         states=states,
         measured=measured,
         commanded=commanded,
@@ -200,16 +249,36 @@ def simulate(
         forces=wrench[..., :3],
         torques=wrench[..., 3:],
         displaced=displaced,
-        clearance=plant.clearance(states, displaced),
+        clearance=clearance,
         contacts=contact_periods,
-        diverged=lost,
-        frame_times=np.arange(len(seen)) * (plan.dt / max(physics.parts, 1)),
+        collided_at=collisions.at,
+        obstacles=tuple(collisions.obstacles),
+        diverged_at=np.where(lost_since <= steps, plan.dt * lost_since, np.inf),
+        failed_at=np.where(failed_since <= steps, plan.dt * failed_since, np.inf),
+        reasons=tuple(reasons),
+        frame_times=np.arange(len(seen)) * (plan.dt / physics.drawn_parts),
         frames=drawn,
         disturbances=tuple(disturbance.describe(plant) for disturbance in disturbances),
         seed=seed,
         first_trial=first_trial,
         versions=versions(),
     )
+
+
+def _commands(given: Any, shape: tuple[int, int]) -> Array:
+    """What a controller returned. Raises InputError for what are no controls of all trials."""
+    try:
+        command = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"got {excerpt(given)}, want controls of shape {shape}") from None
+    if command.shape != shape:
+        raise InputError(f"got controls of shape {command.shape}, want {shape}")
+    return command
+
+
+def _not_a_number(command: Array, names: Sequence[str]) -> str:
+    name, value = next(pair for pair in zip(names, command.tolist(), strict=True) if not np.isfinite(pair[1]))
+    return f"got {value} for {name}, want a finite number"
 
 
 def _records(trials: int, steps: int, size: int) -> Array:
@@ -290,6 +359,12 @@ def _check_solution(solution: Solution, controller: Controller, plant: Plant) ->
                 f"solution: got a policy with {field} {', '.join(space.names)}, want those of robot"
                 f" {plant.robot.name}: {', '.join(want)}"
             )
+    meant, moves = spaces[0], dynamics.state_coordinates
+    if (meant.position, meant.plane, meant.offset) != (moves.position, moves.plane, moves.offset):
+        raise InputError(
+            f"solution: got a policy for a position {_place(meant)}, want that of robot {plant.robot.name}:"
+            f" {_place(moves)}"
+        )
     plan = solution.trajectory
     if plan.states.shape[1] != len(wanted[0]) or plan.controls.shape[1] != len(wanted[1]):
         shapes = f"{plan.states.shape[1]} states and {plan.controls.shape[1]} controls"
@@ -297,3 +372,10 @@ def _check_solution(solution: Solution, controller: Controller, plant: Plant) ->
     if not (np.isfinite(plan.states).all() and np.isfinite(plan.controls).all()):
         raise InputError(f"solution: got a plan that is not finite ({solution.status.name}), want one that can be run")
     return spaces[0], spaces[1]
+
+
+def _place(space: Coordinates) -> str:
+    """What the position is, for a message."""
+    names = ", ".join(space.names[index] for index in space.position) or "of no states"
+    plane = f" in the plane {space.plane!r}" if len(space.plane) == 2 else ""
+    return f"({names}){plane}" + ("" if space.offset is None else f" at {space.offset:g} m")

@@ -1,6 +1,6 @@
 """How trials ended: a table with one row a trial, made of a rollout, small enough to be kept for millions of them."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -9,22 +9,21 @@ from lqrsim import compiled
 from lqrsim.errors import Array, InputError, check_kind, check_shape, excerpt, numbers_of, shaped
 from lqrsim.problem import Problem
 from lqrsim.rollout import Rollout
-from lqrsim.simulation.plant import Plant
-from lqrsim.world import ROW, signed_distance
-
-OUTCOMES = ("reached", "timed out", "collided", "diverged", "error")
+from lqrsim.target import OUTCOMES as OUTCOMES
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcomes:
-    """One entry a trial; the first collision ends a trial, and what is measured is of the time until then.
+    """One entry a trial; what is measured is of the time until it ended, as `Rollout.outcome` and `ended` say.
 
     Attributes:
-      trial: its number. outcome: one of OUTCOMES; "error" is for campaigns, of trials that could not be run.
-      obstacle: what it collided with; empty where it did not.
-      ended: when it collided or was lost, in seconds; the horizon where neither happened.
-      worst, rms: tracking error in metres. final: at the end of the plan; NaN for what ended before.
-      clearance: the least, in metres.
+      trial: its number. outcome: one of OUTCOMES.
+      obstacle: what it collided with; empty unless that ended it.
+      ended: when it collided, was lost or failed, in seconds; the horizon where none of that happened.
+      worst, rms: tracking error, in `Rollout.tracking_unit`: metres for robots with a position. final: at the end of
+        the plan; NaN for what ended before.
+      goal: distance from the goal at the end, in `Target.unit`; NaN for what ended before.
+      clearance: the least, in metres; not above 0 where it collided.
       effort: the integral of the squares of the applied controls over time, in their unit squared times s.
       saturated: share of the control periods with a command at a limit.
       cost: of the problem, over stages and end, with the controls that were applied; NaN for what ended before.
@@ -37,6 +36,7 @@ class Outcomes:
     worst: Array
     rms: Array
     final: Array
+    goal: Array
     clearance: Array
     effort: Array
     saturated: Array
@@ -68,17 +68,24 @@ class Outcomes:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-def outcomes(rollout: Rollout, plant: Plant, problem: Problem | None = None) -> Outcomes:
+def outcomes(
+    rollout: Rollout,
+    problem: Problem | None = None,
+    *,
+    goal_radius: float | None = None,
+    goal_tolerance: float | None = None,
+) -> Outcomes:
     """The outcomes of a rollout's trials.
 
     Args:
-      plant: that it was run on. problem: whose cost to work out; NaN without one.
+      problem: whose cost to work out; NaN without one.
+      goal_radius, goal_tolerance: to be judged by in place of the rollout's; see `simulate`.
+
+    Raises:
+      InputError: one of these is out of range, or not what this rollout's goal is judged by.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
-    check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
     check_kind("problem", problem, (Problem, type(None)), "a Problem or None")
-    if rollout.displaced.shape[1] != len(plant.world):
-        raise InputError(f"plant: got one of {len(plant.world)} obstacles, want that of the rollout's, {rollout.scene}")
     if problem is not None and (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
         got = f"{problem.steps} steps of {problem.dt:g} s"
         raise InputError(f"problem: got {got}, want {rollout.plan.steps} of {rollout.plan.dt:g} s, as in the rollout")
@@ -86,52 +93,29 @@ def outcomes(rollout: Rollout, plant: Plant, problem: Problem | None = None) -> 
         raise InputError(
             f"problem: got one of another system, want states {', '.join(rollout.state_coordinates.names)}"
         )
-    plan, dt, steps = rollout.plan, rollout.plan.dt, rollout.plan.steps
-    hit = np.less(rollout.clearance, 0)
-    lost = np.any(~np.isfinite(rollout.states), axis=2)
-    over = hit | lost
-    last = np.where(over.any(axis=1), over.argmax(axis=1), steps)  # the knot with which a trial ends
-    alive = np.arange(steps + 1) <= last[:, None]
-    rows = np.arange(rollout.trials)
-    collided = hit[rows, last]
-    ended = collided | lost[rows, last] | rollout.diverged
-    measured = alive & ~lost
-    outcome = np.where(
-        collided,
-        "collided",
-        np.where(ended, "diverged", np.where(rollout.reached, "reached", "timed out")),
-    )
-    error = np.where(measured, rollout.tracking_error, 0.0)
-    driven = measured[:, :-1] & (np.arange(steps) < last[:, None])
-    effort = dt * np.where(driven, np.sum(np.square(rollout.applied), axis=2), 0.0).sum(axis=1)
+    if goal_radius is not None or goal_tolerance is not None:
+        rollout = replace(rollout, goal_radius=rollout.target.radius(None, goal_radius, goal_tolerance))
+    plan, ended, counts = rollout.plan, rollout.ended, rollout.counts
+    outcome = np.array(rollout.outcome, dtype=np.str_)
+    whole = np.isin(outcome, ("reached", "timed out"))
+    error = np.where(counts, rollout.tracking_error, 0.0)
+    spent = np.clip(ended[:, None] - rollout.times[:-1], 0.0, plan.dt)  # of each control period
+    driven = (spent > 0) & np.isfinite(rollout.applied).all(axis=2)
+    effort = np.where(driven, spent * np.sum(np.square(rollout.applied), axis=2), 0.0).sum(axis=1)
     cost = np.full(rollout.trials, np.nan)
-    if problem is not None and not ended.all():
-        cost[~ended] = compiled.costs_of(problem, rollout.states[~ended], rollout.applied[~ended])
+    if problem is not None and whole.any():
+        cost[whole] = compiled.costs_of(problem, rollout.states[whole], rollout.applied[whole])
     return Outcomes(
-        trial=rollout.first_trial + rows,
+        trial=rollout.first_trial + np.arange(rollout.trials),
         outcome=outcome,
-        obstacle=_obstacles(rollout, plant, collided, last),
-        ended=np.where(ended, last * dt, plan.horizon),
+        obstacle=np.where(outcome == "collided", np.array(rollout.obstacles, dtype=np.str_), ""),
+        ended=ended,
         worst=error.max(axis=1),
-        rms=np.sqrt(np.square(error).sum(axis=1) / np.maximum(measured.sum(axis=1), 1)),
-        final=np.where(ended, np.nan, rollout.tracking_error[:, -1]),
-        clearance=np.where(measured, rollout.clearance, np.inf).min(axis=1),
+        rms=np.sqrt(np.square(error).sum(axis=1) / np.maximum(counts.sum(axis=1), 1)),
+        final=np.where(whole, rollout.tracking_error[:, -1], np.nan),
+        goal=np.where(whole, rollout.goal_distance, np.nan),
+        clearance=rollout.least_clearance(),
         effort=effort,
         saturated=np.where(driven, rollout.saturated, False).sum(axis=1) / np.maximum(driven.sum(axis=1), 1),
         cost=cost,
     )
-
-
-def _obstacles(
-    rollout: Rollout, plant: Plant, collided: npt.NDArray[np.bool_], last: npt.NDArray[np.int64]
-) -> npt.NDArray[np.str_]:
-    """Names of what was hit, for the trials that hit something."""
-    names = ["" for _ in collided]
-    place, table = list(rollout.state_coordinates.position), plant.world.table.ravel()
-    for trial in np.flatnonzero(collided):
-        point = np.zeros(3)
-        point[: len(place)] = rollout.states[trial, last[trial], place]
-        there = (point - rollout.displaced[trial]).tolist()  # seen from where each obstacle is
-        distances = [signed_distance(table, ROW * number, *seen) for number, seen in enumerate(there)]
-        names[trial] = plant.world.names[int(np.argmin(distances))]
-    return np.array(names, dtype=np.str_)

@@ -1,64 +1,112 @@
 """MuJoCo's side of the loop: all trials' states, and how to advance them by a control period."""
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 from mujoco import batch
 
 from lqrsim.errors import Array
 from lqrsim.machine import processors
 from lqrsim.simulation.plant import Indices, Plant
 
-FRAME_PERIOD = 1 / 30  # s; positions for drawing are recorded at least this often, if the physics step is not longer
+FRAME_PERIOD = 1 / 30  # s; positions are looked at and recorded at least this often, if the physics step is not longer
+AWAY = 2.0**20  # m; how deep a robot must be within an obstacle that is only felt, before it is pushed
 
 _WARNINGS = mujoco.mjtWarning
-_UNSTABLE = [int(warning) for warning in (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)]
+# What MuJoCo does not go on with: it resets the state, or the controls, and only warns.
+UNSTABLE = [
+    int(warning)
+    for warning in (
+        _WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC, _WARNINGS.mjWARN_BADCTRL
+    )
+]  # fmt: skip
+
+
+@dataclass
+class Period:
+    """What a control period came to, in S parts of equal length.
+
+    Attributes:
+      states: S arrays (K, n), at the end of each part; angles in any representative.
+      frames: S arrays (K, nq), MuJoCo's qpos then.
+      felt: S arrays (K, obstacles), whether MuJoCo saw a contact; S empty ones where nothing could be felt.
+      stable: (K,) in how many of the parts, from the first on, the simulation was stable.
+    """
+
+    states: list[Array]
+    frames: list[Array]
+    felt: list[npt.NDArray[np.bool_]]
+    stable: npt.NDArray[np.int64]
 
 
 class Physics:
-    """K simulations of a plant.
+    """K simulations of a plant, in which the robot goes through the obstacles until it is told to run into them.
+
+    Until then each is the same to the bit whether it will be told or not. Of a robot that can touch something at a
+    clearance above 0 the contacts are felt, without a force. `begin` must follow `place`.
 
     Args:
       substeps: physics steps of a control period.
-      frames: whether to record positions for drawing, within the control periods too.
-      contacts: whether the robot collides with obstacles; through them, a quarter of the time is saved.
+      contacts: whether any of them will be told to run into obstacles; without it, a quarter of the time is saved.
       threads: by default as many as there are processors.
-      watch: called with each frame as it comes: its time, what `frame` returns, and `unstable`.
 
     Attributes:
-      simulations: MuJoCo's. parts: frames of a control period.
-      unstable: (K,) who blew up.
+      simulations: MuJoCo's. feels: whether contacts are felt without a force.
+      parts: S, parts of a control period. drawn_parts: how many of them end with a frame to draw.
+      unstable: (K,) who blew up. solid: (K,) who runs into obstacles.
     """
 
-    def __init__(
-        self,
-        plant: Plant,
-        trials: int,
-        substeps: int,
-        *,
-        frames: bool,
-        contacts: bool,
-        threads: int | None,
-        watch: Callable[[float, Array, np.ndarray], object] | None = None,
-    ) -> None:
-        self.plant, self._watch, self._watched = plant, watch, 0
-        model = plant.model if contacts else plant.without_contacts
+    def __init__(self, plant: Plant, trials: int, substeps: int, *, contacts: bool, threads: int | None) -> None:
+        self.plant, self.feels = plant, not plant.enclosed
+        sensing = contacts or self.feels
+        model = plant.model if sensing else plant.without_contacts
         self.simulations = batch.Batch(model, trials, min(trials, threads or processors()))
-        self._sensors = self.simulations.bind("sensordata") if contacts else None
-        self._part = part_of(plant, substeps) if frames else substeps
-        self.parts = substeps // self._part if frames else 0
-        self._steps = substeps // self._part
+        self._sensors = self.simulations.bind("sensordata") if sensing and plant.obstacles else None
+        short = part_of(plant, substeps)
+        self._part = 1 if self.feels else short  # what is felt, is felt at each step
+        self.parts = substeps // self._part
+        self._every = short // self._part
+        self.drawn_parts = self.parts // self._every
         self._qpos, self._qvel = self.simulations.bind("qpos"), self.simulations.bind("qvel")
         self._ctrl, self._wrench = self.simulations.bind("ctrl"), self.simulations.bind("xfrc_applied")
         self._in_qpos, self._in_qvel, self._in_ctrl = (_span(one) for one in (plant.qpos, plant.qvel, plant.ctrl))
         self.unstable = np.zeros(trials, dtype=bool)
+        self.solid = np.zeros(trials, dtype=bool)
+        self._contacts, self._before = contacts, self.simulations.state
+        self._inactive: list[tuple[Array, npt.NDArray[np.intp], Array]] = []
 
     def place(self, states: Array) -> None:
         """Put the robots where analytic states (K, n) say."""
         qpos, qvel = self.plant.robot.configuration(states)
         self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel] = qpos, qvel
+
+    def begin(self, *, altered: bool) -> None:
+        """Have obstacles without effect; and what follows from fields that were `altered` worked out."""
+        model = self.simulations.model
+        if altered:
+            # While obstacles are still such: MuJoCo works out here, too, which bodies can collide at all.
+            self.simulations.set_const()
+        geoms = np.array([model.geom(name).id for name in self.plant.obstacles], dtype=np.intp)
+        if self.feels:
+            # MuJoCo detects a contact below margin + gap, and pushes below the margin.
+            pairs = np.flatnonzero(np.isin(model.pair_geom1, geoms) | np.isin(model.pair_geom2, geoms))
+            for field, ids, sign in (
+                ("geom_margin", geoms, -1), ("geom_gap", geoms, 1), ("pair_margin", pairs, -1), ("pair_gap", pairs, 1),
+            ):  # fmt: skip
+                if len(ids):
+                    self._disarm(field, ids, lambda values, sign=sign: values + sign * AWAY)
+            self.simulations.set_const()
+        elif self._contacts and len(geoms):
+            for field in ("geom_contype", "geom_conaffinity"):
+                self._disarm(field, geoms, np.zeros_like)
+
+    def _disarm(self, field: str, ids: npt.NDArray[np.intp], change: Callable[[Array], Array]) -> None:
+        values = self.simulations.expand(field)
+        self._inactive.append((values, ids, values[:, ids].copy()))
+        values[:, ids] = change(values[:, ids])
 
     def frame(self) -> Array:
         """MuJoCo's qpos now, (K, nq)."""
@@ -68,32 +116,68 @@ class Physics:
         """The analytic states (K, n), angles in any representative."""
         return self.plant.robot.state(self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel])
 
-    def advance(self, controls: Array, wrench: Array) -> tuple[np.ndarray, list[Array]]:
-        """One control period under controls (K, m), forces and torques (K, 6).
+    def felt(self) -> npt.NDArray[np.bool_]:
+        """Who touches which obstacle now, (K, obstacles); of no use to simulations that go on."""
+        assert self._sensors is not None
+        self.simulations.forward()
+        return self._sensors[:, self.plant.contact] > 0
 
-        Returns:
-          who touched an obstacle, (K,), and the frames.
-        """
-        touched, frames = np.zeros(len(controls), dtype=bool), []
+    def advance(self, controls: Array, wrench: Array) -> Period:
+        """One control period under controls (K, m), forces and torques (K, 6)."""
         self._ctrl[:, self._in_ctrl] = self.plant.robot.actuation(controls)
         self._wrench[:, self.plant.body] = wrench
-        for _ in range(self._steps):
+        if self._contacts:
+            self._before, self._was_unstable = self.simulations.state.copy(), self.unstable.copy()
+        return self._run(None)
+
+    def collide(self, rows: npt.NDArray[np.intp], period: Period) -> None:
+        """From the period's start on, let these simulations run into the obstacles; replaces what it came to."""
+        self.simulations.state[rows] = self._before[rows]
+        self.simulations.warning[rows] = 0
+        self.unstable[rows] = self._was_unstable[rows]
+        for values, ids, solid in self._inactive:
+            values[np.ix_(rows, ids)] = solid[rows]
+        if self.feels:
+            self.simulations.set_const(rows)
+        self.solid[rows] = True
+        again = self._run(rows)
+        for part in range(self.parts):
+            period.states[part][rows] = again.states[part][rows]
+            period.frames[part][rows] = again.frames[part][rows]
+            period.felt[part] = again.felt[part]
+        period.stable[rows] = again.stable[rows]
+
+    def touched(self, period: Period) -> npt.NDArray[np.bool_]:
+        """Who of those that run into obstacles touched one, (K,)."""
+        if not self.solid.any():
+            return np.zeros(len(self.solid), dtype=bool)
+        return self.solid & np.any([felt.any(axis=1) for felt in period.felt], axis=0)
+
+    def drawn(self, period: Period) -> list[Array]:
+        """Those of the frames that are needed for drawing."""
+        return period.frames[self._every - 1 :: self._every]
+
+    def _run(self, rows: npt.NDArray[np.intp] | None) -> Period:
+        trials = len(self.unstable)
+        period = Period([], [], [], np.full(trials, self.parts))
+        for part in range(self.parts):
             try:
-                self.simulations.step(nstep=self._part)
+                self.simulations.step(rows, nstep=self._part)
             except batch.SimulationError as error:
                 self.unstable[error.ids] = True
-            if self._sensors is not None:
-                touched |= (self._sensors[:, self.plant.contact] > 0).any(axis=1)
-            if self.parts:
-                frames.append(self.frame())
-                if self._watch is not None:
-                    self._watched += 1
-                    self._watch(self._watched * self._part * self.plant.timestep, frames[-1], self.unstable)
-        # MuJoCo resets an unstable simulation and goes on; only its warnings tell.
-        warned = self.simulations.warning[..., 1]
-        if warned.any():
-            self.unstable |= (warned[:, _UNSTABLE] > 0).any(axis=1)
-        return touched, frames
+            # MuJoCo resets an unstable simulation and goes on; only its warnings tell.
+            warned = self.simulations.warning[..., 1]
+            if warned.any():
+                self.unstable |= (warned[:, UNSTABLE] > 0).any(axis=1)
+            if self.unstable.any():
+                period.stable[self.unstable] = np.minimum(period.stable[self.unstable], part)
+            period.states.append(self.state())
+            period.frames.append(self.frame())
+            if self._sensors is not None and (self.feels or self.solid.any()):
+                period.felt.append(self._sensors[:, self.plant.contact] > 0)
+            else:
+                period.felt.append(np.zeros((0, 0), dtype=bool))
+        return period
 
 
 def part_of(plant: Plant, substeps: int) -> int:
@@ -106,15 +190,3 @@ def _span(indices: Indices) -> slice | Indices:
     """The same place in an array; as a slice, which copies nothing, where they follow each other."""
     first, last = int(indices.min(initial=0)), int(indices.max(initial=-1))
     return slice(first, last + 1) if np.array_equal(indices, np.arange(first, last + 1)) else indices
-
-
-@contextlib.contextmanager
-def unlogged() -> Iterator[None]:
-    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder when a trial becomes unstable; we record it."""
-    before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-    quiet.logto_file = quiet.logto_console = False
-    quiet.set()
-    try:
-        yield
-    finally:
-        before.set()

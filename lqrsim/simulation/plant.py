@@ -1,7 +1,6 @@
-"""A robot in a scene: the MuJoCo model that is run, where the robot is in it, and whether it moves as it should."""
+"""A robot in a scene: the MuJoCo model that is run, and where the robot is in it."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
 from functools import cached_property
 
 import mujoco
@@ -10,25 +9,15 @@ import numpy.typing as npt
 from mujoco import batch
 
 from lqrsim import compiled
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_count,
-    check_items,
-    check_kind,
-    check_number,
-    check_seed,
-    excerpt,
-    shaped,
-    vectors_of,
-)
+from lqrsim.errors import Array, InputError, check_kind, check_number, shaped, vectors_of
 from lqrsim.robots.base import Robot
-from lqrsim.scenes import Scene, obstacle_geoms
+from lqrsim.scenes import Scene, free_name, obstacle_geoms
+from lqrsim.simulation import fitting
 from lqrsim.world import World
 
 MOST_STEPS = 100_000_000  # of the physics in a run: minutes or hours
-MOST_CHECKED = 1_000_000  # of `check_plant`, which makes them one by one
+MOST_SUBSTEPS = 20_000  # physics steps in a control period; with more of them a run takes for ever
+
 Indices = npt.NDArray[np.intp]
 
 
@@ -37,41 +26,39 @@ class Plant:
 
     Attributes:
       robot, scene: what it is made of.
-      world: the obstacles that bound the robot. model: the compiled scene, with a contact sensor for each of them.
+      world: the obstacles that bound the robot's position; none without one.
+      obstacles: names of what the robot can collide with: those; without a position all, but level planes if a free
+        joint, or a slide that is not level, lets the robot stand on them.
+      model: the compiled scene, with a contact sensor for each obstacle.
       body: id of the robot's body. qpos, qvel, ctrl: where its joints' and actuators' numbers are in MuJoCo's arrays.
       contact: where the contact sensors are in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
       timestep: of the physics, in seconds.
 
     Raises:
-      InputError: there is no such robot in the scene: its body, a joint, an actuator or a wheel is missing.
+      InputError: there is no such robot in the scene: its body, a joint, an actuator or a wheel is missing; its maps to
+        MuJoCo's arrays do not fit them; or its position is not where MuJoCo has its body.
     """
 
     def __init__(self, robot: Robot, scene: Scene) -> None:
         check_kind("robot", robot, Robot, "a Robot, such as Quadrotor()")
         check_kind("scene", scene, Scene, "a Scene, such as load_scene('cage')")
-        wanted = {
-            "body": ([robot.body], [scene.model.body(i).name for i in range(scene.model.nbody)]),
-            "joint": (robot.joints, [scene.model.joint(i).name for i in range(scene.model.njnt)]),
-            "actuator": (robot.actuators, [scene.model.actuator(i).name for i in range(scene.model.nu)]),
-            "geom": (robot.wheels, [scene.model.geom(i).name for i in range(scene.model.ngeom)]),
-        }
-        for kind, (names, present) in wanted.items():
-            for name in names:
-                if name not in present:
-                    has = ", ".join(filter(None, present)) or "none"
-                    raise InputError(
-                        f"scene {scene.name}: got no robot {robot.name} in it, want its {kind} {name!r}; it has: {has}"
-                    )
-        dimension = len(robot.dynamics.state_coordinates.position)
+        fitting.check_names(robot, scene)
+        space = robot.dynamics.state_coordinates
         self.robot, self.scene = robot, scene
-        self.world = scene.world.seen_by(dimension) if dimension else World()
+        self.world = scene.world.seen_by(space.plane, space.offset) if space.position else World()
+        self.obstacles = self.world.names if space.position else _in_the_way(robot, scene)
         self.model = self._compile()
         joints = [self.model.joint(name) for name in robot.joints]
         self.body = int(self.model.body(robot.body).id)
         self.qpos = _ranges((joint.qposadr[0], joint.qpos0.size) for joint in joints)
         self.qvel = _ranges((joint.dofadr[0], joint.damping.size) for joint in joints)
         self.ctrl = np.array([self.model.actuator(name).id for name in robot.actuators], dtype=np.intp)
-        self.contact = np.arange(self.model.nsensordata - len(self.world), self.model.nsensordata)
+        self.contact = np.arange(self.model.nsensordata - len(self.obstacles), self.model.nsensordata)
+        try:
+            batch.Batch(self.model, 1, 1)
+        except ValueError as error:
+            raise InputError(f"scene {scene.name}: got an MJCF that cannot be run in batches: {error}") from None
+        fitting.check_maps(self)
 
     @property
     def timestep(self) -> float:
@@ -81,10 +68,11 @@ class Plant:
         """Physics steps in a control period of that many seconds. Raises InputError if it is no multiple of one."""
         period = check_number("control period", period, above=0.0)
         steps = period / self.timestep
-        if steps > MOST_STEPS:
+        if steps > MOST_SUBSTEPS:
+            count = f"{steps:,.0f}" if steps < 1e12 else f"{steps:.3g}"
             raise InputError(
-                f"control period: got {period:g} s, which are {steps:.3g} physics steps of {self.timestep:g} s, want at"
-                f" most {MOST_STEPS}"
+                f"control period: got {period:g} s, {count} physics steps of scene {self.scene.name},"
+                f" want at most {MOST_SUBSTEPS:,}: a larger <option timestep=.../> there than {self.timestep:g} s"
             )
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise InputError(
@@ -98,11 +86,17 @@ class Plant:
         """The same model, but that the robot goes through the obstacles, and nothing says whether it touches them."""
         return self._compile(contacts=False)
 
+    @cached_property
+    def enclosed(self) -> bool:
+        """Whether the robot touches nothing at a clearance above 0: all of it that collides is within its radius."""
+        return not self.obstacles or (len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9))
+
     def clearance(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
         """Signed distance to the nearest obstacle minus the robot's radius in metres, (...), at states (..., n).
 
         Args:
-          displaced: (K, obstacles, 3), by how much obstacles are elsewhere in each trial; states are then (K, k, n).
+          displaced: (K, obstacles, 3), by how much obstacles are elsewhere in each trial, along the world's axes;
+            states are then (K, k, n).
         """
         states = vectors_of("states", states, len(self.robot.dynamics.state_coordinates))
         if displaced is not None:
@@ -110,12 +104,24 @@ class Plant:
             displaced = shaped("displaced", displaced, wanted)
             if displaced.any() and states.ndim != 3:
                 raise InputError(f"states: got shape {states.shape} beside displaced obstacles, want (K, k, n)")
+        return self.clearance_at(states[..., list(self.robot.dynamics.state_coordinates.position)], displaced)
+
+    def clearance_at(self, position: Array, displaced: Array | None = None) -> Array:
+        """The same at positions (..., 2 or 3)."""
         if not len(self.world):
-            return np.full(states.shape[:-1], np.inf)
-        position = states[..., list(self.robot.dynamics.state_coordinates.position)]
+            return np.full(position.shape[:-1], np.inf)
         if displaced is None or not displaced.any():
             return compiled.signed_distance(self.world, position) - self.robot.radius
-        return compiled.signed_distance_displaced(self.world, position, displaced) - self.robot.radius
+        return compiled.signed_distance_displaced(self.world, position, self.across(displaced)) - self.robot.radius
+
+    def across(self, vectors: Array) -> Array:
+        """Vectors (..., 3) along the axes that `world` has, of vectors along those of the scene."""
+        space = self.robot.dynamics.state_coordinates
+        if len(space.position) != 2:
+            return vectors
+        seen = space.of_world(vectors)
+        normal = np.cross(*np.eye(3)[list(space.world_axes)])
+        return np.concatenate([seen, (vectors @ normal)[..., None]], axis=-1)
 
     def displace(self, simulations: batch.Batch, displaced: Array) -> None:
         """Move the obstacles of each simulation by (K, obstacles, 3) metres, world axes; `set_const` must follow."""
@@ -138,13 +144,16 @@ class Plant:
         geoms = {geom.id: geom for geom in spec.geoms}
         for geom, obstacle in zip(obstacle_geoms(self.scene.model), self.scene.world.obstacles, strict=True):
             geoms[geom].name = obstacle.name
-        for name in self.world.names:
+        taken = {sensor.name for sensor in spec.sensors}
+        for name in self.obstacles:
             if not contacts:
                 geom = next(geom for geom in spec.geoms if geom.name == name)
                 geom.contype = geom.conaffinity = 0
                 continue
+            sensor = free_name(f"contact with {name}", taken)
+            taken.add(sensor)
             spec.add_sensor(
-                name=f"contact with {name}",
+                name=sensor,
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
                 objtype=mujoco.mjtObj.mjOBJ_XBODY,  # the robot's body and what is attached to it
                 objname=self.robot.body,
@@ -156,158 +165,67 @@ class Plant:
         return spec.compile()
 
 
-@dataclass(frozen=True)
-class PlantCheck:
-    """How far MuJoCo moves a robot from where its dynamics say, over one control period.
+def extent(plant: Plant) -> float:
+    """How far from its position the robot can touch something, at most, in metres; a bound, and exact for balls.
 
-    Attributes:
-      names, units: of the states. errors: (n,) the largest difference of each over the samples, in its unit.
-      changes: (n,) the largest change that the dynamics predict for it. period: in seconds.
-      state, control: where the worst state of all was furthest off. simulated, predicted: (n,) what came of it.
-      tolerance: what `relative` must not exceed.
+    Seen from above if the robot is; else in space, whatever its plane. Parts that move count wherever they can get,
+    whatever their joints' limits.
     """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    errors: Array
-    changes: Array
-    period: float
-    state: Array
-    control: Array
-    simulated: Array
-    predicted: Array
-    tolerance: float
-
-    def __post_init__(self) -> None:
-        for name in ("names", "units"):
-            found = check_items(f"PlantCheck: {name}", getattr(self, name), str, "texts, one a state")
-            object.__setattr__(self, name, found)
-        n = len(self.names)
-        if not n or len(self.units) != n:
-            raise InputError(f"PlantCheck: units: got {len(self.units)} for {n} names, want one a state, at least one")
-        for name in ("errors", "changes", "state", "simulated", "predicted", "control"):
-            size = None if name == "control" else n
-            object.__setattr__(self, name, shaped(f"PlantCheck: {name}", getattr(self, name), (size,)))
-        for name in ("period", "tolerance"):
-            object.__setattr__(self, name, check_number(f"PlantCheck: {name}", getattr(self, name), above=0.0))
-
-    @property
-    def relative(self) -> Array:
-        """(n,) errors relative to the changes; where next to nothing changes, to the largest change of all."""
-        return self.errors / np.maximum(self.changes, 1e-3 * np.nanmax(self.changes, initial=1e-12))
-
-    @property
-    def worst(self) -> str:
-        """The name of the state that is furthest off, relative to its change."""
-        return self.names[int(np.argmax(self.relative))]
-
-    @property
-    def good(self) -> bool:
-        """Whether every state is within the tolerance."""
-        return bool((self.relative <= self.tolerance).all())
-
-    def __str__(self) -> str:
-        i = self.names.index(self.worst)
-        width = max(len(name) for name in self.names)
-        lines = [f"{'state':<{width}} {'error':>10} {'of change':>10}  over one period of {self.period:.4g} s"]
-        lines += [
-            f"{name:<{width}} {error:>10.2e} {relative:>10.2e}  {unit}"
-            for name, unit, error, relative in zip(self.names, self.units, self.errors, self.relative, strict=True)
-        ]
-        lines.append(
-            f"{'agrees' if self.good else 'DISAGREES'} (tolerance {self.tolerance:g} of the change); worst state:"
-            f" {self.worst}, MuJoCo {self.simulated[i]:.6g}, dynamics {self.predicted[i]:.6g},"
-            f" from x = {np.array2string(self.state, precision=3)}, u = {np.array2string(self.control, precision=3)}"
-        )
-        return "\n".join(lines)
+    model, data, dynamics = plant.model, mujoco.MjData(plant.model), plant.robot.dynamics
+    space, rng = dynamics.state_coordinates, np.random.default_rng(0)
+    axes = [0, 1] if space.from_above else [0, 1, 2]  # of the world, along which distances are measured
+    off, states = 0.0, rng.standard_normal((9, len(space)))
+    states[-1] = 0.0  # the last, in which the geoms are looked at below
+    for state in states:
+        data.qpos[plant.qpos], data.qvel[plant.qvel] = plant.robot.configuration(state)
+        mujoco.mj_kinematics(model, data)
+        place = space.in_world(state[list(space.position)])
+        off = max(off, float(np.linalg.norm((data.xpos[plant.body] - place)[axes])))
+    obstacles = [model.geom(name).id for name in plant.obstacles]
+    thick = model.geom_margin + model.geom_gap  # at which MuJoCo sees a contact
+    thickest = max(thick[obstacles].max(initial=0.0), (model.pair_margin + model.pair_gap).max(initial=0.0))
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    collides[model.pair_geom1], collides[model.pair_geom2] = True, True
+    reach = 0.0
+    for geom in np.flatnonzero(collides):
+        path = [int(model.geom_bodyid[geom])]
+        while path[-1] not in (0, plant.body):
+            path.append(int(model.body_parentid[path[-1]]))
+        if path[-1] != plant.body:
+            continue
+        size, kind = float(model.geom_rbound[geom]) or np.inf, model.geom_type[geom]
+        if kind == mujoco.mjtGeom.mjGEOM_CYLINDER and space.from_above and abs(data.geom_xmat[geom][8]) > 1 - 1e-9:
+            size = float(model.geom_size[geom, 0])  # upright: its outline from above
+        own, jointed = np.linalg.norm(model.geom_pos[geom]), False
+        for body in path[:-1]:
+            first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+            jointed |= count > 0
+            own += np.linalg.norm(model.body_pos[body])
+            for joint in range(first, first + count):
+                slides = model.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
+                own += np.inf if slides else 2 * np.linalg.norm(model.jnt_pos[joint])
+        if not jointed:
+            own = np.linalg.norm((data.geom_xpos[geom] - data.xpos[plant.body])[axes])
+        reach = max(reach, float(own) + size + float(thick[geom]))
+    return off + reach + float(thickest)
 
 
-def check_plant(
-    robot: Robot,
-    scene: Scene,
-    *,
-    period: float | None = None,
-    around: npt.ArrayLike | None = None,
-    spread: float = 0.3,
-    controls: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
-    settle: float | None = None,
-    samples: int = 50,
-    tolerance: float = 0.02,
-    seed: int = 0,
-) -> PlantCheck:
-    """Compare a robot's dynamics with its MJCF: from random states, one control period of each.
+def _in_the_way(robot: Robot, scene: Scene) -> tuple[str, ...]:
+    """Names of the obstacles of a robot without a position: all, but the floor if it may stand on one.
 
-    Obstacles are taken away for it. A mass, a sign or a unit that differs shows in the states that it acts on.
-
-    Args:
-      period: in seconds, a multiple of the physics step; by default that nearest to 0.02 s.
-      around: (n,) the middle of the random states, zero by default. spread: their standard deviation in each unit.
-      controls: lowest and highest random control (m,); by default the dynamics' limits.
-      settle: seconds under the control before the comparison, for velocities that MuJoCo has and the dynamics do not
-        (those of wheels, say); by default 0.5 where MuJoCo has more of them than the dynamics have states, else 0.
-      samples: how many states. tolerance: of an error, relative to the largest change of that state. seed: of all.
-
-    Raises:
-      InputError: the robot is not in the scene, an argument is not as described, or the controls have no limits.
+    It may if a joint lets it sink to level planes, which are its floor: a free one, or a slide that is not level.
     """
-    plant = Plant(robot, scene)
-    period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
-    substeps = plant.substeps(period)
-    dynamics = robot.dynamics
-    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-    middle = check_array("around", np.zeros(n) if around is None else around, (n,))
-    space = dynamics.control_coordinates
-    if controls is not None and (not isinstance(controls, tuple | list) or len(controls) != 2):
-        raise InputError(f"controls: got {excerpt(controls)}, want (lowest, highest), each ({m},)")
-    low, high = (space.low, space.high) if controls is None else controls
-    low, high = (
-        check_array("controls: lowest", low, (m,), infinite=True),
-        check_array("controls: highest", high, (m,), infinite=True),
-    )
-    if not (low <= high).all():
-        raise InputError(f"controls: got {low.tolist()} to {high.tolist()}, want the lowest first")
-    if not np.isfinite([low, high]).all():
-        raise InputError(f"controls: got {robot.name}'s limits, which are infinite, want controls=(lowest, highest)")
-    for name in plant.world.names:
-        geom = plant.model.geom(name)
-        geom.contype[:], geom.conaffinity[:] = 0, 0
-    rng, data = np.random.default_rng(check_seed("seed", seed)), mujoco.MjData(plant.model)
-    spread = check_number("spread", spread, at_least=0.0)
-    if settle is None:
-        settle = 0.5 if 2 * len(plant.qvel) > n else 0.0
-    waiting = check_number("settle", settle, at_least=0.0) / plant.timestep
-    samples = check_count("samples", samples, at_most=100_000)
-    if not samples * (waiting + substeps) <= MOST_CHECKED:
-        raise InputError(
-            f"samples: got {samples}, which are {samples * (waiting + substeps):.3g} physics steps in all, want at most"
-            f" {MOST_CHECKED}: fewer samples, or a shorter period and time to settle"
-        )
-    waiting, found = round(waiting), []
-    tolerance = check_number("tolerance", tolerance, above=0.0)
-    for _ in range(samples):
-        state, control = middle + spread * rng.normal(size=n), rng.uniform(low, high)
-        mujoco.mj_resetData(plant.model, data)
-        data.qpos[plant.qpos], data.qvel[plant.qvel] = robot.configuration(state)
-        data.ctrl[plant.ctrl] = robot.actuation(control)
-        for _ in range(waiting):
-            mujoco.mj_step(plant.model, data)
-        before = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=state)
-        for _ in range(substeps):
-            mujoco.mj_step(plant.model, data)
-        predicted = dynamics.step(before, control, period)
-        simulated = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=predicted)
-        found.append((before, control, simulated, predicted))
-    errors = np.array([np.abs(simulated - predicted) for _, _, simulated, predicted in found])
-    changes = np.array([np.abs(predicted - before) for before, _, _, predicted in found])
-    state, control, simulated, predicted = found[0]
-    check = PlantCheck(
-        names=dynamics.state_coordinates.names, units=dynamics.state_coordinates.units, errors=errors.max(axis=0),
-        changes=changes.max(axis=0), period=period, state=state, control=control, simulated=simulated,
-        predicted=predicted, tolerance=tolerance,
-    )  # fmt: skip
-    at = int(errors[:, check.names.index(check.worst)].argmax())
-    state, control, simulated, predicted = found[at]
-    return replace(check, state=state, control=control, simulated=simulated, predicted=predicted)
+    model, data = scene.model, mujoco.MjData(scene.model)
+    mujoco.mj_kinematics(model, data)
+    body, sinks = int(model.body(robot.body).id), False
+    while body and not sinks:
+        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        for joint in range(first, first + count):
+            slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE and abs(data.xaxis[joint, 2]) > 1e-9
+            sinks |= bool(slides or model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE)
+        body = int(model.body_parentid[body])
+    level = [one.kind == "plane" and abs(one.rotation[2, 2]) > 1 - 1e-9 for one in scene.world.obstacles]
+    return tuple(name for name, lies in zip(scene.world.names, level, strict=True) if not (sinks and lies))
 
 
 def _ranges(starts_and_sizes: Iterable[tuple[int, int]]) -> Indices:

@@ -384,7 +384,18 @@ def assemble(
         candidates=candidates,
         problem_digest=problem.digest,
         versions=versions(),
+        goal=problem.weighed_goal,
+        goal_radius=_radius(problem),
     )
+
+
+def _radius(problem: Problem) -> float | None:
+    """The robot's radius, where the goal has a position, and the problem obstacles that know it; None for a point."""
+    goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
+    if not position or (goal is not None and np.isnan(goal[position]).all()):
+        return None
+    constraints = [constraint for constraint in problem.constraints if isinstance(constraint, Clearance)]
+    return max((one.radius for one in (*problem.obstacle_costs, *constraints)), default=0.0) or None
 
 
 def model(problem: Problem, multipliers: Sequence[Array] = ()) -> tuple[Any, ...]:
@@ -395,12 +406,12 @@ def model(problem: Problem, multipliers: Sequence[Array] = ()) -> tuple[Any, ...
 
 def clearance_of(problem: Problem, states: Array) -> Array | None:
     """Signed distance to the nearest obstacle minus the robot's radius, (T+1,); None without obstacles."""
-    position = list(problem.dynamics.state_coordinates.position)
+    space = problem.dynamics.state_coordinates
     constraints = [constraint for constraint in problem.constraints if isinstance(constraint, Clearance)]
     worlds = {(id(one.world), one.radius): one.world for one in (*problem.obstacle_costs, *constraints)}
-    place = states[:, position]
+    place = states[:, list(space.position)]
     found = [
-        compiled.signed_distance(world.seen_by(len(position)), place) - radius
+        compiled.signed_distance(world.seen_by(space.plane, space.offset), place) - radius
         for (_, radius), world in worlds.items()
         if len(world)
     ]

@@ -17,8 +17,9 @@ from lqrsim.stress.statistics import CONFIDENCE, Estimate, Pairs, compare, holm,
 
 Table = Mapping[Cell, Outcomes]
 
-MEASURES = {
-    "worst": "m", "rms": "m", "final": "m", "clearance": "m", "effort": "unit² s", "saturated": "", "cost": "",
+MEASURES = {  # with units; those of tracking errors and of the goal's distance are of robots with a position
+    "worst": "m", "rms": "m", "final": "m", "goal": "m", "clearance": "m", "effort": "unit² s",
+    "saturated": "", "cost": "",
 }  # fmt: skip
 LEVELS = (0.05, 0.5, 0.95)
 
@@ -49,14 +50,17 @@ def success(cell: Cell, outcomes: Outcomes, *, confidence: float = CONFIDENCE) -
     """How often the trials of a cell succeeded, and how sure that is. Raises InputError for no trials."""
     reached, trials = int(succeeded(outcomes).sum()), len(outcomes)
     exact, band = rate(reached, trials, confidence=confidence), wilson(reached, trials, confidence=confidence)
-    alike = _alike(outcomes)
-    if alike:
+    same = alike(outcomes)
+    if same:
         exact = band = Estimate(exact.value, exact.value, exact.value, confidence)
-    return Success(cell, reached, trials, exact, band, alike)
+    return Success(cell, reached, trials, exact, band, same)
 
 
-def _alike(outcomes: Outcomes) -> bool:
-    return len(outcomes) > 1 and all(np.ptp(one) == 0 for one in (outcomes.rms, outcomes.worst, outcomes.effort))
+def alike(outcomes: Outcomes) -> bool:
+    """Whether all trials, of several, are the same run."""
+    numbers = (outcomes.ended, outcomes.rms, outcomes.worst, outcomes.effort)
+    same = all(np.array_equal(one, np.full_like(one, one[0]), equal_nan=True) for one in numbers)
+    return len(outcomes) > 1 and same and len(set(outcomes.outcome.tolist())) == 1
 
 
 def degradation(table: Table, policy: str, sweep: str, *, confidence: float = CONFIDENCE) -> list[Success]:
@@ -107,7 +111,7 @@ class Comparison:
 
     Attributes:
       pairs: in how many trials only one of them succeeded, and the exact test of that.
-      success: of the first less that of the second. rms: the same of the mean tracking error in metres, among the
+      success: of the first less that of the second. rms: the same of the mean tracking error, among the
         `both` trials in which both succeeded; None if there are fewer than two.
       adjusted: the p-value, for as many comparisons as were made.
     """
@@ -137,7 +141,7 @@ def comparisons(table: Table) -> list[Comparison]:
             second = Cell(other, cell.sweep, cell.strength)
             if cell.policy != policies[0] or second not in table:
                 continue
-            if not (_alike(table[cell]) and _alike(table[second])):
+            if not (alike(table[cell]) and alike(table[second])):
                 found.append(_compared(cell, second, table[cell], table[second]))
     adjusted = holm([one.pairs.p_value for one in found])
     return [

@@ -94,6 +94,8 @@ class Campaign:
         smooth without feedback; "replan" solves again and again as it goes.
       trials: of each cell. seed: of all random numbers.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
+      goal_radius, goal_tolerance: how near the goal counts as having reached it, as in `simulate`; by default as the
+        scenario has it.
       shard: trials of a file. time_limit: seconds that a shard may take before it counts as hung.
 
     Raises:
@@ -107,6 +109,8 @@ class Campaign:
     trials: int = 200
     seed: int = 0
     replan_every: float | None = None
+    goal_radius: float | None = None
+    goal_tolerance: float | None = None
     shard: int = 500
     time_limit: float = 300.0
 
@@ -141,8 +145,9 @@ class Campaign:
                 f"trials: got {self.trials} in shards of {self.shard} for {len(self.cells)} cells, which are {files}"
                 f" files, want at most {_FILES}: fewer, or a larger shard"
             )
-        if self.replan_every is not None:
-            object.__setattr__(self, "replan_every", check_number("replan_every", self.replan_every, above=0.0))
+        for field in ("replan_every", "goal_radius", "goal_tolerance"):
+            if (value := getattr(self, field)) is not None:
+                object.__setattr__(self, field, check_number(field, value, above=0.0))
         object.__setattr__(self, "time_limit", check_number("time_limit", self.time_limit, above=0.0))
 
     @property

@@ -220,12 +220,11 @@ class Largest:
 
 
 def in_words(rollout: Rollout, trial: int = 0) -> list[Largest]:
-    """The largest disturbances of a trial in physical units, until it first collides; what was not there is left out.
+    """The largest disturbances of a trial in physical units, until it ends; what was not there is left out.
 
     An applied control differs from the command also by the actuators' limits.
     """
-    hit = rollout.clearance[trial] < 0
-    last = int(np.argmax(hit)) if hit.any() else rollout.plan.steps
+    last = int(rollout.counts[trial].sum()) - 1
     states, controls = rollout.state_coordinates, rollout.control_coordinates
     measured = states.difference(rollout.measured[trial], rollout.states[trial])
     disturbed = rollout.applied[trial] - rollout.commanded[trial]

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from typing import Any
 
-from lqrsim.errors import InputError
+from lqrsim.errors import InputError, told
 from lqrsim.stress.asked import Shard
 from lqrsim.stress.executors import Done
 from lqrsim.stress.trials import Job, failed_work, work
@@ -113,7 +113,7 @@ def _collected(job: Job, shard: Shard, future: Any) -> bytes:
     if future.status in ("cancelled", "lost"):
         raise CancelledError
     error = future.exception()
-    return failed_work(job, shard, " ".join(f"{type(error).__name__}: {error}".split()))
+    return failed_work(job, shard, told(error))
 
 
 def _stop(client: Any, future: Any, worker: str) -> None:

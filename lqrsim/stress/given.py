@@ -109,21 +109,31 @@ class _Counting(Given):
         return np.zeros(count)
 
 
-def collision(rollout: Rollout) -> Array:
-    """How far into an obstacle each trial gets, (K,), in metres; less the least clearance if it stays clear of them.
+DEPTH = 1e-9  # m; the score of a collision that no knot sees
 
-    What is lost counts as infinitely far.
+
+def collision(rollout: Rollout) -> Array:
+    """How far into an obstacle each trial that collides gets, (K,), in metres; less the least clearance of the others.
+
+    It is positive for all that collide or are lost, and only for them. How far is meant of runs without contacts, in
+    which the robot goes on through what it has run into. What is lost, or what its controller fails, counts as
+    infinitely far.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
-    clearance = np.where(np.isnan(rollout.clearance), np.inf, rollout.clearance).min(axis=1)
-    return np.where(rollout.diverged, np.inf, -clearance)
+    deep = -np.where(np.isnan(rollout.clearance), np.inf, rollout.clearance).min(axis=1)
+    outcome = np.array(rollout.outcome)
+    score = np.where(outcome == "collided", np.maximum(deep, DEPTH), -rollout.least_clearance())
+    return np.where(np.isin(outcome, ("diverged", "error")), np.inf, score)
 
 
 def miss(rollout: Rollout) -> Array:
-    """Positive for each trial that does not reach its goal, (K,), in metres: it collides, or ends too far away."""
+    """Positive for each trial that does not reach its goal, (K,): it collides, or ends too far away.
+
+    In metres; where the goal has no position, of the scaled error by which it is judged.
+    """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
-    away = rollout.tracking_error[:, -1] - rollout.goal_radius
-    return np.maximum(collision(rollout), np.where(rollout.diverged, np.inf, away))
+    away = np.nan_to_num(rollout.goal_distance - rollout.goal_radius, nan=-np.inf)
+    return np.maximum(collision(rollout), away)
 
 
 @dataclass
@@ -133,7 +143,7 @@ class TrialScore:
     A trial fails if its score is positive. Numbers that are standard normal give the trials that `simulate` gives.
 
     Args:
-      failure: scores a rollout's trials, (K,). contacts: whether obstacles stop the robot; as in `simulate`.
+      failure: scores a rollout's trials, (K,). goal_radius, goal_tolerance, contacts: as in `simulate`.
       batch: how many trials are run at once.
 
     Attributes:
@@ -145,6 +155,8 @@ class TrialScore:
     disturbances: Sequence[Disturbance]
     controller: Controller | None = None
     failure: Callable[[Rollout], Array] = collision
+    goal_radius: float | None = None
+    goal_tolerance: float | None = None
     contacts: bool = False
     batch: int = 256
     threads: int | None = None
@@ -197,6 +209,8 @@ class TrialScore:
             disturbances=self.disturbances,
             controller=self.controller,
             trials=trials,
+            goal_radius=self.goal_radius,
+            goal_tolerance=self.goal_tolerance,
             frames=frames,
             contacts=self.contacts,
             threads=self.threads,

@@ -20,7 +20,7 @@ from lqrsim.results import Solution
 from lqrsim.stress.asked import POLICIES, Campaign, Cell
 from lqrsim.stress.shards import write
 
-FORMAT, VERSION, NAME = "lqrsim campaign", 2, "manifest.json"
+FORMAT, VERSION, NAME = "lqrsim campaign", 3, "manifest.json"
 _LARGEST = 1 << 26  # bytes
 
 _HASH = plain.line
@@ -31,7 +31,10 @@ _CAMPAIGN = plain.record(
     {  # the fields of Campaign
         "scenario": plain.line, "sweeps": plain.mapped(plain.listed(_DISTURBANCE)),
         "strengths": plain.listed(_STRENGTH), "policies": plain.listed(_POLICY),
-        "trials": plain.count, "seed": plain.count, "replan_every": plain.optional(plain.number(above=0.0)),
+        "trials": plain.count, "seed": plain.count,
+        **dict.fromkeys(
+            ("replan_every", "goal_radius", "goal_tolerance"), plain.optional(plain.number(above=0.0))
+        ),
         "shard": plain.count, "time_limit": plain.number(above=0.0),
     }
 )  # fmt: skip
@@ -120,5 +123,6 @@ def digest_of(contents: bytes) -> str:
 def digest_of_solution(solution: Solution) -> str:
     """Hash of what running it depends on: not of how long it took to find."""
     plan, policy = solution.trajectory, solution.policy
-    arrays = plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt])
+    goal = np.zeros(0) if solution.goal is None else solution.goal
+    arrays = plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt]), goal
     return digest_of(b"".join(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes() for array in arrays))

@@ -16,6 +16,7 @@ from lqrsim.references import from_anywhere, resolve
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.outcomes import OUTCOMES, Outcomes
+from lqrsim.stress.analysis import alike
 from lqrsim.stress.asked import Campaign, Cell, Shard, shards_of
 from lqrsim.stress.manifest import cells_of, digest_of, digest_of_solution, read_manifest
 from lqrsim.stress.shards import Damaged, Table, read
@@ -89,7 +90,7 @@ class Results:
         return found
 
     def summary(self) -> str:
-        """A line for each cell: how its trials ended, and how sure the rate is; then why trials came to nothing."""
+        """A line for each cell: how its trials ended, how sure the rate is; then where the plans end, and errors."""
         width = max(len(name) for name in ["sweep", *self.manifest["campaign"]["sweeps"]])
         others = [name for name in OUTCOMES if name != "reached"]
         interval = f"reached, {100 * CONFIDENCE:g} % interval"
@@ -102,13 +103,27 @@ class Results:
             sure = rate(ends["reached"], total)
             among = f"{ends['reached']}/{total}"
             share = f"{among:>13} {100 * sure.value:5.1f} [{100 * sure.low:5.1f}, {100 * sure.high:5.1f}]"
+            if alike(self.outcomes(cell, partial=True)):
+                share = f"{among:>13} deterministic: 1 run"
             line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<10} {share:>33}"
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
             if ends["error"]:
                 reasons.update(self.reasons(cell).values())
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
+        lines += self.plans()
         lines += [f"{count} trials came to nothing: {reason}" for reason, count in reasons.most_common(5)]
         return "\n".join(lines)
+
+    def plans(self) -> list[str]:
+        """Where the plan of each policy ends, and whether it misses the goal."""
+        asked, lines = self.manifest["campaign"], []
+        for policy in self.manifest["policies"]:
+            solution = self.solution(policy)
+            near, radius = (asked["goal_radius"], asked["goal_tolerance"]), solution.goal_radius
+            if near != (None, None):
+                radius = solution.target.radius(None, *near)
+            lines += [f"{policy}: {line}" for line in solution.target.of_plan(radius)]
+        return lines
 
     def reasons(self, cell: Cell) -> dict[int, str]:
         """Why trials of a cell are an "error", by their numbers."""
@@ -203,7 +218,7 @@ def replay(
     frames: bool = True,
     contacts: bool = True,
 ) -> Rollout:
-    """The very trial of a campaign again, to the bit until its first collision; and to its end without contacts.
+    """The very trial of a campaign again, the same to the bit until it ends; to the plan's end without contacts.
 
     That is so on the kind of processor and with the versions that `results.manifest["versions"]` has.
 
@@ -218,14 +233,23 @@ def replay(
     return results.trials.run(cell, trial, frames=frames, contacts=contacts)
 
 
-def agrees(results: Results, cell: Cell, trial: int) -> bool:
-    """Whether a trial that is run again, through the obstacles as in the campaign, gives its row again, to the bit.
+def row(results: Results, cell: Cell, trial: int) -> dict[str, Any]:
+    """The row of a trial in the campaign's table. Raises InputError if it is missing or damaged."""
+    shard = next(shard for shard in results.shards(cell) if trial < shard.first + shard.count)
+    return {name: column[trial - shard.first] for name, column in results.table(shard).items()}
+
+
+def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> list[str]:
+    """What a trial that was run again has otherwise than its row in the table, in words; empty if nothing.
+
+    All that a row has is of the time until the trial ended, so that obstacles may have stopped the robot or not.
 
     Raises:
-      InputError: as `replay` does; or the row is missing or damaged.
+      InputError: the row is missing or damaged.
     """
-    again = results.trials.outcomes(replay(results, cell, trial, frames=False, contacts=False)).columns()
-    shard = next(shard for shard in results.shards(cell) if trial < shard.first + shard.count)
-    table, place = results.table(shard), trial - shard.first
-    row = {name: table[name][place : place + 1] for name in again}
-    return all(row[name].tobytes() == value.astype(row[name].dtype).tobytes() for name, value in again.items())
+    was, now = row(results, cell, trial), results.trials.outcomes(again).columns()
+    return [
+        f"{name}: {value[0]} (in the table: {was[name]})"
+        for name, value in now.items()
+        if value.astype(np.asarray(was[name]).dtype)[0].tobytes() != np.asarray(was[name]).tobytes()
+    ]

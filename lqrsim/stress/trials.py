@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import InputError
+from lqrsim.errors import InputError, told
 from lqrsim.references import resolve
 from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
@@ -59,6 +59,7 @@ def solve(policies: tuple[str, ...], scenario: Scenario) -> dict[str, Solution]:
     for policy in policies:
         if not np.isfinite(found[policy].trajectory.states).all():
             raise InputError(f"policies: got {policy}, whose plan is not finite ({found[policy].status.name})")
+        found[policy] = replace(found[policy], goal_radius=scenario.reach())
         if not found[policy].success:
             _log.warning("%s did not converge (%s); its plan is run as it is", policy, found[policy].status.name)
     return {policy: found[policy] for policy in policies}
@@ -98,6 +99,7 @@ class Trials:
             self.solutions[cell.policy],
             controller=self._controller(cell.policy),
             disturbances=self.campaign.disturbances(cell),
+            **self.scenario.near_enough(self.campaign.goal_radius, self.campaign.goal_tolerance),
             seed=self.campaign.seed,
             trials=count,
             first_trial=first,
@@ -113,30 +115,34 @@ class Trials:
 
     def outcomes(self, rollout: Rollout) -> Outcomes:
         """How the trials of a rollout ended."""
-        return outcomes(rollout, self.plant, self.scenario.problem)
+        return outcomes(rollout, self.scenario.problem)
 
     def table(self, shard: Shard, batch: int) -> Table:
-        """The rows of a shard. Where an exception ends a batch, its trials are run one by one."""
+        """The rows of a shard. Where an exception or a controller ends a batch, its trials are run one by one."""
         cell = self.campaign.cells[shard.cell]
         last = shard.first + shard.count
         parts: list[Table] = []
         for first in range(shard.first, last, batch):
             count = min(batch, last - first)
             try:
-                parts.append(self._rows(cell, first, count))
-            except Exception:  # of a disturbance, a scenario or a controller, whatever it is: the trial failed
-                parts += [self._row(cell, trial) for trial in range(first, first + count)]
+                rows = self._rows(cell, first, count)
+                alone = count > 1 and bool((rows["outcome"] == "error").any())
+            except Exception:  # of a disturbance or a scenario, whatever it is: the trial failed
+                rows, alone = {}, True
+            parts += [self._row(cell, trial) for trial in range(first, first + count)] if alone else [rows]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def _rows(self, cell: Cell, first: int, count: int) -> Table:
-        table = self.outcomes(self.run(cell, first, count, frames=False, contacts=False)).columns()
-        return table | {"reason": np.full(count, "")}
+        rollout = self.run(cell, first, count, frames=False, contacts=False)
+        reasons = np.array(rollout.reasons, dtype=np.str_)
+        table = self.outcomes(rollout).columns()
+        return table | {"reason": np.where(table["outcome"] == "error", reasons, "")}
 
     def _row(self, cell: Cell, trial: int) -> Table:
         try:
             return self._rows(cell, trial, 1)
         except Exception as error:
-            return failed(trial, 1, " ".join(f"{type(error).__name__}: {error}".split()))
+            return failed(trial, 1, told(error))
 
     def _controller(self, policy: str) -> Controller:
         return controller(policy, self.scenario, self.solutions[policy], self.campaign.replan_every)

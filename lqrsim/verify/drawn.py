@@ -15,7 +15,6 @@ from lqrsim.verify.record import Progress
 from lqrsim.verify.verdict import Verification, judge
 from lqrsim.view import cameras, gl
 from lqrsim.view.cameras import Camera
-from lqrsim.view.recorded import robot_body
 
 SIZE = (640, 480)
 BOUND = 1 / 60  # the worst error that is allowed, in radii of the robot: 5 and 2.8 mm for the packaged ones
@@ -28,7 +27,8 @@ def verify_run(
 ) -> Verification:
     """Draws what a rollout recorded for drawing, reads positions from the pixels, and compares them with its states.
 
-    Each control period is drawn from above, and from the side too if the robot moves in space. The pictures are
+    Each control period is drawn from above if the robot moves on a floor, from the side if it moves in a vertical
+    plane, and from both if it moves in space. The pictures are
     segmentations that show nothing but a part of the robot that can collide: X-rays, in which obstacles hide nothing.
 
     Args:
@@ -40,27 +40,28 @@ def verify_run(
       InputError: there is no such trial, nothing to draw, or no OpenGL.
     """
     record.check_asked(solution, progress)
-    model, size = record.model(rollout, trial), len(rollout.state_coordinates.position)
-    geom = _part(model)
-    views = [cameras.top(rollout), cameras.side(rollout)][: size - 1]
+    model, space = record.model(rollout, trial), rollout.state_coordinates
+    body = int(model.body(rollout.body).id)
+    geom = _part(model, body)
+    views = [{"top": cameras.top, "side": cameras.side}[name](rollout) for name in cameras.measuring(rollout)]
     times, rows = record.drawn(rollout, trial)
     seen: list[Array] = []
     offsets: list[Array] = []
-    for masks, offset in _silhouettes(model, geom, rollout.frames[trial, rows], views):
+    for masks, offset in _silhouettes(model, geom, body, rollout.frames[trial, rows], views):
         seen.append(
             np.array([view.measure(pixels.middle(mask), SIZE) for view, mask in zip(views, masks, strict=True)])
         )
         offsets.append(offset)
         if progress:
             progress(len(seen), len(rows))
-    places, apart = pixels.place(views, seen, size)
+    places, apart = pixels.place(views, seen, space.plane)
     name = model.geom(geom).name or model.geom(geom).id
     return judge(
         record.subject(rollout, trial),
         f"the silhouette of {name} in {SIZE[0]} x {SIZE[1]} pixels from {' and '.join(view.name for view in views)},"
         " all else left out (X-ray)",
         times,
-        places - np.array(offsets)[:, :size],
+        places - space.of_world(offsets),
         record.states(rollout, trial, times),
         record.planned(rollout, times),
         apart,
@@ -70,10 +71,10 @@ def verify_run(
     )
 
 
-def _part(model: mujoco.MjModel) -> int:
+def _part(model: mujoco.MjModel, body: int) -> int:
     """The largest geom of the robot's body that can collide and whose silhouette's middle is its centre."""
     kinds = [kind.value for kind in SYMMETRIC]
-    fits = (model.geom_bodyid == robot_body(model)) & np.isin(model.geom_type, kinds)
+    fits = (model.geom_bodyid == body) & np.isin(model.geom_type, kinds)
     fits &= (model.geom_contype | model.geom_conaffinity) != 0
     if not fits.any():
         raise InputError("rollout.model: got no sphere, capsule, ellipsoid, cylinder or box that is the robot's")
@@ -81,7 +82,7 @@ def _part(model: mujoco.MjModel) -> int:
 
 
 def _silhouettes(
-    model: mujoco.MjModel, geom: int, frames: Array, views: Sequence[Camera]
+    model: mujoco.MjModel, geom: int, body: int, frames: Array, views: Sequence[Camera]
 ) -> Iterator[tuple[list[npt.NDArray[np.bool_]], Array]]:
     """For each frame (nq,): a mask (height, width) of the geom in each view, and where it is in the robot's body."""
     gl.bind()
@@ -90,7 +91,6 @@ def _silhouettes(
     model.vis.global_.offwidth, model.vis.global_.offheight = SIZE
     data, options = mujoco.MjData(model), mujoco.MjvOption()
     options.geomgroup[:], options.sitegroup[:] = [1, 0, 0, 0, 0, 0], 0
-    body = robot_body(model)
     with mujoco.Renderer(model, SIZE[1], SIZE[0]) as renderer:
         for frame in frames:
             data.qpos = frame

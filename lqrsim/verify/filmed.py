@@ -46,8 +46,8 @@ def verify_video(
     """Reads positions from a video's pixels, by the mark in its calibrated panes, and compares them with a rollout.
 
     Args:
-      path: what `lqrsim render` wrote with the camera `top`, and for robots that move in space `side`, whatever else
-        is in the picture.
+      path: what `lqrsim render` wrote with the camera `top`, for robots in a vertical plane `side`, and for those that
+        move in space both, whatever else is in the picture.
       trial: row of the rollout; by default the first that the video shows.
       solution, progress: as for `verify_run`.
 
@@ -57,13 +57,13 @@ def verify_video(
     record.check_asked(solution, progress)
     trial = None if trial is None else check_count("trial", trial, at_least=0)
     told = footage.read(path)
-    digest, size = footage.digest(rollout), len(rollout.state_coordinates.position)
+    digest, plane = footage.digest(rollout), rollout.state_coordinates.plane
     run = told.runs.index(digest) if digest in told.runs else 0
     panes = [pane for pane in told.panes if pane.run == run and pane.camera is not None]
     trial = (panes[0].trial if panes and panes[0].trial < rollout.trials else 0) if trial is None else trial
     panes = [pane for pane in panes if pane.trial == trial] if digest in told.runs else panes
     views = [pane.camera for pane in panes if pane.camera is not None]
-    pixels.place(views, np.zeros((0, len(views), 2)), size)  # says what is missing before it takes any time
+    pixels.place(views, np.zeros((0, len(views), 2)), plane)  # says what is missing before it takes any time
     model = record.model(rollout, trial)
     seen: list[list[Array]] = []
     amiss = 0.0  # seconds between when a frame is shown and when it should be, at most
@@ -74,7 +74,7 @@ def verify_video(
             progress(len(seen), told.frames)
     count = min(len(seen), told.frames)
     times = told.times()[:count]
-    places, apart = pixels.place(views, seen[:count], size)
+    places, apart = pixels.place(views, seen[:count], plane)
     known, interval = digest in told.runs, 1 / float(told.rate)
     size_of_mark = min(
         np.pi * (told.markers[run] * pane.height / view.height) ** 2 for pane, view in zip(panes, views, strict=True)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError
-from lqrsim.view.cameras import Camera
+from lqrsim.view.cameras import Camera, measuring_of
 from lqrsim.view.marker import RIM
 
 FEWEST = 20  # pixels of what is tracked; the middle of fewer is not known well enough
@@ -44,19 +44,20 @@ def mark(image: npt.NDArray[np.uint8], radius: float) -> Array:
     return centre
 
 
-def place(views: Sequence[Camera], measured: npt.ArrayLike, size: int) -> tuple[Array, Array]:
-    """Positions (N, size) that fit best what N frames' views measured (N, views, 2), and how far apart views are (N,).
+def place(views: Sequence[Camera], measured: npt.ArrayLike, plane: str) -> tuple[Array, Array]:
+    """Positions (N, d) that fit best what N frames' views measured (N, views, 2), and how far apart views are (N,).
 
     Args:
-      size: 3, or 2 for a robot in the plane, whose height does not matter.
+      plane: the axes of the positions: "xyz", or those of a robot in the plane; where it is across does not matter.
 
     Raises:
       InputError: the views do not see all directions.
     """
-    axes = np.vstack([view.axes for view in views])[:, :size] if views else np.zeros((0, size))
+    size, columns = len(plane), ["xyz".index(axis) for axis in plane]
+    axes = np.vstack([view.axes for view in views])[:, columns] if views else np.zeros((0, size))
     if np.linalg.matrix_rank(axes) < size:
         names = " and ".join(view.name for view in views) or "none"
-        raise InputError(f"views: got {names}, want {'top and side' if size == 3 else 'top'} to tell where a robot is")
+        raise InputError(f"views: got {names}, want {' and '.join(measuring_of(plane))} to tell where a robot is")
     values = np.asarray(measured, dtype=np.float64).reshape(-1, len(axes))
     seen = np.linalg.norm(axes, axis=1) > 1e-6  # a direction out of the plane says nothing
     axes, values = axes[seen], values[:, seen]

@@ -11,7 +11,7 @@ from lqrsim.results import Solution
 from lqrsim.rollout import Rollout
 from lqrsim.simulation.controllers import Feedback
 from lqrsim.verify.verdict import Test
-from lqrsim.view.recorded import model_of, robot_body
+from lqrsim.view.recorded import model_of
 
 Progress = Callable[[int, int], object]
 
@@ -60,13 +60,12 @@ def planned(rollout: Rollout, times: Array) -> Array:
 def between(rollout: Rollout, trial: int, model: mujoco.MjModel, times: Array) -> Array:
     """Positions (N, d) of the robot's body, as recorded for drawing: closer in time than the states are."""
     good = np.isfinite(rollout.frames[trial]).all(axis=1)
-    data, body, places = mujoco.MjData(model), robot_body(model), []
+    data, body, places = mujoco.MjData(model), int(model.body(rollout.body).id), []
     for frame in rollout.frames[trial, good]:
         data.qpos = frame
         mujoco.mj_kinematics(model, data)
         places.append(data.xpos[body].copy())
-    size = len(rollout.state_coordinates.position)
-    columns = np.array(places).T[:size]
+    columns = rollout.state_coordinates.of_world(places).T
     return np.stack([np.interp(times, rollout.frame_times[good], column) for column in columns], axis=1)
 
 

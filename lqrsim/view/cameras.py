@@ -92,7 +92,21 @@ def top(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
 def side(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
     """From the side, level, so that the longer way lies across; the rest is as for `top`."""
     low, high = _bounds(rollout)
-    return _camera("side", low, high, _right(high - low, 1.0), np.array([0.0, 0.0, 1.0]), aspect)
+    plane = rollout.state_coordinates.plane
+    level = plane.replace("z", "")
+    # A vertical plane is seen from across.
+    right = np.eye(3)["xyz".index(level)] if len(level) == 1 else _right(high - low, 1.0)
+    return _camera("side", low, high, right, np.array([0.0, 0.0, 1.0]), aspect)
+
+
+def measuring(rollout: Rollout) -> tuple[str, ...]:
+    """The cameras, of `top` and `side`, that it takes to tell where the robot is."""
+    return measuring_of(rollout.state_coordinates.plane)
+
+
+def measuring_of(plane: str) -> tuple[str, ...]:
+    """The same for robots in that plane, or in space."""
+    return ("top", "side") if len(plane) == 3 else ("side",) if "z" in plane else ("top",)
 
 
 def _camera(name: str, low: Array, high: Array, right: Array, up: Array, aspect: float) -> Camera:
@@ -105,11 +119,10 @@ def _camera(name: str, low: Array, high: Array, right: Array, up: Array, aspect:
 
 
 def _bounds(rollout: Rollout) -> tuple[Array, Array]:
-    """The lowest and highest corner (3,) of what a fixed camera shows; robots in the plane are at height zero."""
-    columns = list(rollout.state_coordinates.position)
-    places = np.vstack([rollout.plan.states, *rollout.states])[:, columns]
-    low, high = np.zeros(3), np.zeros(3)
-    low[: len(columns)], high[: len(columns)] = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
+    """The lowest and highest corner (3,) of what a fixed camera shows; robots seen from above are at height zero."""
+    space = rollout.state_coordinates
+    places = np.vstack([rollout.plan.states, *rollout.states])[:, list(space.position)]
+    low, high = (space.in_world(extreme(places, axis=0)) for extreme in (np.nanmin, np.nanmax))
     margin = rollout.radius + 0.05 * float((high - low).max())
     return low - margin, high + margin
 

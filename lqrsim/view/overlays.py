@@ -166,12 +166,15 @@ def _tube(track: Track, solution: Solution) -> tuple[Array, Array, Array]:
     if not np.array_equal(solution.trajectory.states, track.rollout.plan.states):
         raise InputError("solution: got one with another plan than that of the run, want the one that was executed")
     knots = np.unique(np.linspace(0, track.rollout.plan.steps, ELLIPSOIDS).astype(np.int64))
-    position = track.rollout.state_coordinates.position
-    size, count = len(position), len(knots)
-    centres, rotations = np.full((count, 3), track.floor), np.tile(np.eye(3), (count, 1, 1))
-    half_axes = np.full((count, 3), 0.1 * LIFT)
-    centres[:, :size], half_axes[:, :size], rotations[:, :size, :size] = ellipsoids(solution, position, knots)
-    return centres, half_axes, rotations
+    space = track.rollout.state_coordinates
+    size, count = len(space.position), len(knots)
+    places, lengths, turns = ellipsoids(solution, space.position, knots)
+    half_axes, rotations = np.full((count, 3), 0.1 * LIFT), np.zeros((count, 3, 3))
+    half_axes[:, :size] = lengths
+    rotations[:, list(space.world_axes), :size] = turns
+    if size == 2:  # what is flat is thin across
+        rotations[:, :, 2] = np.cross(rotations[:, :, 0], rotations[:, :, 1])
+    return space.in_world(places, height=track.floor), half_axes, rotations
 
 
 def _round_up(value: float) -> float:

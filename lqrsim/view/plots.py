@@ -33,11 +33,12 @@ def plot_run(
     _check(solution, rollouts, trial, world)
     with style.figure(path, size=(11, 7.5)) as figure:
         strips = len(solution.policy.control_coordinates)
-        left = figure.add_gridspec(1, 1, left=0.05, right=0.455, bottom=0.13, top=0.95)[0]
+        in_space = len(solution.policy.state_coordinates.position) == 3
+        left = figure.add_gridspec(1, 1, left=0.05 if in_space else 0.075, right=0.455, bottom=0.13, top=0.95)[0]
         right = figure.add_gridspec(
             3, 1, left=0.57, right=0.92, bottom=0.13, top=0.95, hspace=0.42, height_ratios=(1, 0.7 + 0.3 * strips, 1)
         )
-        if len(solution.policy.state_coordinates.position) == 3:
+        if in_space:
             path_axes = figure.add_subplot(left, projection="3d")
             assert isinstance(path_axes, Axes3D)
             _path_in_space(path_axes, solution, rollouts, world, trial)
@@ -83,7 +84,9 @@ def _paths(solution: Solution, rollouts: Mapping[str, Rollout], trial: int) -> l
 def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
     paths, radius = _paths(solution, rollouts, trial), next(iter(rollouts.values())).radius
     places = np.vstack([points for *_, points in paths])
-    scenery.draw_in_plane(axes, world, *scenery.bounds(places, world.seen_by(2), 1.5 * radius), radius)
+    space = solution.policy.state_coordinates
+    flat = world.seen_by(space.plane, space.offset)
+    scenery.draw_in_plane(axes, flat, *scenery.bounds(places, flat, 1.5 * radius), radius, plane=space.plane)
     for name, color, line, points in paths:
         axes.plot(*points.T, line, color=color, label=name)
     plan = paths[-1][-1]
@@ -108,7 +111,8 @@ def _tracking_error(axes: Axes, rollouts: Mapping[str, Rollout], trial: int) -> 
     worst = np.array([np.nanmax(error) for error in errors.values()])
     # Runs that differ by decades need a logarithmic axis, which has no place for the zero that they start from.
     decades = bool(worst.max() > 30 * worst.min())
-    factor, unit = (1e3, "mm") if worst.max() < 1 and not decades else (1.0, "m")
+    of = next(iter(rollouts.values())).tracking_unit
+    factor, unit = (1e3, "mm") if of == "m" and worst.max() < 1 and not decades else (1.0, of)
     for (name, error), color in zip(errors.items(), RUNS, strict=False):
         shown = np.where(error > 0, error, np.nan) if decades else error
         axes.plot(rollouts[name].times, factor * shown, color=color)

@@ -73,7 +73,9 @@ def _tube(axes: Axes, solution: Solution, world: World, radius: float, plane: tu
     states = [position[axis] for axis in plane]
     plan = solution.trajectory.states[:, list(position)]
     if len(position) == 2:
-        scenery.draw_in_plane(axes, world, *scenery.bounds(plan, world.seen_by(2), 1.5 * radius), radius)
+        space = solution.policy.state_coordinates
+        flat = world.seen_by(space.plane, space.offset)
+        scenery.draw_in_plane(axes, flat, *scenery.bounds(plan, flat, 1.5 * radius), radius, plane=space.plane)
         axes.set_title("tube (pale: closer than the robot's radius)")
     else:
         scenery.draw_projected(axes, world, *scenery.bounds(plan, world, 1.5 * radius), *plane)

@@ -5,6 +5,7 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_count, check_kind
 from lqrsim.rollout import Rollout
+from lqrsim.scenes import model_from_xml
 
 
 def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
@@ -14,23 +15,16 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
         raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
     if len(rollout.state_coordinates.position) not in (2, 3):
         raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
-    try:
-        model = mujoco.MjModel.from_xml_string(rollout.model)
-    except (ValueError, mujoco.FatalError) as error:
-        raise InputError(f"rollout.model: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
+    model = model_from_xml(rollout.model, "rollout.model")
+    if not isinstance(rollout.body, str) or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, rollout.body) < 0:
+        raise InputError(f"rollout.body: got {rollout.body!r}, want a body of its model")
     if model.nq != rollout.frames.shape[-1]:
         raise InputError(f"rollout.frames: got {rollout.frames.shape[-1]} numbers each, want the model's {model.nq}")
     return model
 
 
-def robot_body(model: mujoco.MjModel) -> int:
-    """The number of the robot's body: the first that moves."""
-    return int(np.argmax(model.body_weldid != 0))
-
-
-def floor_below(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """The height of what is below the robot, in metres; its own where there is nothing."""
-    robot = robot_body(model)
+def floor_below(model: mujoco.MjModel, data: mujoco.MjData, robot: int) -> float:
+    """The height of what is below that body, in metres; its own where there is nothing."""
     centre, drop = data.xpos[robot], np.array([0.0, 0.0, -1.0])
     hit = mujoco.mj_ray(model, data, centre, drop, None, True, robot, np.zeros(1, np.int32))
     return float(centre[2] - max(hit, 0.0))

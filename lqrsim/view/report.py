@@ -16,6 +16,7 @@ import jinja2
 import numpy as np
 from PIL import Image
 
+from lqrsim.coordinates import Coordinates
 from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path
 from lqrsim.files import replacing
 from lqrsim.scenarios import Scenario
@@ -25,6 +26,7 @@ from lqrsim.stress import analysis
 from lqrsim.stress.asked import Campaign, Cell
 from lqrsim.stress.results import Results, replay
 from lqrsim.stress.statistics import Estimate
+from lqrsim.target import Target, tracking_unit
 from lqrsim.view import gl
 from lqrsim.view.curves import plot_errors, plot_success
 
@@ -119,10 +121,10 @@ def _page(results: Results, table: analysis.Table, scenario: Scenario) -> dict[s
         "breaks": _breaks(table),
         "breaks_note": f"The least strength that was tried at which the 95 % interval of the success rate lies wholly"
         f" below {100 * BELOW:g} %, the least first.",
-        "success_note": "A trial succeeds if it ends within the goal radius of the plan's end, without a collision"
+        "success_note": f"A trial succeeds if it ends within {_reach(results, scenario)}, without a collision"
         " until then. Tables have exact (Clopper-Pearson) intervals of 95 %, the bands of the curves are Wilson's."
-        " Where nothing is random all trials are alike, and there is no interval.",
-        "compared": _compared(whole),
+        " Where nothing is random all trials are one run, and there is no interval.",
+        "compared": _compared(whole, tracking_unit(_space(scenario))),
         "compared_note": "Trials of the same number have the same random numbers, whatever the policy. What tells"
         " policies apart are the trials that only one of them reached: p is McNemar's exact test, raised for the number"
         " of comparisons on this page (Holm). Differences are the first less the second, with 95 % intervals: of"
@@ -131,10 +133,21 @@ def _page(results: Results, table: analysis.Table, scenario: Scenario) -> dict[s
         "modes": _modes(table),
         "measures": _measures(table, scenario),
         "measures_note": "Median, and from 5 to 95 % of the trials in parentheses. Until a trial collides or is lost;"
-        " final error and cost are of those that ran to the end.",
-        "worst": _worst(table),
+        " final error, distance from the goal and cost are of those that ran to the end.",
+        "worst": _worst(table, tracking_unit(_space(scenario))),
         "worst_note": f"Of each policy and sweep the {EACH} worst. {analysis.RANKING}",
     }
+
+
+def _space(scenario: Scenario) -> Coordinates:
+    return scenario.problem.dynamics.state_coordinates
+
+
+def _reach(results: Results, scenario: Scenario) -> str:
+    """Within which distance of what a trial has reached its goal."""
+    target = next(iter(results.trials.solutions.values())).target
+    asked = results.campaign
+    return f"{scenario.reach(asked.goal_radius, asked.goal_tolerance):g} {target.unit} of the {target.name}"
 
 
 def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[str, list[str]]:
@@ -150,6 +163,7 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
         ],
         "Strengths": [", ".join(f"{strength:g}" for strength in sorted({cell.strength for cell in table}))],
         "Policies": [", ".join(_policies(table)), *([manifest["left_out"]] if manifest.get("left_out") else [])],
+        "Plans": results.plans(),
         "Trials": [
             f"{campaign.trials} of each combination, {sum(map(len, table.values()))} in all, with the same random"
             f" numbers in each, of seed {campaign.seed}."
@@ -189,11 +203,12 @@ def _percent(one: Estimate, scale: float = 100.0, unit: str = " %") -> str:
     return f"{scale * one.value:.1f} ({scale * one.low:.1f} to {scale * one.high:.1f}){unit}"
 
 
-def _compared(table: analysis.Table) -> list[Rows]:
+def _compared(table: analysis.Table, unit: str) -> list[Rows]:
     found = analysis.comparisons(table)
+    factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
     head = (
         "strength", "only the first", "only the second", "p", "difference in success (%)", "both reached",
-        "difference in rms (mm)",
+        f"difference in rms ({unit})",
     )  # fmt: skip
     groups = dict.fromkeys((one.first.sweep, one.first.policy, one.second.policy) for one in found)
     return [
@@ -204,7 +219,7 @@ def _compared(table: analysis.Table) -> list[Rows]:
                 [
                     f"{one.first.strength:g}", str(one.pairs.only_first), str(one.pairs.only_second),
                     f"{one.adjusted:.2g}", _percent(one.success, unit=""), str(one.both),
-                    "" if one.rms is None else _between(one.rms.value, one.rms.low, one.rms.high, 1e3),
+                    "" if one.rms is None else _between(one.rms.value, one.rms.low, one.rms.high, factor),
                 ]
                 for one in found
                 if (one.first.sweep, one.first.policy, one.second.policy) == (sweep, first, second)
@@ -245,6 +260,8 @@ def _measures(table: analysis.Table, scenario: Scenario) -> list[Rows]:
         unit = of_controls.pop()
         units["effort"] = f"{unit}² s" if unit.isalpha() else f"({unit})² s"
     units["saturated"] = "share of periods"
+    units |= dict.fromkeys(("worst", "rms", "final"), tracking_unit(_space(scenario)))
+    units["goal"] = Target(_space(scenario), scenario.problem.weighed_goal, np.zeros((1, len(_space(scenario))))).unit
     head = ["policy", "strength", *(f"{name} ({unit})" if unit else name for name, unit in units.items())]
     tables = []
     for sweep in dict.fromkeys(cell.sweep for cell in table):
@@ -269,7 +286,7 @@ def _worst_of(table: analysis.Table, group: tuple[str, str]) -> list[analysis.Tr
     return analysis.worst({cell: one for cell, one in table.items() if (cell.policy, cell.sweep) == group}, EACH)
 
 
-def _worst(table: analysis.Table) -> Rows:
+def _worst(table: analysis.Table, unit: str) -> Rows:
     rows = [
         [
             *_name(one.cell), str(one.trial), one.outcome, one.obstacle, f"{one.ended:.2f}",
@@ -280,7 +297,7 @@ def _worst(table: analysis.Table) -> Rows:
     ]  # fmt: skip
     head = (
         "policy", "sweep", "strength", "trial", "outcome", "collided with", "ended (s)", "least clearance (m)",
-        "largest error (m)",
+        f"largest error ({unit})",
     )  # fmt: skip
     return Rows("Worst trials", head, rows)
 
@@ -288,6 +305,7 @@ def _worst(table: analysis.Table) -> Rows:
 def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campaign, folder: Path) -> dict[str, Any]:
     """The figures and the table of one sweep."""
     policies = list(dict.fromkeys(cell.policy for cell in table if cell.sweep == name))
+    unit = tracking_unit(_space(scenario))
     curves = {policy: analysis.degradation(table, policy, name) for policy in policies}
     errors = {
         policy: {point.cell.strength: analysis.quantiles(table[point.cell], "rms") for point in points}
@@ -313,10 +331,10 @@ def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campa
                 alt=f"Success over strength. {shares}.",
             ),
             _picture(
-                plot_errors(errors, folder / "errors.png", label="tracking error, rms (m)"),
+                plot_errors(errors, folder / "errors.png", label=f"tracking error, rms ({unit})"),
                 caption="Root mean square of a trial's distance from the plan, until it ends or collides: median, and"
                 " from 5 to 95 % of the trials.",
-                alt=f"Median tracking error in metres over strength. {medians}.",
+                alt=f"Median tracking error ({unit}) over strength. {medians}.",
             ),
         ],
         "success": Rows(
@@ -331,7 +349,7 @@ def _share(point: analysis.Success | None) -> str:
     if point is None:
         return "not run"
     count = f"{point.reached}/{point.trials}"
-    return f"{count}, all alike" if point.alike else f"{count}, {_percent(point.exact)}"
+    return f"{count}, deterministic: 1 run" if point.alike else f"{count}, {_percent(point.exact)}"
 
 
 def _picture(path: Path, *, caption: str, alt: str) -> dict[str, Any]:

@@ -20,10 +20,14 @@ def bounds(places: Array, world: World, margin: float = 0.0) -> tuple[Array, Arr
     return np.nanmin(places, axis=0) - margin, np.nanmax(places, axis=0) + margin
 
 
-def draw_in_plane(axes: Axes, world: World, low: Array, high: Array, radius: float) -> None:
-    """Obstacles between two corners (2,), and, paler, where they are closer than the robot's radius in metres."""
-    flat = world.seen_by(2)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x (m)", ylabel="y (m)")
+def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: float, *, plane: str = "xy") -> None:
+    """Obstacles between two corners (2,), and, paler, where they are closer than the robot's radius in metres.
+
+    Args:
+      flat: the world as a robot in that plane sees it.
+    """
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    axes.set(xlabel=f"{plane[0]} (m)", ylabel=f"{plane[1]} (m)")
     if not flat.obstacles:
         return
     # What the planner sees, whatever the obstacles are made of: the distance itself, and where it is the radius.

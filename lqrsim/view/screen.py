@@ -10,10 +10,11 @@ import mujoco
 import numpy as np
 from mujoco import mjtGeom as Geom
 
+from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError
 from lqrsim.results import Trajectory
 from lqrsim.view.decor import PLAN, decorate
-from lqrsim.view.recorded import floor_below, robot_body
+from lqrsim.view.recorded import floor_below
 
 WANTED = (*PLAN, 0.25)
 TRACE = (0.05, 0.35, 0.62, 1.0)
@@ -44,7 +45,7 @@ class Screen(abc.ABC):
     """A viewer. Subclasses say how it draws, and call `push`, `pull` and so on when someone interferes.
 
     Args:
-      model: what moves. plan: what it should do. position: which of the plan's states are where it is.
+      model: what moves. plan: what it should do. space: of the plan's states. body: the robot's in the model.
       radius: of the robot, in metres. push: what a key adds to its velocity, in m/s.
       speed: of the time shown, 1 is real. seconds: after which the viewer closes; never by default.
 
@@ -56,24 +57,25 @@ class Screen(abc.ABC):
         self,
         model: mujoco.MjModel,
         plan: Trajectory,
-        position: tuple[int, ...],
+        space: Coordinates,
+        body: str,
         *,
         radius: float,
         push: float = 0.3,
         speed: float = 1.0,
         seconds: float | None = None,
     ) -> None:
-        if len(position) not in (2, 3):
+        if not space.position:
             raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
         # A copy: a viewer has sliders for gravity and the like.
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
-        self.robot = robot_body(model)
+        self.space, self.robot = space, int(model.body(body).id)
         self.radius, self.speed, self.paused, self.caption = radius, speed, False, ""
         self.wrench = np.zeros(6)
         self._mass = float(model.body_subtreemass[self.robot])
         self._push, self._impulse = push * self._mass, np.zeros(3)
-        self._times, self._places = plan.times, plan.states[:, list(position)]
+        self._times, self._places = plan.times, plan.states[:, list(space.position)]
         self._time, self._ahead, self._restart = 0.0, 0.0, False
         self._until = np.inf if seconds is None else clock.monotonic() + seconds
         self._trace: list[Array] = []
@@ -97,9 +99,9 @@ class Screen(abc.ABC):
         place = self.data.xpos[self.robot].copy()
         if begins:
             self._trace.clear()
-            self._floor = floor_below(self.model, self.data)
+            self._floor = floor_below(self.model, self.data, self.robot)
         apart = float(np.linalg.norm(np.ptp(self._places, axis=0))) / SEGMENTS
-        on_floor = self._on_floor(place[: self._places.shape[1]])
+        on_floor = self._on_floor(self.space.of_world(place))
         if not self._trace or np.linalg.norm(on_floor - self._trace[-1]) > apart:
             self._trace = [*self._trace, on_floor][-2 * SEGMENTS :]
         self.caption = f"{time:.1f} s, {1e3 * np.linalg.norm(on_floor - self.wanted()):.0f} mm from the plan"
@@ -145,7 +147,7 @@ class Screen(abc.ABC):
             for ends in itertools.pairwise(points):
                 geom = decorate(new(), Geom.mjGEOM_CAPSULE, [thick] * 3, ends[0], colour)
                 mujoco.mjv_connector(geom, Geom.mjGEOM_CAPSULE, thick, *ends)
-        flat = self._places.shape[1] == 2
+        flat = self.space.from_above
         shape = (Geom.mjGEOM_CYLINDER, [self.radius, LIFT, 0.0]) if flat else (Geom.mjGEOM_SPHERE, [self.radius] * 3)
         decorate(new(), *shape, self.wanted(), WANTED)
 
@@ -161,7 +163,7 @@ class Screen(abc.ABC):
             camera.elevation = np.degrees(np.arctan2(away[2], np.hypot(away[0], away[1])))
 
     def _on_floor(self, place: Array | list[float]) -> Array:
-        return np.append(place, self._floor + LIFT)[:3]
+        return self.space.in_world(place, height=self._floor + LIFT)
 
     def _wait(self, left: float) -> None:
         """Until `left` seconds of the time shown have gone by."""

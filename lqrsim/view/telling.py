@@ -77,7 +77,7 @@ class Caption:
         told += [f"clearance {clearance:.2f} m"] if np.isfinite(clearance) else []
         if "forces" in self.overlays.show:
             told += [f"force {np.linalg.norm(track.force_at(time)):.2f} N"]
-        return told + (["diverged"] if track.lost(time) else [])
+        return told + ([over.replace("_", " ")] if (over := track.over(time)) else [])
 
 
 class Legend:

@@ -5,7 +5,7 @@ import numpy as np
 
 from lqrsim.errors import Array, InputError
 from lqrsim.rollout import Rollout
-from lqrsim.view.recorded import floor_below, model_of, robot_body
+from lqrsim.view.recorded import floor_below, model_of
 
 SEEN = 0.2  # seconds for which a push is shown: one control period would be gone before it is seen, and noise flickers
 
@@ -14,7 +14,8 @@ class Track:
     """A trial; where it diverged, it ends with its last finite state and stands still.
 
     Attributes:
-      model: to draw. robot: the body of the model that is the robot. planar: whether it moves in the plane.
+      model: to draw. robot: the body of the model that is the robot.
+      planar: whether it is seen from above, and what is drawn of it lies on the floor.
       floor: height of what it stands on in the first frame, in metres.
       end: seconds from the first state to the last one of the plan.
       times: (k,) of the finite states; states, measured: (k, n); error, clearance: (k,) in metres.
@@ -35,11 +36,11 @@ class Track:
         self.error, self.clearance = rollout.tracking_error[trial, alive], rollout.clearance[trial, alive]
         self.force = _recent(rollout.forces[trial], rollout.plan.dt)
         self.end = float(rollout.times[-1])
-        self.planar = len(rollout.state_coordinates.position) == 2
-        self.robot = robot_body(self.model)
+        self.planar = rollout.state_coordinates.from_above
+        self.robot = int(self.model.body(rollout.body).id)
         data = mujoco.MjData(self.model)
         self.pose(data, 0.0)
-        self.floor = floor_below(self.model, data)
+        self.floor = floor_below(self.model, data, self.robot)
 
     def pose(self, data: mujoco.MjData, time: float) -> None:
         """Puts the model where it was at `time`, between two recorded frames if need be."""
@@ -55,7 +56,7 @@ class Track:
         mujoco.mj_camlight(self.model, data)
 
     def driven(self, at: Array | float) -> Array:
-        """Where the robot was at these times, (..., 3); on the floor, if it moves in the plane."""
+        """Where the robot was at these times, (..., 3); on the floor, if it is seen from above."""
         return self.places(self.states, self.times, at)
 
     def planned(self, at: Array | float) -> Array:
@@ -64,8 +65,9 @@ class Track:
 
     def places(self, states: Array, times: Array, at: Array | float) -> Array:
         """The positions (..., 3) of states (k, n) at `times`, at other times."""
-        columns = [np.interp(at, times, states[:, i]) for i in self.rollout.state_coordinates.position]
-        return np.stack([*columns, np.full_like(columns[0], self.floor)][:3], axis=-1)
+        space = self.rollout.state_coordinates
+        columns = [np.interp(at, times, states[:, i]) for i in space.position]
+        return space.in_world(np.stack(columns, axis=-1), height=self.floor)
 
     def force_at(self, time: float) -> Array:
         """The force (3,) in N that has disturbed the robot lately."""
@@ -75,9 +77,12 @@ class Track:
         """One of `error` and `clearance` at a time."""
         return float(np.interp(time, self.times, values))
 
-    def lost(self, time: float) -> bool:
-        """Whether the trial had diverged by then."""
-        return bool(self.rollout.diverged[self.trial]) and time > self.times[-1]
+    def over(self, time: float) -> str:
+        """What had ended the trial by then, in words; empty if nothing had."""
+        run, k = self.rollout, self.trial
+        if run.outcome[k] not in ("collided", "diverged", "error") or time < run.ended[k]:
+            return ""
+        return f"collided with {run.obstacles[k]}" if run.collided[k] else run.outcome[k]
 
 
 def _recent(forces: Array, dt: float) -> Array:

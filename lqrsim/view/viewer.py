@@ -96,14 +96,15 @@ def of_rollout(rollout: Rollout, trial: int) -> dict[str, Any]:
     model = model_of(rollout, trial)
     if not np.isfinite(rollout.frames[trial]).all(axis=1).any():
         raise InputError(f"rollout: got trial {trial} without one finite state, want something to show")
-    position = rollout.state_coordinates.position
-    return {"model": model, "plan": rollout.plan, "position": position, "radius": rollout.radius}
+    where = {"space": rollout.state_coordinates, "body": rollout.body, "radius": rollout.radius}
+    return {"model": model, "plan": rollout.plan, **where}
 
 
 def of_plant(plant: Plant, solution: Solution) -> dict[str, Any]:
     """What a Screen needs to show a live run."""
-    position = plant.robot.dynamics.state_coordinates.position
-    return {"model": plant.model, "plan": solution.trajectory, "position": position, "radius": plant.robot.radius}
+    robot = plant.robot
+    where = {"space": robot.dynamics.state_coordinates, "body": robot.body, "radius": robot.radius}
+    return {"model": plant.model, "plan": solution.trajectory, **where}
 
 
 class _Person(Disturbance):
@@ -151,10 +152,10 @@ def live(
     Args:
       ended: called with a line on each run that has ended.
     """
-    dimension = len(plant.robot.dynamics.state_coordinates.position)
+    space = plant.robot.dynamics.state_coordinates
 
     def watch(time: float, qpos: Array, unstable: np.ndarray) -> None:
-        apart = np.linalg.norm((screen.show(time, qpos[0]) - screen.wanted())[:dimension])
+        apart = np.linalg.norm(space.of_world(screen.show(time, qpos[0]) - screen.wanted()))
         if unstable.any() or not apart < plant.model.stat.extent:
             ended(f"run {run}: lost after {time:.1f} s")
             raise Again

@@ -34,7 +34,7 @@ class InitialStateError(Spread):
 
 
 class DisplacedObstacles(Spread):
-    """Obstacles are not where the plan has them. Planes stay, and for a robot in the plane, heights.
+    """Obstacles are not where the plan has them. Planes stay, and for a robot that is seen from above, heights.
 
     Args:
       std: standard deviation in m; one number, or three along the world's axes.
@@ -56,6 +56,6 @@ class DisplacedObstacles(Spread):
         self.check(plant)
         displaced = fit(self, self.std, "xyz") * normal(generators, len(plant.world), 3)
         displaced[:, [obstacle.kind == "plane" for obstacle in plant.world.obstacles]] = 0.0
-        if len(plant.robot.dynamics.state_coordinates.position) == 2:
+        if plant.robot.dynamics.state_coordinates.from_above:
             displaced[..., 2] = 0.0
         return Effect(displaced=displaced)

@@ -1,0 +1,108 @@
+"""The one definition of a collision: the first moment at which a robot touches an obstacle, of each trial.
+
+It touches one where the signed distance of its position less its radius is negative, or where MuJoCo sees a contact of
+any of its geoms with one. Both are looked for in runs without obstacle contacts, so that they are the same to the bit
+whether an obstacle then stops the robot or not: at the knots, and between them at each part of the control period, as
+`Physics` has them; and between these along the straight line.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array
+from lqrsim.simulation.physics import Period
+from lqrsim.simulation.plant import Plant
+from lqrsim.world import ROW, signed_distance
+
+FINEST = 0.02  # of the radius: along a line no two looks are further apart than what is clear there and this
+MOST = 1000  # looks along a line, at most
+
+
+class Collisions:
+    """The first collisions of K trials.
+
+    Args:
+      displaced: (K, obstacles, 3) metres. dt: of a control period.
+
+    Attributes:
+      at: (K,) seconds; infinite where there was none. obstacles: (K) names of what was hit; empty where nothing was.
+      clearance: (K,) signed distance to the nearest obstacle less the radius now, in metres.
+    """
+
+    def __init__(self, plant: Plant, states: Array, displaced: Array, dt: float) -> None:
+        self.plant, self.displaced, self.dt = plant, displaced, dt
+        self._moved = bool(displaced.any())
+        self.at = np.full(len(states), np.inf)
+        self.obstacles = [""] * len(states)
+        self._place = list(plant.robot.dynamics.state_coordinates.position)
+        self._last = states[:, self._place]
+        self.clearance = self._clear(self._last)
+        for row in np.flatnonzero(self.clearance < 0):
+            self._hit(int(row), 0.0, self._last[row])
+
+    def look(self, step: int, period: Period, *, ignored: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+        """The trials that collide for the first time in a period, by their rows.
+
+        Args:
+          step: its number. ignored: (K,) trials that are over already.
+        """
+        begun, parts = self.at.copy(), len(period.states)
+        for part, (states, felt) in enumerate(zip(period.states, period.felt, strict=True)):
+            open_ = np.isinf(self.at) & ~ignored & (part < period.stable)
+            start = (step + part / parts) * self.dt
+            for row in np.flatnonzero(open_ & felt.any(axis=1)) if len(felt) else ():
+                self.feel(int(row), start, felt[row])
+            if len(self.plant.world):
+                self._along(step, part, parts, states[:, self._place], open_)
+        found = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
+        # What is computed of a time in the period may be rounded to beyond its end.
+        self.at[found] = np.minimum(self.at[found], (step + 1) * self.dt)
+        return found
+
+    def feel(self, row: int, time: float, felt: npt.NDArray[np.bool_]) -> None:
+        """A contact that MuJoCo saw, with which obstacles (obstacles,)."""
+        self.at[row] = time
+        self.obstacles[row] = self.plant.obstacles[int(np.argmax(felt))]
+
+    def now(self, states: Array) -> None:
+        """The trials are elsewhere, as obstacles have stopped some of them."""
+        self._last = states[:, self._place]
+        self.clearance = self._clear(self._last)
+
+    def _along(self, step: int, part: int, parts: int, there: Array, open_: npt.NDArray[np.bool_]) -> None:
+        """Look along the lines from the last places to these (K, 2 or 3)."""
+        last, before = self._last, self.clearance
+        self._last, self.clearance = there, self._clear(there)
+        length = np.linalg.norm(there - last, axis=1)
+        # No place of a line is nearer to an obstacle than its ends allow.
+        rows = np.flatnonzero(open_ & np.isinf(self.at) & ~(before + self.clearance > length))
+        rows = rows[np.isfinite(length[rows])]
+        if not len(rows):
+            return
+        finest = np.maximum(FINEST * self.plant.robot.radius, length[rows] / MOST)
+        gone, clear = np.zeros(len(rows)), before[rows]
+        looking = np.ones(len(rows), dtype=bool)
+        while looking.any():
+            gone = np.where(looking, np.minimum(gone + np.maximum(clear, finest), length[rows]), gone)
+            share = (gone / np.where(length[rows] > 0, length[rows], 1.0))[:, None]
+            at_end = gone >= length[rows]
+            places = np.where(at_end[:, None], there[rows], last[rows] + share * (there[rows] - last[rows]))
+            clear = self._clear(places, rows)
+            for k in np.flatnonzero(looking & (clear < 0)):
+                self._hit(int(rows[k]), (step + (part + float(share[k, 0])) / parts) * self.dt, places[k])
+            looking &= (clear >= 0) & ~at_end
+
+    def _clear(self, places: Array, rows: npt.NDArray[np.intp] | None = None) -> Array:
+        """Clearance (k,) at places (k, 2 or 3) of these trials."""
+        if not self._moved:
+            return self.plant.clearance_at(places)
+        return self.plant.clearance_at(places[:, None], self.displaced if rows is None else self.displaced[rows])[:, 0]
+
+    def _hit(self, row: int, time: float, place: Array) -> None:
+        self.at[row] = time
+        world, point = self.plant.world, np.zeros(3)
+        point[: len(place)] = place
+        there = (point - self.plant.across(self.displaced[row])).tolist()  # seen from where each obstacle is
+        table = world.table.ravel()
+        distances = [signed_distance(table, ROW * number, *seen) for number, seen in enumerate(there)]
+        self.obstacles[row] = world.names[int(np.argmin(distances))]

@@ -1,0 +1,150 @@
+"""Whether a robot fits a scene: its names are there, its maps have MuJoCo's sizes, and it is where its states say."""
+
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from lqrsim.coordinates import PLANES, SPACE, Coordinates
+from lqrsim.errors import Array, InputError, check_number, excerpt
+from lqrsim.robots.base import Robot
+from lqrsim.scenes import Scene
+
+if TYPE_CHECKING:
+    from lqrsim.simulation.plant import Plant
+
+OFF = 1e-4  # metres, or of a metre's move, by which the body may be elsewhere: less than six digits in an MJCF leave
+
+
+def check_names(robot: Robot, scene: Scene) -> None:
+    """Raises InputError unless the robot's body, joints, actuators and wheels are in the scene by their names.
+
+    Its radius and its drag must be numbers that are not negative.
+    """
+    check_number(f"robot {robot.name}: radius", getattr(robot, "radius", None), at_least=0.0)
+    check_number(f"robot {robot.name}: drag", robot.drag, at_least=0.0)
+    model = scene.model
+    wanted = {
+        "body": ("body", [robot.body], model.nbody),
+        "joint": ("joints", robot.joints, model.njnt),
+        "actuator": ("actuators", robot.actuators, model.nu),
+        "geom": ("wheels", robot.wheels, model.ngeom),
+    }
+    for kind, (field, names, count) in wanted.items():
+        if isinstance(names, str) or not all(isinstance(name, str) and name for name in names):
+            raise InputError(f"robot {robot.name}: {field}: got {excerpt(names)}, want names of the MJCF in a tuple")
+        if len(set(names)) != len(names):
+            raise InputError(
+                f"robot {robot.name}: {field}: got a name twice in {', '.join(names)}, want different ones"
+            )
+        elements = [getattr(model, kind)(number).name for number in range(count)]
+        for name in names:
+            if name not in elements:
+                raise InputError(
+                    f"scene {scene.name}: got no robot {robot.name} in it, want its {kind} {name!r};"
+                    f" it has: {_present(kind, elements)}"
+                )
+
+
+def _present(kind: str, names: list[str]) -> str:
+    """The names, and which of the elements have none and are in need of one."""
+    named, unnamed = list(filter(None, names)), [str(number) for number, name in enumerate(names) if not name]
+    if kind not in ("joint", "actuator") or not unnamed:
+        return ", ".join(named) or "none"
+    several = f"{kind}s {', '.join(unnamed)} have" if len(unnamed) > 1 else f"{kind} {unnamed[0]} has"
+    return f"{', '.join([*named, f'{len(unnamed)} without a name'])} ({several} none, counted from 0: name them there)"
+
+
+def check_maps(plant: "Plant") -> None:
+    """Raises InputError unless the robot's maps have the sizes of its joints and actuators, and put it where it is."""
+    robot = plant.robot
+    n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
+    qpos, qvel = (np.asarray(part) for part in robot.configuration(np.zeros(n)))
+    joints, actuators = ", ".join(robot.joints) or "no joints", ", ".join(robot.actuators) or "no actuators"
+    for what, got, want, of in (
+        ("configuration: qpos", qpos, len(plant.qpos), joints),
+        ("configuration: qvel", qvel, len(plant.qvel), joints),
+        ("actuation", np.asarray(robot.actuation(np.zeros(m))), len(plant.ctrl), actuators),
+        ("state", np.asarray(robot.state(qpos, qvel)), n, "its dynamics"),
+    ):
+        if got.shape != (want,):
+            raise InputError(f"robot {robot.name}: {what}: got shape {got.shape}, want ({want},) for {of}")
+    if robot.dynamics.state_coordinates.position:
+        _check_position(plant)
+
+
+def _check_position(plant: "Plant") -> None:
+    """Raises InputError unless the body's origin is where the position is, and moves with it.
+
+    Whatever the joints are: it is MuJoCo's kinematics that say where the body goes.
+    """
+    robot, space = plant.robot, plant.robot.dynamics.state_coordinates
+    n, data = len(space), mujoco.MjData(plant.model)
+
+    def body(state: Array) -> Array:
+        data.qpos[plant.qpos] = robot.configuration(state)[0]
+        mujoco.mj_kinematics(plant.model, data)
+        return data.xpos[plant.body].copy()
+
+    # About a state in which nothing is zero, so that angles and the like are seen to turn what they turn.
+    middle = 0.1 + 0.01 * np.arange(n)
+    moves = np.array([(body(middle + step) - body(middle - step)) / 2 for step in np.eye(n)[list(space.position)]])
+    wanted = np.eye(3)[list(space.world_axes)]
+    who = f"robot {robot.name}: position"
+    names = [space.names[index] for index in space.position]
+    if np.abs(moves - wanted).max() > OFF:
+        raise InputError(f"{who}: got ({', '.join(names)}) in {_of(space)}; {_remedy(plant, names, moves)}")
+    for state in (np.zeros(n), middle):
+        place = state[list(space.position)]
+        there, said = body(state), space.in_world(place)
+        off = there - said
+        if space.from_above:
+            off[2] = 0.0  # it has no certain height
+        if np.abs(off).max() <= OFF:
+            continue
+        across = 3 - sum(space.world_axes) if len(names) == 2 else -1
+        if across >= 0 and np.abs(np.delete(off, across)).max() <= OFF:
+            raise InputError(
+                f"{who}: got the plane {space.plane!r} at {SPACE[across]} = {said[across]:g} m, where MuJoCo has body"
+                f" {robot.body!r} at {SPACE[across]} = {there[across]:g} m; want offset={there[across]:g}"
+            )
+        raise InputError(
+            f"{who}: got {_point(place)} m in {_of(space)}, where MuJoCo has the origin of body {robot.body!r} at"
+            f" {_point(there)} m; want configuration() to put it there (slides count from the body's pos in the MJCF)"
+        )
+
+
+def _remedy(plant: "Plant", names: list[str], moves: Array) -> str:
+    """What moves the body where, and what would be right."""
+    exact = np.abs(np.round(moves) - moves).max() <= OFF
+    rows = np.round(moves)
+    directions = [_direction(row) for row in (rows if exact else moves)]
+    told = ", ".join(f"{name} along {direction}" for name, direction in zip(names, directions, strict=True))
+    told = f"MuJoCo moves body {plant.robot.body!r} by a metre of {told}"
+    if exact and (np.abs(rows).sum(axis=1) == 1).all() and (rows.sum(axis=1) == 1).all():
+        axes = "".join(SPACE[int(row.argmax())] for row in rows)
+        if axes in PLANES:
+            return f"{told}; want plane={axes!r}"
+        if sorted(axes) == sorted(SPACE):
+            order = ", ".join(repr(names[axes.index(letter)]) for letter in SPACE)
+            return f"{told}; want position=({order})"
+    return f"{told}; want it to move by a metre along its own axis, and not otherwise: check joints and configuration()"
+
+
+def _of(space: Coordinates) -> str:
+    return "space" if len(space.position) == 3 else f"the plane {space.plane!r}"
+
+
+def _point(numbers: Any) -> str:
+    return "(" + ", ".join(f"{number:.4g}" for number in numbers) + ")"
+
+
+def _direction(row: Array) -> str:
+    """A move in words: `+x`, `-z`, or by its numbers."""
+    lengths = np.abs(row)
+    if lengths.max() <= OFF:
+        return "nothing"
+    if np.count_nonzero(lengths > OFF) == 1 and abs(lengths.max() - 1) <= OFF:
+        axis = int(lengths.argmax())
+        return f"{'-' if row[axis] < 0 else '+'}{SPACE[axis]}"
+    return _point(row)

@@ -1,0 +1,226 @@
+"""Whether MuJoCo moves a robot as its dynamics say."""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_items,
+    check_number,
+    check_seed,
+    excerpt,
+    shaped,
+)
+from lqrsim.robots.base import Robot
+from lqrsim.scenes import Scene, unlogged
+from lqrsim.simulation.physics import UNSTABLE
+from lqrsim.simulation.plant import Plant
+
+MOST_STEPS = 1_000_000  # of the physics in a check, which makes them one by one
+SHOWN = 8  # pairs of geoms in contact that are printed
+
+
+@dataclass(frozen=True)
+class PlantCheck:
+    """How far MuJoCo moves a robot from where its dynamics say, over one control period.
+
+    Attributes:
+      names, units: of the states. errors: (n,) the largest difference of each over the samples, in its unit.
+      changes: (n,) the largest change that the dynamics predict for it. period: in seconds.
+      state, control: where the worst state of all was furthest off. simulated, predicted: (n,) what came of it.
+      tolerance: what `relative` must not exceed.
+      contacts: pairs of geoms that touched, and in how many of the `samples`, most often first: contacts that were not
+        taken away, which the dynamics may know nothing of.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    errors: Array
+    changes: Array
+    period: float
+    state: Array
+    control: Array
+    simulated: Array
+    predicted: Array
+    tolerance: float
+    samples: int
+    contacts: tuple[tuple[str, str, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("names", "units"):
+            found = check_items(f"PlantCheck: {name}", getattr(self, name), str, "texts, one a state")
+            object.__setattr__(self, name, found)
+        n = len(self.names)
+        if not n or len(self.units) != n:
+            raise InputError(f"PlantCheck: units: got {len(self.units)} for {n} names, want one a state, at least one")
+        for name in ("errors", "changes", "state", "simulated", "predicted", "control"):
+            size = None if name == "control" else n
+            object.__setattr__(self, name, shaped(f"PlantCheck: {name}", getattr(self, name), (size,)))
+        for name in ("period", "tolerance"):
+            object.__setattr__(self, name, check_number(f"PlantCheck: {name}", getattr(self, name), above=0.0))
+        object.__setattr__(self, "samples", check_count("PlantCheck: samples", self.samples))
+        wanted = "(geom, geom, in how many samples) of each pair that touched"
+        pairs = check_items("PlantCheck: contacts", self.contacts, tuple, wanted)
+        for pair in pairs:
+            if len(pair) != 3 or not all(isinstance(name, str) for name in pair[:2]):
+                raise InputError(f"PlantCheck: contacts: got {excerpt(pair)}, want {wanted}")
+            check_count("PlantCheck: contacts: count", pair[2], at_most=self.samples)
+        object.__setattr__(self, "contacts", pairs)
+
+    @property
+    def relative(self) -> Array:
+        """(n,) errors relative to the changes; where next to nothing changes, to the largest change of all."""
+        return self.errors / np.maximum(self.changes, 1e-3 * np.nanmax(self.changes, initial=1e-12))
+
+    @property
+    def worst(self) -> str:
+        """The name of the state that is furthest off, relative to its change."""
+        return self.names[int(np.argmax(self.relative))]
+
+    @property
+    def good(self) -> bool:
+        """Whether every state is within the tolerance."""
+        return bool((self.relative <= self.tolerance).all())
+
+    def __str__(self) -> str:
+        i = self.names.index(self.worst)
+        width = max(len(name) for name in self.names)
+        lines = [f"{'state':<{width}} {'error':>10} {'of change':>10}  over one period of {self.period:.4g} s"]
+        lines += [
+            f"{name:<{width}} {error:>10.2e} {relative:>10.2e}  {unit}"
+            for name, unit, error, relative in zip(self.names, self.units, self.errors, self.relative, strict=True)
+        ]
+        lines.append(
+            f"{'agrees' if self.good else 'DISAGREES'} (tolerance {self.tolerance:g} of the change); worst state:"
+            f" {self.worst}, MuJoCo {self.simulated[i]:.6g}, dynamics {self.predicted[i]:.6g},"
+            f" from x = {np.array2string(self.state, precision=3)}, u = {np.array2string(self.control, precision=3)}"
+        )
+        lines += [
+            f"touching in {count} of {self.samples} samples: {a} and {b}" for a, b, count in self.contacts[:SHOWN]
+        ]
+        if len(self.contacts) > SHOWN:
+            lines.append(f"and {len(self.contacts) - SHOWN} pairs of geoms more")
+        return "\n".join(lines)
+
+
+def check_plant(
+    robot: Robot,
+    scene: Scene,
+    *,
+    period: float | None = None,
+    around: npt.ArrayLike | None = None,
+    spread: float = 0.3,
+    controls: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+    settle: float | None = None,
+    samples: int = 50,
+    tolerance: float = 0.02,
+    seed: int = 0,
+) -> PlantCheck:
+    """Compare a robot's dynamics with its MJCF: from random states, one control period of each.
+
+    A mass, a sign or a unit that differs shows in the states that it acts on. For it, what the robot can
+    collide with is taken away: `Plant.obstacles`, floors too. What stays is what runs do not count as an obstacle: the
+    floor that it stands on, or planes parallel to its own. Contacts with what stays, and of parts that move with each
+    other, are in the result, by the names of the geoms.
+
+    Args:
+      period: in seconds, a multiple of the physics step; by default that nearest to 0.02 s.
+      around: (n,) the middle of the random states, zero by default. spread: their standard deviation in each unit.
+      controls: lowest and highest random control (m,); by default the dynamics' limits.
+      settle: seconds under the control before the comparison, for velocities that MuJoCo has and the dynamics do not
+        (those of wheels, say); by default 0.5 where MuJoCo has more of them than the dynamics have states, else 0.
+      samples: how many states. tolerance: of an error, relative to the largest change of that state. seed: of all.
+
+    Raises:
+      InputError: the robot is not in the scene, an argument is not as described, the controls have no limits, or the
+        simulation becomes unstable.
+    """
+    plant = Plant(robot, scene)
+    period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
+    substeps = plant.substeps(period)
+    dynamics = robot.dynamics
+    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+    middle = check_array("around", np.zeros(n) if around is None else around, (n,))
+    space = dynamics.control_coordinates
+    if controls is not None and (not isinstance(controls, tuple | list) or len(controls) != 2):
+        raise InputError(f"controls: got {excerpt(controls)}, want (lowest, highest), each ({m},)")
+    low, high = (space.low, space.high) if controls is None else controls
+    low, high = (
+        check_array("controls: lowest", low, (m,), infinite=True),
+        check_array("controls: highest", high, (m,), infinite=True),
+    )
+    if not (low <= high).all():
+        raise InputError(f"controls: got {low.tolist()} to {high.tolist()}, want the lowest first")
+    if not np.isfinite([low, high]).all():
+        raise InputError(f"controls: got {robot.name}'s limits, which are infinite, want controls=(lowest, highest)")
+    taken_away = [plant.model.geom(name).id for name in plant.obstacles]
+    plant.model.geom_contype[taken_away] = plant.model.geom_conaffinity[taken_away] = 0
+    rng, data = np.random.default_rng(check_seed("seed", seed)), mujoco.MjData(plant.model)
+    spread = check_number("spread", spread, at_least=0.0)
+    if settle is None:
+        settle = 0.5 if 2 * len(plant.qvel) > n else 0.0
+    waiting = check_number("settle", settle, at_least=0.0) / plant.timestep
+    samples = check_count("samples", samples, at_most=100_000)
+    if not samples * (waiting + substeps) <= MOST_STEPS:
+        raise InputError(
+            f"samples: got {samples}, which are {samples * (waiting + substeps):.3g} physics steps in all, want at most"
+            f" {MOST_STEPS}: fewer samples, or a shorter period and time to settle"
+        )
+    waiting, tolerance = round(waiting), check_number("tolerance", tolerance, above=0.0)
+    found, touching = [], Counter[tuple[str, str]]()
+    with unlogged():
+        for _ in range(samples):
+            state, control = middle + spread * rng.normal(size=n), rng.uniform(low, high)
+            mujoco.mj_resetData(plant.model, data)
+            data.qpos[plant.qpos], data.qvel[plant.qvel] = robot.configuration(state)
+            data.ctrl[plant.ctrl] = robot.actuation(control)
+            for _ in range(waiting):
+                mujoco.mj_step(plant.model, data)
+            before = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=state)
+            touched: set[tuple[str, str]] = set()
+            for _ in range(substeps):
+                mujoco.mj_step(plant.model, data)
+                touched |= _touching(plant, data)
+            touching.update(touched)
+            if any(data.warning[kind].number for kind in UNSTABLE):
+                raise InputError(
+                    f"scene {scene.name}: got a simulation that becomes unstable from"
+                    f" x = {np.array2string(state, precision=3)}, u = {np.array2string(control, precision=3)},"
+                    " want a smaller timestep, other states (around, spread) or other controls"
+                )
+            predicted = dynamics.step(before, control, period)
+            simulated = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=predicted)
+            found.append((before, control, simulated, predicted))
+    errors = np.array([np.abs(simulated - predicted) for _, _, simulated, predicted in found])
+    changes = np.array([np.abs(predicted - before) for before, _, _, predicted in found])
+    state, control, simulated, predicted = found[0]
+    check = PlantCheck(
+        names=dynamics.state_coordinates.names, units=dynamics.state_coordinates.units, errors=errors.max(axis=0),
+        changes=changes.max(axis=0), period=period, state=state, control=control, simulated=simulated,
+        predicted=predicted, tolerance=tolerance,
+        samples=len(found), contacts=tuple((*pair, count) for pair, count in touching.most_common()),
+    )  # fmt: skip
+    at = int(errors[:, check.names.index(check.worst)].argmax())
+    state, control, simulated, predicted = found[at]
+    return replace(check, state=state, control=control, simulated=simulated, predicted=predicted)
+
+
+def _touching(plant: Plant, data: mujoco.MjData) -> set[tuple[str, str]]:
+    """The pairs of geoms that touch, of which one is the robot's or of what it is attached to."""
+    model = plant.model
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[plant.body]
+    pairs = {tuple(sorted(contact.geom.tolist())) for contact in data.contact if contact.efc_address >= 0}
+    return {(_name(model, a), _name(model, b)) for a, b in pairs if own[a] or own[b]}
+
+
+def _name(model: mujoco.MjModel, geom: int) -> str:
+    """The geom's name, or that of its body with its number, if it has none."""
+    body = model.body(int(model.geom_bodyid[geom])).name
+    return model.geom(geom).name or f"geom {geom}" + (f" of {body}" if body else "")

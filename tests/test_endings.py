@@ -1,0 +1,564 @@
+"""How a trial ends: one answer everywhere, judged by the goal, for robots with a position and without one."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tracking import hover, track
+
+import lqrsim as ls
+from lqrsim.cli import main
+from lqrsim.errors import InputError
+from lqrsim.robots.base import Robot
+from lqrsim.scenes import scene_from_xml
+from lqrsim.simulation.controllers import Control, Controller, Feedback
+from lqrsim.simulation.outcomes import OUTCOMES, Outcomes, outcomes
+from lqrsim.simulation.plant import Plant
+from lqrsim.stress import trials
+from lqrsim.stress.campaign import Campaign, run_campaign
+from lqrsim.stress.results import Results, differences, replay
+from lqrsim.target import OF_RANGE, Target, endings
+
+ARM = """<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="2 2 0.1" pos="0 0 -0.5"/>
+    <geom name="post" type="cylinder" size="0.05 0.5" pos="0.5 0.5 0"/>
+    <body name="arm">
+      <joint name="shoulder" type="hinge" axis="0 0 1" damping="1"/>
+      <geom type="capsule" fromto="0 0 0 1 0 0" size="0.03" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="torque" joint="shoulder" ctrlrange="-5 5"/></actuator>
+</mujoco>"""
+
+CART_POLE = """<mujoco>
+  <option timestep="0.01" integrator="RK4"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="9 9 0.1" pos="0 0 -0.2"/>
+    <body name="cart">
+      <joint name="slide" type="slide" axis="1 0 0"/>
+      <geom type="box" size="0.1 0.1 0.05" mass="1" contype="0" conaffinity="0"/>
+      <body name="pole">
+        <joint name="hinge" type="hinge" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0.1 0 0 0.6" size="0.02" mass="0.1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="slide" ctrlrange="-20 20"/></actuator>
+</mujoco>"""
+
+
+class Jointed(Robot):
+    """A robot whose states are its joints' positions and speeds, and none of them a position in the world."""
+
+    radius = 0.1
+
+    def state(self, qpos, qvel, near=None):
+        state = np.concatenate([qpos, qvel], axis=-1)
+        return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
+
+    def configuration(self, state):
+        qpos, qvel = np.split(np.asarray(state, dtype=float), 2, axis=-1)
+        return qpos, qvel
+
+
+@dataclass(frozen=True)
+class Arm(Jointed):
+    name = "arm"
+    body = "arm"
+    joints = ("shoulder",)
+    actuators = ("torque",)
+
+    @cached_property
+    def dynamics(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return ls.Dynamics(
+            lambda x, u, p: [x[1], (u[0] - x[1]) / 0.34],
+            states={"angle": "rad", "rate": "rad/s"}, controls={"torque": "N m"}, angles=("angle",),
+            control_limits=(-5, 5),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class CartPole(Jointed):
+    name = "cart_pole"
+    body = "cart"
+    joints = ("slide", "hinge")
+    actuators = ("push",)
+
+    @cached_property
+    def dynamics(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return ls.Dynamics(  # about the upright pole, which is all that these tests plan for
+            lambda x, u, p: [x[2], x[3], u[0], 20 * x[1] - 2 * u[0]],
+            states={"x": "m", "angle": "rad", "v": "m/s", "rate": "rad/s"}, controls={"push": "N"}, angles=("angle",),
+            control_limits=(-20, 20),
+        )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def arm() -> Plant:
+    return Plant(Arm(), scene_from_xml(ARM, "bench"))
+
+
+@pytest.fixture(scope="module")
+def swing(arm: Plant) -> ls.Solution:
+    """From 0 to a little over half a turn, past the post at an eighth of a turn."""
+    solution = track(arm.robot, (0.0, 0.0), np.full((40, 1), 2.0), 0.05, feedback=False)
+    return replace(solution, goal=np.array([solution.trajectory.states[-1, 0], np.nan]))
+
+
+@pytest.fixture(scope="module")
+def cage(quadrotor: ls.Scenario) -> Plant:
+    return quadrotor.plant()
+
+
+# Robots without a position.
+
+
+@pytest.mark.parametrize("contacts", [True, False])
+def test_an_arm_that_is_stuck_on_a_post_has_collided_with_it(arm: Plant, swing: ls.Solution, contacts: bool) -> None:
+    rollout = ls.simulate(arm, swing, contacts=contacts)
+    assert rollout.outcome == ("collided",)
+    assert rollout.obstacles == ("post",)
+    # The post's near side is at asin((0.05 + 0.03) / |(0.5, 0.5)|) before an eighth of a turn; a step is 0.03 rad.
+    touch = np.pi / 4 - np.arcsin(0.08 / np.sqrt(0.5))
+    at = np.interp(rollout.collided_at[0], rollout.times, rollout.states[0, :, 0])
+    assert touch - 0.03 < at < touch + 0.06
+    assert rollout.tracking_unit == rollout.target.unit == OF_RANGE
+    line = rollout.summary().splitlines()[-1]
+    assert "collided with post" in line
+    assert line.split(";")[1].endswith(OF_RANGE)  # and not in metres
+    if contacts:
+        assert rollout.states[0, -1, 0] < np.pi / 4  # stopped
+        assert rollout.contacts[0] > 20
+    else:
+        assert rollout.states[0, -1, 0] > np.pi / 2
+        assert rollout.contacts[0] == 0
+    assert not arm.enclosed
+
+
+def test_contacts_that_are_only_felt_change_no_bit_and_miss_none(arm: Plant, swing: ls.Solution) -> None:
+    """Against MuJoCo's own loop over the model without the obstacle, and its collisions in the model with it."""
+    rollout = ls.simulate(arm, swing, contacts=False)
+    free, solid = arm.without_contacts, arm.model
+    data, probe = mujoco.MjData(free), mujoco.MjData(solid)
+    first = None
+    for step in range(40):
+        np.testing.assert_array_equal(rollout.states[0, step], [*data.qpos, *data.qvel])
+        data.ctrl[:] = rollout.applied[0, step]
+        for sub in range(5):
+            probe.qpos[:] = data.qpos
+            mujoco.mj_forward(solid, probe)
+            if probe.ncon and first is None:
+                first = 0.05 * step + 0.01 * sub
+            mujoco.mj_step(free, data)
+    assert rollout.collided_at[0] == pytest.approx(first, abs=1e-9)
+
+
+def test_an_arm_that_gets_there_has_reached_it_and_one_that_does_not_has_not(arm: Plant, swing: ls.Solution) -> None:
+    """Scaled error by hand: the angle's range along the plan, a state without weight left out."""
+    clear = Plant(Arm(), scene_from_xml(ARM.replace('pos="0.5 0.5 0"', 'pos="-3 0 0"'), "bench"))
+    rollout = ls.simulate(clear, swing)
+    angle, plan = rollout.states[0, -1, 0], rollout.plan.states[:, 0]
+    assert rollout.goal_distance[0] == pytest.approx(abs(angle - plan[-1]) / np.ptp(plan), rel=1e-12)
+    assert rollout.outcome == ("reached",)
+    # Whole turns are taken out; so is what the plan is told of how near counts.
+    turned = replace(swing, goal=np.array([plan[-1] + 2 * np.pi, np.nan]))
+    assert ls.simulate(clear, turned).goal_distance[0] == pytest.approx(rollout.goal_distance[0], abs=1e-12)
+    strict = ls.simulate(clear, swing, goal_tolerance=0.5 * rollout.goal_distance[0])
+    assert strict.outcome == ("timed out",)
+    assert outcomes(rollout, goal_tolerance=0.5 * rollout.goal_distance[0]).outcome.tolist() == ["timed out"]
+    with pytest.raises(InputError, match=r"^goal_radius: got 0.1, want goal_tolerance.*angle, rate$"):
+        ls.simulate(clear, swing, goal_radius=0.1)
+
+
+def test_a_cart_pole_that_has_fallen_has_not_reached_its_goal() -> None:
+    plant = Plant(CartPole(), scene_from_xml(CART_POLE.replace("0 0 -0.2", "0 0 -0.7"), "rail"))  # out of reach
+    plan = track(plant.robot, np.zeros(4), np.zeros((25, 1)), 0.05)
+    plan = replace(plan, goal=np.zeros(4))
+    held = ls.simulate(plant, plan, disturbances=[ls.InitialStateError((0, 0.02, 0, 0))])
+    assert held.outcome == ("reached",)
+    fallen = ls.simulate(plant, plan.open_loop(), disturbances=[ls.InitialStateError((0, 0.02, 0, 0))])
+    assert abs(fallen.states[0, -1, 1]) > 1
+    assert fallen.outcome == ("timed out",)
+    assert fallen.tracking_error.max() > 1
+    assert "0 of 1 trials reached the goal" in fallen.tally()
+
+
+@pytest.mark.parametrize("contacts", [True, False])
+def test_the_floor_is_an_obstacle_of_what_cannot_stand_on_it(contacts: bool) -> None:
+    plant = Plant(CartPole(), scene_from_xml(CART_POLE, "rail"))
+    assert plant.obstacles == ("floor",)
+    plan = track(plant.robot, np.zeros(4), np.zeros((60, 1)), 0.05)
+    fallen = ls.simulate(
+        plant, plan.open_loop(), disturbances=[ls.InitialStateError((0, 0.02, 0, 0))], contacts=contacts
+    )
+    assert (fallen.outcome, fallen.obstacles) == (("collided",), ("floor",))
+    # The pole's tip, 0.6 m from the hinge and 2 cm thick, is then on the floor, 0.2 m below the hinge.
+    touch, at = np.arccos(-0.18 / 0.6), round(fallen.collided_at[0] / 0.05 - 0.5)
+    assert (np.abs(fallen.states[0, : at + 1, 1]) < touch).all()
+    if contacts:
+        assert abs(fallen.states[0, -1, 1]) == pytest.approx(touch, abs=1e-3)  # it lies there
+    else:
+        assert abs(fallen.states[0, at + 1, 1]) > touch
+
+
+def test_what_can_sink_to_the_floor_stands_on_it() -> None:
+    slide = '<joint name="slide" type="slide" axis="1 0 0"/>'
+    lifted = CART_POLE.replace(slide, slide + '<joint name="up" type="slide" axis="0 0 1"/>')
+
+    @dataclass(frozen=True)
+    class Lifted(CartPole):
+        joints = ("slide", "up", "hinge")
+
+        def state(self, qpos, qvel, near=None):
+            return super().state(qpos[..., [0, 2]], qvel[..., [0, 2]], near)
+
+        def configuration(self, state):
+            qpos, qvel = (np.insert(part, 1, 0.0, axis=-1) for part in super().configuration(state))
+            return qpos, qvel
+
+    assert Plant(Lifted(), scene_from_xml(lifted, "rail")).obstacles == ()
+
+
+# Judged by the goal.
+
+
+def short(by: float) -> ls.Solution:
+    """A plan that ends so far from its goal."""
+    plan = hover()
+    goal = plan.trajectory.states[-1] + np.array([by, *np.zeros(11)])
+    return replace(plan, goal=goal, goal_radius=0.3)
+
+
+def test_a_plan_that_stops_short_of_its_goal_does_not_reach_it_and_says_so(cage: Plant) -> None:
+    solution = short(1.9)
+    rollout = ls.simulate(cage, solution, trials=2)
+    assert rollout.outcome == ("timed out",) * 2
+    np.testing.assert_allclose(rollout.goal_distance, 1.9, atol=1e-3)
+    for text in (str(solution), rollout.summary()):
+        assert "the plan ends 1.9 m from the goal" in text
+        assert "the plan MISSES the goal: it ends 1.6 m outside 0.3" in text
+    assert rollout.tally() == "0 of 2 trials reached the goal"
+    assert outcomes(rollout).goal == pytest.approx(rollout.goal_distance)
+    near = ls.simulate(cage, short(0.2))
+    assert near.outcome == ("reached",)
+    assert "MISSES" not in near.summary()
+    assert ls.simulate(cage, short(0.2), goal_radius=0.1).outcome == ("timed out",)
+    with pytest.raises(InputError, match=r"^goal_tolerance: got 0\.1, want goal_radius, in metres"):
+        ls.simulate(cage, solution, goal_tolerance=0.1)
+
+
+def test_without_a_goal_it_is_the_end_of_the_plan_and_is_called_so(cage: Plant) -> None:
+    rollout = ls.simulate(cage, hover())
+    assert rollout.outcome == ("reached",)
+    assert "the plan's end stands in for it" in rollout.summary()
+    assert "from the plan's end" in rollout.summary()
+    assert rollout.tally() == "1 of 1 trials reached the plan's end"
+
+
+def test_what_the_final_cost_gives_no_weight_does_not_count(quadrotor: ls.Scenario) -> None:
+    problem = quadrotor.problem
+    weight = np.array([500.0, 0.0, 500.0, *np.zeros(9)])
+    goal = replace(problem, final_cost=ls.QuadraticCost(weight, about=np.arange(12.0))).weighed_goal
+    np.testing.assert_array_equal(goal, [0.0, np.nan, 2.0, *[np.nan] * 9])
+    space = problem.dynamics.state_coordinates
+    target = Target(space, goal, np.zeros((2, 12)))
+    assert target.distance(np.array([3.0, 99.0, 6.0, *np.full(9, 7.0)])) == 5
+    assert replace(problem, final_cost=ls.QuadraticCost(np.zeros(12), about=np.ones(12))).weighed_goal is None
+    speed = replace(problem, final_cost=ls.QuadraticCost([0.0] * 3 + [1.0] * 3 + [0.0] * 6, about=np.ones(12)))
+    assert Target(space, speed.weighed_goal, np.zeros((2, 12))).unit == OF_RANGE
+
+
+def test_a_solution_and_its_files_keep_the_goal(quadrotor_solution: ls.Solution, cage: Plant, tmp_path) -> None:
+    solution = quadrotor_solution
+    assert solution.goal is not None
+    away = np.linalg.norm(solution.trajectory.states[-1, :3] - solution.goal[:3])
+    assert f"the plan ends {away:.3g} m from the goal" in solution.summary()
+    again = ls.load_solution(ls.save(solution, tmp_path / "solution.npz"))
+    np.testing.assert_array_equal(again.goal, solution.goal)
+    assert again.goal_radius == solution.goal_radius == 0.3
+    half = replace(short(1.9), goal=np.array([1.0, *[np.nan] * 11]))
+    rollout = ls.simulate(cage, half, disturbances=[ls.ForceNoise(2.0)], trials=4)
+    loaded = ls.load_rollout(ls.save(rollout, tmp_path / "rollout.npz"))
+    assert loaded.outcome == rollout.outcome
+    assert loaded.obstacles == rollout.obstacles
+    np.testing.assert_array_equal(loaded.goal, half.goal)
+    assert loaded.summary() == rollout.summary()
+
+
+# The first event ends a trial.
+
+
+def test_what_hits_something_and_then_blows_up_has_collided_everywhere(cage: Plant) -> None:
+    """Thrown at a wall, and out of the world two seconds later."""
+    push = [ls.Push((3.0, 0.0, 0.0), at=0.0), ls.Push((1e12, 0.0, 0.0), at=1.5)]
+    for contacts in (True, False):
+        rollout = ls.simulate(cage, hover(), disturbances=push, contacts=contacts)
+        assert np.isfinite(rollout.diverged_at[0])
+        assert rollout.outcome == ("collided",)
+        assert (rollout.collided[0], rollout.diverged[0]) == (True, False)
+        assert outcomes(rollout).outcome.tolist() == ["collided"]
+        assert outcomes(rollout).ended[0] == rollout.collided_at[0] < rollout.diverged_at[0]
+        assert "collided with" in rollout.summary()
+    lost = ls.simulate(cage, hover(), disturbances=[ls.ForceNoise(1e300)], trials=2)
+    assert set(lost.outcome) <= {"diverged", "collided"}
+    assert lost.summary()  # whatever the strength
+
+
+def test_a_collision_between_two_knots_is_one(cage: Plant) -> None:
+    """At 20 m/s over a bar: no knot is within it, the line between two is, along a chord that is worked out by hand."""
+    speed, plan = 20.0, hover(3)
+    # Bar x1 lies along x at y = z = -1.25, radius 0.4; the robot's is 0.3. It flies along y, 0.69 m above its axis.
+    start = np.array([0.0, -1.25 - 1.5 * speed / 30, -1.25 + 0.69, 0.0, speed, *np.zeros(7)])
+    states = np.array([start + np.array([0.0, speed * t, *np.zeros(10)]) for t in plan.trajectory.times])
+    plan = replace(plan, trajectory=replace(plan.trajectory, states=states)).open_loop()
+    for contacts in (True, False):
+        rollout = ls.simulate(cage, plan, contacts=contacts)
+        assert rollout.outcome == ("collided",)
+        assert rollout.obstacles == ("bar_x1",)
+        y, height = (np.interp(rollout.collided_at[0], rollout.times[:3], rollout.states[0, :3, i]) for i in (1, 2))
+        if not contacts:
+            assert (rollout.clearance >= 0).all()
+            chord = np.sqrt(0.7**2 - (height + 1.25) ** 2)
+            assert -1.25 - chord <= y <= -1.25 - chord + 0.02 * 0.3 + 1e-3
+
+
+@given(
+    st.lists(
+        st.tuples(*[st.sampled_from([0.0, 0.5, 1.0, 1.5, np.inf])] * 3, st.sampled_from([0.0, 0.1, 0.2, np.nan])),
+        min_size=1, max_size=9,
+    )
+)  # fmt: skip
+def test_the_first_event_ends_a_trial(rows: list[tuple[float, float, float, float]]) -> None:
+    collided, diverged, failed, distance = (np.array(column) for column in zip(*rows, strict=True))
+    outcome, ended = endings(
+        collided_at=collided, diverged_at=diverged, failed_at=failed, distance=distance, radius=0.1, horizon=2.0
+    )
+    for one, when, (hit, lost, erred, away) in zip(outcome, ended, rows, strict=True):
+        first = min(hit, lost, erred)
+        if first == np.inf:
+            assert (one, when) == ("reached" if away <= 0.1 else "timed out", 2.0)
+        else:
+            assert when == first
+            assert {"collided": hit, "diverged": lost, "error": erred}[one] == first
+
+
+def by_hand(rollout: ls.Rollout, table: Outcomes, k: int) -> None:
+    """A row of the table from the rollout's records, in the plainest way."""
+    first = min(rollout.collided_at[k], rollout.diverged_at[k], rollout.failed_at[k])
+    last = [step for step in range(rollout.plan.steps + 1) if step == 0 or rollout.times[step] < first]
+    last = list(range(rollout.plan.steps + 1)) if first == np.inf else last
+    error = np.linalg.norm(rollout.states[k, last, :3] - rollout.plan.states[last, :3], axis=1)
+    assert table.worst[k] == pytest.approx(error.max(), rel=1e-12)
+    assert table.rms[k] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
+    total = 0.0
+    for step in range(rollout.plan.steps):
+        begun = rollout.times[step]
+        if begun < first:
+            total += min(rollout.plan.dt, first - begun) * float(np.sum(rollout.applied[k, step] ** 2))
+    assert table.effort[k] == pytest.approx(total, rel=1e-9)
+    assert table.ended[k] == min(first, rollout.plan.horizon)
+
+
+@settings(max_examples=25)
+@given(
+    st.sampled_from([0.0, 0.5, 2.0, 1e6, 1e13]), st.sampled_from([0.0, 1.9]), st.integers(0, 1000), st.booleans(),
+    st.sampled_from([1, 5]),
+)  # fmt: skip
+def test_table_and_rollout_agree(force: float, by: float, seed: int, contacts: bool, trials: int) -> None:
+    plant = Plant(ls.Quadrotor(), ls.load_scene("cage"))
+    noise = [ls.ForceNoise(force)]
+    rollout = ls.simulate(plant, short(by), disturbances=noise, seed=seed, trials=trials, contacts=contacts)
+    other = ls.simulate(
+        plant, short(by), disturbances=noise, seed=seed, trials=trials, contacts=not contacts, frames=False
+    )
+    table = outcomes(rollout)
+    assert tuple(table.outcome) == rollout.outcome
+    assert set(rollout.outcome) <= set(OUTCOMES)
+    for flag, name in ((rollout.reached, "reached"), (rollout.collided, "collided"), (rollout.diverged, "diverged")):
+        np.testing.assert_array_equal(flag, table.outcome == name)
+    for k in range(trials):
+        by_hand(rollout, table, k)
+    for name, column in outcomes(other).columns().items():
+        assert column.tobytes() == table.columns()[name].tobytes(), name
+
+
+# The same in a campaign, in a replay, and in a rollout.
+
+ROUGH = Campaign(
+    scenario="quadrotor",
+    sweeps={"scenario": ls.scenarios.quadrotor().disturbances},
+    strengths=(0.0, 1.4),
+    policies=("smooth",),
+    trials=300,
+)
+
+
+@pytest.fixture(scope="module")
+def rough(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    return run_campaign(ROUGH, tmp_path_factory.mktemp("rough") / "out", workers=0)
+
+
+def test_a_row_is_what_a_rollout_with_contacts_and_a_replay_say(rough: Results, cage: Plant) -> None:
+    cell = rough.cells[1]
+    table = rough.outcomes(cell)
+    rollout = ls.simulate(
+        cage, rough.solution("smooth"), disturbances=ROUGH.disturbances(cell), trials=300, frames=False
+    )
+    again = rough.trials.outcomes(rollout)
+    assert (table.outcome == "collided").sum() >= 3
+    for name, column in again.columns().items():
+        np.testing.assert_array_equal(column, table.columns()[name], err_msg=name)
+    for trial in np.flatnonzero(table.outcome == "collided")[:5]:
+        solid = replay(rough, cell, int(trial))
+        assert differences(rough, cell, int(trial), solid) == []
+        assert solid.outcome == ("collided",)
+        assert solid.obstacles == (table.obstacle[trial],)
+
+
+def test_a_replay_says_what_differs(rough: Results) -> None:
+    cell = rough.cells[1]
+    other = replay(rough, cell, 1)
+    found = differences(rough, cell, 0, other)
+    assert any(line.startswith("worst: ") for line in found)
+
+
+def test_at_strength_0_there_is_one_run_and_no_interval(rough: Results) -> None:
+    calm, windy = rough.summary().splitlines()[1:3]
+    assert "300/300 deterministic: 1 run" in calm
+    assert "[" not in calm
+    assert "[" in windy
+    assert "smooth: the plan ends 0.0654 m from the goal" in rough.summary()
+
+
+# Controllers that fail.
+
+
+class Failing(Controller):
+    """Follows the policy, and fails at step 7 in a way of its own, wherever a trial is further left than another."""
+
+    def __init__(self, solution: ls.Solution, how: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
+        self.policy, self.how = Feedback(solution.policy), how
+
+    def start(self, trials: int) -> Control:
+        control = self.policy.start(trials)
+        return lambda step, shown: self.how(shown, control(step, shown)) if step == 7 else control(step, shown)
+
+    @property
+    def digest(self) -> str:
+        return "failing"
+
+    @property
+    def spaces(self):
+        return self.policy.spaces
+
+
+def raising(shown: np.ndarray, command: np.ndarray) -> np.ndarray:
+    raise ZeroDivisionError("two\nlines")
+
+
+def one_nan(shown: np.ndarray, command: np.ndarray) -> np.ndarray:
+    command[int(np.argmax(shown[:, 0])), 2] = np.nan
+    return command
+
+
+@pytest.mark.parametrize(
+    ("how", "failed", "why"),
+    [
+        (raising, 3, "ZeroDivisionError: two lines"),
+        (lambda shown, command: command[:, :3], 3, "InputError: got controls of shape (3, 3), want (3, 4)"),
+        (lambda shown, command: None, 3, "InputError: got"),
+        (lambda shown, command: "none", 3, "InputError: got 'none', want controls of shape (3, 4)"),
+        (one_nan, 1, "got nan for rotor_3, want a finite number"),
+    ],
+)
+def test_a_controller_that_fails_ends_its_trials_and_says_why(cage: Plant, how, failed: int, why: str) -> None:
+    noise, plan = [ls.ForceNoise(0.1)], hover()
+    calm = ls.simulate(cage, plan, disturbances=noise, trials=3)
+    rollout = ls.simulate(cage, plan, controller=Failing(plan, how), disturbances=noise, trials=3)
+    assert rollout.outcome.count("error") == failed
+    for k, outcome in enumerate(rollout.outcome):
+        until = 8 if outcome == "error" else len(rollout.times)
+        np.testing.assert_array_equal(rollout.states[k, :until], calm.states[k, :until])
+        assert np.isnan(rollout.states[k, until:]).all()
+        if outcome == "error":
+            assert rollout.failed_at[k] == pytest.approx(7 / 30)
+            assert rollout.reasons[k].startswith(f"controller at 0.2333 s: {why}")
+            assert f"trial {k}: error after 0.23 s: controller at" in rollout.summary()
+            assert np.isnan(rollout.applied[k, 7:]).all()
+    assert outcomes(rollout).outcome.tolist() == list(rollout.outcome)
+    assert len(rollout.frame_times) == rollout.frames.shape[1]
+
+
+def some(shown: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """Fails, whatever runs beside it, where a trial is to one side; a batch with such a trial fails as a whole."""
+    if (shown[:, 0] > FAR).any():
+        raise ValueError("too far to the side")
+    return command
+
+
+FAR = -2.2  # m; about half of the trials are beyond it at the seventh step
+
+
+def test_in_a_campaign_only_those_trials_fail_that_fail_alone(
+    rough: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = replace(ROUGH, strengths=(1.4,), trials=12)
+    alone = rough.trials.run(rough.cells[1], 0, 12, frames=False, contacts=False)
+    beyond = alone.measured[:, 7, 0] > np.median(alone.measured[:, 7, 0])
+    monkeypatch.setitem(globals(), "FAR", float(np.median(alone.measured[:, 7, 0])))
+    monkeypatch.setattr(trials.Trials, "_controller", lambda own, policy: Failing(own.solutions[policy], some))
+    files = []
+    for batch in (12, 5):
+        results = run_campaign(campaign, tmp_path / str(batch), workers=0, batch=batch)
+        table = results.outcomes(results.cells[0])
+        np.testing.assert_array_equal(table.outcome == "error", beyond)
+        assert set(results.reasons(results.cells[0]).values()) == {
+            "controller at 0.2333 s: ValueError: too far to the side"
+        }
+        files.append([path.read_bytes() for path in sorted((tmp_path / str(batch) / "shards").iterdir())])
+    assert files[0] == files[1]
+
+
+def test_simulate_says_how_many_reached_the_goal_and_that_a_plan_misses_it(
+    quadrotor_solution: ls.Solution, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = str(ls.save(replace(quadrotor_solution, scenario="quadrotor"), tmp_path / "solution.npz"))
+    assert main(["simulate", path, "--trials", "3"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "3 of 3 trials reached the goal"
+    assert main(["simulate", path, "--trials", "3", "--goal-radius", "0.01"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "0 of 3 trials reached the goal"
+    assert "  the plan MISSES the goal: it ends 0.0554 m outside 0.01" in lines
+    assert main(["simulate", path, "--goal-tolerance", "0.1"]) == 2
+    assert "want goal_radius, in metres" in capsys.readouterr().err
+
+
+def test_parts_that_stick_out_of_the_radius_collide_too(cage: Plant) -> None:
+    """The packaged ball of 0.3 m with a radius of 0.2: contacts are felt, at the states at which MuJoCo has them."""
+    assert cage.enclosed
+    plant = Plant(ls.Quadrotor(radius=0.2), cage.scene)
+    assert not plant.enclosed
+    noise = [ls.ForceNoise(10.0), ls.DisplacedObstacles(0.05), ls.MassMismatch(0.05)]
+    runs = {c: ls.simulate(plant, hover(), disturbances=noise, trials=8, contacts=c) for c in (True, False)}
+    free, solid = runs[False], runs[True]
+    assert free.collided.sum() >= 4
+    for name, column in outcomes(solid).columns().items():
+        assert column.tobytes() == outcomes(free).columns()[name].tobytes(), name
+    np.testing.assert_array_equal(free.states[free.counts], solid.states[free.counts])
+    for k in np.flatnonzero(free.collided):
+        # Each bar, wall and floor by its own distance, where the trial has it; a period is one physics step.
+        moved = free.displaced[k]
+        near = [
+            min(plant.world.distances(place - moved[i])[i] for i in range(len(moved))) - 0.3
+            for place in free.states[k, :, :3]
+        ]
+        assert free.collided_at[k] == free.times[np.argmax(np.array(near) < 0)]
+        assert solid.contacts[k] > 0

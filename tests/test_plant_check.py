@@ -1,0 +1,107 @@
+"""What `check_plant` takes away, what it leaves, and that it says so."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pytest
+from planar_quadrotor import BLOCK, PlanarQuadrotor, mjcf
+
+import lqrsim as ls
+from lqrsim.scenes import scene_from_xml
+
+MASS, LENGTH, GRAVITY = 0.4, 0.5, 9.81
+
+
+@dataclass(frozen=True)
+class Arm(ls.Robot):
+    """A rod that a motor swings, with a ball at its end: nothing of it is a position."""
+
+    radius: float = 0.1
+    length: float = LENGTH  # m
+
+    name = "arm"
+    body = "arm"
+    joints = ("shoulder",)
+    actuators = ("motor",)
+
+    @cached_property
+    def dynamics(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        def rate(x, u, p):
+            from sympy import sin
+
+            return [x[1], u[0] / (p.mass * p.length**2) - p.gravity / p.length * sin(x[0])]
+
+        return ls.Dynamics(
+            rate,
+            states={"angle": "rad", "speed": "rad/s"},
+            controls={"torque": "N m"},
+            parameters={"mass": MASS, "gravity": GRAVITY, "length": self.length},
+            angles=("angle",),
+            control_limits=(-3, 3),
+        )
+
+    def state(self, qpos, qvel, near=None):
+        return np.concatenate([qpos, qvel], axis=-1)
+
+    def configuration(self, state):
+        return np.asarray(state)[..., :1], np.asarray(state)[..., 1:]
+
+
+def arm(things: str) -> ls.Scene:
+    return scene_from_xml(
+        f"""
+<mujoco><option timestep="0.005" integrator="RK4" gravity="0 0 -{GRAVITY}"/>
+  <worldbody>{things}
+    <body name="arm" pos="0 0 0.5"><joint name="shoulder" type="hinge" axis="0 -1 0"/>
+      <inertial pos="0 0 -{LENGTH}" mass="{MASS}" diaginertia="1e-9 1e-9 1e-9"/>
+      <geom name="fist" size="0.1" pos="0 0 -{LENGTH}"/></body>
+  </worldbody>
+  <actuator><motor name="motor" joint="shoulder"/></actuator>
+</mujoco>""",
+        "bench",
+    )
+
+
+POSTS = (
+    '<geom name="post" type="cylinder" size="0.1 1" pos="0.25 0 0.5"/><geom type="box" size="0.1 1 1" pos="-0.3 0 0"/>'
+)
+FLOOR = '<geom name="floor" type="plane" size="1 1 1" pos="0 0 0.05"/>'
+
+
+def test_an_arm_between_posts_and_on_a_floor_that_it_reaches_agrees() -> None:
+    found = ls.check_plant(Arm(), arm(POSTS + FLOOR))
+    assert found.good, found
+    assert found.contacts == ()
+    assert not ls.check_plant(Arm(length=0.6), arm(POSTS + FLOOR)).good
+
+
+def test_a_planar_quadrotor_over_a_floor_among_obstacles_agrees() -> None:
+    floor = '<geom name="floor" type="plane" size="1 1 1"/>'  # on which half of the states lie
+    found = ls.check_plant(PlanarQuadrotor(), scene_from_xml(mjcf(BLOCK + floor), "planar"))
+    assert found.good, found
+    assert found.contacts == ()
+
+
+def test_contacts_that_stay_are_named() -> None:
+    """What can move is not taken away, here a heavy box on the way of the arm's fist."""
+    box = '<body pos="0.3 0 0"><freejoint/><geom type="box" size="0.12 0.3 0.3" mass="50"/></body>'
+    found = ls.check_plant(Arm(), arm(box + FLOOR), samples=30)
+    assert not found.good
+    (pair,) = found.contacts
+    assert pair[:2] == ("geom 1", "fist")
+    assert 0 < pair[2] < 30
+    assert f"touching in {pair[2]} of 30 samples: {pair[0]} and {pair[1]}" in str(found)
+
+
+def test_wheels_stay_on_their_floor_and_their_contacts_are_said() -> None:
+    found = ls.check_plant(ls.DifferentialDrive(), ls.load_scene("arena"), samples=10)
+    assert found.good
+    named = {name for a, b, _ in found.contacts for name in (a, b)}
+    assert {"floor", "create_tread_left", "create_tread_right"} <= named
+    assert not named & set(ls.Plant(ls.DifferentialDrive(), ls.load_scene("arena")).world.names)
+
+
+def test_a_simulation_that_becomes_unstable_is_told() -> None:
+    with pytest.raises(ls.InputError, match="scene bench: got a simulation that becomes unstable from x = "):
+        ls.check_plant(Arm(), arm(""), controls=((1e12,), (1e13,)))
