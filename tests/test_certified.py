@@ -158,7 +158,7 @@ class TestLimits:
         assert contradictions(drive, late) == []
 
     @pytest.mark.parametrize("bad", [0, -1, "1", float("nan"), float("inf")])
-    def test_a_time_limit_is_a_number_of_seconds(self, drive: ls.Problem, bad: object) -> None:
+    def test_a_time_limit_is_a_number_of_seconds(self, drive: ls.Problem, bad: Any) -> None:
         for solver in (ls.smooth, ls.ilqr):
             with pytest.raises(ls.InputError, match="time_limit: got"):
                 solver(drive, time_limit=bad)

@@ -47,7 +47,8 @@ def solve(drawn: Draw) -> list[ls.Solution]:
     if shift is None:
         return [solution]
     options.pop("starts", None)
-    return [solution, ls.smooth(drawn.problem, threads=1, **options | {"start": solution.shifted(shift)})]
+    options["start"] = solution.shifted(shift)
+    return [solution, ls.smooth(drawn.problem, threads=1, **options)]
 
 
 def _limited(rng: Generator, problem: ls.Problem) -> ls.Problem:
@@ -195,13 +196,13 @@ def planar_free(rng: Generator) -> ls.Problem:
 
 def _reweighed(rng: Generator, problem: ls.Problem) -> ls.Problem:
     """With weights of any size: where controls cost much, plans go through the wall, or stop before it."""
-    hover = problem.nominal_control
-    world = planar_quadrotor.world()
+    hover, goal, world = problem.nominal_control, problem.goal, planar_quadrotor.world()
+    assert goal is not None
     return replace(
         problem,
         stage_cost=ls.ControlCost(np.full(2, _weights(rng, 1, 0.1, 20.0)[0]), about=hover)
         + ls.ObstacleCost(world, radius=planar_quadrotor.RADIUS, sharpness=float(rng.choice([5.0, 10.0, 20.0]))),
-        final_cost=ls.QuadraticCost(np.full(6, _weights(rng, 1, 100.0, 1000.0)[0]), about=problem.goal),
+        final_cost=ls.QuadraticCost(np.full(6, _weights(rng, 1, 100.0, 1000.0)[0]), about=goal),
     )
 
 

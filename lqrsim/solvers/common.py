@@ -237,9 +237,11 @@ def iterate(
             clock = time.perf_counter()
             count, outcome, backward, failed = run(first, first + 1 if each else last)
             seconds = (time.perf_counter() - clock) / max(count - first, 1)
-            for i, (*numbers, method) in enumerate(log[first:count].tolist(), first):
+            for i, row in enumerate(log[first:count].tolist(), first):
+                cost, improvement, gap, optimality, residual, method = row
                 missed = look() if i == count - 1 or not problem.constraints else float("nan")
-                iterations.append(Iteration(*numbers, missed, seconds, _METHODS[int(method)]))
+                name = _METHODS[int(method)]
+                iterations.append(Iteration(cost, improvement, gap, optimality, residual, missed, seconds, name))
                 if callback is not None:
                     callback(iterations[-1])
             for function in functions:
