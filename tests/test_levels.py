@@ -100,7 +100,7 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("dynamics", "cost"), PAIRS)
-@pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
+@pytest.mark.parametrize("solver", [ls.ilqr])  # what it compiles takes a third of the time; the functions are the same
 def test_every_level_finds_the_same(solver, dynamics: str, cost: str) -> None:
     """To the rounding of central differences, 1e-9, where derivatives are such; exact ones agree to 1e-12."""
     want = solver(swing(DYNAMICS["symbolic"], COSTS["symbolic"]))
@@ -175,9 +175,9 @@ def test_helpers_of_numba_can_be_given_p() -> None:
     def using_a_helper(x, u, p):
         return x[1], u[0] / p.inertia - swing_back(x, p)
 
-    want = ls.smooth(swing(DYNAMICS["compiled"], COSTS["compiled"]))
+    want = ls.ilqr(swing(DYNAMICS["compiled"], COSTS["compiled"]))
     for level in ("compiled", "plain"):
-        found = ls.smooth(swing(ls.Dynamics(using_a_helper, level=level, **FIELDS), COSTS["compiled"]))
+        found = ls.ilqr(swing(ls.Dynamics(using_a_helper, level=level, **FIELDS), COSTS["compiled"]))
         assert found.cost == pytest.approx(want.cost, rel=1e-12)
 
 
@@ -186,18 +186,18 @@ def test_a_cost_must_name_all_that_it_depends_on() -> None:
     with pytest.raises(
         ls.InputError, match=r"bump\(x, u, p\): got a value that depends on speed, want it in depends_on"
     ):
-        ls.smooth(swing(DYNAMICS["plain"], forgetful))
+        ls.ilqr(swing(DYNAMICS["plain"], forgetful))
 
 
 def test_numbers_and_plain_functions_are_data() -> None:
     """Other goals, weights, parameters, lengths, and plain functions compile nothing."""
-    ls.smooth(swing(DYNAMICS["plain"], COSTS["compiled"]))
+    ls.ilqr(swing(DYNAMICS["plain"], COSTS["compiled"]))
     before = len(core.compilations)
     heavy = ls.Dynamics(pendulum, level="plain", **{**FIELDS, "parameters": {**FIELDS["parameters"], "inertia": 0.03}})
     other = ls.Dynamics(lambda x, u, p: [x[1], u[0] - x[0]], level="plain", **{**FIELDS, "parameters": {}})
     goal = ls.QuadraticCost([20.0, 2.0], about=[1.0, 0.0])
     costs = {
-        ls.smooth(problem).cost
+        ls.ilqr(problem).cost
         for problem in (
             swing(heavy, COSTS["compiled"]),
             swing(other, COSTS["compiled"]),
@@ -211,10 +211,10 @@ def test_numbers_and_plain_functions_are_data() -> None:
 @pytest.mark.parametrize("level", ["compiled here", "plain with Jacobian"])
 def test_a_problem_can_be_copied_and_sent_to_another_process(level: str) -> None:
     problem = swing(DYNAMICS[level], COSTS["plain with derivatives"])
-    want = ls.smooth(problem, max_iterations=2, safeguard=False)
+    want = ls.ilqr(problem, max_iterations=2)
     for other in (pickle.loads(pickle.dumps(problem)), copy.deepcopy(problem)):
         assert other.digest == problem.digest
-        np.testing.assert_array_equal(ls.smooth(other, max_iterations=2, safeguard=False).policy.gain, want.policy.gain)
+        np.testing.assert_array_equal(ls.ilqr(other, max_iterations=2).policy.gain, want.policy.gain)
 
 
 def test_what_a_plain_function_raises_ends_the_solve_with_its_words() -> None:
@@ -243,7 +243,7 @@ def test_ctrl_c_in_a_plain_function_stops_the_solve() -> None:
 
     dynamics = ls.Dynamics(interrupted, level="plain", **FIELDS)
     with pytest.raises(KeyboardInterrupt):
-        ls.smooth(swing(dynamics, COSTS["compiled"]))
+        ls.ilqr(swing(dynamics, COSTS["compiled"]))
     assert len(calls) == 101  # it was not called again
 
 
@@ -266,7 +266,7 @@ def test_ctrl_c_stops_plain_functions_in_other_threads() -> None:
     stopped = len(calls)
     time.sleep(0.05)
     assert len(calls) == stopped  # nothing runs on
-    assert ls.smooth(problems[1], max_iterations=1, safeguard=False).iterations  # and nothing is left stopped
+    assert ls.ilqr(problems[1], max_iterations=1).iterations  # and nothing is left stopped
 
 
 def _index(x, u, p):
@@ -330,13 +330,13 @@ def test_what_a_function_does_only_later_is_not_taken_for_numbers(level: str) ->
 )
 def test_bad_functions_get_one_line(level: str, function, fields: dict, message: str) -> None:
     with pytest.raises(ls.InputError, match=message) as caught:
-        ls.smooth(swing(ls.Dynamics(function, level=level, **FIELDS, **fields), COSTS["compiled"]))
+        ls.ilqr(swing(ls.Dynamics(function, level=level, **FIELDS, **fields), COSTS["compiled"]))
     assert "\n" not in str(caught.value)
 
 
 def test_what_numba_can_not_compile_gets_one_line() -> None:
     with pytest.raises(ls.InputError, match=r"_writes\(x, u, p\): got what numba can not compile, want .*readonly"):
-        ls.smooth(swing(ls.Dynamics(_writes, level="compiled", **FIELDS), COSTS["compiled"]))
+        ls.ilqr(swing(ls.Dynamics(_writes, level="compiled", **FIELDS), COSTS["compiled"]))
     with pytest.raises(ls.InputError, match="jacobian: got one for symbolic, which is symbolic, want none"):
         ls.Dynamics(symbolic, jacobian=pendulum_jacobian, **FIELDS)
     with pytest.raises(ls.InputError, match="level: got 'fast', want one of: symbolic, compiled, plain"):
@@ -363,9 +363,7 @@ def test_kinks_and_jumps_have_derivatives_almost_everywhere() -> None:
         assert value == pytest.approx(max(a, 0) ** 2 + abs(b) ** 3 + abs(b), rel=1e-14)
         np.testing.assert_allclose(gradient[:2], [2 * max(a, 0), 3 * b * abs(b) + np.sign(b)], rtol=0, atol=1e-12)
         np.testing.assert_allclose(hessian[:2, :2], np.diag([2.0 * (a > 0), 6 * abs(b)]), rtol=0, atol=1e-12)
-    assert np.isfinite(
-        ls.smooth(swing(DYNAMICS["symbolic"], cost), max_iterations=3, safeguard=False).cost
-    )  # and it compiles
+    assert np.isfinite(ls.ilqr(swing(DYNAMICS["symbolic"], cost), max_iterations=3).cost)  # and it compiles
 
 
 def test_a_cost_that_is_not_a_number_at_the_start_is_refused() -> None:
@@ -374,9 +372,8 @@ def test_a_cost_that_is_not_a_number_at_the_start_is_refused() -> None:
 
         return -log(x[0] - 5)
 
-    for solver in (ls.smooth, ls.ilqr):
-        with pytest.raises(ls.InputError, match=r"logarithm\(x, u, p\): got nan as its value at the start"):
-            solver(swing(DYNAMICS["symbolic"], ls.SymbolicCost(logarithm)))
+    with pytest.raises(ls.InputError, match=r"logarithm\(x, u, p\): got nan as its value at the start"):
+        ls.ilqr(swing(DYNAMICS["symbolic"], ls.SymbolicCost(logarithm)))
     with pytest.raises(ls.InputError, match="SymbolicCost: got the numba function bump, want FunctionCost"):
         ls.SymbolicCost(numba.njit(bump))
 

@@ -1,4 +1,4 @@
-"""A thousand random problems: whatever a solution claims of itself is so, and nearly all of them are solved.
+"""Random problems: whatever a solution claims of itself is so, and nearly all of them are solved.
 
 Claims are held against kkt.py, which shares nothing with the solvers.
 """
@@ -56,7 +56,7 @@ def problems() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def cases(problems: ModuleType) -> list[Case]:
-    drawn = list(problems.thousand())
+    drawn = list(problems.thousand(share=0.1))  # benchmark_reliability.py has all, test_whole_problems.py others
     solutions = ls.smooth_many([problem for _, problem in drawn])
     seen: Counter[str] = Counter()
     made = []

@@ -222,7 +222,7 @@ class TestWithoutAWay:
             ({"obstacles": (0.0, 1.5)}, "InitialPrior: obstacles: got .*, want numbers from 0 to 1"),
             ({"about": [[0.0, 0.0], [1.0]]}, "InitialPrior: about: got .*"),
             ({"controls": "none"}, "InitialPrior: controls: got 'none', want .*"),
-            ({"weight": (-1.0, 0.0)}, "InitialPrior: weight: got -1, want numbers >= 0"),
+            ({"weight": (-1.0, 0.0)}, r"InitialPrior: weight: got \[-1.0, 0.0\], want numbers >= 0"),
         ],
     )
     def test_priors_that_are_none_get_one_line(self, fields: dict[str, Any], message: str) -> None:

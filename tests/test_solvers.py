@@ -309,7 +309,7 @@ class TestMany:
         fixed = dataclasses.replace(good, initial=ls.FixedState((0, -2.5, np.pi)))
         with pytest.raises(ls.InputError, match=r"^problems\[1\]: initial: got a FixedState, want an initial cost"):
             ls.smooth_many([good, fixed], form="primal")
-        with pytest.raises(ls.InputError, match=r"^problems\[0\]: problem: got str, want a Problem"):
+        with pytest.raises(ls.InputError, match=r"^problems\[0\]: problem: got 'quadrotor', want a Problem"):
             ls.ilqr_many(["quadrotor"])  # pyright: ignore[reportArgumentType]
         with pytest.raises(ls.InputError, match=r"^threads: got 0, want a whole number >= 1"):
             ls.smooth_many([good], threads=0)
@@ -318,7 +318,7 @@ class TestMany:
             assert good.status is Status.CONVERGED
             assert lost.status is Status.NOT_FINITE
             assert "rate(x, u, p): got nan as entry 0 (x) at the start" in lost.detail
-        with pytest.raises(ls.InputError, match=r"^problem: got NoneType, want a Problem"):
+        with pytest.raises(ls.InputError, match=r"^problem: got None, want a Problem"):
             ls.smooth(None)  # pyright: ignore[reportArgumentType]
 
 

@@ -53,6 +53,8 @@ class Solve:
     """Relative change of the cost below which it has settled, and the measure of the other tests."""
     max_iterations: Annotated[int | None, optional("INT")] = None
     """Give up after so many. By default the solver's own limit."""
+    time_limit: Annotated[float | None, optional("SECONDS")] = None
+    """Give up after so long, compiling not counted, with the best plan so far. By default there is no limit."""
     starts: Annotated[int | None, optional("INT")] = None
     """How many ways to the goal smooth tries for a few iterations, to go on with the best. By default 7."""
     paper_start: bool = False
@@ -83,6 +85,8 @@ class Solve:
         options: dict[str, object] = {"stop": self.stop, "tolerance": self.tolerance}
         if self.max_iterations is not None:
             options["max_iterations"] = self.max_iterations
+        if self.time_limit is not None:
+            options["time_limit"] = self.time_limit
         if self.starts is not None or self.paper_start:
             if self.solver != "smooth":
                 raise InputError(f"--starts, --paper-start: got one for {self.solver}, want them with --solver smooth")

@@ -137,7 +137,8 @@ class Attempt:
             return found
         optimality = self.look_back()
         detail = f"{found.detail}; the plan is the best so far" if found.detail else "the plan is the best so far"
-        return self._about_plan(found.iterations, optimality, found.status, detail)
+        status = Status.MAX_ITERATIONS if found.status is Status.DIVERGED else found.status  # this plan has not
+        return self._about_plan(found.iterations, optimality, status, detail)
 
     def look_back(self) -> float:
         """Make policy and value functions about the plan in the memory; its optimality, NaN if that fails."""
@@ -154,7 +155,8 @@ class Attempt:
         damped = self.damp(before=found.iterations, each=each, callback=callback)
         if not np.isfinite(work.memory[interface.PLAN_COST]):
             # Nothing that was tried leads anywhere. What is left is how it failed.
-            return replace(found, detail=detail, iterations=damped.iterations, values={})
+            status = Status.DIVERGED if found.status is Status.MAX_ITERATIONS else found.status
+            return replace(found, status=status, detail=detail, iterations=damped.iterations, values={})
         status = damped.status
         if damped.outcome == interface.STALLED:
             status, detail = self.ending.status, f"{detail}; from the best plan, no step lowers the cost any more"

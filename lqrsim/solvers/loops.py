@@ -149,7 +149,8 @@ def cycling(log, done):
 def no_progress(log, done):
     """Whether the least cost so far has not fallen for NO_FALL iterations, or next to nothing for SLOW_FALL.
 
-    Costs that rise are no sign: the method passes through them on its way. Costs that swing about, or creep, are.
+    Costs that rise are no sign: the method passes through them on its way. Costs that swing about, or creep, are, and
+    costs that stay infinite.
     """
     least, reference, since, slow = inf, inf, 0, 0
     for i in range(done + 1):
@@ -160,7 +161,7 @@ def no_progress(log, done):
             since = 0
         if not least < inf:
             since = 0
-        if least < reference - 1e-3 * abs(reference) or not reference < inf:
+        if least < reference - 1e-3 * abs(reference) or (least < inf and not reference < inf):
             reference, slow = least, 0
     return since >= NO_FALL or slow >= SLOW_FALL
 
