@@ -160,7 +160,7 @@ def told(name: str, one: ls.Disturbance, plant: ls.Plant, found: dict[float, ls.
 def success(found: dict[float, ls.Outcomes]) -> list[tuple[float, list[float]]]:
     """Strength and exact interval of success, the weakest first."""
     return [
-        (strength, interval(analysis.success(ls.Cell("smooth", "", strength), outcomes).exact))
+        (strength, interval(analysis.success(ls.Cell("smooth", "alone", strength), outcomes).exact))
         for strength, outcomes in sorted(found.items())
     ]
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
+from lqrsim.view import style
 from lqrsim.view.plots import plot_run
 from lqrsim.view.scenery import surface
 
@@ -117,3 +118,16 @@ def test_needs_no_pyplot() -> None:
     code = "import sys, lqrsim.view.plots; print('matplotlib.pyplot' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False"]
+
+
+def test_logarithmic_axes_have_numbers_and_names_keep_their_dollars(tmp_path: Path) -> None:
+    """Where names are not mathematics, neither are matplotlib's own powers of ten."""
+    path = tmp_path / "decades.svg"
+    with style.figure(path, size=(4, 3)) as figure:
+        axes = figure.add_subplot()
+        axes.semilogy([0, 1], [1e-3, 10.0])
+        axes.set_title("a $name$ of mine")
+    found = texts(path)
+    assert "a $name$ of mine" in found
+    assert {"0.001", "0.1", "10"} <= set(found)
+    assert not any("mathdefault" in text for text in found)

@@ -8,7 +8,7 @@ import matplotlib.style
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 from lqrsim.errors import InputError, check_path, excerpt
 from lqrsim.files import replacing
@@ -54,6 +54,11 @@ def figure(*paths: str | os.PathLike[str], size: tuple[float, float]) -> Iterato
         drawn = Figure(figsize=size)
         FigureCanvasAgg(drawn)
         yield drawn
+        for axes in drawn.axes:
+            for axis in (axes.xaxis, axes.yaxis):
+                if isinstance(axis.get_major_formatter(), LogFormatter):  # its powers would be mathematics
+                    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+                    axis.set_minor_formatter(NullFormatter())
         for suffix, file in unfinished:
             drawn.savefig(file, format=suffix[1:], metadata=METADATA[suffix])
 
