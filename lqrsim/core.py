@@ -112,22 +112,47 @@ class Core:
         return ast.unparse(node)
 
     def _namespace(self) -> dict[str, Any]:
-        """The names that the entries call."""
+        """The functions that the entries call, each made of its text and what it calls."""
         if not self._compilable:
-            import math
+            nodes = {node.name: node for node in ast.parse(self.source).body if isinstance(node, ast.FunctionDef)}
+            keys: dict[str, str] = {}
 
-            import numba
+            def make(name: str) -> str:
+                if name not in keys:
+                    text = ast.unparse(nodes[name])
+                    names = {node.id for node in ast.walk(nodes[name]) if isinstance(node, ast.Name)}
+                    callees = sorted(names & nodes.keys() - {name})
+                    key = disk.key(text, *map(make, callees))
+                    if key not in _parts:
+                        namespace = {**_vocabulary(), **{callee: _parts[keys[callee]] for callee in callees}}
+                        exec(compile(text, "<lqrsim core>", "exec"), namespace)
+                        _parts[key] = namespace[name]
+                    keys[name] = key
+                return keys[name]
 
-            from lqrsim import pointers
-
-            jit: Any = numba.njit
-            inner = jit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
-            inlined = jit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
-            names = {**vars(math), "__name__": __name__, "inner": inner, "inlined": inlined}
-            names |= {name: getattr(pointers, name) for name in ("stack", "pointer", "invoke", "invoke_writing")}
-            exec(compile(self.source, "<lqrsim core>", "exec"), names)
-            self._compilable.update(names)
+            self._compilable.update(_vocabulary(), **{name: _parts[make(name)] for name in nodes})
         return self._compilable
+
+
+# The functions that this process has made, under a hash of their text and of all that they call. Cores share them: the
+# second problem with the same dynamics, or only with as many states and controls, takes less time to compile.
+_parts: dict[str, Any] = {}
+
+
+@cache
+def _vocabulary() -> dict[str, Any]:
+    """What a core's functions may call that is not their own."""
+    import math
+
+    import numba
+
+    from lqrsim import pointers
+
+    jit: Any = numba.njit
+    inner = jit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
+    inlined = jit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
+    names = {**vars(math), "__name__": __name__, "inner": inner, "inlined": inlined}
+    return names | {name: getattr(pointers, name) for name in ("stack", "pointer", "invoke", "invoke_writing")}
 
 
 def address_of(function: External) -> float:
