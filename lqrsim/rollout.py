@@ -41,7 +41,8 @@ class Rollout:
       radius: of the robot's collision circle or sphere, in metres.
       states: (K, T+1, n) true states; angles in the representative nearest the plan.
       measured: (K, T+1, n) the states that the policy was shown.
-      commanded: (K, T, m) what the policy asked for, within the limits. applied: (K, T, m) what the actuators got.
+      commanded: (K, T, m) what the policy asked for. applied: (K, T, m) what the actuators got, within
+        the robot's limits.
       forces: (K, T, 3) disturbing force at the robot's centre of mass in N, world axes. torques: the same in N m.
       displaced: (K, obstacles, 3) by how much each obstacle is away from where the plan believes it, in metres.
       clearance: (K, T+1) signed distance to the nearest obstacle minus the radius in metres; infinite without any.

@@ -105,3 +105,29 @@ def test_wheels_stay_on_their_floor_and_their_contacts_are_said() -> None:
 def test_a_simulation_that_becomes_unstable_is_told() -> None:
     with pytest.raises(ls.InputError, match="scene bench: got a simulation that becomes unstable from x = "):
         ls.check_plant(Arm(), arm(""), controls=((1e12,), (1e13,)))
+
+
+@pytest.mark.parametrize(
+    ("limited", "got"),
+    [
+        (
+            'ctrlrange="-2 2"',
+            r"got controls \(torque -3\) within them, of which actuation\(\) makes -3 for actuator 'motor'",
+        ),
+        ('ctrlrange="-3 2.9"', r"got controls \(torque 3\) within them, of which actuation\(\) makes 3"),
+    ],
+)
+def test_limits_that_an_actuator_cuts_off_are_refused(limited: str, got: str) -> None:
+    """MuJoCo would cut the control off without a word, and what the rollout says was applied would not be so."""
+    with pytest.raises(ls.InputError, match=f"robot arm: control_limits: {got}"):
+        ls.Plant(Arm(), motored(limited))
+
+
+@pytest.mark.parametrize("limited", ['ctrlrange="-3 3"', 'ctrlrange="-1 1" ctrllimited="false"'])
+def test_limits_that_actuators_let_through_are_accepted(limited: str) -> None:
+    ls.Plant(Arm(), motored(limited))
+
+
+def motored(limited: str) -> ls.Scene:
+    free = arm("")
+    return scene_from_xml(free.xml.replace('joint="shoulder"', f'joint="shoulder" {limited}'), "bench")

@@ -371,7 +371,10 @@ def _check_solution(solution: Solution, controller: Controller, plant: Plant) ->
         raise InputError(f"solution: got a plan of {shapes}, want {len(wanted[0])} and {len(wanted[1])}")
     if not (np.isfinite(plan.states).all() and np.isfinite(plan.controls).all()):
         raise InputError(f"solution: got a plan that is not finite ({solution.status.name}), want one that can be run")
-    return spaces[0], spaces[1]
+    # A command that the robot cuts off is at a limit, whatever the policy took the limits to be.
+    own = dynamics.control_coordinates
+    low, high = np.maximum(spaces[1].low, own.low), np.minimum(spaces[1].high, own.high)
+    return spaces[0], spaces[1].limited(low, high)
 
 
 def _place(space: Coordinates) -> str:

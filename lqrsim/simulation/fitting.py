@@ -1,5 +1,6 @@
 """Whether a robot fits a scene: its names are there, its maps have MuJoCo's sizes, and it is where its states say."""
 
+import itertools
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from lqrsim.simulation.plant import Plant
 
 OFF = 1e-4  # metres, or of a metre's move, by which the body may be elsewhere: less than six digits in an MJCF leave
+UNLIMITED = 1e9  # stands for an infinite limit of a control
+MIXED = 10  # of so many controls at most, all corners of their limits are looked at
 
 
 def check_names(robot: Robot, scene: Scene) -> None:
@@ -69,8 +72,41 @@ def check_maps(plant: "Plant") -> None:
     ):
         if got.shape != (want,):
             raise InputError(f"robot {robot.name}: {what}: got shape {got.shape}, want ({want},) for {of}")
+    _check_limits(plant)
     if robot.dynamics.state_coordinates.position:
         _check_position(plant)
+
+
+def _check_limits(plant: "Plant") -> None:
+    """Raises InputError if a control within its limits asks an actuator for what its ctrlrange cuts off.
+
+    MuJoCo would say nothing of it, and records of what was applied would not be true.
+    """
+    robot, space, model = plant.robot, plant.robot.dynamics.control_coordinates, plant.model
+    m = len(space)
+    limits = np.array([space.low, space.high])
+    finite = np.clip(limits, -UNLIMITED, UNLIMITED)
+    if m <= MIXED:  # every corner, for actuation may mix controls
+        which = np.array(list(itertools.product((0, 1), repeat=m)))
+        corners = np.take_along_axis(finite, which, axis=0)
+    else:
+        corners = np.repeat(np.clip(0.0, *finite)[None], 2 * m, axis=0)
+        for k in range(m):
+            corners[2 * k : 2 * k + 2, k] = finite[:, k]
+    asked = np.asarray(robot.actuation(corners), dtype=np.float64)
+    if asked.shape != (len(corners), len(plant.ctrl)):
+        return  # a map of one control only, which says so when it is run
+    low, high = model.actuator_ctrlrange[plant.ctrl].T
+    spare = 1e-9 * np.maximum(np.abs(low), np.abs(high))
+    beyond = model.actuator_ctrllimited[plant.ctrl].astype(bool) & ~((asked >= low - spare) & (asked <= high + spare))
+    if beyond.any():
+        row, k = (int(place) for place in np.argwhere(beyond)[0])
+        given = ", ".join(f"{name} {float(value):g}" for name, value in zip(space.names, corners[row], strict=True))
+        raise InputError(
+            f"robot {robot.name}: control_limits: got controls ({given}) within them, of which actuation() makes"
+            f" {asked[row, k]:g} for actuator {robot.actuators[k]!r}, want at most what its ctrlrange in the MJCF lets"
+            f" through, {low[k]:g} to {high[k]:g}"
+        )
 
 
 def _check_position(plant: "Plant") -> None:
