@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 from scipy import stats
 
-from lqrsim.stress.splitting import NoFailure, split
+from lqrsim.stress.multilevel_splitting import NoFailure, split
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, paired_difference
 from lqrsim.versions import versions
 

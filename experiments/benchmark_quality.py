@@ -18,7 +18,7 @@ limits       With narrow limits of the controls: kept to the last bit, and what 
              straight line and from our plan.
 worlds       Random worlds of both robots, one in five nearly blocked; settings untouched.
 resolve      Started with a solution of a similar problem: of a horizon that moved along, of another goal.
-ingredients  What each choice of the search brings; see lqrsim/solvers/search.py.
+ingredients  What each choice of the search brings; see lqrsim/solvers/multistart.py.
 """
 
 import json

@@ -24,7 +24,7 @@ from tqdm import tqdm
 import lqrsim as ls
 from lqrsim.machine import description
 from lqrsim.versions import versions
-from lqrsim.view import footage, gl
+from lqrsim.view import gl, video_metadata
 
 VIEWS = {"quadrotor": ("top", "side"), "differential_drive": ("top",)}  # a camera, and insets
 RUN, VIDEO = "the run, drawn", "the video"
@@ -78,7 +78,7 @@ def measure(name: str, config: Config, folder: Path) -> dict[str, dict[str, Any]
         RUN: verdict(ls.verify_run(run, solution=solution)),
         VIDEO: verdict(ls.verify_video(video, run, solution=solution)),
     }
-    made = all_faults(video, footage.digest(other))
+    made = all_faults(video, video_metadata.digest(other))
     for label, (make, is_other) in tqdm(made.items(), desc=f"{name}, faults", leave=False, delay=2.0, disable=None):
         make(video, changed)
         found[label] = verdict(ls.verify_video(changed, other if is_other else run, solution=solution))
@@ -87,7 +87,7 @@ def measure(name: str, config: Config, folder: Path) -> dict[str, dict[str, Any]
 
 def all_faults(video: Path, digest: str) -> dict[str, tuple[faults.Fault, bool]]:
     """What makes each of the video, and whether it is then said to be of the other run, of that digest."""
-    views = [camera for _, camera in faults.calibrated(footage.read(video))]
+    views = [camera for _, camera in faults.calibrated(video_metadata.read(video))]
     made: dict[str, tuple[faults.Fault, bool]] = {
         "one frame late": (faults.late, False),
         "one frame dropped": (faults.dropped, False),

@@ -31,8 +31,8 @@ from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from lqrsim.results.goal import OUTCOMES
 from lqrsim.stress.statistics import rate
-from lqrsim.target import OUTCOMES
 from lqrsim.view import scenery
 from lqrsim.view.style import MARGIN, PLAN, RUNS, SOLID
 

@@ -13,10 +13,10 @@ import av
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.view import footage
+from lqrsim.view import video_metadata
 from lqrsim.view.cameras import Camera
-from lqrsim.view.footage import Footage, Pane
 from lqrsim.view.video import encoder
+from lqrsim.view.video_metadata import Footage, Pane
 
 Pixels = npt.NDArray[np.uint8]
 Fault = Callable[[Path, Path], None]
@@ -65,19 +65,19 @@ def late(source: Path, path: Path) -> None:
             yield frame if before is None else before
             before = frame
 
-    write(path, frames(), footage.read(source))
+    write(path, frames(), video_metadata.read(source))
 
 
 def dropped(source: Path, path: Path) -> None:
     """The middle one is missing, and the file gives the number of those that are left."""
-    told = footage.read(source)
+    told = video_metadata.read(source)
     frames = (frame for number, frame in enumerate(decoded(source)) if number != told.frames // 2)
     write(path, frames, dataclasses.replace(told, frames=told.frames - 1))
 
 
 def swapped(source: Path, path: Path) -> None:
     """The middle one comes after the next."""
-    told = footage.read(source)
+    told = video_metadata.read(source)
 
     def frames() -> Iterator[Pixels]:
         held = []
@@ -94,7 +94,7 @@ def swapped(source: Path, path: Path) -> None:
 
 def mirrored(source: Path, path: Path) -> None:
     """The first calibrated pane, from left to right."""
-    told = footage.read(source)
+    told = video_metadata.read(source)
     pane, _ = calibrated(told)[0]
     rows, columns = slice(pane.top, pane.top + pane.height), slice(pane.left, pane.left + pane.width)
 
@@ -119,7 +119,7 @@ def off(view: str, axis: int) -> Fault:
         return dataclasses.replace(pane, camera=dataclasses.replace(pane.camera, position=tuple(position.tolist())))
 
     def fault(source: Path, path: Path) -> None:
-        told = footage.read(source)
+        told = video_metadata.read(source)
         retold(source, path, dataclasses.replace(told, panes=tuple(moved(pane) for pane in told.panes)))
 
     return fault
@@ -129,7 +129,7 @@ def forged(digest: str) -> Fault:
     """The file says that it shows the run of that digest."""
 
     def fault(source: Path, path: Path) -> None:
-        retold(source, path, dataclasses.replace(footage.read(source), runs=(digest,)))
+        retold(source, path, dataclasses.replace(video_metadata.read(source), runs=(digest,)))
 
     return fault
 

@@ -35,8 +35,8 @@ from solver_benchmark.common import median, take_turns
 from solver_benchmark.scaling import chain_of_masses
 
 import lqrsim as ls
-from lqrsim.costs import CostSum, terms_of
 from lqrsim.errors import Array
+from lqrsim.problem.costs import CostSum, terms_of
 from lqrsim.stress.statistics import bootstrap
 from lqrsim.view.style import LIMIT, PLAN, RUNS, plain_decades
 

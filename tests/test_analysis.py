@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 import lqrsim as ls
 from lqrsim.simulation.outcomes import Outcomes
 from lqrsim.stress.analysis import breaks, comparisons, degradation, modes, quantiles, success, worst
-from lqrsim.stress.asked import Cell
+from lqrsim.stress.specification import Cell
 
 
 def table_of(outcome: Sequence[str], *, first: int = 0, **columns: ArrayLike) -> Outcomes:

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 import lqrsim as ls
-from lqrsim.stress.breaking import in_words, smallest_failure
-from lqrsim.stress.given import TrialScore
+from lqrsim.stress.design_point import in_words, smallest_failure
+from lqrsim.stress.trial_score import TrialScore
 
 
 @pytest.mark.parametrize("size", [2, 50])

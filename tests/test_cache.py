@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim import cache, core, rotations
-from lqrsim.fingerprint import fingerprint
+from lqrsim import rotations
+from lqrsim.codegen import disk_cache, jit
+from lqrsim.codegen.fingerprint import fingerprint
 
 # The smallest problem there is, in a file of its own so that two processes trace the same function.
 SYSTEM = """
@@ -71,11 +72,11 @@ def test_a_damaged_item_is_made_again(
     source = "def double(x, out):\n    out[0] = 2 * x[0]\n"
     x, out = np.array([21.0]), np.zeros(1)
     for expected in (1, 0, 1, 0):
-        before = len(core.compilations)
-        core.Core(source, {}, "a test").double(x, out)
+        before = len(jit.compilations)
+        jit.Core(source, {}, "a test").double(x, out)
         assert out[0] == 42
-        assert len(core.compilations) - before == expected
-        if len(core.compilations) - before == 0:
+        assert len(jit.compilations) - before == expected
+        if len(jit.compilations) - before == 0:
             (item,) = tmp_path.iterdir()
             item.write_bytes(damage(item.read_bytes()))
 
@@ -85,10 +86,10 @@ def test_what_was_well_kept_and_can_not_be_used_is_made_again(monkeypatch: pytes
     monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
     source = "def triple(x, out):\n    out[0] = 3 * x[0]\n"
     x, out = np.array([2.0]), np.zeros(1)
-    core.Core(source, {}, "a test").triple(x, out)
+    jit.Core(source, {}, "a test").triple(x, out)
     (item,) = tmp_path.iterdir()
-    cache.save(item.stem, b"not what numba writes", "a test")
-    core.Core(source, {}, "a test").triple(x, out)
+    disk_cache.save(item.stem, b"not what numba writes", "a test")
+    jit.Core(source, {}, "a test").triple(x, out)
     assert out[0] == 6
 
 
@@ -97,38 +98,38 @@ def test_a_cache_that_can_not_be_written_costs_only_time(monkeypatch: pytest.Mon
     monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path / "file" / "cache"))
     out = np.zeros(1)
     for _ in range(2):
-        core.Core("def half(x, out):\n    out[0] = x[0] / 2\n", {}, "a test").half(np.array([4.0]), out)
+        jit.Core("def half(x, out):\n    out[0] = x[0] / 2\n", {}, "a test").half(np.array([4.0]), out)
         assert out[0] == 2
-    assert cache.items() == []
-    assert cache.clear() == 0
+    assert disk_cache.items() == []
+    assert disk_cache.clear() == 0
 
 
 def test_a_cache_that_can_only_be_read_is_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
-    cache.save("kept", b"contents", "a test")
+    disk_cache.save("kept", b"contents", "a test")
 
     def refuse(*arguments: object, **options: object) -> None:
         raise PermissionError("read-only")
 
     monkeypatch.setattr(os, "utime", refuse)
     monkeypatch.setattr(Path, "touch", refuse)
-    cache.save("lost", b"contents", "a test")
-    assert cache.load("kept") == b"contents"
-    assert cache.load("lost") is None
+    disk_cache.save("lost", b"contents", "a test")
+    assert disk_cache.load("kept") == b"contents"
+    assert disk_cache.load("lost") is None
 
 
 def test_the_cache_is_bounded_and_forgets_what_was_used_longest_ago(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(cache, "LIMIT", 3500)
+    monkeypatch.setattr(disk_cache, "LIMIT", 3500)
     for i in range(3):
-        cache.save(f"item{i}", bytes(1000), "a test")
+        disk_cache.save(f"item{i}", bytes(1000), "a test")
         os.utime(tmp_path / f"item{i}.item", (i, i))
-    assert cache.load("item0") is not None  # used now
-    cache.save("item3", bytes(1000), "a test")
-    assert {item.path.stem for item in cache.items()} == {"item0", "item2", "item3"}
-    assert cache.clear() == 3
+    assert disk_cache.load("item0") is not None  # used now
+    disk_cache.save("item3", bytes(1000), "a test")
+    assert {item.path.stem for item in disk_cache.items()} == {"item0", "item2", "item3"}
+    assert disk_cache.clear() == 3
     assert list(tmp_path.iterdir()) == []
 
 
@@ -210,8 +211,8 @@ def test_code_with_addresses_of_this_process_is_not_kept(monkeypatch: pytest.Mon
         states={"x": ""}, controls={"u": ""},
     )  # fmt: skip
     assert fingerprint(dynamics.f) is not None
-    assert core.address_of(dynamics.functions[0]) > 0
-    assert cache.items() == []
+    assert jit.address_of(dynamics.functions[0]) > 0
+    assert disk_cache.items() == []
 
 
 GAIN = 1.0
@@ -229,8 +230,8 @@ def test_what_numba_compiled_with_an_old_global_is_not_kept(monkeypatch: pytest.
         function = numba.njit(lambda x, u, p: (u[0] - drag(x[0]),))
         dynamics = ls.Dynamics(function, states={"x": ""}, controls={"u": ""})
         dynamics.functions[0].call(np.ones(1), np.ones(1), {})  # as the solvers do first
-        core.address_of(dynamics.functions[0])
-        return len(cache.items())
+        jit.address_of(dynamics.functions[0])
+        return len(disk_cache.items())
 
     assert kept(1.0) == 1
     assert kept(50.0) == 1  # numba's drag still has a gain of 1: under the name of 50 it would be wrong elsewhere

@@ -13,8 +13,8 @@ import pytest
 import lqrsim as ls
 from lqrsim.view import cameras, gl, marker
 from lqrsim.view.cameras import Camera
-from lqrsim.view.footage import Footage, Pane, digest, read
 from lqrsim.view.video import encoder
+from lqrsim.view.video_metadata import Footage, Pane, digest, read
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
 TILTED = Camera("tilted", (3.0, -4.0, 5.0), (0.0, 0.6, -0.8), (0.0, 0.8, 0.6), 4.0)

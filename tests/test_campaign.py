@@ -19,14 +19,14 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
+from lqrsim.control.controllers import Control, Controller, Feedback
 from lqrsim.errors import InputError
-from lqrsim.references import resolve
-from lqrsim.simulation.controllers import Control, Controller, Feedback
+from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
 from lqrsim.stress import trials
 from lqrsim.stress.campaign import Campaign, Cell, run_campaign
 from lqrsim.stress.results import Results, differences, replay
-from lqrsim.stress.shards import Damaged, unpack
+from lqrsim.stress.trial_tables import Damaged, unpack
 
 OWN = """
 import dataclasses

@@ -10,8 +10,8 @@ from whole_problems import planar_quadrotor
 from whole_problems.claims import contradictions
 
 import lqrsim as ls
-from lqrsim import core
-from lqrsim.results import Certificate, Iteration, Status
+from lqrsim.codegen import jit
+from lqrsim.results.solution import Certificate, Iteration, Status
 from lqrsim.solvers import certify
 from lqrsim.solvers.certify import faults
 
@@ -214,8 +214,8 @@ def test_nothing_is_compiled_in_mid_solve() -> None:
     """The damped iterations once were, where the first solve came to need them."""
     easy = planar_quadrotor.problem((-1.2, 0.1), (1.6, 0.3), steps=150)
     ls.smooth(easy)
-    before = len(core.compilations)
+    before = len(jit.compilations)
     hard = planar_quadrotor.problem((-1.42, 0.16), (1.94, 0.04), steps=257, effort=10.0, weight=1000.0)
     solution = ls.smooth(hard)
     assert "damped" in {iteration.method for iteration in solution.iterations}
-    assert core.compilations[before:] == []
+    assert jit.compilations[before:] == []

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim import cache
 from lqrsim.cli import main
+from lqrsim.codegen import disk_cache
 from lqrsim.commands import COMMANDS
-from lqrsim.reproduce import SCRIPTS
+from lqrsim.commands.reproduce import SCRIPTS
 from lqrsim.view import gl
 
 OWN_SCENARIOS = """
@@ -319,7 +319,7 @@ def test_cache_shows_and_clears(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
-    cache.save("kept", bytes(10_000), "smoother for pendulum (2 states, 1 controls)")
+    disk_cache.save("kept", bytes(10_000), "smoother for pendulum (2 states, 1 controls)")
     assert main(["cache"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("    0.01 MB  last used 20")

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from tracking import hover, track, weave
 
-from lqrsim import files
-from lqrsim.dynamics import Dynamics
 from lqrsim.errors import InputError
-from lqrsim.results import Solution, Status, Trajectory
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results import files
+from lqrsim.results.solution import Solution, Status, Trajectory
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
-from lqrsim.scenarios import Scenario
-from lqrsim.scenes import load_scene
+from lqrsim.scenarios.packaged import Scenario
+from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import ControlNoise, Disturbance, Effect, ForceNoise, MeasurementNoise
 from lqrsim.simulation.plant import Plant

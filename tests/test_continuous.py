@@ -9,11 +9,11 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.linear_quadratic import Stage
-from lqrsim.results import Status
-from lqrsim.solvers import differential
+from lqrsim.problem.linear_quadratic import Stage
+from lqrsim.results.solution import Status
+from lqrsim.results.value_functions import Quadratic
+from lqrsim.solvers import riccati_ode
 from lqrsim.solvers.continuous import ContinuousSolution, smooth_continuous, smooth_lq_continuous
-from lqrsim.value_functions import Quadratic
 
 
 def measured_orders(errors: list[Any]) -> Array:
@@ -300,7 +300,7 @@ class TestEndings:
         assert np.isfinite(found.policy(np.zeros(3), 3.0)).all()
 
     def test_an_integration_that_takes_too_long(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(differential, "_EVALUATIONS", 20)
+        monkeypatch.setattr(riccati_ode, "_EVALUATIONS", 20)
         found = smooth_continuous(scalar())
         assert found.status is Status.MAX_ITERATIONS
         assert "forward pass of iteration 1, at " in found.detail

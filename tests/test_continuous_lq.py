@@ -10,10 +10,10 @@ from scipy.linalg import expm, solve_continuous_are
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.linear_quadratic import Stage
-from lqrsim.results import Status
+from lqrsim.problem.linear_quadratic import Stage
+from lqrsim.results.solution import Status
+from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers.continuous import smooth_lq_continuous
-from lqrsim.value_functions import Quadratic
 
 UNIT = Quadratic(np.eye(1), np.zeros(1), np.array(0.0))
 STAGE = Stage(A=[[0.0]], B=[[1.0]], R=[[1.0]])

@@ -11,7 +11,7 @@ import lqrsim as ls
 from lqrsim.errors import InputError
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
-from lqrsim.scenes import load_scene
+from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation import disturbances
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import KINDS, PRESETS, Disturbance, GilbertElliott, preset

@@ -8,7 +8,7 @@ from tracking import hover, track, weave
 from lqrsim.errors import InputError
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
-from lqrsim.scenes import load_scene
+from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import (
     AxleMismatch,

@@ -7,10 +7,10 @@ from scipy.signal import welch
 from tracking import hover, weave
 
 from lqrsim.errors import InputError
-from lqrsim.results import Trajectory
+from lqrsim.results.solution import Trajectory
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
-from lqrsim.scenes import load_scene
+from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Dryden, Gusts, MeanWind
 from lqrsim.simulation.disturbances.wind import first_order, second_order

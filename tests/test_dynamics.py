@@ -10,8 +10,10 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
-from lqrsim import compiled, core, rotations
+from lqrsim import rotations
+from lqrsim.codegen import jit
 from lqrsim.errors import Array
+from lqrsim.solvers import compiled
 
 ROBOTS = [ls.DifferentialDrive(), ls.Quadrotor()]
 
@@ -165,9 +167,9 @@ def test_other_parameters_compile_nothing_and_change_what_they_are_in(level: str
 def test_a_solve_with_other_parameters_uses_the_solver_there_is(differential_drive: ls.Scenario) -> None:
     problem = differential_drive.problem
     first = ls.smooth(problem, max_iterations=3)
-    before = len(core.compilations)
+    before = len(jit.compilations)
     wider = ls.smooth(replace(problem, dynamics=problem.dynamics.with_parameters(axle_length=0.3)), max_iterations=3)
-    assert len(core.compilations) == before
+    assert len(jit.compilations) == before
     fresh = ls.smooth(replace(problem, dynamics=ls.DifferentialDrive(0.3).dynamics), max_iterations=3)
     np.testing.assert_array_equal(wider.trajectory.states, fresh.trajectory.states)
     assert (wider.trajectory.states != first.trajectory.states).any()

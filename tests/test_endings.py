@@ -14,16 +14,16 @@ from tracking import hover, track
 
 import lqrsim as ls
 from lqrsim.cli import main
+from lqrsim.control.controllers import Control, Controller, Feedback
 from lqrsim.errors import InputError
+from lqrsim.results.goal import OF_RANGE, Target, endings
 from lqrsim.robots.base import Robot
-from lqrsim.scenes import scene_from_xml
-from lqrsim.simulation.controllers import Control, Controller, Feedback
+from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.simulation.outcomes import OUTCOMES, Outcomes, outcomes
 from lqrsim.simulation.plant import Plant
 from lqrsim.stress import trials
 from lqrsim.stress.campaign import Campaign, run_campaign
 from lqrsim.stress.results import Results, differences, replay
-from lqrsim.target import OF_RANGE, Target, endings
 
 ARM = """<mujoco>
   <option timestep="0.01"/>

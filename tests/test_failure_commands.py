@@ -13,8 +13,8 @@ from scipy import stats
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.references import resolve
-from lqrsim.stress.given import TrialScore
+from lqrsim.scenarios.references import resolve
+from lqrsim.stress.trial_score import TrialScore
 
 # One random number decides: how far towards the wall behind it the robot begins.
 OWN = """

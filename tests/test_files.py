@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim import files
 from lqrsim.cli import main
+from lqrsim.results import files
 
 fuzzer: ModuleType = importlib.import_module("robustness.files")
 same = fuzzer.same
@@ -395,7 +395,7 @@ def test_what_compresses_too_well_can_be_read_again(
     tmp_path: Path, rollout: ls.Rollout, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Many trials that are all alike look like a bomb; they are written as they are, then."""
-    monkeypatch.setattr("lqrsim.archive._LARGE", 1 << 20)
+    monkeypatch.setattr("lqrsim.results.archive._LARGE", 1 << 20)
     calm = {name: np.zeros((400, *getattr(rollout, name).shape[1:])) for name in ("states", "measured", "commanded")}
     calm |= {name: np.zeros((400, *getattr(rollout, name).shape[1:])) for name in ("applied", "forces", "torques")}
     calm |= {name: np.zeros((400, *getattr(rollout, name).shape[1:])) for name in ("displaced", "clearance", "frames")}

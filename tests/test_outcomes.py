@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim.rollout import Rollout
-from lqrsim.simulation.controllers import Replanning
+from lqrsim.control.controllers import Replanning
+from lqrsim.results.rollout import Rollout
 from lqrsim.simulation.outcomes import OUTCOMES, outcomes
 from lqrsim.simulation.plant import Plant
 

@@ -10,10 +10,10 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.references import resolve
-from lqrsim.stress.asked import Campaign
+from lqrsim.scenarios.references import resolve
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results
+from lqrsim.stress.specification import Campaign
 
 OWN = """
 import dataclasses

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim.costs import terms_of
 from lqrsim.errors import Array
-from lqrsim.world import ROW, signed_distance_derivatives
+from lqrsim.kernels.interface import ROW
+from lqrsim.kernels.signed_distance import signed_distance_derivatives
+from lqrsim.problem.costs import terms_of
 
 ROBOTS = ("differential_drive", "quadrotor")
 

@@ -15,13 +15,12 @@ from scipy.spatial.transform import Rotation
 from tracking import track
 
 import lqrsim as ls
-from lqrsim.coordinates import PLANES
 from lqrsim.errors import Array
-from lqrsim.scenes import scene_from_xml
+from lqrsim.scenes.scene import scene_from_xml
+from lqrsim.scenes.world import KINDS, PLANES
 from lqrsim.simulation.disturbances import Effect
 from lqrsim.view import cameras, gl, policy_plot, viewer
-from lqrsim.view.screen import Screen
-from lqrsim.world import KINDS
+from lqrsim.view.viewer_base import Screen
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
 SIDES = '<geom name="beside" type="plane" size="1 1 1" pos="0 0.9 0" zaxis="0 -1 0"/>'

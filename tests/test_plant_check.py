@@ -8,7 +8,7 @@ import pytest
 from planar_quadrotor import BLOCK, PlanarQuadrotor, mjcf
 
 import lqrsim as ls
-from lqrsim.scenes import scene_from_xml
+from lqrsim.scenes.scene import scene_from_xml
 
 MASS, LENGTH, GRAVITY = 0.4, 0.5, 9.81
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
-from lqrsim import compiled
+from lqrsim.solvers import compiled
 
 
 def test_on_the_plan_it_plays_the_plan(drive_solution: ls.Solution) -> None:

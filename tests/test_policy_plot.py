@@ -11,9 +11,9 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 import lqrsim as ls
+from lqrsim.view.ellipsoids import outlines
 from lqrsim.view.policy_plot import draw, strength
 from lqrsim.view.scenery import draw_projected
-from lqrsim.view.tube import outlines
 
 
 def drawn(solution: ls.Solution, scenario: ls.Scenario) -> Figure:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim import compiled
+from lqrsim.solvers import compiled
 
 
 def test_a_sum_of_costs_keeps_its_terms_in_order() -> None:

@@ -21,14 +21,15 @@ COMMAND = [sys.executable, "-m", "lqrsim.cli"]
 PICTURE = """
 import sys, time
 from pathlib import Path
-from lqrsim.files import replacing
+from lqrsim.results.files import replacing
 with replacing(Path(sys.argv[sys.argv.index("--out") + 1]) / "figures" / "a.png") as unfinished:
     unfinished.write_bytes(b"half")
     time.sleep(60)
 """
 REPRODUCE = """
 import pathlib, sys
-from lqrsim import cli, reproduce
+from lqrsim import cli
+from lqrsim.commands import reproduce
 reproduce.EXPERIMENTS = pathlib.Path(sys.argv.pop(1))
 sys.exit(cli.main())
 """
@@ -57,7 +58,7 @@ def wait_for(found: Path, pattern: str, process: subprocess.Popen[str]) -> None:
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("module", ["tyro", "numpy", "lqrsim.costs", "mujoco"])
+@pytest.mark.parametrize("module", ["tyro", "numpy", "lqrsim.problem.costs", "mujoco"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_it_starts_is_one_line(module: str, number: int) -> None:
     """As soon as it says that a module has been imported; it goes on for a while."""

@@ -14,9 +14,9 @@ from linear_quadratic import LinearQuadratic, solve_dense
 from whole_problems import kkt
 
 import lqrsim as ls
-from lqrsim.costs import terms_of
 from lqrsim.errors import Array
-from lqrsim.results import Status
+from lqrsim.problem.costs import terms_of
+from lqrsim.results.solution import Status
 
 # Eleven kinds of problems are compiled where nothing is cached, some 10 seconds each, before the first test ends.
 pytestmark = pytest.mark.timeout(900)

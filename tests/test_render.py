@@ -13,8 +13,8 @@ import pytest
 from PIL import Image, ImageSequence
 
 import lqrsim as ls
-from lqrsim.view import footage, gl
-from lqrsim.view.choices import OVERLAYS, Overlay
+from lqrsim.view import gl, video_metadata
+from lqrsim.view.options import OVERLAYS, Overlay
 from lqrsim.view.overlays import ELLIPSOIDS, Overlays, Scale
 from lqrsim.view.picture import picture
 from lqrsim.view.render import render, still
@@ -194,8 +194,8 @@ def test_video_says_what_it_shows(flight: ls.Rollout, tmp_path: Path) -> None:
     """Two runs, each with the first camera and two calibrated ones: where the panes are, and that they are apart."""
     other = dataclasses.replace(flight, seed=4)
     path = render([flight, other], tmp_path / "run.mp4", size=(640, 360), fps=1, insets=("top", "side"))
-    found = footage.read(path)
-    assert found.runs == (footage.digest(flight), footage.digest(other))
+    found = video_metadata.read(path)
+    assert found.runs == (video_metadata.digest(flight), video_metadata.digest(other))
     assert (found.rate, found.speed, found.frames) == (1, 1.0, 6)
     assert [pane.run for pane in found.panes] == [0, 0, 0, 1, 1, 1]
     cameras = [None if pane.camera is None else pane.camera.name for pane in found.panes]

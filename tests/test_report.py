@@ -13,12 +13,12 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
+from lqrsim.reports.page import report
 from lqrsim.simulation.outcomes import Outcomes
-from lqrsim.stress.asked import Campaign, Cell
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results
+from lqrsim.stress.specification import Campaign, Cell
 from lqrsim.view import gl
-from lqrsim.view.report import report
 
 NASTY = '<script>alert("&")</script>'
 SWEEPS = {
@@ -139,7 +139,7 @@ def test_worst_trials_are_run_again_and_filmed(
 ) -> None:
     if not gl.available():
         pytest.skip("no OpenGL here")
-    monkeypatch.setattr("lqrsim.view.report.FPS", 1)  # as fast as it gets
+    monkeypatch.setattr("lqrsim.reports.page.FPS", 1)  # as fast as it gets
     told: list[tuple[int, int]] = []
     path = report(results, tmp_path / "a.html", videos=2, progress=lambda done, total: told.append((done, total)))
     page = Page(path.read_text(encoding="utf-8"))

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 import lqrsim as ls
-from lqrsim import reproduce
 from lqrsim.cli import main
+from lqrsim.commands import reproduce
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "experiments"
@@ -84,7 +84,8 @@ def test_ctrl_c_ends_the_script_too_and_leaves_nothing(tmp_path: Path) -> None:
     (folder / "table_1.py").write_text(
         "import os, pathlib, time\npathlib.Path(__file__).with_name('pid').write_text(str(os.getpid()))\ntime.sleep(60)"
     )
-    code = "import sys, pathlib; from lqrsim import cli, reproduce; reproduce.EXPERIMENTS = pathlib.Path(sys.argv[1])\n"
+    code = "import sys, pathlib; from lqrsim import cli; from lqrsim.commands import reproduce\n"
+    code += "reproduce.EXPERIMENTS = pathlib.Path(sys.argv[1])\n"
     code += "sys.exit(cli.main(['reproduce', 'table_1', '--out', sys.argv[2]]))"
     command = [sys.executable, "-c", code, str(folder), str(tmp_path / "out")]
     with subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE, text=True) as process:

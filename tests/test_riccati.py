@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from linear_quadratic import LinearQuadratic, random_problem, solve_dense
 
 import lqrsim as ls
-from lqrsim import compiled
 from lqrsim.errors import Array
+from lqrsim.solvers import compiled
 
 
 def stage_of(problem: LinearQuadratic) -> ls.Stage:

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim.costs import Term
 from lqrsim.errors import (
     LONGEST,
     InputError,
@@ -30,6 +29,7 @@ from lqrsim.errors import (
     excerpt,
 )
 from lqrsim.machine import memory
+from lqrsim.problem.costs import Term
 
 api: Any = import_module("robustness.api")  # of experiments/
 of_runs: Any = import_module("robustness.of_runs")

@@ -4,9 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from lqrsim import scenes
 from lqrsim.errors import InputError
-from lqrsim.scenes import load_scene
+from lqrsim.scenes.scene import MODELS, load_scene, names, scene_from_xml
 
 # method.md, section 4, in metres
 PILLARS = [
@@ -64,7 +63,7 @@ def test_distances_in_the_cage_are_those_of_twelve_infinite_bars_and_a_cube():
     np.testing.assert_allclose(world.distance(points), np.min(distances, axis=0), atol=1e-12)
 
 
-@pytest.mark.parametrize("name", scenes.names())
+@pytest.mark.parametrize("name", names())
 def test_packaged_scenes(name):
     scene = load_scene(name)
     assert scene.name == name
@@ -73,7 +72,7 @@ def test_packaged_scenes(name):
     assert "include" not in scene.xml.replace("Include", "")
     # The text alone makes the very same model again, to the last bit.
     again = mujoco.MjModel.from_xml_string(scene.xml)
-    from_file = mujoco.MjModel.from_xml_path(str(scenes.MODELS / f"{name}.xml"))
+    from_file = mujoco.MjModel.from_xml_path(str(MODELS / f"{name}.xml"))
     for field in ("body_mass", "body_inertia", "geom_pos", "geom_size", "dof_damping", "actuator_gear", "cam_pos"):
         np.testing.assert_array_equal(getattr(again, field), getattr(from_file, field), err_msg=field)
     assert again.opt.timestep == from_file.opt.timestep == scene.model.opt.timestep
@@ -201,7 +200,7 @@ def test_elements_nested_by_the_thousand_get_one_line(tmp_path):
     deep = "<mujoco><worldbody>" + "<body><geom size='1'/>" * 3000 + "</body>" * 3000 + "</worldbody></mujoco>"
     (tmp_path / "deep.xml").write_text(deep)
     with pytest.raises(InputError, match=r"^scene deep: got elements nested deeper than 490"):
-        scenes.scene_from_xml(deep, "deep")
+        scene_from_xml(deep, "deep")
     with pytest.raises(InputError, match=r"^scene: got deep.xml with elements nested deeper than 490"):
         load_scene(tmp_path / "deep.xml")
 
@@ -211,7 +210,7 @@ def test_a_huge_height_field_gets_one_line(scene_of):
     with pytest.raises(
         InputError, match="got 100000 x 100000 heights in the height field 'land', want 16,777,216 at most"
     ):
-        scenes.scene_from_xml(f"<mujoco>{asset}<worldbody><geom size='1'/></worldbody></mujoco>", "hills")
+        scene_from_xml(f"<mujoco>{asset}<worldbody><geom size='1'/></worldbody></mujoco>", "hills")
 
 
 def test_a_nan_in_the_file_gets_one_line_and_leaves_no_log(tmp_path, monkeypatch):
@@ -220,7 +219,7 @@ def test_a_nan_in_the_file_gets_one_line_and_leaves_no_log(tmp_path, monkeypatch
     with pytest.raises(
         InputError, match=r"^scene odd: got NaN in the MJCF \(MuJoCo's actuator_\w+\[0\]\), want numbers"
     ):
-        scenes.scene_from_xml(
+        scene_from_xml(
             f'<mujoco><worldbody>{body}</worldbody><actuator><motor joint="j" gear="nan"/></actuator></mujoco>', "odd"
         )
     assert not list(tmp_path.iterdir())

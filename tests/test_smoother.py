@@ -9,8 +9,8 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results import Status
-from lqrsim.solvers.start import StartLike
+from lqrsim.results.solution import Status
+from lqrsim.solvers.initial_guess import StartLike
 
 FORMS = ("dual", "primal")
 

@@ -8,8 +8,8 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results import Status
-from lqrsim.scenarios import quadrotor_queries
+from lqrsim.results.solution import Status
+from lqrsim.scenarios.packaged import quadrotor_queries
 
 PILLARS = [
     (0, -1.35), (1, -0.5), (-0.95, -0.5), (-0.2, 0.3), (0.8, 0.7), (1.1, 2.0), (-1.2, 0.8), (-1.1, 2.1), (-0.1, 1.6),

@@ -9,9 +9,9 @@ from scipy import stats
 
 import lqrsim as ls
 from lqrsim.simulation.disturbances import preset
-from lqrsim.stress.given import Given, TrialScore, collision, miss
-from lqrsim.stress.splitting import NoFailure, split
+from lqrsim.stress.multilevel_splitting import NoFailure, split
 from lqrsim.stress.statistics import rate
+from lqrsim.stress.trial_score import Given, TrialScore, collision, miss
 
 
 def along(size: int, distance: float) -> Callable[[np.ndarray], np.ndarray]:

@@ -12,9 +12,9 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.verify import pixels
-from lqrsim.view import cameras, footage, gl
+from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera
-from lqrsim.view.footage import Footage
+from lqrsim.view.video_metadata import Footage
 
 faults: Any = importlib.import_module("injected_faults")  # of experiments/, whose benchmark makes them at full size
 
@@ -60,7 +60,7 @@ def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         ls.render(run, path, camera="top", insets=("side",), size=(800, 360), speed=3)
     else:
         ls.render(run, path, camera="top", size=(560, 360), speed=10)
-    return Case(name, solution, run, other, path, list(faults.decoded(path)), footage.read(path))
+    return Case(name, solution, run, other, path, list(faults.decoded(path)), video_metadata.read(path))
 
 
 def failed(found: ls.Verification) -> set[str]:
@@ -230,7 +230,7 @@ def test_calibration_that_is_off_by_2_cm_is_told(case: Case, tmp_path: Path) -> 
 
 def test_another_seeds_run_is_told_by_the_pixels_alone(case: Case, tmp_path: Path) -> None:
     assert {"run", "position"} <= failed(ls.verify_video(case.video, case.other))
-    faults.forged(footage.digest(case.other))(case.video, tmp_path / "changed.mp4")
+    faults.forged(video_metadata.digest(case.other))(case.video, tmp_path / "changed.mp4")
     found = ls.verify_video(tmp_path / "changed.mp4", case.other)
     assert "position" in failed(found)
     assert "run" not in failed(found)

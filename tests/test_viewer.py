@@ -21,13 +21,14 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 import lqrsim as ls
-from lqrsim import cache, files
 from lqrsim.cli import main
+from lqrsim.codegen import disk_cache
 from lqrsim.errors import Array, InputError
+from lqrsim.results import files
 from lqrsim.simulation.disturbances import ForceNoise
 from lqrsim.view import viewer
 from lqrsim.view.browser import Browser
-from lqrsim.view.screen import PUSHES, Screen
+from lqrsim.view.viewer_base import PUSHES, Screen
 
 PORT = 18650 + os.getpid() % 1000  # of our own, also where tests run side by side
 
@@ -68,7 +69,7 @@ def viewing(folder: Path, *arguments: str, before: str = "") -> Iterator[subproc
     code = f"{before}\nimport sys; from lqrsim.cli import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "view", *arguments, "--viewer", "browser", "--seconds", "100"]
     # MuJoCo keeps the layout of its panels in the home; what is compiled stays where it is.
-    environment = {**os.environ, "HOME": str(folder), "LQRSIM_CACHE_DIR": str(cache.folder())}
+    environment = {**os.environ, "HOME": str(folder), "LQRSIM_CACHE_DIR": str(disk_cache.folder())}
     outside = {"cwd": folder, "env": environment}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **outside) as process:
         try:
@@ -380,7 +381,7 @@ def test_a_browser_draws_the_run(served: int, rollout: ls.Rollout, tmp_path: Pat
 @needs_browser
 def test_keys_and_the_mouse_reach_the_robot(tmp_path: Path) -> None:
     """In the browser: an arrow key pushes the robot, and Ctrl with the right mouse button drags it."""
-    before = """import lqrsim.view.viewer as viewer, lqrsim.view.screen as screen
+    before = """import lqrsim.view.viewer as viewer, lqrsim.view.viewer_base as screen
 push, pull = screen.Screen.push, screen.Screen.pull
 def pushed(self, direction, azimuth):
     push(self, direction, azimuth)

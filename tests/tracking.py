@@ -3,8 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.policy import AffinePolicy
-from lqrsim.results import Certificate, Solution, Status, Trajectory
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.solution import Certificate, Solution, Status, Trajectory
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor

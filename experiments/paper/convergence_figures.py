@@ -12,7 +12,7 @@ from matplotlib.patches import Ellipse
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.value_functions import Moments
+from lqrsim.results.value_functions import Moments
 from lqrsim.view import scenery
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 from paper.rates import tail

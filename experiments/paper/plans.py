@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 import lqrsim as ls
-from lqrsim.costs import terms_of
 from lqrsim.errors import Array
+from lqrsim.problem.costs import terms_of
 from paper.common import Result, as_in_the_paper, counting, numbers
 from paper.homotopy import Way, way
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from lqrsim.reports.curves import LINES, MARKERS
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress.campaign import POLICIES
 from lqrsim.view import style
-from lqrsim.view.curves import LINES, MARKERS
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 from paper.common import Result, Settings, figure
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 import lqrsim as ls
-from lqrsim import cache as disk
-from lqrsim.costs import terms_of
+from lqrsim.codegen import disk_cache as disk
 from lqrsim.errors import Array
+from lqrsim.problem.costs import terms_of
 from lqrsim.versions import versions_of
 
 # Rounding as in lqrsim's compiled functions: sums may be reordered, NaN and infinity stay meaningful.

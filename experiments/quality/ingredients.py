@@ -10,7 +10,7 @@ import peers
 from reliability.common import mean, paper_start
 
 from lqrsim.errors import Array
-from lqrsim.solvers import search
+from lqrsim.solvers import multistart
 from quality.common import (
     NONE,
     Config,
@@ -44,25 +44,25 @@ ROWS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "dropped late": ({}, LATE),
     "no continuation": ({}, {"SHARES": ()}),
     "at even speed": ({}, {"path": linear}),
-    "pull x 0.3": ({}, {"PULL": 0.3 * search.PULL}),
-    "pull x 3": ({}, {"PULL": 3 * search.PULL}),
+    "pull x 0.3": ({}, {"PULL": 0.3 * multistart.PULL}),
+    "pull x 3": ({}, {"PULL": 3 * multistart.PULL}),
     "1 start, at even speed": ({"starts": 1}, {"path": linear}),
-    "1 start, pull x 0.3": ({"starts": 1}, {"PULL": 0.3 * search.PULL}),
-    "1 start, pull x 3": ({"starts": 1}, {"PULL": 3 * search.PULL}),
+    "1 start, pull x 0.3": ({"starts": 1}, {"PULL": 0.3 * multistart.PULL}),
+    "1 start, pull x 3": ({"starts": 1}, {"PULL": 3 * multistart.PULL}),
 }
 
 
 @contextmanager
 def instead(values: dict[str, Any]) -> Iterator[None]:
     """`search` with other values of its names, within the block only."""
-    before = {name: getattr(search, name) for name in values}
+    before = {name: getattr(multistart, name) for name in values}
     try:
         for name, value in values.items():
-            setattr(search, name, value)
+            setattr(multistart, name, value)
         yield
     finally:
         for name, value in before.items():
-            setattr(search, name, value)
+            setattr(multistart, name, value)
 
 
 def measure(config: Config) -> dict[str, Any]:

@@ -9,8 +9,8 @@ import numpy as np
 from tqdm import tqdm
 
 import lqrsim as ls
-from lqrsim.costs import terms_of
 from lqrsim.errors import check_name
+from lqrsim.problem.costs import terms_of
 from reliability.problems import KINDS
 
 Section = Literal["stiff", "fragile", "random", "overhead", "ablation"]

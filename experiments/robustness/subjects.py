@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import Any
 
 import lqrsim as ls
-from lqrsim.stress.shards import Damaged
+from lqrsim.stress.trial_tables import Damaged
 from robustness.of_problems import problems, results, solving
 from robustness.of_runs import campaigns, pictures, running
 from robustness.place import Place

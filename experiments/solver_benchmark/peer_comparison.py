@@ -11,8 +11,8 @@ import numpy as np
 import peers
 
 import lqrsim as ls
-from lqrsim.costs import terms_of
 from lqrsim.errors import Array
+from lqrsim.problem.costs import terms_of
 from solver_benchmark.by_hand import compiled, quadrotor_rate
 from solver_benchmark.common import MANY, Config, make_problems, median, take_turns
 

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.linalg import solve_banded
 
 import lqrsim as ls
-from lqrsim.costs import Cost, terms_of
 from lqrsim.errors import Array
+from lqrsim.problem.costs import Cost, terms_of
 
 Values = Any  # an array of real or complex numbers
 Rate = Callable[[list[Values], list[Values], Any], list[Any]]

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from lqrsim.errors import Array
-    from lqrsim.stress.given import TrialScore
+    from lqrsim.stress.trial_score import TrialScore
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,13 +39,13 @@ class Search:
 
     def _trials(self) -> "tuple[TrialScore, dict[str, Any]]":
         """The trials as a function of the numbers that they draw, and what there is to say of them in a file."""
-        from lqrsim import console
+        from lqrsim.commands import console
         from lqrsim.errors import InputError, check_count, check_number
         from lqrsim.machine import description
-        from lqrsim.references import resolve
-        from lqrsim.stress import given
-        from lqrsim.stress.asked import described
+        from lqrsim.scenarios.references import resolve
+        from lqrsim.stress import trial_score
         from lqrsim.stress.manifest import digest_of, digest_of_solution
+        from lqrsim.stress.specification import described
         from lqrsim.stress.sweeps import sweep
         from lqrsim.stress.trials import controller, solve
         from lqrsim.versions import versions
@@ -55,13 +55,13 @@ class Search:
         scenario = resolve(self.scenario)
         disturbances = [one.scaled(self.strength) for one in sweep(self.sweep, scenario)]
         solution = solve((self.policy,), scenario)[self.policy]
-        trials = given.TrialScore(
+        trials = trial_score.TrialScore(
             scenario.plant(),
             solution,
             disturbances,
             controller=controller(self.policy, scenario, solution),
             **scenario.near_enough(self.goal_radius, self.goal_tolerance),
-            failure={"collision": given.collision, "miss": given.miss}[self.failure],
+            failure={"collision": trial_score.collision, "miss": trial_score.miss}[self.failure],
         )
         if self.failure == "collision" and not len(trials.plant.world):
             raise InputError(
@@ -91,7 +91,8 @@ def write(folder: Path, name: str, about: dict[str, Any], trials: "TrialScore", 
     """The trials with these numbers as rollout.npz, and what was asked and found."""
     from dataclasses import replace
 
-    from lqrsim import console, files
+    from lqrsim.commands import console
+    from lqrsim.results import files
 
     # As they look: stopped by what they run into, up to which they are the same to the bit.
     rollout = replace(trials, contacts=True).rollout(numbers)
@@ -130,10 +131,10 @@ class Rare(Search):
         """Carry the command out; its exit code."""
         import numpy as np
 
-        from lqrsim import console
+        from lqrsim.commands import console
         from lqrsim.errors import check_count
-        from lqrsim.references import folder_name, resolve
-        from lqrsim.stress.splitting import NoFailure, split
+        from lqrsim.scenarios.references import folder_name, resolve
+        from lqrsim.stress.multilevel_splitting import NoFailure, split
 
         folder = self.out or Path("runs/rare") / folder_name(resolve(self.scenario))
         console.check_output("--out", folder)
@@ -198,11 +199,11 @@ class Break(Search):
         """Carry the command out; its exit code."""
         import numpy as np
 
-        from lqrsim import console
+        from lqrsim.commands import console
         from lqrsim.errors import InputError, check_count
-        from lqrsim.references import folder_name, resolve
-        from lqrsim.stress.breaking import in_words, smallest_failure
-        from lqrsim.stress.splitting import NoFailure, split
+        from lqrsim.scenarios.references import folder_name, resolve
+        from lqrsim.stress.design_point import in_words, smallest_failure
+        from lqrsim.stress.multilevel_splitting import NoFailure, split
 
         folder = self.out or Path("runs/break") / folder_name(resolve(self.scenario))
         console.check_output("--out", folder)
@@ -260,7 +261,7 @@ class Break(Search):
 
 def _teller(trials: "TrialScore") -> "Callable[[float], None]":
     """Says a level of the score, with its unit."""
-    from lqrsim import console
+    from lqrsim.commands import console
 
     unit = "m" if len(trials.plant.world) else trials.solution.target.unit
 

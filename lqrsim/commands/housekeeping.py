@@ -31,7 +31,7 @@ class Demo:
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim.demo import demo
+        from lqrsim.commands.demo import demo
 
         return demo(self.robots, out=self.out, seed=self.seed, video=self.video, quick=self.quick)
 
@@ -56,7 +56,7 @@ class Reproduce:
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim.reproduce import reproduce
+        from lqrsim.commands.reproduce import reproduce
 
         return reproduce(self.results, out=self.out, quick=self.quick)
 
@@ -76,19 +76,24 @@ class Cache:
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim import cache, console
+        from lqrsim.codegen import disk_cache
+        from lqrsim.commands import console
         from lqrsim.errors import InputError
 
         if self.clear:
             try:
-                console.say(f"removed {cache.clear()} items from {cache.folder()}")
+                console.say(f"removed {disk_cache.clear()} items from {disk_cache.folder()}")
             except OSError as error:
-                raise InputError(f"--clear: got {cache.folder()}, want files that can be removed ({error})") from None
+                raise InputError(
+                    f"--clear: got {disk_cache.folder()}, want files that can be removed ({error})"
+                ) from None
             return 0
-        items = cache.items()
+        items = disk_cache.items()
         for item in items:
             used = time.strftime("%Y-%m-%d %H:%M", time.localtime(item.used))
             console.say(f"{item.size / 1e6:8.2f} MB  last used {used}  {item.what}")
         total = sum(item.size for item in items) / 1e6
-        console.say(f"{len(items)} items, {total:.1f} of at most {cache.LIMIT / 1e6:.0f} MB, in {cache.folder()}")
+        console.say(
+            f"{len(items)} items, {total:.1f} of at most {disk_cache.LIMIT / 1e6:.0f} MB, in {disk_cache.folder()}"
+        )
         return 0

@@ -18,8 +18,9 @@ class List:
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim import console, scenarios
-        from lqrsim.references import resolve
+        from lqrsim import scenarios
+        from lqrsim.commands import console
+        from lqrsim.scenarios.references import resolve
 
         for name in scenarios.names():
             scenario = resolve(name)
@@ -68,10 +69,11 @@ class Solve:
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim import console, files
-        from lqrsim.constraints import Clearance
+        from lqrsim.commands import console
         from lqrsim.errors import InputError
-        from lqrsim.references import folder_name, from_anywhere, resolve
+        from lqrsim.problem.constraints import Clearance
+        from lqrsim.results import files
+        from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
 
         scenario = resolve(self.scenario)
         folder = self.out or Path("runs") / folder_name(scenario)
@@ -154,9 +156,10 @@ class Simulate:
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim import console, files
+        from lqrsim.commands import console
         from lqrsim.errors import InputError
-        from lqrsim.references import resolve
+        from lqrsim.results import files
+        from lqrsim.scenarios.references import resolve
         from lqrsim.simulation.closed_loop import simulate
         from lqrsim.stress.sweeps import sweep
 

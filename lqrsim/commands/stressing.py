@@ -60,8 +60,8 @@ class Stress:
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim import console
-        from lqrsim.references import folder_name, resolve
+        from lqrsim.commands import console
+        from lqrsim.scenarios.references import folder_name, resolve
         from lqrsim.stress.campaign import Campaign, run_campaign
         from lqrsim.stress.results import Results
         from lqrsim.stress.sweeps import sweep
@@ -116,9 +116,10 @@ class Replay:
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim import console, files
-        from lqrsim.stress.asked import Cell
+        from lqrsim.commands import console
+        from lqrsim.results import files
         from lqrsim.stress.results import Results, differences, replay
+        from lqrsim.stress.specification import Cell
         from lqrsim.versions import changed
 
         console.check_output("--out", self.out.parent, self.out.name)
@@ -156,10 +157,10 @@ class Report:
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim import console
+        from lqrsim.commands import console
         from lqrsim.errors import InputError
+        from lqrsim.reports.page import report
         from lqrsim.stress.results import Results
-        from lqrsim.view.report import report
 
         page = self.out or self.folder / "report.html"
         if page.suffix != ".html":

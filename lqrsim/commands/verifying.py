@@ -32,10 +32,11 @@ class Verify:
 
     def run(self) -> int:
         """Carry the command out; its exit code: 1 if a test failed."""
-        from lqrsim import console, files
-        from lqrsim.verify.drawn import verify_run
-        from lqrsim.verify.filmed import run_beside, verify_video
-        from lqrsim.verify.record import follows
+        from lqrsim.commands import console
+        from lqrsim.results import files
+        from lqrsim.verify.ground_truth import follows
+        from lqrsim.verify.rollout_check import verify_run
+        from lqrsim.verify.video_check import run_beside, verify_video
 
         is_run = self.file.suffix.lower() == ".npz"
         path = self.file if is_run else self.run_file or run_beside(self.file)

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from lqrsim.commands.options import optional
-from lqrsim.view.choices import OVERLAYS, Overlay, Quality
+from lqrsim.view.options import OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
-    from lqrsim.view.screen import Screen
+    from lqrsim.view.viewer_base import Screen
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +59,9 @@ class Render:
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim import console, files
+        from lqrsim.commands import console
         from lqrsim.errors import InputError
+        from lqrsim.results import files
         from lqrsim.view.render import render, still
 
         if not self.rollouts:
@@ -124,9 +125,10 @@ class View:
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
-        from lqrsim import console, files
+        from lqrsim.commands import console
         from lqrsim.errors import check_count, check_number, check_seed
-        from lqrsim.references import resolve
+        from lqrsim.results import files
+        from lqrsim.scenarios.references import resolve
         from lqrsim.view import viewer
 
         check_number("--speed", self.speed, at_least=0.01, at_most=100)

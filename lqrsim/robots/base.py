@@ -9,7 +9,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array, check_number
 
 if TYPE_CHECKING:
-    from lqrsim.dynamics import Dynamics
+    from lqrsim.problem.dynamics import Dynamics
 
 
 class Robot(abc.ABC):

@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.dynamics import Dynamics
 from lqrsim.errors import Array, vectors_of
+from lqrsim.problem.dynamics import Dynamics
 from lqrsim.robots.base import Robot
 
 

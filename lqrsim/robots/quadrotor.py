@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import rotations
-from lqrsim.dynamics import Dynamics
 from lqrsim.errors import Array, InputError, vectors_of
+from lqrsim.problem.dynamics import Dynamics
 from lqrsim.robots.base import Robot
 
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim import compiled
-from lqrsim.coordinates import Coordinates
+from lqrsim.control import law
+from lqrsim.control.controllers import Controller, Feedback
 from lqrsim.errors import (
     Array,
     InputError,
@@ -23,17 +23,17 @@ from lqrsim.errors import (
     shaped,
     told,
 )
-from lqrsim.results import Solution, Trajectory
-from lqrsim.rollout import Rollout
-from lqrsim.scenes import unlogged
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.goal import Target
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution, Trajectory
+from lqrsim.scenes.scene import unlogged
 from lqrsim.simulation.collisions import Collisions
-from lqrsim.simulation.controllers import Controller, Feedback
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.disturbances.base import Hook
 from lqrsim.simulation.physics import Physics, part_of
 from lqrsim.simulation.plant import MOST_STEPS, Plant
 from lqrsim.solvers.common import check_threads
-from lqrsim.target import Target
 from lqrsim.versions import versions
 
 
@@ -69,8 +69,8 @@ def simulate(
       seed: of all random numbers. trials: how many runs. first_trial: number of the first; trial `i` of a seed is the
         same to the last bit whatever runs beside it.
       goal_radius: how near the goal counts as having reached it, in metres; by default the robot's radius.
-      goal_tolerance: the same for goals without a position, relative to the plan's range; 0.1 by default. `target.py`
-        says of what.
+      goal_tolerance: the same for goals without a position, relative to the plan's range; 0.1 by default.
+        `results/goal.py` says of what.
       frames: whether to record what drawing needs, between the control periods too; without it there is no video.
       contacts: whether obstacles stop the robot, from the control period of its first collision on; or it goes through
         them, which takes a quarter less time and is the same to the bit until then, with the same outcome.
@@ -218,7 +218,7 @@ def simulate(
     seen += [np.full_like(seen[0], np.nan)] * missing
     drawn = np.stack(seen, axis=1)
     for array in (states, measured):
-        compiled.turn_to_nearest(states_space, array.transpose(1, 0, 2), plan.states)
+        law.turn_to_nearest(states_space, array.transpose(1, 0, 2), plan.states)
     if (np.minimum(lost_since, failed_since) <= steps).any():
         known_until = np.minimum(lost_since, failed_since + 1)  # the knot at which a controller fails is known
         driven_until = np.minimum(lost_since, failed_since)

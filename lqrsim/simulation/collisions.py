@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
+from lqrsim.scenes.world import ROW, signed_distance
 from lqrsim.simulation.physics import Period
 from lqrsim.simulation.plant import Plant
-from lqrsim.world import ROW, signed_distance
 
 FINEST = 0.02  # of the radius: along a line no two looks are further apart than what is clear there and this
 MOST = 1000  # looks along a line, at most

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from lqrsim.coordinates import PLANES, SPACE, Coordinates
 from lqrsim.errors import Array, InputError, check_number, excerpt
+from lqrsim.results.coordinates import Coordinates
 from lqrsim.robots.base import Robot
-from lqrsim.scenes import Scene
+from lqrsim.scenes.scene import Scene
+from lqrsim.scenes.world import PLANES, SPACE
 
 if TYPE_CHECKING:
     from lqrsim.simulation.plant import Plant

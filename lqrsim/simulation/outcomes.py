@@ -5,11 +5,11 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim import compiled
 from lqrsim.errors import Array, InputError, check_kind, check_shape, excerpt, numbers_of, shaped
-from lqrsim.problem import Problem
-from lqrsim.rollout import Rollout
-from lqrsim.target import OUTCOMES as OUTCOMES
+from lqrsim.problem.problem import Problem
+from lqrsim.results.goal import OUTCOMES as OUTCOMES
+from lqrsim.results.rollout import Rollout
+from lqrsim.solvers import compiled
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,12 +8,12 @@ import numpy as np
 import numpy.typing as npt
 from mujoco import batch
 
-from lqrsim import compiled
+from lqrsim.codegen import distances
 from lqrsim.errors import Array, InputError, check_kind, check_number, shaped, vectors_of
 from lqrsim.robots.base import Robot
-from lqrsim.scenes import Scene, free_name, obstacle_geoms
+from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
+from lqrsim.scenes.world import World
 from lqrsim.simulation import fitting
-from lqrsim.world import World
 
 MOST_STEPS = 100_000_000  # of the physics in a run: minutes or hours
 MOST_SUBSTEPS = 20_000  # physics steps in a control period; with more of them a run takes for ever
@@ -111,8 +111,8 @@ class Plant:
         if not len(self.world):
             return np.full(position.shape[:-1], np.inf)
         if displaced is None or not displaced.any():
-            return compiled.signed_distance(self.world, position) - self.robot.radius
-        return compiled.signed_distance_displaced(self.world, position, self.across(displaced)) - self.robot.radius
+            return distances.signed_distance(self.world, position) - self.robot.radius
+        return distances.signed_distance_displaced(self.world, position, self.across(displaced)) - self.robot.radius
 
     def across(self, vectors: Array) -> Array:
         """Vectors (..., 3) along the axes that `world` has, of vectors along those of the scene."""

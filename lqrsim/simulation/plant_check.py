@@ -19,7 +19,7 @@ from lqrsim.errors import (
     shaped,
 )
 from lqrsim.robots.base import Robot
-from lqrsim.scenes import Scene, unlogged
+from lqrsim.scenes.scene import Scene, unlogged
 from lqrsim.simulation.physics import UNSTABLE
 from lqrsim.simulation.plant import Plant
 

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import Array
-from lqrsim.problem import Problem
-from lqrsim.results import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
-from lqrsim.solvers import interface
+from lqrsim.kernels import interface
+from lqrsim.problem.problem import Problem
+from lqrsim.results.solution import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers.certify import certified
 from lqrsim.solvers.common import LOG_COLUMNS, Callback, Ending, SmootherSettings, Stop, check_outcome, iterate
-from lqrsim.solvers.start import Start
+from lqrsim.solvers.initial_guess import Start
 from lqrsim.solvers.workspace import Workspace
 
 
@@ -170,7 +170,7 @@ class Attempt:
         each: bool,
         callback: Callback | None,
     ) -> Ending:
-        """Damped iterations from the plan, whose cost and merit are in the memory; see `solvers/safeguard.py`.
+        """Damped iterations from the plan, whose cost and merit are in the memory; see `kernels/damped_iterations.py`.
 
         Args:
           before: the iterations that led there. least: what the tolerances of cost and gap are to be at least.

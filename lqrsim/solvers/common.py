@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim import compiled
-from lqrsim.checks import check_functions, check_start, functions_of
-from lqrsim.constraints import Clearance
+from lqrsim.codegen import distances
+from lqrsim.codegen.user_functions import External
 from lqrsim.errors import (
     Array,
     InputError,
@@ -24,14 +23,16 @@ from lqrsim.errors import (
     check_name,
     check_number,
 )
-from lqrsim.functions import External
+from lqrsim.kernels import interface
 from lqrsim.machine import processors
-from lqrsim.policy import AffinePolicy
-from lqrsim.problem import Problem
-from lqrsim.results import Candidate, Certificate, Iteration, Multipliers, Solution, Status, Trajectory
-from lqrsim.solvers import interface
-from lqrsim.solvers.start import Start, StartLike, resolve
-from lqrsim.value_functions import Moments, Quadratic
+from lqrsim.problem.constraints import Clearance
+from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
+from lqrsim.problem.problem import Problem
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.solution import Candidate, Certificate, Iteration, Multipliers, Solution, Status, Trajectory
+from lqrsim.results.value_functions import Moments, Quadratic
+from lqrsim.solvers import compiled
+from lqrsim.solvers.initial_guess import Start, StartLike, resolve
 from lqrsim.versions import versions
 
 Callback = Callable[[Iteration], object]
@@ -208,7 +209,7 @@ def iterate(
     stop: Stop,
     callback: Callback | None = None,
 ) -> Ending:
-    """Run a loop of `solvers/loops.py` until it ends, or there are so many iterations.
+    """Run a loop of `kernels/iterations.py` until it ends, or there are so many iterations.
 
     Args:
       problem: whose functions may raise meanwhile.
@@ -413,7 +414,7 @@ def clearance_of(problem: Problem, states: Array) -> Array | None:
     worlds = {(id(one.world), one.radius): one.world for one in (*problem.obstacle_costs, *constraints)}
     place = states[:, list(space.position)]
     found = [
-        compiled.signed_distance(world.seen_by(space.plane, space.offset), place) - radius
+        distances.signed_distance(world.seen_by(space.plane, space.offset), place) - radius
         for (_, radius), world in worlds.items()
         if len(world)
     ]

@@ -1,9 +1,9 @@
 """Constraints: from the optimum without them to one that keeps them, by the method of multipliers.
 
-The smoother minimises the augmented Lagrangian (see `augmented.py`), roughly; then the multipliers are renewed, and
-where what is missed has not halved, the penalty grows; and again. Were they renewed after every iteration, plans that
-slide along an obstacle would swing to and fro, for the model leaves out how an obstacle curves. Where undamped
-iterations do not settle, the safeguard's minimise each augmented Lagrangian.
+The smoother minimises the augmented Lagrangian (see `augmented_lagrangian.py`), roughly; then the multipliers are
+renewed, and where what is missed has not halved, the penalty grows; and again. Were they renewed after every iteration,
+plans that slide along an obstacle would swing to and fro, for the model leaves out how an obstacle curves. Where
+undamped iterations do not settle, the safeguard's minimise each augmented Lagrangian.
 """
 
 import dataclasses
@@ -11,15 +11,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lqrsim.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.errors import Array
-from lqrsim.problem import Problem
-from lqrsim.results import Iteration, Multipliers, Status
-from lqrsim.solvers import interface
+from lqrsim.kernels import interface
+from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
+from lqrsim.problem.problem import Problem
+from lqrsim.results.solution import Iteration, Multipliers, Status
+from lqrsim.results.value_functions import Moments
 from lqrsim.solvers.attempt import Attempt, Found
 from lqrsim.solvers.common import LOG_COLUMNS, Callback
-from lqrsim.solvers.start import Start
-from lqrsim.value_functions import Moments
+from lqrsim.solvers.initial_guess import Start
 
 PENALTY = 8.0  # at first, relative to what it costs to change what is constrained
 GROWTH = 5.0  # of the penalty

@@ -1,6 +1,6 @@
 """LQR smoothing and its iteration in continuous time: Secs. IV and V as the paper writes them.
 
-`differential.py` has the equations and integrates them.
+`riccati_ode.py` has the equations and integrates them.
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import PPoly
 
-from lqrsim.checks import check_functions, check_start, functions_of
+from lqrsim.codegen.user_functions import External
 from lqrsim.errors import (
     Array,
     InputError,
@@ -25,11 +25,13 @@ from lqrsim.errors import (
     excerpt,
     real,
 )
-from lqrsim.functions import External
-from lqrsim.linear_quadratic import Stage, check_end
-from lqrsim.problem import FixedState, Problem
-from lqrsim.results import Iteration, Status
-from lqrsim.solvers.differential import (
+from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
+from lqrsim.problem.linear_quadratic import Stage, check_end
+from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.results.solution import Iteration, Status
+from lqrsim.results.value_functions import Quadratic
+from lqrsim.solvers.initial_guess import InitialPrior
+from lqrsim.solvers.riccati_ode import (
     NO_MINIMUM,
     Model,
     Pass,
@@ -42,8 +44,6 @@ from lqrsim.solvers.differential import (
     riccati_pass,
     tolerances_of,
 )
-from lqrsim.solvers.start import InitialPrior
-from lqrsim.value_functions import Quadratic
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -4,12 +4,13 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from lqrsim import compiled
-from lqrsim.checks import check_functions
 from lqrsim.errors import Array, InputError
-from lqrsim.problem import Problem
-from lqrsim.results import Solution, Status
-from lqrsim.solvers import interface
+from lqrsim.kernels import interface
+from lqrsim.problem.derivative_check import check_functions
+from lqrsim.problem.problem import Problem
+from lqrsim.results.solution import Solution, Status
+from lqrsim.results.value_functions import Quadratic
+from lqrsim.solvers import compiled
 from lqrsim.solvers.certify import certified
 from lqrsim.solvers.common import (
     LOG_COLUMNS,
@@ -24,8 +25,7 @@ from lqrsim.solvers.common import (
     model,
     solve_all,
 )
-from lqrsim.solvers.start import InitialPrior, StartLike, resolve
-from lqrsim.value_functions import Quadratic
+from lqrsim.solvers.initial_guess import InitialPrior, StartLike, resolve
 
 
 def ilqr(

@@ -5,14 +5,14 @@ import time
 
 import numpy as np
 
-from lqrsim import compiled
-from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array, check_kind, check_memory, check_name, check_number
-from lqrsim.linear_quadratic import Stage, check_end
-from lqrsim.policy import AffinePolicy
-from lqrsim.problem import FixedState
-from lqrsim.results import Certificate, Iteration, Solution, Status, Trajectory
-from lqrsim.value_functions import Moments, Quadratic
+from lqrsim.problem.linear_quadratic import Stage, check_end
+from lqrsim.problem.problem import FixedState
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.solution import Certificate, Iteration, Solution, Status, Trajectory
+from lqrsim.results.value_functions import Moments, Quadratic
+from lqrsim.solvers import compiled
 from lqrsim.versions import versions
 
 

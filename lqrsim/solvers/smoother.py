@@ -4,10 +4,10 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from lqrsim.checks import check_functions
 from lqrsim.errors import InputError
-from lqrsim.problem import FixedState, Problem
-from lqrsim.results import Solution
+from lqrsim.problem.derivative_check import check_functions
+from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.results.solution import Solution
 from lqrsim.solvers.attempt import Attempt
 from lqrsim.solvers.common import (
     Callback,
@@ -21,8 +21,8 @@ from lqrsim.solvers.common import (
     list_of,
     solve_all,
 )
-from lqrsim.solvers.search import STARTS, Search, check_starts, guides
-from lqrsim.solvers.start import StartLike, resolve
+from lqrsim.solvers.initial_guess import StartLike, resolve
+from lqrsim.solvers.multistart import STARTS, Search, check_starts, guides
 
 
 def smooth(
@@ -48,7 +48,7 @@ def smooth(
     passes linearise about the states of least total cost. No trajectory is needed to start from. Paper: Sec. V.
 
     Which local optimum it ends in depends on the start. With an ObstacleCost, unless a start is given, several are
-    tried for a few iterations each, and the most promising goes on; see `solvers/search.py`.
+    tried for a few iterations each, and the most promising goes on; see `solvers/multistart.py`.
 
     Args:
       problem: with an initial cost, the paper's soft start, or a `FixedState`, which only the dual form takes.
@@ -56,7 +56,7 @@ def smooth(
       first_pass: "forward" or "backward"; each iteration ends with a backward pass, so the latter is one pass more.
         From controls it runs the dynamics backwards in time, from the minimiser of the final cost.
       safeguard: where the method fails, go on from the best plan so far by steps that lower its cost; see
-        `solvers/safeguard.py`. Where it converges, the safeguard changes nothing, to the last bit.
+        `kernels/damped_iterations.py`. Where it converges, the safeguard changes nothing, to the last bit.
       stop: "optimal" (change of cost, gap and first-order optimality all within tolerance) or "cost", the paper's
         test, which looks at the change of cost alone and can pass early.
       tolerance: of the relative change of cost, and of the optimality (see `Iteration`).

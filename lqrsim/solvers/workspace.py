@@ -5,20 +5,20 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim import compiled
 from lqrsim.errors import Array
-from lqrsim.problem import FixedState, Problem
-from lqrsim.solvers import interface
+from lqrsim.kernels import interface
+from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.results.value_functions import Moments, Quadratic
+from lqrsim.solvers import compiled
 from lqrsim.solvers.common import SmootherSettings, model
-from lqrsim.solvers.start import Start
-from lqrsim.value_functions import Moments, Quadratic
+from lqrsim.solvers.initial_guess import Start
 
 
 class Workspace:
-    """What the loops read and write; see `solvers/loops.py` and `safeguard.py` for what each is.
+    """What the loops read and write; see `kernels/iterations.py` and `damped_iterations.py` for what each is.
 
     Attributes:
-      multipliers: of each constraint, as `solvers/augmented.py` has them; changes act at once.
+      multipliers: of each constraint, as `kernels/augmented_lagrangian.py` has them; changes act at once.
       core: the compiled loops.
     """
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number
 from lqrsim.simulation.outcomes import Outcomes
-from lqrsim.stress.asked import Cell
+from lqrsim.stress.specification import Cell
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, Pairs, compare, holm, mean, paired_difference, rate, wilson
 
 Table = Mapping[Cell, Outcomes]

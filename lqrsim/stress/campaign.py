@@ -18,21 +18,21 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim import files
 from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path, check_text, excerpt
 from lqrsim.machine import description, processors
-from lqrsim.references import resolve
-from lqrsim.results import Trajectory
-from lqrsim.scenarios import Scenario
+from lqrsim.results import files
+from lqrsim.results.solution import Trajectory
+from lqrsim.scenarios.packaged import Scenario
+from lqrsim.scenarios.references import resolve
 from lqrsim.stress import cluster, executors
-from lqrsim.stress.asked import POLICIES as POLICIES
-from lqrsim.stress.asked import Campaign as Campaign
-from lqrsim.stress.asked import Cell as Cell
-from lqrsim.stress.asked import Shard
 from lqrsim.stress.lock import sole_writer
 from lqrsim.stress.manifest import NAME, digest_of, digest_of_solution, read_manifest, write_manifest
 from lqrsim.stress.results import Results
-from lqrsim.stress.shards import Damaged, write
+from lqrsim.stress.specification import POLICIES as POLICIES
+from lqrsim.stress.specification import Campaign as Campaign
+from lqrsim.stress.specification import Cell as Cell
+from lqrsim.stress.specification import Shard
+from lqrsim.stress.trial_tables import Damaged, write
 from lqrsim.stress.trials import Job, lean, left_out, possible, solve
 from lqrsim.versions import changed, versions
 

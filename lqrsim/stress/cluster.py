@@ -11,8 +11,8 @@ from concurrent.futures import CancelledError
 from typing import Any
 
 from lqrsim.errors import InputError, told
-from lqrsim.stress.asked import Shard
 from lqrsim.stress.executors import Done
+from lqrsim.stress.specification import Shard
 from lqrsim.stress.trials import Job, failed_work, work
 from lqrsim.versions import versions
 

@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection, wait
 
 from lqrsim import process
 from lqrsim.errors import InputError
-from lqrsim.stress.asked import Shard
+from lqrsim.stress.specification import Shard
 from lqrsim.stress.trials import Job, failed_work, prepare, work
 
 Done = Generator[tuple[Shard, bytes]]

@@ -13,38 +13,38 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim import plain
-from lqrsim.archive import Other, blamed
 from lqrsim.errors import InputError, excerpt
-from lqrsim.results import Solution
-from lqrsim.stress.asked import POLICIES, Campaign, Cell
-from lqrsim.stress.shards import write
+from lqrsim.results import schema
+from lqrsim.results.archive import Other, blamed
+from lqrsim.results.solution import Solution
+from lqrsim.stress.specification import POLICIES, Campaign, Cell
+from lqrsim.stress.trial_tables import write
 
 FORMAT, VERSION, NAME = "lqrsim campaign", 3, "manifest.json"
 _LARGEST = 1 << 26  # bytes
 
-_HASH = plain.line
-_POLICY = plain.one_of(POLICIES)
-_STRENGTH = plain.number(at_least=0.0)
-_DISTURBANCE = plain.record({"kind": plain.line, "settings": plain.mapped(plain.anything)})
-_CAMPAIGN = plain.record(
+_HASH = schema.line
+_POLICY = schema.one_of(POLICIES)
+_STRENGTH = schema.number(at_least=0.0)
+_DISTURBANCE = schema.record({"kind": schema.line, "settings": schema.mapped(schema.anything)})
+_CAMPAIGN = schema.record(
     {  # the fields of Campaign
-        "scenario": plain.line, "sweeps": plain.mapped(plain.listed(_DISTURBANCE)),
-        "strengths": plain.listed(_STRENGTH), "policies": plain.listed(_POLICY),
-        "trials": plain.count, "seed": plain.count,
+        "scenario": schema.line, "sweeps": schema.mapped(schema.listed(_DISTURBANCE)),
+        "strengths": schema.listed(_STRENGTH), "policies": schema.listed(_POLICY),
+        "trials": schema.count, "seed": schema.count,
         **dict.fromkeys(
-            ("replan_every", "goal_radius", "goal_tolerance"), plain.optional(plain.number(above=0.0))
+            ("replan_every", "goal_radius", "goal_tolerance"), schema.optional(schema.number(above=0.0))
         ),
-        "shard": plain.count, "time_limit": plain.number(above=0.0),
+        "shard": schema.count, "time_limit": schema.number(above=0.0),
     }
 )  # fmt: skip
-_MANIFEST = plain.record(
+_MANIFEST = schema.record(
     {
-        "format": plain.line, "version": plain.count, "campaign": _CAMPAIGN, "model": _HASH, "problem": _HASH,
-        "code": plain.mapped(plain.optional(_HASH)),
-        "policies": plain.mapped(plain.record({"digest": _HASH, "sha256": _HASH})),
-        "cells": plain.listed(plain.row(_POLICY, plain.line, _STRENGTH)), "versions": plain.mapped(plain.line),
-        "digest": _HASH, "machine": plain.line, "left_out": plain.line, "sha256": _HASH,
+        "format": schema.line, "version": schema.count, "campaign": _CAMPAIGN, "model": _HASH, "problem": _HASH,
+        "code": schema.mapped(schema.optional(_HASH)),
+        "policies": schema.mapped(schema.record({"digest": _HASH, "sha256": _HASH})),
+        "cells": schema.listed(schema.row(_POLICY, schema.line, _STRENGTH)), "versions": schema.mapped(schema.line),
+        "digest": _HASH, "machine": schema.line, "left_out": schema.line, "sha256": _HASH,
     }
 )  # fmt: skip
 
@@ -54,7 +54,7 @@ def write_manifest(folder: Path, contents: dict[str, Any]) -> None:
     manifest = {"format": FORMAT, "version": VERSION, **contents, "cells": _cells(contents["campaign"])}
     manifest["digest"] = digest_of_rows(manifest)
     manifest["sha256"] = _seal(manifest)
-    _check(plain.parse(json.dumps(manifest)))  # in this order: that of the sweeps is that of the cells
+    _check(schema.parse(json.dumps(manifest)))  # in this order: that of the sweeps is that of the cells
     write(json.dumps(manifest, indent=1).encode(), folder / NAME)
 
 
@@ -66,7 +66,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     with blamed(path, "folder"):
         if path.stat().st_size > _LARGEST:
             raise InputError(f"size: got {path.stat().st_size:,} bytes, want at most {_LARGEST:,}")
-        manifest = plain.parse(path.read_text(encoding="utf-8"))
+        manifest = schema.parse(path.read_text(encoding="utf-8"))
         if not isinstance(manifest, dict):
             raise InputError(f"manifest: got {excerpt(manifest)}, want an object")
         if (manifest.get("format"), manifest.get("version")) != (FORMAT, VERSION):
@@ -82,7 +82,7 @@ def _check(manifest: dict[str, Any]) -> None:
     if manifest["sha256"] != _seal(manifest):
         raise InputError("sha256: got another than that of the content, want a file that has not been changed")
     asked = manifest["campaign"]
-    if plain.canonical(manifest["cells"]) != plain.canonical(_cells(asked)):
+    if schema.canonical(manifest["cells"]) != schema.canonical(_cells(asked)):
         raise InputError("cells: got others than those of the campaign, want each sweep, strength and policy")
     if set(manifest["policies"]) != set(asked["policies"]):
         raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(asked['policies'])}")
@@ -103,7 +103,7 @@ def cells_of(manifest: Mapping[str, Any]) -> list[Cell]:
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:
-    return digest_of(plain.canonical({name: one for name, one in manifest.items() if name != "sha256"}).encode())
+    return digest_of(schema.canonical({name: one for name, one in manifest.items() if name != "sha256"}).encode())
 
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
@@ -112,7 +112,7 @@ def digest_of_rows(manifest: Mapping[str, Any]) -> str:
         "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},
         "policies": {policy: hashes["digest"] for policy, hashes in manifest["policies"].items()},
     }
-    return digest_of(plain.canonical(lasting).encode())
+    return digest_of(schema.canonical(lasting).encode())
 
 
 def digest_of(contents: bytes) -> str:

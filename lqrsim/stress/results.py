@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim import files
 from lqrsim.errors import InputError, check_count, check_flag, check_kind, check_name, check_path, check_text, excerpt
-from lqrsim.references import from_anywhere, resolve
-from lqrsim.results import Solution
-from lqrsim.rollout import Rollout
+from lqrsim.results import files
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
+from lqrsim.scenarios.references import from_anywhere, resolve
 from lqrsim.simulation.outcomes import OUTCOMES, Outcomes
 from lqrsim.stress.analysis import alike
-from lqrsim.stress.asked import Campaign, Cell, Shard, shards_of
 from lqrsim.stress.manifest import cells_of, digest_of, digest_of_solution, read_manifest
-from lqrsim.stress.shards import Damaged, Table, read
+from lqrsim.stress.specification import Campaign, Cell, Shard, shards_of
 from lqrsim.stress.statistics import CONFIDENCE, rate
+from lqrsim.stress.trial_tables import Damaged, Table, read
 from lqrsim.stress.trials import Trials
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from lqrsim.errors import InputError, check_name
-from lqrsim.scenarios import Scenario
+from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.disturbances.presets import PRESETS, preset
 

@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from lqrsim.control.controllers import Controller, Feedback, Replanning
 from lqrsim.errors import InputError, told
-from lqrsim.references import resolve
-from lqrsim.results import Solution
-from lqrsim.rollout import Rollout
-from lqrsim.scenarios import Scenario
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
+from lqrsim.scenarios.packaged import Scenario
+from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.closed_loop import simulate
-from lqrsim.simulation.controllers import Controller, Feedback, Replanning
 from lqrsim.simulation.outcomes import Outcomes, outcomes
 from lqrsim.solvers.ilqr import ilqr
 from lqrsim.solvers.smoother import smooth
-from lqrsim.stress.asked import POLICIES, Campaign, Cell, Shard
-from lqrsim.stress.shards import Table, pack
+from lqrsim.stress.specification import POLICIES, Campaign, Cell, Shard
+from lqrsim.stress.trial_tables import Table, pack
 
 _log = logging.getLogger("lqrsim")
 

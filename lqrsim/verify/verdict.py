@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt, shaped
-from lqrsim.verify.faults import explain
+from lqrsim.verify.diagnosis import explain
 
 HIDDEN = 0.05  # of the frames that may not show what is tracked
 SCALE = 0.002

@@ -32,7 +32,7 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.web import web_server
 
 from lqrsim.errors import InputError
-from lqrsim.view.screen import PUSHES, Screen
+from lqrsim.view.viewer_base import PUSHES, Screen
 
 TESTED = "4.0."  # MuJoCo's versions whose server is known
 LOOPBACK = "127.0.0.1"

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_array, check_number
-from lqrsim.rollout import Rollout
+from lqrsim.results.rollout import Rollout
 
 if TYPE_CHECKING:
     import mujoco

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from lqrsim.errors import Array
-from lqrsim.rollout import Rollout
+from lqrsim.results.rollout import Rollout
 from lqrsim.view.cameras import Camera
 from lqrsim.view.decor import decorate
 

@@ -9,13 +9,13 @@ import numpy.typing as npt
 from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError
-from lqrsim.results import Solution
-from lqrsim.view import caption
-from lqrsim.view.caption import Colour
-from lqrsim.view.choices import Overlay
+from lqrsim.results.solution import Solution
+from lqrsim.view import text_tiles
 from lqrsim.view.decor import PLAN, decorate
+from lqrsim.view.ellipsoids import ABOVE, SIGMAS, ellipsoids
+from lqrsim.view.options import Overlay
+from lqrsim.view.text_tiles import Colour
 from lqrsim.view.track import Track
-from lqrsim.view.tube import ABOVE, SIGMAS, ellipsoids
 
 # As PLAN, no colours of the error map, and none of the robots.
 FORCE = (0.0, 0.50, 0.36)
@@ -96,7 +96,7 @@ class Overlays:
             done = int(np.searchsorted(self.knots, time, side="right"))
             points = np.vstack([self.trace[:done], track.driven(time)])
             errors = np.append(self.errors[:done], track.number_at(track.error, time))
-            colours = caption.error_colours(0.5 * (errors[1:] + errors[:-1]) / self.scale.error)
+            colours = text_tiles.error_colours(0.5 * (errors[1:] + errors[:-1]) / self.scale.error)
             pen.ribbon(points + lift, (2.6 if track.planar else 1.1) * self.width, colours)
         if "plan" in self.show:
             colours = np.tile((*PLAN, 1.0), (len(self.plan) - 1, 1))

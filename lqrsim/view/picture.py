@@ -8,26 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import (
-    InputError,
-    check_count,
-    check_items,
-    check_kind,
-    check_name,
-    check_text,
-    excerpt,
-)
-from lqrsim.results import Solution
-from lqrsim.rollout import Rollout
+from lqrsim.errors import InputError, check_count, check_items, check_kind, check_name, check_text, excerpt
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
 from lqrsim.view import gl, marker
-from lqrsim.view.caption import Pixels
-from lqrsim.view.choices import OVERLAYS, Overlay, Quality
-from lqrsim.view.footage import Pane
+from lqrsim.view.camera_views import Shot, leaves_room, shot
+from lqrsim.view.captions import Caption, Legend
+from lqrsim.view.options import OVERLAYS, Overlay, Quality
 from lqrsim.view.overlays import Overlays, scale
-from lqrsim.view.shots import Shot, leaves_room, shot
-from lqrsim.view.stage import Box, Stage, stage
-from lqrsim.view.telling import Caption, Legend
+from lqrsim.view.scene_renderer import Box, Stage, stage
+from lqrsim.view.text_tiles import Pixels
 from lqrsim.view.track import Track
+from lqrsim.view.video_metadata import Pane
 
 LARGEST = 8192  # pixels of a side: what OpenGL can surely draw
 RUNS = 6  # more can not be told apart side by side

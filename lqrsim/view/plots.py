@@ -10,11 +10,11 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_text
-from lqrsim.results import Solution, Trajectory
-from lqrsim.rollout import Rollout
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution, Trajectory
+from lqrsim.scenes.world import World
 from lqrsim.view import scenery, style
 from lqrsim.view.style import LIMIT, PLAN, RUNS
-from lqrsim.world import World
 
 
 def plot_run(

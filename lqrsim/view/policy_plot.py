@@ -10,12 +10,12 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from lqrsim.errors import Array, InputError, check_kind, check_number
-from lqrsim.policy import AffinePolicy
-from lqrsim.results import Solution
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.solution import Solution
+from lqrsim.scenes.world import World
 from lqrsim.view import scenery, style
+from lqrsim.view.ellipsoids import ABOVE, SIGMAS, outlines
 from lqrsim.view.style import PLAN, RUNS
-from lqrsim.view.tube import ABOVE, SIGMAS, outlines
-from lqrsim.world import World
 
 TUBE, OUTLINE = "#d5c8ec", "#7a4dc7"
 OUTLINES = 24  # ellipses whose outlines are drawn

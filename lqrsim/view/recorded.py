@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 
 from lqrsim.errors import InputError, check_count, check_kind
-from lqrsim.rollout import Rollout
-from lqrsim.scenes import model_from_xml
+from lqrsim.results.rollout import Rollout
+from lqrsim.scenes.scene import model_from_xml
 
 
 def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:

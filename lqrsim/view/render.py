@@ -9,13 +9,13 @@ import numpy as np
 from PIL import Image
 
 from lqrsim.errors import InputError, check_function, check_name, check_number, check_path, excerpt
-from lqrsim.files import replacing
-from lqrsim.results import Solution
-from lqrsim.rollout import Rollout
-from lqrsim.view import footage
-from lqrsim.view.choices import OVERLAYS, Overlay, Quality
+from lqrsim.results.files import replacing
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
+from lqrsim.view import video_metadata
+from lqrsim.view.options import OVERLAYS, Overlay, Quality
 from lqrsim.view.picture import QUALITIES, Picture, picture
-from lqrsim.view.stage import ROBOTS
+from lqrsim.view.scene_renderer import ROBOTS
 from lqrsim.view.video import encoder, gif
 
 FADE_SECONDS = 0.25
@@ -86,8 +86,8 @@ def render(
             writer = gif(unfinished, rate, samples)
         else:
             looks = QUALITIES[quality]
-            about = footage.Footage(
-                tuple(footage.digest(run) for run in drawn.runs), drawn.markers, rate, speed, count, drawn.panes
+            about = video_metadata.Footage(
+                tuple(video_metadata.digest(run) for run in drawn.runs), drawn.markers, rate, speed, count, drawn.panes
             )
             writer = encoder(unfinished, drawn.size, rate, crf=looks.crf, preset=looks.preset, footage=about)
         with writer as encode:

@@ -5,10 +5,10 @@ from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d import Axes3D
 from scipy.spatial import ConvexHull
 
-from lqrsim import compiled
+from lqrsim.codegen import distances
 from lqrsim.errors import Array
+from lqrsim.scenes.world import Obstacle, World
 from lqrsim.view.style import MARGIN, SOLID
-from lqrsim.world import Obstacle, World
 
 EDGE = "#5b6470"
 
@@ -37,7 +37,7 @@ def draw_in_plane(axes: Axes, flat: World, low: Array, high: Array, radius: floa
         np.unique(np.append(np.arange(low[axis], high[axis] + spacing, spacing), np.array(places)[:, axis]))
         for axis in (0, 1)
     )
-    distance = compiled.signed_distance(flat, np.stack(np.meshgrid(x, y), axis=-1))
+    distance = distances.signed_distance(flat, np.stack(np.meshgrid(x, y), axis=-1))
     levels = [-np.inf, 0, radius] if radius > 0 else [-np.inf, 0]
     axes.contourf(x, y, distance, levels=levels, colors=[SOLID, MARGIN][: len(levels) - 1])
     axes.contour(x, y, distance, levels=[0], colors=[EDGE], linewidths=0.8)

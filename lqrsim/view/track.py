@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from lqrsim.errors import Array, InputError
-from lqrsim.rollout import Rollout
+from lqrsim.results.rollout import Rollout
 from lqrsim.view.recorded import floor_below, model_of
 
 SEEN = 0.2  # seconds for which a push is shown: one control period would be gone before it is seen, and noise flickers

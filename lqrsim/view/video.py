@@ -12,8 +12,8 @@ import numpy as np
 from av.video.reformatter import Colorspace
 from PIL import Image
 
-from lqrsim.view.caption import Pixels
-from lqrsim.view.footage import Footage
+from lqrsim.view.text_tiles import Pixels
+from lqrsim.view.video_metadata import Footage
 
 WAITING = 3  # frames that may wait to be encoded
 COLOURS = 192  # of a GIF

@@ -12,14 +12,14 @@ import mujoco
 import numpy as np
 
 from lqrsim.errors import Array, InputError
-from lqrsim.results import Solution
-from lqrsim.rollout import Rollout
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
 from lqrsim.view.browser import Browser
 from lqrsim.view.recorded import model_of
-from lqrsim.view.screen import PUSHES, Again, Closed, Screen
+from lqrsim.view.viewer_base import PUSHES, Again, Closed, Screen
 
 KEYS = """Arrow keys and Page Up/Down push the robot, seen from the camera. Ctrl and the right mouse button drag it.
 Space pauses, Backspace starts again."""

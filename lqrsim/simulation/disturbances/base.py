@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from mujoco import batch
 
-from lqrsim.coordinates import Coordinates
 from lqrsim.errors import Array, InputError, check_array, check_function, check_number, excerpt, real, shaped
-from lqrsim.results import Trajectory
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.solution import Trajectory
 from lqrsim.simulation.plant import Plant
 
 Hook = Callable[[int, Array], Array]

@@ -6,17 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lqrsim.errors import InputError, check_array, check_number
-from lqrsim.results import Trajectory
-from lqrsim.simulation.disturbances.base import (
-    Disturbance,
-    Effect,
-    Spread,
-    fit,
-    normal,
-    times,
-    with_units,
-    words,
-)
+from lqrsim.results.solution import Trajectory
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, Spread, fit, normal, times, with_units, words
 from lqrsim.simulation.plant import Plant
 
 

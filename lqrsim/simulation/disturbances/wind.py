@@ -6,17 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lqrsim.errors import Array, InputError, check_array, check_name, check_number
-from lqrsim.results import Trajectory
-from lqrsim.simulation.disturbances.base import (
-    Disturbance,
-    Effect,
-    Numbers,
-    check_numbers,
-    fit,
-    normal,
-    times,
-    words,
-)
+from lqrsim.results.solution import Trajectory
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, Numbers, check_numbers, fit, normal, times, words
 from lqrsim.simulation.plant import Plant
 
 FOOT = 0.3048  # m

@@ -1,0 +1,148 @@
+"""What took long to make, kept on disk by content: compiled functions, and the sources traced from formulas.
+
+An item's name is a hash of all that it depends on, so an item cannot be stale; its first line is a checksum, so a
+damaged one is as good as none. A cache that cannot be read or written costs time, never an error. When the items
+outgrow `LIMIT`, those that were used longest ago go.
+
+Items are programs: compiled functions are unpickled and run, and sources are executed. The checksum keeps off damage,
+not people. Who can write the folder can have code run by whoever reads it: share it with nobody whom you do not trust.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import platformdirs
+
+from lqrsim.errors import InputError
+from lqrsim.results.files import replacing
+
+LIMIT = 256 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about one megabyte
+_SUFFIX = ".item"
+_DURATIONS = "durations.json"
+
+
+@dataclass(frozen=True)
+class Item:
+    """One thing in the cache: what it is, its size in bytes, and when it was last used (seconds since 1970)."""
+
+    what: str
+    path: Path
+    size: int
+    used: float
+
+
+def folder() -> Path:
+    """Where the items are: $LQRSIM_CACHE_DIR, or the user's cache folder."""
+    override = os.environ.get("LQRSIM_CACHE_DIR")
+    return Path(override).expanduser() if override else Path(platformdirs.user_cache_dir("lqrsim", appauthor=False))
+
+
+def key(*parts: str | bytes) -> str:
+    """A name for what is made of these parts, in this order."""
+    hasher = hashlib.sha256()
+    for part in parts:
+        encoded = part.encode() if isinstance(part, str) else part
+        hasher.update(f"{len(encoded)}:".encode() + encoded)
+    return hasher.hexdigest()[:32]
+
+
+def load(name: str) -> bytes | None:
+    """The contents of an item; None if there is none, or it is damaged or cannot be read."""
+    path = folder() / f"{name}{_SUFFIX}"
+    try:
+        header, _, contents = path.read_bytes().partition(b"\n")
+        good = json.loads(header)["sha256"] == hashlib.sha256(contents).hexdigest()
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    if not good:
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)  # it was used now
+    return contents
+
+
+def save(name: str, contents: bytes, what: str) -> None:
+    """Keep an item if that is possible; two processes that keep the same one do not disturb each other."""
+    header = json.dumps({"what": what, "sha256": hashlib.sha256(contents).hexdigest()}).encode()
+    with contextlib.suppress(OSError, InputError):
+        with replacing(folder() / f"{name}{_SUFFIX}") as unfinished:
+            unfinished.write_bytes(header + b"\n" + contents)
+        _shrink()
+
+
+def note(name: str, seconds: float) -> None:
+    """Keep how long something took on this machine, if that is possible; the last time counts."""
+    with contextlib.suppress(OSError, InputError, ValueError), replacing(folder() / _DURATIONS) as unfinished:
+        unfinished.write_text(json.dumps(_durations() | {name: seconds}), encoding="utf-8")
+
+
+def noted(name: str) -> float | None:
+    """How many seconds that took the last time; None if that is not known."""
+    seconds = _durations().get(name)
+    return seconds if isinstance(seconds, float) and 0 < seconds < 1e5 else None
+
+
+def _durations() -> dict[str, object]:
+    try:
+        found = json.loads((folder() / _DURATIONS).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def items() -> list[Item]:
+    """What there is, the last used first."""
+    found = []
+    for path in _files(f"[!.]*{_SUFFIX}"):
+        with contextlib.suppress(OSError):  # another process may remove it meanwhile
+            status = path.stat()
+            with path.open("rb") as file:
+                header = file.readline(10_000)
+            try:
+                what = str(json.loads(header)["what"])
+            except (ValueError, KeyError, TypeError):
+                what = "damaged; it will be made again"
+            found.append(Item(what, path, status.st_size, status.st_mtime))
+    return sorted(found, key=lambda item: -item.used)
+
+
+def clear() -> int:
+    """Remove all items, and what was left unfinished; how many items there were. Raises OSError if one stays."""
+    removed = items()
+    for path in [*(item.path for item in removed), *_unfinished(0.0)]:
+        path.unlink(missing_ok=True)
+    with contextlib.suppress(NotADirectoryError):
+        (folder() / _DURATIONS).unlink(missing_ok=True)
+    return len(removed)
+
+
+def _shrink() -> None:
+    total = 0
+    for item in items():
+        total += item.size
+        if total > LIMIT:
+            item.path.unlink(missing_ok=True)
+    for path in _unfinished(3600.0):
+        path.unlink(missing_ok=True)
+
+
+def _files(pattern: str) -> list[Path]:
+    try:
+        return list(folder().glob(pattern))
+    except OSError:  # a folder that may not be looked into
+        return []
+
+
+def _unfinished(age: float) -> list[Path]:
+    """What a process that was killed did not finish, at least `age` seconds ago."""
+    found = []
+    for path in _files(f".*{_SUFFIX}"):
+        with contextlib.suppress(OSError):
+            if time.time() - path.stat().st_mtime >= age:
+                found.append(path)
+    return found

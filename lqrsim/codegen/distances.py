@@ -1,0 +1,43 @@
+"""Distances to obstacles, compiled."""
+
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen.jit import Core, compiling, source_of
+from lqrsim.errors import Array
+from lqrsim.kernels import interface
+from lqrsim.kernels import signed_distance as kernel
+from lqrsim.scenes.world import World
+
+
+def signed_distance(world_seen: World, points: npt.ArrayLike) -> Array:
+    """As `world_seen.distance(points)`, compiled: (...) from points (..., 2 or 3)."""
+    points = np.asarray(points, dtype=np.float64)
+    flat = np.zeros((points[..., 0].size, 3))
+    flat[:, : points.shape[-1]] = points.reshape(-1, points.shape[-1])
+    out = np.empty(len(flat))
+    table = np.array(world_seen.table)
+    with compiling:
+        distances = _distance_core()
+    distances.nearest(len(table), len(flat), table.ravel(), flat, out)
+    return out.reshape(points.shape[:-1])
+
+
+def signed_distance_displaced(world_seen: World, points: Array, displaced: Array) -> Array:
+    """The same with obstacles that are elsewhere: (K, k) from points (K, k, 2 or 3), displaced (K, obstacles, 3)."""
+    trials, count, size = points.shape
+    flat = np.zeros((trials * count, 3))
+    flat[:, :size] = points.reshape(-1, size)
+    out, table = np.empty(len(flat)), np.array(world_seen.table)
+    away = np.ascontiguousarray(displaced, dtype=np.float64).reshape(trials, -1)
+    with compiling:
+        distances = _distance_core()
+    distances.nearest_displaced(len(table), len(flat), count, table.ravel(), flat, away, out)
+    return out.reshape(trials, count)
+
+
+@cache
+def _distance_core() -> Core:
+    return Core(source_of(kernel), {"ROW": interface.ROW}, "distances to obstacles")

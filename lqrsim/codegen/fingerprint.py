@@ -1,0 +1,173 @@
+"""A hash of what a function does, without running it: the key under which what is derived from it can be kept.
+
+It covers the function's code, constants, defaults and closure, numba's options, and the functions, numbers and strings
+it refers to, as deep as that goes. What belongs to NumPy, SymPy or numba counts by that package's version. A function
+that refers to anything else (an object that may change, a module of the user's own, a file) has no fingerprint, and
+nothing of it is kept.
+"""
+
+import dis
+import functools
+import importlib.metadata
+import inspect
+import sys
+import types
+import weakref
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from lqrsim import rotations
+from lqrsim.codegen import disk_cache
+from lqrsim.kernels import rotation_ratios
+
+# What formulas may use without being read: by version, which the hash includes.
+_PACKAGES = ("math", "numba", "numpy", "sympy")
+_MODULES = ("lqrsim", "lqrsim.rotations")
+# What reads files, other names or chance: a function that mentions these does more than can be covered.
+_REFUSED = {
+    "open", "input", "eval", "exec", "compile", "globals", "locals", "vars", "getattr", "setattr", "__import__",
+    "random", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "frompyfunc", "vectorize",
+}  # fmt: skip
+_PLAIN = (int, float, complex, str, bytes, bool, type(None), type(Ellipsis))
+
+
+class _NoFingerprint(Exception):
+    pass
+
+
+def fingerprint(function: Any) -> str | None:
+    """The hash, the same in every process; None if there is something that it could not cover."""
+    try:
+        return disk_cache.key(*_versions(), *_function(function, {}))
+    except (_NoFingerprint, RecursionError):
+        return None
+
+
+@functools.cache
+def _versions() -> tuple[str, ...]:
+    installed = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES if name != "math")
+    return (sys.version, *installed, inspect.getsource(rotations), inspect.getsource(rotation_ratios))
+
+
+def helpers(function: Any) -> list[Any]:
+    """The numba functions that a function with a fingerprint refers to, at any depth."""
+    seen: dict[int, Any] = {}
+    for _ in _function(function, seen):
+        pass
+    return [found for found in seen.values() if found is not function and hasattr(found, "py_func")]
+
+
+_seen_fresh: weakref.WeakKeyDictionary[Any, str | None] = weakref.WeakKeyDictionary()
+
+
+def note_helpers(function: Any) -> None:
+    """Remember which helpers are not compiled yet: their globals will be what they are now."""
+    if fingerprint(function) is not None:
+        _seen_fresh.update((helper, fingerprint(helper)) for helper in helpers(function) if not helper.overloads)
+
+
+def stale(function: Any) -> bool:
+    """Whether a helper may have been compiled when its globals were others: numba keeps them as they were."""
+    return any(helper.overloads and _seen_fresh.get(helper, "") != fingerprint(helper) for helper in helpers(function))
+
+
+def _function(function: Any, seen: dict[int, Any]) -> Iterator[str]:
+    """What a Python or numba function is made of."""
+    if id(function) in seen:  # by its number, for another one would be another function
+        yield f"seen {list(seen).index(id(function))}"
+        return
+    seen[id(function)] = function
+    if hasattr(function, "py_func"):
+        yield from _value(getattr(function, "targetoptions", {}), seen)
+        yield repr(getattr(function, "locals", {}))
+        function = function.py_func
+    if not isinstance(function, types.FunctionType) or vars(function):
+        raise _NoFingerprint
+    yield from _code(function.__code__)
+    yield from _value(function.__defaults__, seen)
+    for name, default in sorted((function.__kwdefaults__ or {}).items()):
+        yield name
+        yield from _value(default, seen)
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        yield name
+        try:
+            contents = cell.cell_contents
+        except ValueError:  # not assigned yet
+            raise _NoFingerprint from None
+        yield from _value(contents, seen)
+    for name in sorted(_names(function.__code__)):
+        if name in function.__globals__:
+            yield name
+            yield from _value(function.__globals__[name], seen)
+
+
+def _code(code: types.CodeType) -> Iterator[str]:
+    yield repr((code.co_code, code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars, code.co_flags))
+    yield repr((code.co_argcount, code.co_kwonlyargcount, code.co_posonlyargcount, code.co_exceptiontable))
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from _code(constant)
+        else:
+            yield from _value(constant, {})
+
+
+def _names(code: types.CodeType) -> set[str]:
+    """The global names that code reads, and that of functions inside it; refuses imports of what has no version."""
+    if _REFUSED & set(code.co_names):
+        raise _NoFingerprint
+    found = set()
+    instructions = list(dis.get_instructions(code))
+    for i, instruction in enumerate(instructions):
+        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+            found.add(instruction.argval)
+        elif instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
+            raise _NoFingerprint
+        elif instruction.opname == "IMPORT_NAME":
+            absolute = instructions[i - 2].argval == 0  # the level of the import
+            if not (absolute and _known(instruction.argval)):
+                raise _NoFingerprint
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            found |= _names(constant)
+    return found
+
+
+def _known(module: str) -> bool:
+    return module in _MODULES or module.split(".")[0] in _PACKAGES
+
+
+def _value(value: Any, seen: dict[int, Any]) -> Iterator[str]:
+    """A value that a function refers to."""
+    if isinstance(value, _PLAIN):
+        yield f"{type(value).__name__} {value!r}"
+    elif (type(value) is np.ndarray or isinstance(value, np.generic)) and not value.dtype.hasobject:
+        yield repr((value.dtype.descr, value.shape, value.tobytes()))
+    elif isinstance(value, tuple | list | frozenset | set):
+        yield f"{type(value).__name__} {len(value)}"
+        parts = ["\n".join(_value(part, seen)) for part in value]
+        yield from sorted(parts) if isinstance(value, frozenset | set) else parts
+    elif isinstance(value, dict):
+        yield f"dict {len(value)}"
+        for key, part in value.items():
+            yield from _value(key, seen)
+            yield from _value(part, seen)
+    elif _packaged(value):
+        owner = getattr(value, "__module__", None)
+        yield f"{owner}.{getattr(value, '__qualname__', getattr(value, '__name__', ''))}"
+    else:
+        yield from _function(value, seen)
+
+
+def _packaged(value: Any) -> bool:
+    """Whether a module, a function or a class is an installed package's, or Python's own."""
+    if isinstance(value, types.ModuleType):
+        return _known(value.__name__)
+    if isinstance(value, types.BuiltinFunctionType):
+        return True
+    if isinstance(value, np.ufunc):
+        return getattr(np, value.__name__, None) is value
+    named = isinstance(value, types.FunctionType | type) or hasattr(value, "py_func")
+    home = getattr(value, "__module__", None) or ""
+    return named and (home.split(".")[0] in _PACKAGES or (home == "builtins" and isinstance(value, type)))

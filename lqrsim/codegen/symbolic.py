@@ -1,0 +1,204 @@
+"""From a plain Python function of symbols to the source of a compiled one. SymPy is imported only when this runs."""
+
+import contextlib
+import functools
+import json
+import keyword
+import unicodedata
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from lqrsim.codegen import disk_cache
+from lqrsim.codegen.fingerprint import fingerprint
+from lqrsim.errors import InputError, check_kind, check_number, excerpt
+from lqrsim.rotations import RATIOS
+
+MOST = 1000  # parameters of a function
+
+
+class Parameters(SimpleNamespace):
+    """The `p` of `f(x, u, p)`: one attribute a parameter; an unknown name is refused with the valid ones."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise InputError(f"parameter: got {name!r}, want one of: {', '.join(vars(self)) or '(there are none)'}")
+
+
+def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]:
+    """The parameters as floats. Raises InputError unless each is finite and its name can be written `p.name`."""
+    if parameters is None:
+        return {}
+    check_kind("parameters", parameters, Mapping, "a dictionary of name: value")
+    if len(parameters) > MOST:
+        raise InputError(f"parameters: got {len(parameters)}, want at most {MOST}")
+    for name in parameters:
+        if not isinstance(name, str) or not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):
+            raise InputError(
+                f"parameters: got the name {excerpt(name)}, want a Python name without a leading underscore, for p.name"
+            )
+    # Python reads p.µ by the normal form of the name.
+    normal = {unicodedata.normalize("NFKC", name): value for name, value in parameters.items()}
+    return {name: check_number(f"parameters: {name}", value) for name, value in normal.items()}
+
+
+def kept(function: Callable[..., Any], details: object, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What `make` derives from a user's function, from the cache if it is there: then SymPy need not be imported.
+
+    What can not be told from other functions by its fingerprint is derived anew, and errors are not kept.
+    """
+    print_of_it = fingerprint(function)
+    if print_of_it is None:
+        return make()
+    key = disk_cache.key("derivatives", _writers(), print_of_it, repr(details))
+    stored = disk_cache.load(key)
+    if stored is not None:
+        with contextlib.suppress(ValueError):
+            return json.loads(stored)
+    made = make()
+    name = getattr(function, "__qualname__", repr(function))
+    disk_cache.save(key, json.dumps(made).encode(), f"derivatives of {name}(x, u, p)")
+    return made
+
+
+@functools.cache
+def _writers() -> str:
+    """The code that writes what is kept: with other code, something else may be right."""
+    package = Path(__file__).parents[1]
+    files = (package / name for name in ("codegen/symbolic.py", "problem/dynamics.py", "problem/costs.py"))
+    return "".join(file.read_text(encoding="utf-8") for file in files)
+
+
+def trace(
+    function: Callable[..., Any], states: int, controls: int, parameters: Sequence[str]
+) -> tuple[list[Any], list[Any], list[Any]]:
+    """Call `function(x, u, p)` with symbols.
+
+    Returns:
+      The expressions it returned (one, or a list of them), the symbols x[0], x[1], ..., and the symbols u[0], ....
+
+    Raises:
+      InputError: it failed on symbols, or returned something that is no expression.
+    """
+    import sympy
+
+    x = [sympy.Symbol(f"x{i}", real=True) for i in range(states)]
+    u = [sympy.Symbol(f"u{i}", real=True) for i in range(controls)]
+    p = Parameters(**{name: sympy.Symbol(f"p{i}", real=True) for i, name in enumerate(parameters)})
+    name = getattr(function, "__qualname__", repr(function))
+    try:
+        returned = function(tuple(x), tuple(u), p)
+    except InputError as error:
+        raise InputError(f"{name}(x, u, p): {error}") from None
+    except Exception as error:  # whatever a user's function may raise becomes one line
+        raise InputError(
+            f"{name}(x, u, p): got {type(error).__name__} ({error}) when called with symbols, {states} in x and"
+            f" {controls} in u, want plain arithmetic and functions of SymPy (from sympy import sin, Max, ...);"
+            " for NumPy's functions and for branches there is level='compiled' or 'plain'"
+        ) from None
+    if returned is None:
+        raise InputError(f"{name}(x, u, p): got None, want what it computes: is a return missing?")
+    if hasattr(returned, "tolist"):  # an array of NumPy's, or a matrix of SymPy's
+        returned = [entry for row in returned.tolist() for entry in (row if isinstance(row, list) else [row])]
+    listed = returned if isinstance(returned, (list, tuple)) else [returned]
+    expressions = []
+    for i, entry in enumerate(listed):
+        try:
+            expression = sympy.sympify(entry, strict=True)
+        except sympy.SympifyError:
+            raise InputError(f"{name}(x, u, p): got {excerpt(entry)} as entry {i}, want an expression") from None
+        if not isinstance(expression, sympy.Expr):
+            raise InputError(f"{name}(x, u, p): got {excerpt(entry)} as entry {i}, want an expression")
+        known = {*x, *u, *vars(p).values()}
+        strange = sorted(str(symbol) for symbol in expression.free_symbols - known)
+        if strange:
+            raise InputError(f"{name}(x, u, p): got the unknown symbol {strange[0]} in entry {i}, want x, u and p only")
+        if expression.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo, sympy.I):
+            raise InputError(f"{name}(x, u, p): got {expression} as entry {i}, want a finite real expression")
+        for piecewise in expression.atoms(sympy.Piecewise):
+            last: Any = piecewise.args[-1]
+            if last[1] != sympy.true:
+                raise InputError(
+                    f"{name}(x, u, p): got {piecewise} in entry {i}, want its last case to be (expression, True)"
+                )
+        expressions.append(expression)
+    return expressions, x, u
+
+
+def write_function(
+    name: str, arguments: str, data: str, assignments: Mapping[str, Any], *, of: str, returns: str | None = None
+) -> str:
+    """Source of a function that evaluates SymPy expressions, with common subexpressions shared.
+
+    Args:
+      arguments: the signature. data: the argument that holds the parameters p0, p1, ...; x and u are those named so.
+      assignments: target (`out[0]`, `hessian[1, 2]`, ...; `+=` if it ends in `+`) -> expression.
+      of: what messages call the user's function.
+      returns: the target, among `assignments`, that is returned instead of stored.
+    """
+    import sympy
+    from sympy.printing.codeprinter import PrintMethodNotImplementedError
+    from sympy.printing.pycode import PythonCodePrinter
+
+    class Printer(PythonCodePrinter):
+        def _print_Function(self, expr: Any) -> str:
+            head = expr.func.__name__
+            if head.partition("_d")[0] in RATIOS:
+                return f"{head}({self._print(expr.args[0])})"
+            return super()._print_Function(expr)  # pyright: ignore[reportAttributeAccessIssue]
+
+        def _print_Pow(self, expr: Any, rational: bool = False) -> str:
+            base, exponent = expr.args
+            if exponent.is_Integer and 2 <= abs(int(exponent)) <= 4:
+                # Products are several times faster than pow.
+                product = "*".join([self.parenthesize(base, 60)] * abs(int(exponent)))
+                return f"({product})" if exponent > 0 else f"(1/({product}))"
+            return super()._print_Pow(expr, rational=rational)
+
+    def smooth_almost_everywhere(expression: Any) -> Any:
+        """A kink or a jump has no derivative there, and where it has one its delta is zero."""
+        expression = expression.replace(sympy.DiracDelta, lambda *arguments: sympy.Integer(0))
+        for kind in (sympy.sign, sympy.Heaviside):
+            expression = expression.replace(
+                kind, lambda *arguments, kind=kind: kind(*arguments).rewrite(sympy.Piecewise)
+            )
+        return expression
+
+    assignments = {target: smooth_almost_everywhere(value) for target, value in assignments.items()}
+    printer = Printer({"fully_qualified_modules": False})
+    shared, reduced = sympy.cse(list(assignments.values()), symbols=sympy.numbered_symbols("s"))
+    used = set().union(*(e.free_symbols for e in [*reduced, *(value for _, value in shared)]))
+    lines = [f"def {name}({arguments}):"]
+    for symbol in sorted((s for s in used if str(s)[0] in "xup"), key=lambda s: (str(s)[0], int(str(s)[1:]))):
+        letter, index = str(symbol)[0], str(symbol)[1:]
+        lines.append(f"    {symbol} = {data if letter == 'p' else letter}[{index}]")
+    try:
+        lines += [f"    {symbol} = {printer.doprint(value)}" for symbol, value in shared]
+        for target, value in zip(assignments, reduced, strict=True):
+            sign = "+=" if target.endswith("+") else "="
+            lines.append(f"    {target.rstrip('+')} {sign} {printer.doprint(value)}")
+    except PrintMethodNotImplementedError as error:
+        raise InputError(f"{of}: got what can not be compiled ({error}), want elementary functions") from None
+    if returns is not None:
+        lines.append(f"    return {returns}")
+    return "\n".join(lines) + "\n"
+
+
+def write_chain(states: int, slopes: Iterable[str]) -> str:
+    """Source of `chain` of `kernels/runge_kutta.py` for a Jacobian that is zero but for these (`fx[0, 3]`, ...).
+
+    Knowing the zeros beforehand makes an iteration faster than finding them while running.
+    """
+    entries = [(target[:2], *map(int, target[3:-1].split(", "))) for target in slopes]
+    inner = [(i, k) for matrix, i, k in entries if matrix == "fx"]
+    lines = ["def chain(fx, fu, previous, a, out):"]
+    lines += [f"    f{i}_{k} = a * fx[{i}, {k}]" for i, k in inner]
+    lines.append("    for j in range(W):")
+    for i in range(states):
+        total = " + ".join(f"f{row}_{k} * previous[{k}, j]" for row, k in inner if row == i)
+        lines.append(f"        out[{i}, j] = {total or '0.0'}")
+    for matrix, i, k in entries:
+        lines.append(f"    out[{i}, {k if matrix == 'fx' else states + k}] += {matrix}[{i}, {k}]")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,256 @@
+"""A user's own function, numba's or plain Python's, at an address that compiled code can call.
+
+Compiled code knows only that there is a function, so a core serves all functions of the same sizes. A numba function is
+compiled once more behind C's calling convention, and kept on disk where it has a fingerprint; a plain one is called
+back through Python, microseconds a call.
+"""
+
+import collections
+import ctypes
+import inspect
+import math
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cache, cached_property, partial
+from typing import Any
+
+import numpy as np
+
+from lqrsim.codegen.fingerprint import fingerprint, note_helpers
+from lqrsim.errors import Array, InputError, check_name, excerpt
+from lqrsim.kernels import linear_algebra, rotation_ratios, signed_distance
+
+LEVELS = ("symbolic", "compiled", "plain")
+
+
+def level_of(function: Any, asked: str | None) -> str:
+    """The level at which a function is stated: as asked, else compiled for a numba function and symbolic for others."""
+    if not callable(function):
+        raise InputError(f"function: got {excerpt(function)}, want a function of (x, u, p)")
+    is_compiled = hasattr(function, "py_func")
+    if asked is not None and not isinstance(asked, str):
+        raise InputError(f"level: got {excerpt(asked)}, want one of: {', '.join(LEVELS)}")
+    if asked is None:
+        return "compiled" if is_compiled else "symbolic"
+    if check_name("level", asked, LEVELS) != "compiled" and is_compiled:
+        raise InputError(f"level: got {asked!r} for {name_of(function)}, want 'compiled' for a numba function")
+    return asked
+
+
+def name_of(function: Any) -> str:
+    """What messages call a function."""
+    plain = getattr(function, "py_func", function)
+    name = getattr(plain, "__qualname__", None)
+    return name if isinstance(name, str) and name else type(plain).__name__
+
+
+@cache
+def parameters_class(names: tuple[str, ...]) -> Any:
+    """The class of `p`: a named tuple, which numba knows, too, so that helpers of numba's can be given p."""
+
+    def unknown(self: Any, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        raise InputError(f"parameter: got {name!r}, want one of: {', '.join(names) or '(there are none)'}")
+
+    return type("Parameters", (collections.namedtuple("Parameters", names),), {"__slots__": (), "__getattr__": unknown})
+
+
+@dataclass(frozen=True, kw_only=True)
+class External:
+    """One function, and how it is called.
+
+    With `values`, `function(x, u, p)` returns that many numbers (one: the number itself); with `writes`,
+    `function(x, u, p, a, b)` writes to arrays of those two shapes, which are zero when it is called.
+
+    Attributes:
+      level: compiled or plain.
+      states, controls: sizes of x and u. parameters: the names in p, whose values come after `offset` other numbers.
+      unused: the entries of (x, u), and their names, that the value is said not to depend on.
+      held: once it has an address, what must be kept alive for that, and the address.
+      stopped: set it to end the solves that call back, in whatever thread they are.
+      entries: what each returned value is for, as messages name it; without, the value is returned bare.
+    """
+
+    function: Callable[..., Any]
+    level: str
+    states: int
+    controls: int
+    parameters: tuple[str, ...]
+    offset: int
+    values: int = 0
+    writes: tuple[tuple[int, ...], ...] = ()
+    entries: tuple[str, ...] = ()
+    unused: tuple[tuple[int, str], ...] = ()
+    held: list[tuple[Any, int]] = field(default_factory=list, init=False, repr=False, compare=False)
+    stopped: threading.Event = field(default_factory=threading.Event, init=False, repr=False, compare=False)
+    _thread: threading.local = field(default_factory=threading.local, init=False, repr=False, compare=False)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Without its address, which another process has no use for."""
+        stated = {field.name: getattr(self, field.name) for field in fields(self) if field.init}
+        return partial(External, **stated), ()
+
+    @property
+    def name(self) -> str:
+        """As messages have it."""
+        return f"{name_of(self.function)}(x, u, p{', ...' if self.writes else ''})"
+
+    @cached_property
+    def identity(self) -> str:
+        """What tells it from other functions, in the digest of a problem: its fingerprint, or else its code."""
+        code = getattr(getattr(self.function, "py_func", self.function), "__code__", None)
+        return fingerprint(self.function) or f"{name_of(self.function)} {getattr(code, 'co_code', b'').hex()}"
+
+    def call(self, x: Array, u: Array, p: Mapping[str, float]) -> list[Array]:
+        """Call it in plain Python: the returned values as one vector, or the arrays that it wrote.
+
+        Raises:
+          InputError: it fails, or does not return what it should.
+        """
+        plain = getattr(self.function, "py_func", self.function)
+        if not self.held:  # before the first call compiles them
+            note_helpers(self.function)
+        written: list[Array] = [np.zeros(shape) for shape in self.writes]
+        try:
+            with np.errstate(all="ignore"):  # NaN and infinity are dealt with where they arrive
+                returned = plain(x.copy(), u.copy(), parameters_class(tuple(p))(*p.values()), *written)
+                if self.writes and returned is not None:
+                    raise InputError(f"got {excerpt(returned)} returned, want it written to the last two arguments")
+        except InputError as error:
+            raise InputError(f"{self.name}: {error}") from None
+        except Exception as error:  # whatever a user's function may raise becomes one line
+            raise InputError(
+                f"{self.name}: got {type(error).__name__} ({error}), want it to work at x = {brief(x)}"
+            ) from error
+        return written or [self._vector(returned)]
+
+    def _vector(self, returned: Any) -> Array:
+        try:
+            array = np.array(returned)
+            if array.dtype.kind not in "biufO":  # no text, no complex numbers
+                raise TypeError
+            vector = np.array([float(entry) for entry in array.reshape(-1)])
+        except (TypeError, ValueError):
+            raise InputError(f"{self.name}: got {excerpt(returned)}, want {self._wanted()}") from None
+        if len(vector) != self.values:
+            raise InputError(f"{self.name}: got {len(vector)} entries, want {self._wanted()}")
+        return vector
+
+    def _wanted(self) -> str:
+        return f"{self.values}: one for each of {', '.join(self.entries)}" if self.entries else "one number"
+
+    @cached_property
+    def called_back(self) -> tuple[Any, int]:
+        """A C function that calls this one through Python: what must be kept alive, and its address.
+
+        `f(x, u, data, out)` or `f(x, u, data, a, b)`, all pointers to float64.
+        """
+        count = 4 if self.values else 5
+        prototype = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * count)
+        sizes = [int(np.prod(shape)) for shape in self.writes] or [self.values]
+        end = self.offset + len(self.parameters)
+
+        def callback(x: int, u: int, data: int, *outputs: int) -> None:
+            arrays = [_view(address, size) for address, size in zip(outputs, sizes, strict=True)]
+            try:
+                if self.stopped.is_set():
+                    raise KeyboardInterrupt
+                if self.raised is not None:
+                    raise self.raised
+                values = _view(data, end)[self.offset :]
+                p = parameters_class(self.parameters)(*values.tolist())
+                state, control = _view(x, self.states).copy(), _view(u, self.controls).copy()
+                with np.errstate(all="ignore"):
+                    if self.writes:
+                        # Not the memory itself, which is gone when this returns; the user's function may keep them.
+                        written = [np.zeros(shape) for shape in self.writes]
+                        self.function(state, control, p, *written)
+                        for array, values_written in zip(arrays, written, strict=True):
+                            array[:] = values_written.reshape(-1)
+                    else:
+                        arrays[0][:] = self._vector(self.function(state, control, p))
+            except BaseException as error:  # Ctrl-C, too: C code can not pass it on, so the solver asks for it
+                self._thread.raised = error
+                for array in arrays:
+                    array[:] = np.nan
+
+        held = prototype(callback)
+        address = ctypes.cast(held, ctypes.c_void_p).value
+        assert address is not None
+        return held, address
+
+    @property
+    def raised(self) -> BaseException | None:
+        """What it raised in this thread, when it was called back; it is not called again until `forget`."""
+        return getattr(self._thread, "raised", None)
+
+    def forget(self) -> None:
+        """Start anew after an exception."""
+        self._thread.raised = None
+
+    def adapter(self) -> tuple[str, dict[str, Any]]:
+        """Source of what numba compiles around the function, and the names in it that are its own."""
+        lines = [f"x, u = readonly(carray(x, {self.states})), readonly(carray(u, {self.controls}))"]
+        numbers = "".join(f"data[{self.offset + i}], " for i in range(len(self.parameters)))
+        lines.append(f"p = Parameters({numbers})")
+        if self.writes:
+            outputs = ("a", "b")
+            lines += [f"{name} = carray({name}, {shape})" for name, shape in zip(outputs, self.writes, strict=True)]
+            # A function that raises leaves NaN, which the solver sees, and not half of its numbers.
+            lines += ["try:", "    function(x, u, p, a, b)", "except Exception:", "    a[:] = nan", "    b[:] = nan"]
+        else:
+            outputs = ("out",)
+            lines += ["try:", "    returned = function(x, u, p)"]
+            copies = [f"out[{i}] = returned{f'[{i}]' if self.entries else ''}" for i in range(self.values)]
+            if self.entries:  # an array may have another length at another time
+                lines.append(f"    if len(returned) == {self.values}:")
+                copies = [f"    {line}" for line in copies]
+            lines += [f"    {line}" for line in copies]
+            lines += ["except Exception:", "    out[0] = nan"]
+        body = "\n".join(f"    {line}" for line in lines)
+        source = f"def adapter(x, u, data, {', '.join(outputs)}):\n{body}\n"
+        return source, {"Parameters": parameters_class(self.parameters)}
+
+
+def plain_names(states: int, controls: int, functions: Sequence[External], parameters: Mapping[str, float]) -> dict:
+    """The names that sources in the numba subset are run with as plain Python, instead of being compiled.
+
+    An address stands for a function here, too: its place among `functions`.
+    """
+
+    def invoke(place: float, x: Array, u: Array, data: Array, *outputs: Array) -> None:
+        for output, value in zip(outputs, functions[int(place)].call(x, u, parameters), strict=True):
+            output[:] = value
+
+    names: dict[str, Any] = {"N": states, "M": controls, "W": states + controls, "clear": linear_algebra.clear}
+    names |= {"stack": lambda *shape: np.empty(shape), "invoke": invoke, "invoke_writing": invoke}
+    # NumPy's functions and not those of math, which raise where compiled code goes on with NaN or infinity.
+    names |= vars(math) | {name: getattr(np, name) for name in vars(math) if callable(getattr(np, name, None))}
+    for module in (rotation_ratios, signed_distance):
+        names |= {name: value for name, value in vars(module).items() if inspect.isfunction(value)}
+    return names
+
+
+def _view(address: int, size: int) -> Array:
+    memory: Any = (ctypes.c_double * size).from_address(address)
+    return np.frombuffer(memory, dtype=np.float64)
+
+
+def brief(x: Array) -> str:
+    """A few of the numbers, for a message."""
+    return "(" + ", ".join(f"{value:g}" for value in x[:6]) + (", ...)" if len(x) > 6 else ")")
+
+
+def check_signature(function: Any, wanted: Sequence[str]) -> None:
+    """Raises InputError unless the function can be called with those arguments."""
+    plain = getattr(function, "py_func", function)
+    try:
+        inspect.signature(plain).bind(*wanted)
+    except TypeError as error:
+        raise InputError(f"{name_of(function)}: {error}, want a function of ({', '.join(wanted)})") from None
+    except ValueError:  # a built-in tells nothing about itself
+        return
+    except Exception:  # an object that raises whatever it likes when it is looked at
+        raise InputError(f"function: got {excerpt(function)}, want a function of ({', '.join(wanted)})") from None

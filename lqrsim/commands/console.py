@@ -1,0 +1,129 @@
+"""What the commands share: progress on the terminal, and an early look at whether the outputs can be written."""
+
+import contextlib
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lqrsim import process
+from lqrsim.errors import InputError
+from lqrsim.results.archive import excerpt_of
+
+if TYPE_CHECKING:
+    from lqrsim.problem.problem import Problem
+    from lqrsim.results.solution import Iteration, Solution
+
+
+def say(text: str = "") -> None:
+    """Print at once, also where the output goes to a file or a pipe, and above any progress bar.
+
+    Raises:
+      process.Unprintable: it cannot be written.
+    """
+    bars = sys.modules.get("tqdm")
+    with process.printing():
+        if bars is None:
+            print(text, flush=True)
+        else:
+            bars.tqdm.write(text)
+            sys.stdout.flush()
+
+
+def check_output(field: str, folder: Path, name: str = "") -> None:
+    """Find out before the work starts whether `folder`, or a file of that name in it, can be written.
+
+    Raises:
+      InputError: it cannot.
+    """
+    existing = folder.absolute()
+    while not os.path.exists(existing) and existing != existing.parent:
+        existing = existing.parent
+    try:
+        tempfile.TemporaryFile(dir=existing).close()
+        with contextlib.suppress(FileNotFoundError):
+            os.lstat(folder / name)  # fails otherwise for what no file can be called
+    except (OSError, ValueError) as error:
+        reason, what = getattr(error, "strerror", None) or error, "file" if name else "folder"
+        place = excerpt_of(folder / name)
+        raise InputError(f"{field}: got {place}, want a {what} that can be written ({reason})") from None
+
+
+def solve(problem: "Problem", solver: str, *, reach: float | None = None, **options: object) -> "Solution":
+    """Call `lqrsim.smooth` or `lqrsim.ilqr`; print each iteration as it ends, then the status.
+
+    Args:
+      reach: the solution's `goal_radius`.
+    """
+    from lqrsim.results.solution import Iteration
+    from lqrsim.solvers.ilqr import ilqr
+    from lqrsim.solvers.smoother import smooth
+
+    count = 0
+
+    def show(iteration: "Iteration") -> None:
+        nonlocal count
+        count += 1
+        say(iteration.row(count))
+
+    say(Iteration.HEADER)
+    solution = {"smooth": smooth, "ilqr": ilqr}[solver](problem, callback=show, **options)
+    solution = solution if reach is None else replace(solution, goal_radius=reach)
+    say(solution.summary())
+    return solution
+
+
+@contextlib.contextmanager
+def progress(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on a terminal, one line elsewhere, for what takes long; call it with how many are done of all."""
+    from tqdm import tqdm
+
+    watched = sys.stderr.isatty()
+    begun = time.monotonic()
+    told = False
+    with tqdm(desc=what, unit=unit, leave=False, delay=1.0, disable=not watched) as bar:
+
+        def update(done: int, total: int) -> None:
+            nonlocal told
+            bar.total = total
+            bar.update(done - bar.n)
+            if not (watched or told) and time.monotonic() - begun > 1.0:
+                told = True
+                say(f"{what} {total} {unit}s ...")
+
+        yield update
+
+
+@contextlib.contextmanager
+def long_progress(what: str, unit: str, every: float = 10.0) -> Iterator[Callable[[int, int], None]]:
+    """For what takes minutes or hours, and may have been begun before: how fast it goes, and how long it will take.
+
+    A bar on a terminal; elsewhere a line now and then. The first call says how many are done already.
+    """
+    from tqdm import tqdm
+
+    watched = sys.stderr.isatty()
+    begun = told = time.monotonic()
+    before: int | None = None
+    with tqdm(desc=what, unit=f" {unit}s", leave=False, delay=1.0, disable=not watched) as bar:
+
+        def update(done: int, total: int) -> None:
+            nonlocal before, told
+            if before is None:
+                before = bar.initial = bar.n = done
+                if done and done < total:
+                    say(f"{done} of {total} {unit}s are there, {total - done} to go")
+            bar.total = total
+            bar.update(done - bar.n)
+            now = time.monotonic()
+            if not watched and done > before and (now - told > every or (done == total and now - begun > every)):
+                told = now
+                rate = (done - before) / (now - begun)
+                left = tqdm.format_interval((total - done) / rate)
+                say(f"{what}: {done} of {total} {unit}s, {rate:.3g} {unit}s/s, {left} left")
+
+        yield update

@@ -1,0 +1,125 @@
+"""The whole chain, once for each scenario: solve, execute, draw, film, and say what came out."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lqrsim.commands import console
+from lqrsim.errors import InputError
+from lqrsim.results import files
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
+from lqrsim.scenarios.packaged import Scenario
+from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
+from lqrsim.simulation.closed_loop import simulate
+from lqrsim.view import gl
+from lqrsim.view.plots import plot_run
+from lqrsim.view.policy_plot import plot_policy
+
+TABLE = (
+    f"{'scenario':<20} {'run':<12} {'iterations':>10} {'cost':>10} {'gap':>9} {'clearance m':>12}"
+    f" {'rms m':>9} {'max m':>9} {'final m':>9} {'goal m':>9} {'outcome':>9}"
+)
+
+
+def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick: bool) -> int:
+    """Run the chain for each scenario and print a closing table.
+
+    Args:
+      references: the scenarios; see `scenarios/references.py`.
+      out: each scenario gets a folder in it.
+      seed: of the disturbances.
+      video: whether to film at all. quick: small videos of fewer frames.
+
+    Returns:
+      1 if a plan did not converge, or an undisturbed run left its plan by more than the scenario's bound; else 0.
+
+    Raises:
+      InputError: an unknown scenario, or a folder that cannot be written.
+    """
+    console.check_output("--out", out)
+    scenarios = {reference: resolve(reference) for reference in references}
+    video = video and _can_film()
+    rows: list[str] = []
+    failures: list[str] = []
+    misses: list[str] = []
+    for reference, scenario in scenarios.items():
+        folder = out / folder_name(scenario)
+        console.say(f"\n== {reference}: {scenario.summary}")
+        solved = console.solve(scenario.problem, "smooth", reach=scenario.reach())
+        solution = replace(solved, scenario=from_anywhere(reference))
+        console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
+        if solution.cost_to_go is not None:
+            drawn = plot_policy(
+                solution, folder / "policy.png", world=scenario.scene.world, radius=scenario.robot.radius
+            )
+            console.say(f"wrote {drawn}")
+        if not solution.success:
+            failures.append(f"{reference}: the plan did not converge ({solution.status.name})")
+        runs = {
+            "undisturbed": _execute(scenario, solution, folder / "undisturbed.npz", seed, disturbed=False),
+            "disturbed": _execute(scenario, solution, folder / "disturbed.npz", seed, disturbed=True),
+        }
+        worst, unit = float(runs["undisturbed"].tracking_error.max()), runs["undisturbed"].tracking_unit
+        if not worst <= scenario.tracking_bound:  # a diverged run is NaN
+            bound = f"want <= {scenario.tracking_bound:g} {unit}"
+            failures.append(f"{reference}: undisturbed up to {worst:.3g} {unit} off its plan, {bound}")
+        figure = plot_run(solution, runs, folder / "figure.png", world=scenario.scene.world)
+        console.say(f"wrote {figure}")
+        plan, reach = runs["undisturbed"].target, runs["undisturbed"].goal_radius
+        misses += [f"{reference}: {line}" for line in plan.of_plan(reach)[1:]]
+        if video:
+            _film(runs["disturbed"], solution, folder / "video.mp4", quick=quick)
+        rows += [_row(reference, name, solution, rollout) for name, rollout in runs.items()]
+    console.say("\n" + "\n".join([TABLE, *rows]))
+    for miss in misses:
+        console.say(miss)
+    for failure in failures:
+        console.say(f"FAILED {failure}")
+    return 1 if failures else 0
+
+
+def _can_film() -> bool:
+    try:
+        gl.bind()
+    except InputError as error:
+        console.say(f"No videos, everything else works: {error}")
+        return False
+    return True
+
+
+def _execute(scenario: Scenario, solution: Solution, path: Path, seed: int, *, disturbed: bool) -> Rollout:
+    """One closed-loop run, saved and summed up in a line."""
+    disturbances = scenario.disturbances if disturbed else ()
+    with console.progress("simulating", "step") as progress:
+        rollout = simulate(
+            scenario.plant(), solution, disturbances=disturbances, seed=seed, progress=progress,
+            **scenario.near_enough(),
+        )  # fmt: skip
+    console.say(rollout.summary())
+    console.say(f"wrote {files.save(rollout, path)}")
+    return rollout
+
+
+def _film(rollout: Rollout, solution: Solution, path: Path, *, quick: bool) -> None:
+    """With the calibrated panes from which the robot's position can be measured."""
+    from lqrsim.view import cameras
+    from lqrsim.view.render import render
+
+    insets = cameras.measuring(rollout)
+    quality, fps = ("draft", 5) if quick else ("standard", 30)
+    with console.progress("rendering", "frame") as progress:
+        render(rollout, path, insets=insets, solution=solution, quality=quality, fps=fps, progress=progress)
+    console.say(f"wrote {path}")
+
+
+def _row(reference: str, run: str, solution: Solution, rollout: Rollout) -> str:
+    error = rollout.tracking_error[0, rollout.counts[0]]
+    final, away = (np.nan, np.nan) if not rollout.counts[0, -1] else (error[-1], rollout.goal_distance[0])
+    return (
+        f"{reference:<20} {run:<12} {len(solution.iterations):>10} {solution.cost:>10.4f} {solution.gap:>9.1e}"
+        f" {rollout.least_clearance()[0]:>12.3f} {np.sqrt(np.mean(error**2)):>9.2e} {error.max():>9.2e} {final:>9.2e}"
+        f" {away if rollout.target.unit == 'm' else np.nan:>9.2e} {rollout.outcome[0]:>9}"
+    )

@@ -1,0 +1,1 @@
+"""All that is compiled, in the numba subset of Python; read `interface.py` first."""

@@ -1,0 +1,63 @@
+"""The augmented Lagrangian: what is added to the cost for constraints. The numba subset; see `interface.py`.
+
+For inequalities d >= 0, with multipliers lambda >= 0 and a penalty mu, it is
+
+    sum (max(0, lambda - mu d)^2 - lambda^2) / (2 mu)
+
+At the optimum the multipliers are `max(0, lambda - mu d)`. Here d is what a constraint has to spare beyond the
+tolerance to which it is solved, so that what is within the tolerance keeps the constraint itself. Of the curvature only
+`mu n n'` is taken, n the slope of d: the rest can be negative. `solvers/compiled.py` makes these functions for each
+constraint.
+
+`multipliers` is one array a constraint: mu, how many inequalities there are at a step, the first step at which they
+act, the tolerance, and from HEADER on lambda, step by step. With mu of zero there is nothing.
+"""
+
+from math import inf
+
+from lqrsim.kernels.interface import HEADER, W, constraint_slope, constraint_value, stack
+
+
+def augment(x, u, t, data, multipliers, hessian, gradient):
+    """Add the quadratic model at (x, u) to hessian (W, W) and gradient (W,), and return the value."""
+    penalty, rows = multipliers[0], int(multipliers[1])
+    slope = stack(W)
+    total = 0.0
+    if penalty > 0 and t >= multipliers[2]:
+        for row in range(rows):
+            multiplier = multipliers[HEADER + rows * t + row]
+            force = multiplier - penalty * (constraint_value(x, u, t, row, data) - multipliers[3])
+            total -= multiplier * multiplier
+            if force > 0:
+                total += force * force
+                for i in range(W):
+                    slope[i] = 0.0
+                constraint_slope(x, u, t, row, data, slope)
+                for i in range(W):
+                    gradient[i] -= force * slope[i]
+                    for j in range(W):
+                        hessian[i, j] += penalty * slope[i] * slope[j]
+        total /= 2 * penalty
+    return total
+
+
+def augmentation(x, u, t, data, multipliers):
+    """The value alone."""
+    penalty, rows = multipliers[0], int(multipliers[1])
+    total = 0.0
+    if penalty > 0 and t >= multipliers[2]:
+        for row in range(rows):
+            multiplier = multipliers[HEADER + rows * t + row]
+            force = multiplier - penalty * (constraint_value(x, u, t, row, data) - multipliers[3])
+            total -= multiplier * multiplier
+            if force > 0:
+                total += force * force
+        total /= 2 * penalty
+    return total
+
+
+def look(x, u, t, acts, data, multipliers, values):
+    """Write the values at a step, step by step as the multipliers are; infinite where they do not act."""
+    rows = int(multipliers[1])
+    for row in range(rows):
+        values[rows * t + row] = constraint_value(x, u, t, row, data) if acts and t >= multipliers[2] else inf

@@ -1,0 +1,312 @@
+"""The dual form: the cost-to-come by its moments, as a Kalman filter whose noise is the control. The numba subset.
+
+`1/2 (x - mean)' covariance^-1 (x - mean) + constant` is the cost-to-come. The covariance may be singular, and is
+zero at a fixed start; neither the inverse dynamics nor an invertible A is needed. In the backward pass the costate, the
+slope of the cost-to-go at the minimiser, leads from each step to the one before (the modified Bryson-Frazier smoother).
+
+`primal_form.py` has functions of the same names; `passes.py` is written against either. With F = R^-1 P and h = R^-1 r,
+the control is eliminated by u = w - F x - h: the rest is At = A - B F, Qt = Q - P'F, qt = q - P'h, ct = c - B h.
+"""
+
+from math import sqrt
+
+from lqrsim.kernels.interface import M, N, stack
+from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, offset, within
+from lqrsim.kernels.runge_kutta import step_jacobian
+
+
+def begin(Q, q, constant, x, S, covariance, mean):
+    """Write the cost-to-come at 0, given c_0 about the origin, quadratised at x; return its constant.
+
+    Where c_0 has no curvature, there is no covariance, and it gets a little about x, relative to that of the cost-to-go
+    S where there is one by now. An optimum stays one, and the next iteration moves x on. What is little is told in
+    units of each state's own curvature.
+    """
+    factor, column, slope = stack(N, N), stack(N), stack(N)
+    largest = 0.0
+    for i in range(N):
+        largest = max(largest, abs(Q[i, i]))
+        slope[i] = q[i]
+        column[i] = sqrt(Q[i, i]) if Q[i, i] > 0 else 0.0
+    for i in range(N):
+        for j in range(N):
+            scale = column[i] * column[j]
+            factor[i, j] = Q[i, j] / scale if scale > 0 else 0.0
+    curved = cholesky(factor, N)
+    for i in range(N):
+        curved = curved and factor[i, i] < 1e6  # the reciprocal of the root of a pivot
+    for i in range(N):
+        for j in range(N):
+            factor[i, j] = Q[i, j]
+    if not curved:
+        for i in range(N):
+            little = 1e-6 * max(abs(Q[i, i]), S[i, i])
+            if not little > 0:
+                little = 1e-6 * largest if largest > 0 else 1e-6
+            factor[i, i] += little
+            slope[i] -= little * x[i]
+            constant += 0.5 * little * x[i] * x[i]
+    if not cholesky(factor, N):
+        return constant, False
+    for j in range(N):
+        for i in range(N):
+            column[i] = 1.0 if i == j else 0.0
+        cholesky_solve(factor, N, column)
+        for i in range(N):
+            covariance[i, j] = column[i]
+    for i in range(N):
+        for j in range(i):
+            covariance[i, j] = covariance[j, i] = 0.5 * (covariance[i, j] + covariance[j, i])
+    for i in range(N):
+        total = 0.0
+        for j in range(N):
+            total -= covariance[i, j] * slope[j]
+        mean[i] = total
+        constant += 0.5 * slope[i] * total
+    return constant, True
+
+
+def linearize(x, u, p, dt, fx, fu, x_next, jacobian, c):
+    """Write where (x, u) leads, and the step linearised there: x_next = jacobian (x, u) + c."""
+    step_jacobian(x, u, p, dt, fx, fu, x_next, jacobian)
+    offset(jacobian, x, u, x_next, c)
+
+
+def riccati_forward(
+    jacobian, c, cost, slope, constant, V0, x0, k0, smoothing, updated, gain, feedforward, V, x
+):  # fmt: skip
+    """One step of the cost-to-come, in moments: from (V0, x0, k0) at t to (V, x) at t + 1.
+
+    `jacobian` = [A B] and c are the linearised step; the cost is as in `riccati_backward`. What the backward pass needs
+    is written, too: given the costate at t + 1, the minimiser at t is `updated - smoothing costate` and the control
+    `gain costate + feedforward`. Returns the constant and whether the step succeeded.
+    """
+    factor, F, h, BT = stack(M, M), stack(M, N), stack(M), stack(M, N)
+    Q, q, AT, slope0, size = stack(N, N), stack(N), stack(N, N), stack(N), stack(N)
+    # Products are formed here, where nothing else can point to, and then copied: only so they become vector code.
+    U, G = stack(N, N), stack(N, N)
+    crossed = 0.0
+    for i in range(M):
+        h[i] = slope[N + i]
+        for j in range(M):
+            factor[i, j] = cost[N + i, N + j]
+        for j in range(N):
+            F[i, j] = cost[N + i, j]
+            BT[i, j] = jacobian[j, N + i]
+            crossed += abs(F[i, j])
+    if not cholesky(factor, M):
+        return k0, False
+    cholesky_solve(factor, M, h)
+    for i in range(N):
+        q[i], size[i] = slope[i], abs(cost[i, i])
+        for j in range(N):
+            Q[i, j] = cost[i, j]
+            AT[i, j] = jacobian[j, i]
+    if crossed != 0:
+        forward_substitute(factor, F)
+        back_substitute(factor, F)
+        for k in range(M):
+            for i in range(N):
+                q[i] -= cost[N + k, i] * h[k]
+                for j in range(N):
+                    Q[i, j] -= cost[N + k, i] * F[k, j]
+                    AT[i, j] -= F[k, i] * BT[k, j]
+    # Update: add what the step costs, first its value and slope at the mean.
+    value = k0 + constant
+    for k in range(M):
+        value -= 0.5 * slope[N + k] * h[k]
+    for i in range(N):
+        curved = 0.0
+        for j in range(N):
+            curved += Q[i, j] * x0[j]
+            U[i, j] = V0[i, j]
+        slope0[i] = curved + q[i]
+        value += (0.5 * curved + q[i]) * x0[i]
+    if not update(U, Q, size):
+        return k0, False
+    for i in range(N):
+        moved = 0.0
+        for j in range(N):
+            moved += U[i, j] * slope0[j]
+        updated[i] = x0[i] - moved
+        value -= 0.5 * slope0[i] * moved
+    # Predict: along the step, and let the control act.
+    for i in range(N):
+        for j in range(N):
+            total = 0.0
+            for k in range(N):
+                total += U[i, k] * AT[k, j]
+            G[i, j] = total
+        total = c[i]
+        for j in range(N):
+            total += AT[j, i] * updated[j]
+        for k in range(M):
+            total -= BT[k, i] * h[k]
+        x[i] = total
+    forward_substitute(factor, BT)
+    for i in range(N):
+        for j in range(N):
+            total = 0.0
+            for k in range(N):
+                total += AT[k, i] * G[k, j]
+            for k in range(M):
+                total += BT[k, i] * BT[k, j]
+            U[i, j] = total
+    for i in range(N):
+        for j in range(N):
+            smoothing[i, j] = G[i, j]
+            V[i, j] = U[i, j] if i <= j else U[j, i]
+    back_substitute(factor, BT)
+    for k in range(M):
+        feedforward[k] = -h[k]
+        for j in range(N):
+            gain[k, j] = -BT[k, j]
+    if crossed != 0:
+        for k in range(M):
+            for i in range(N):
+                feedforward[k] -= F[k, i] * updated[i]
+                for j in range(N):
+                    gain[k, j] += F[k, i] * G[i, j]
+    return value, True
+
+
+def forward_substitute(factor, rows):
+    """Turn (M, N) rows into U^-T rows, given R = U'U as `cholesky` leaves it."""
+    for i in range(M):
+        for j in range(N):
+            rows[i, j] *= factor[i, i]
+        for k in range(i + 1, M):
+            for j in range(N):
+                rows[k, j] -= factor[i, k] * rows[i, j]
+
+
+def back_substitute(factor, rows):
+    """Turn (M, N) rows into U^-1 rows."""
+    for i in range(M - 1, -1, -1):
+        for k in range(i + 1, M):
+            for j in range(N):
+                rows[i, j] -= factor[i, k] * rows[k, j]
+        for j in range(N):
+            rows[i, j] *= factor[i, i]
+
+
+def update(V, Q, size):
+    """Turn V into (V^-1 + Q)^-1, for V and Q semidefinite, in place; False if there is none. Q is used up.
+
+    With Q = sum of d f f', one term at a time: V - K f'V with K = d V f / (1 + d f'V f). Where that cancels digits,
+    what is left is worked out in the form of Joseph, (I - K f') V (I - K f')' + K K' / d: a sum of squares, which keeps
+    V semidefinite. It takes little time where Q has few entries, as those of obstacles have. `size` (N,) is the
+    diagonal of Q before anything was taken from it: what is far less is rounding.
+    """
+    f, w, gain = stack(N), stack(N), stack(N)
+    scale = 0.0
+    for i in range(N):
+        scale = max(scale, size[i])
+    for i in range(N):
+        d = Q[i, i]
+        if abs(d) <= 1e-14 * size[i]:  # then so is the row, unless Q is indefinite
+            for j in range(i + 1, N):
+                if not abs(Q[i, j]) <= 1e-6 * scale:
+                    return False
+            continue
+        for j in range(N):
+            f[j] = Q[i, j] / d if j >= i else 0.0
+            w[j] = V[i, j]  # f[i] is 1
+        for k in range(i + 1, N):
+            if f[k] != 0:
+                for j in range(N):
+                    Q[k, j] -= d * f[k] * f[j]
+                    w[j] += f[k] * V[k, j]
+        total = w[i]
+        for j in range(i + 1, N):
+            total += f[j] * w[j]
+        total = 1 + d * total
+        if not total > 0:
+            return False
+        for j in range(N):
+            gain[j] = d / total * w[j]
+            for k in range(N):
+                V[j, k] -= gain[j] * w[k]
+        if total > 1e3:
+            for j in range(N):
+                left = 0.0
+                for k in range(N):
+                    left += V[j, k] * f[k]
+                w[j] = left
+            for j in range(N):
+                for k in range(N):
+                    V[j, k] += (gain[j] / d - w[j]) * gain[k]
+    return True
+
+
+def minimizer(S, s, V, x0, costate, x):
+    """Write the minimiser of the total cost and the costate there; False if there is none.
+
+    costate = (I + S V)^-1 (S x0 + s), x = x0 - V costate.
+    """
+    a = stack(N, N)
+    for i in range(N):
+        for j in range(N):
+            total = 1.0 if i == j else 0.0
+            for k in range(N):
+                total += S[i, k] * V[k, j]
+            a[i, j] = total
+    for i in range(N):
+        total = s[i]
+        for j in range(N):
+            total += S[i, j] * x0[j]
+        costate[i] = total
+    if not solve(a, costate):
+        return False
+    for i in range(N):
+        total = x0[i]
+        for j in range(N):
+            total -= V[i, j] * costate[j]
+        x[i] = total
+    return True
+
+
+def solve(a, b):
+    """Solve a y = b in place by elimination with row pivots; False for a singular matrix.
+
+    Whole rows are subtracted, with what is zero already: loops of constant length take less time than shorter ones.
+    """
+    for k in range(N):
+        pivot, largest = k, abs(a[k, k])
+        for i in range(k + 1, N):
+            if abs(a[i, k]) > largest:
+                pivot, largest = i, abs(a[i, k])
+        if not largest > 0:  # a NaN too
+            return False
+        if pivot != k:
+            b[k], b[pivot] = b[pivot], b[k]
+            for j in range(N):
+                a[k, j], a[pivot, j] = a[pivot, j], a[k, j]
+        inverse = 1 / a[k, k]
+        for i in range(k + 1, N):
+            factor = inverse * a[i, k]
+            b[i] -= factor * b[k]
+            for j in range(N):
+                a[i, j] -= factor * a[k, j]
+        b[k] *= inverse
+        for j in range(N):
+            a[k, j] *= inverse
+    for k in range(N - 1, 0, -1):
+        for i in range(k):
+            b[i] -= a[i, k] * b[k]
+    return True
+
+
+def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, low, high, x, u):
+    """Write the state and control (x, u) on the way to the minimiser at t + 1, whose costate is given."""
+    for i in range(N):
+        total = updated[i]
+        for j in range(N):
+            total -= smoothing[i, j] * costate[j]
+        x[i] = total
+    for k in range(M):
+        total = feedforward[k]
+        for j in range(N):
+            total += gain[k, j] * costate[j]
+        u[k] = total
+    within(u, low, high)

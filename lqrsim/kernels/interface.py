@@ -1,0 +1,135 @@
+"""What a compiled core knows about its problem: the names that the kernels are written against.
+
+The modules of the numba subset, with one of `dual_form.py` and `primal_form.py`, and the sources that dynamics and
+costs write are joined into one text for each structure (see `solvers/compiled.py`), with these sizes as constants and
+these functions filled in. This module only declares them, so that each of those files can be read, linted and
+type-checked on its own.
+"""
+
+import numpy as np
+
+N = 0  # states
+M = 0  # controls
+W = N + M  # a state and a control, joined
+K = 0  # of these, how many entries a cost is not convex in
+LIMITS = 0  # which array of `stage` has the limits of the controls: lowest (M,), highest (M,)
+
+# How iterations end; see `Status`. Of those without a status of their own, NO_START is a first trajectory that is not
+# finite, STALLED a line search that found no lower cost, CYCLING that the same costs come again and again, and
+# NO_PROGRESS that the least cost so far does not fall. TIMED_OUT is for the drivers: no kernel looks at a clock.
+RUNNING, CONVERGED, COST_CONVERGED, MAX_ITERATIONS, DIVERGED = 0, 1, 2, 3, 4
+NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED, CYCLING = 5, 6, 7, 8, 9
+NO_PROGRESS, TIMED_OUT = 10, 11
+LONGEST_CYCLE = 8
+# After how many iterations without a lower cost, and after how many in which it fell by less than a thousandth, there
+# is no progress. `python experiments/benchmark_reliability.py --sections overhead` shows that neither is met where the
+# method converges on the paper's queries.
+NO_FALL, SLOW_FALL = 12, 30
+ROW = 16  # numbers that an obstacle takes in `World.table`: kind, position (3), rotation (9, row by row), size (3)
+HEADER = 4  # numbers that come before the multipliers; see `augmented_lagrangian.py`
+
+# What an entry is to do; see `entry_points.py`.
+ITERATE, DAMP, CERTIFY, EVALUATE = 0, 1, 2, 3
+
+# What an iteration was; see `Iteration.method`.
+SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
+
+# The safeguard's memory: the cost of the plan; how far the next iteration reaches, and the weight on changes of the
+# controls; how many small changes there were in a row; of iterations at reach 0, iLQR's, how many are left, how many
+# there will be the next time, and how many others there were since, of which PATIENCE are enough.
+# At the end, how far the states of least total cost are from the plan; at the beginning, whether that was made.
+# MERIT is the cost of the plan, and what the augmented Lagrangian adds to it: what is to be lowered. WATCHED is 1 where
+# the undamped iterations are to end when they make no progress, because there is a safeguard to go on.
+PLAN_COST, REACH, WEIGHT, SMALL, ILQR_LEFT, ILQR_NEXT, SINCE_ILQR, FINAL_GAP, STARTED, MERIT, WATCHED = range(11)
+MEMORY = 11
+PATIENCE = 50
+
+
+def stack(*shape: int) -> np.ndarray:
+    """An uninitialised float64 array of constant shape, on the stack of the compiled function."""
+    return np.empty(shape)
+
+
+def rate(x, u, p, out) -> None:
+    """Write xdot = f(x, u), (N,)."""
+
+
+def rate_jacobian(x, u, p, out, fx, fu) -> None:
+    """Write f (N,), and the entries of df/dx (N, N) and df/du (N, M) that are not zero everywhere."""
+
+
+def stage_value(x, u, t, data) -> float:
+    """The stage cost c(x, u, t)."""
+    return 0.0
+
+
+def stage_quadratic(x, u, t, data, hessian, gradient) -> float:
+    """Write the projected Hessian (W, W) and the gradient (W,) of the stage cost at (x, u); return its value."""
+    return 0.0
+
+
+def stage_added(x, u, t, data) -> float:
+    """What the augmented Lagrangian adds to the stage cost for constraints."""
+    return 0.0
+
+
+def final_added(x, u, t, data) -> float:
+    """What it adds to the final cost."""
+    return 0.0
+
+
+def constraint_value(x, u, t, row, data) -> float:
+    """One of a constraint's numbers that are not to be negative."""
+    return 0.0
+
+
+def constraint_slope(x, u, t, row, data, gradient) -> None:
+    """Add its gradient (W,)."""
+
+
+def initial_value(x, u, t, data) -> float:
+    """The initial cost c_0(x)."""
+    return 0.0
+
+
+def initial_quadratic(x, u, t, data, hessian, gradient) -> float:
+    """As `stage_quadratic`, of the initial cost."""
+    return 0.0
+
+
+def final_value(x, u, t, data) -> float:
+    """The final cost c_l(x)."""
+    return 0.0
+
+
+def final_quadratic(x, u, t, data, hessian, gradient) -> float:
+    """As `stage_quadratic`, of the final cost."""
+    return 0.0
+
+
+# What the form of the cost-to-come brings; see `dual_form.py` and `primal_form.py`.
+
+
+def begin(Q, q, constant, x, S, C, b) -> tuple[float, bool]:
+    """Write the cost-to-come at 0."""
+    return 0.0, True
+
+
+def linearize(x, u, p, dt, fx, fu, x_next, jacobian, c) -> None:
+    """Write where (x, u) leads, and the linearised step that `riccati_forward` takes."""
+
+
+def riccati_forward(
+    jacobian, c, cost, slope, constant, C0, b0, k0, smoothing, updated, gain, feedforward, C, b
+) -> tuple[float, bool]:
+    """One step of the cost-to-come."""
+    return 0.0, True
+
+
+def minimizer(S, s, C, b, costate, x) -> bool:
+    """Write the minimiser of the total cost, and the costate there."""
+    return True
+
+
+def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, low, high, x, u) -> None:
+    """Write the state and control, within its limits, on the way to the minimiser at t + 1."""

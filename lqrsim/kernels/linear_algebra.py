@@ -1,0 +1,212 @@
+"""Small dense algebra and the Riccati steps of LQR smoothing. The numba subset; see `interface.py`.
+
+The innermost loops are sums of constant length, which LLVM unrolls and turns into vector instructions. Matrices are
+(N, N) or, with states and controls joined, (W, W); their upper triangle is what is read where they are symmetric.
+Paper: Eqs. (8)-(21), in discrete time.
+"""
+
+from math import inf, sqrt
+
+from lqrsim.kernels.interface import M, N, W, stack
+
+
+def cholesky(a, size):
+    """Factor a = U'U in place, upper triangle, reciprocals on the diagonal; False unless positive definite."""
+    for k in range(size):
+        if not a[k, k] > 0:  # a NaN too
+            return False
+        inverse = 1 / sqrt(a[k, k])
+        a[k, k] = inverse
+        for j in range(k + 1, size):
+            a[k, j] *= inverse
+        for i in range(k + 1, size):
+            factor = a[k, i]
+            for j in range(i, size):
+                a[i, j] -= factor * a[k, j]
+    return True
+
+
+def clear(a, rows, columns):
+    """Set a matrix to zero."""
+    for i in range(rows):
+        for j in range(columns):
+            a[i, j] = 0.0
+
+
+def finite(a, rows, columns):
+    """Whether no entry of a matrix is NaN or infinite."""
+    for i in range(rows):
+        for j in range(columns):
+            if not abs(a[i, j]) < inf:
+                return False
+    return True
+
+
+def cholesky_solve(a, size, b):
+    """Solve U'U y = b in place, given the factor."""
+    for i in range(size):
+        b[i] *= a[i, i]
+        factor = b[i]
+        for j in range(i + 1, size):
+            b[j] -= a[i, j] * factor
+    for i in range(size - 1, -1, -1):
+        total = b[i]
+        for j in range(i + 1, size):
+            total -= a[i, j] * b[j]
+        b[i] = total * a[i, i]
+
+
+def about_origin(hessian, gradient, x, u, value):
+    """Turn the gradient at (x, u) into the slope at the origin, in place; return the constant term. Eq. (27)."""
+    constant = value
+    for i in range(W):
+        zi = x[i] if i < N else u[i - N]
+        curved = 0.0
+        for j in range(N):
+            curved += hessian[i, j] * x[j]
+        for j in range(M):
+            curved += hessian[i, N + j] * u[j]
+        constant += (0.5 * curved - gradient[i]) * zi
+        gradient[i] -= curved
+    return constant
+
+
+def offset(jacobian, x_from, u, x_to, c):
+    """Write c = x_to - A x_from - B u, the constant of a linearised step. Eq. (25)."""
+    for i in range(N):
+        total = x_to[i]
+        for j in range(N):
+            total -= jacobian[i, j] * x_from[j]
+        for j in range(M):
+            total -= jacobian[i, N + j] * u[j]
+        c[i] = total
+
+
+def minimize_control(g, h, gain, feedforward, hessian, gradient):
+    """Minimise `1/2 z'gz + h'z` over the control part of z = (x, u).
+
+    Writes the minimiser `u = gain x + feedforward` and what is left, a quadratic in x. Returns the decrease that
+    the feedforward brings, or -1 if the control block is not positive definite. `g` (W, W) and `h` (W,) are used up.
+
+    With C, E and e the parts of method and paper: L = -E^-1 C, l = -E^-1 e, S = D + C'L, s = d + C'l.
+    """
+    e, c, y = stack(M, M), stack(M, N), stack(M)
+    for i in range(M):
+        y[i] = h[N + i]
+        for j in range(M):
+            e[i, j] = g[N + i, N + j]
+        for j in range(N):
+            c[i, j] = g[N + i, j]
+    if not cholesky(e, M):
+        return -1.0
+    # With E = U'U: c becomes U^-T C and y becomes U^-T e.
+    decrease = 0.0
+    for i in range(M):
+        y[i] *= e[i, i]
+        decrease += 0.5 * y[i] * y[i]
+        for j in range(N):
+            c[i, j] *= e[i, i]
+        for k in range(i + 1, M):
+            factor = e[i, k]
+            y[k] -= factor * y[i]
+            for j in range(N):
+                c[k, j] -= factor * c[i, j]
+    for i in range(N):
+        total = h[i]
+        for k in range(M):
+            total -= c[k, i] * y[k]
+        gradient[i] = total
+        for j in range(i, N):
+            total = 0.5 * (g[i, j] + g[j, i])
+            for k in range(M):
+                total -= c[k, i] * c[k, j]
+            hessian[i, j] = total
+            hessian[j, i] = total
+    # Back substitution: c becomes E^-1 C and y becomes E^-1 e.
+    for i in range(M - 1, -1, -1):
+        for k in range(i + 1, M):
+            factor = e[i, k]
+            y[i] -= factor * y[k]
+            for j in range(N):
+                c[i, j] -= factor * c[k, j]
+        y[i] *= e[i, i]
+        feedforward[i] = -y[i]
+        for j in range(N):
+            gain[i, j] = -e[i, i] * c[i, j]
+            c[i, j] *= e[i, i]
+    return decrease
+
+
+def congruence(jacobian, z, v, g, h):
+    """Add `jacobian' z jacobian` to g (W, W) and `jacobian' v` to h (W,)."""
+    product = stack(N, W)
+    for i in range(N):
+        for j in range(W):
+            total = 0.0
+            for k in range(N):
+                total += z[i, k] * jacobian[k, j]
+            product[i, j] = total
+    for i in range(W):
+        for j in range(W):
+            total = g[i, j]
+            for k in range(N):
+                total += jacobian[k, i] * product[k, j]
+            g[i, j] = total
+        total = h[i]
+        for k in range(N):
+            total += v[k] * jacobian[k, i]
+        h[i] = total
+
+
+def quadratic_at(z, v, c):
+    """The value `1/2 c'zc + v'c`."""
+    total = 0.0
+    for i in range(N):
+        curved = 0.0
+        for j in range(N):
+            curved += z[i, j] * c[j]
+        total += (0.5 * curved + v[i]) * c[i]
+    return total
+
+
+def riccati_backward(jacobian, c, cost, slope, constant, S1, s1, k1, gain, feedforward, S, s):
+    """One step of the cost-to-go, Eqs. (9)-(11), (13): from (S1, s1, k1) at t + 1 to (S, s) at t.
+
+    The rest is as in `ahead`. Returns the constant and whether the step succeeded.
+    """
+    shifted = ahead(jacobian, c, cost, slope, constant, S1, s1, k1)
+    decrease = minimize_control(cost, slope, gain, feedforward, S, s)
+    return shifted - decrease, decrease >= 0
+
+
+def ahead(jacobian, c, cost, slope, constant, S1, s1, k1):
+    """Add to a stage about the origin, `cost` (W, W) and `slope` (W,), the cost-to-go where its step leads.
+
+    `jacobian` = [A B] and c are the linearised step. Returns the sum's constant.
+    """
+    v = stack(N)
+    for i in range(N):
+        v[i] = s1[i]
+        for j in range(N):
+            v[i] += S1[i, j] * c[j]
+    shifted = k1 + constant + quadratic_at(S1, s1, c)
+    congruence(jacobian, S1, v, cost, slope)
+    return shifted
+
+
+def affine(gain, feedforward, x, u):
+    """Write u = gain x + feedforward, (M,)."""
+    for i in range(M):
+        total = feedforward[i]
+        for j in range(N):
+            total += gain[i, j] * x[j]
+        u[i] = total
+
+
+def within(u, low, high):
+    """Cut a control off at its limits; a NaN stays."""
+    for i in range(M):
+        if u[i] < low[i]:
+            u[i] = low[i]
+        elif u[i] > high[i]:
+            u[i] = high[i]

@@ -1,0 +1,472 @@
+"""Cost terms; `+` composes them. Their structure is source text, their numbers are data.
+
+To add a kind of cost, subclass `Cost` and write `bind`; or state it as a formula with `SymbolicCost`.
+"""
+
+import abc
+import ast
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen import symbolic
+from lqrsim.codegen.user_functions import External, check_signature, level_of, name_of
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_flag,
+    check_function,
+    check_items,
+    check_kind,
+    check_name,
+    check_number,
+    check_weight,
+    excerpt,
+)
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.scenes.world import ROW, World
+
+
+@dataclass(frozen=True)
+class Term:
+    """A cost term, made for one system: what gets compiled, and the numbers it reads.
+
+    Attributes:
+      source: defines `value(x, u, t, data)` and `derivatives(x, u, t, data, hessian, gradient)`, both returning the
+        cost; the latter *adds* the Hessian (n+m, n+m) and gradient (n+m,) at the point, states before controls. The
+        numba subset; the names of `kernels/signed_distance.py` and `kernels/rotation_ratios.py`, and N, M, W, sqrt, exp
+        and the like are at hand, by their bare names: `cos`, not `math.cos` or `np.cos`, which are refused.
+      data: (any,) float64; the source can index it, but not ask for its length.
+      bends: indices of the entries of (x, u) in which the Hessian may be indefinite: None for a convex term. The sum of
+        all such terms is projected to the nearest positive-semidefinite matrix.
+      uses_control: whether it depends on u (only stage costs may).
+      factor: index in `data` of a number that the whole term is proportional to, for what may be eased in the first
+        iterations; see `InitialPrior`. None where there is none.
+      functions: what the source calls with `invoke`; their addresses come first in the data that it is given.
+    """
+
+    source: str
+    data: Array
+    bends: tuple[int, ...] | None = None
+    uses_control: bool = False
+    factor: int | None = None
+    functions: tuple[External, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "data", check_array("Term: data", self.data, (None,), infinite=True))
+        check_source("Term", self.source, {"value": 4, "derivatives": 6})
+        if self.bends is not None:
+            bends = check_items("Term: bends", self.bends, (int, np.integer), "a tuple of indices, or None")
+            object.__setattr__(self, "bends", tuple(check_count("Term: bends", i, at_least=0) for i in bends))
+        object.__setattr__(self, "uses_control", check_flag("Term: uses_control", self.uses_control))
+        if self.factor is not None:
+            last = len(self.data) - 1
+            object.__setattr__(self, "factor", check_count("Term: factor", self.factor, at_least=0, at_most=last))
+        wanted = "a tuple of External, as FunctionCost makes them"
+        object.__setattr__(self, "functions", check_items("Term: functions", self.functions, External, wanted))
+
+
+class Cost(abc.ABC):
+    """One term of a cost."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return type(self).__name__
+
+    @abc.abstractmethod
+    def bind(self, dynamics: Dynamics) -> Term:
+        """This cost for a system. Raises InputError if it does not fit (a weight of the wrong size, say)."""
+
+    def __add__(self, other: "Cost") -> "CostSum":
+        return CostSum((*terms_of(self), *terms_of(other)))
+
+
+class CostSum(Cost):
+    """What `+` makes: the terms, in order."""
+
+    def __init__(self, terms: tuple[Cost, ...]) -> None:
+        self.terms = terms
+
+    def bind(self, dynamics: Dynamics) -> Term:
+        raise InputError("cost: got a sum to bind, want its terms one by one")
+
+
+def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
+    """The terms of a sum; a single cost is its own. Raises InputError for what is no cost."""
+    if isinstance(cost, CostSum):
+        return cost.terms
+    if not isinstance(cost, Cost):
+        raise InputError(f"{field}: got {excerpt(cost)}, want a cost such as QuadraticCost(...) or a sum of costs")
+    return (cost,)
+
+
+class QuadraticCost(Cost):
+    """`1/2 (x - about)' weight (x - about)`.
+
+    Args:
+      weight: (n, n) symmetric positive semidefinite, or its diagonal (n,).
+      about: (n,) the state where it is zero.
+    """
+
+    def __init__(self, weight: npt.ArrayLike, *, about: npt.ArrayLike) -> None:
+        self.weight = check_weight("QuadraticCost: weight", weight)
+        self.about = check_array("QuadraticCost: about", about, (len(self.weight),))
+
+    def bind(self, dynamics: Dynamics) -> Term:
+        _check_size("QuadraticCost: weight", self.weight, len(dynamics.state_coordinates), "states")
+        return Term(_QUADRATIC.format(first="0", size="N", z="x"), np.concatenate([self.about, self.weight.ravel()]))
+
+
+class ControlCost(Cost):
+    """`1/2 (u - about)' weight (u - about)`.
+
+    Args:
+      weight: (m, m) symmetric positive definite, or its diagonal (m,).
+      about: (m,) the nominal control, where it is zero; the solvers start from it unless told otherwise. By default no
+        control at all, (0, ..., 0).
+    """
+
+    def __init__(self, weight: npt.ArrayLike, *, about: npt.ArrayLike | None = None) -> None:
+        self.weight = check_weight("ControlCost: weight", weight, definite=True)
+        about = np.zeros(len(self.weight)) if about is None else about
+        self.about = check_array("ControlCost: about", about, (len(self.weight),))
+
+    def bind(self, dynamics: Dynamics) -> Term:
+        _check_size("ControlCost: weight", self.weight, len(dynamics.control_coordinates), "controls")
+        source = _QUADRATIC.format(first="N", size="M", z="u")
+        return Term(source, np.concatenate([self.about, self.weight.ravel()]), uses_control=True)
+
+
+class ObstacleCost(Cost):
+    """`weight * sum over obstacles of exp(-sharpness * (distance - radius))`, from the first step on.
+
+    Paper: Sec. VI-A, with the sharpness made explicit. At t = 0, where the state is given, it does not act. A robot in
+    the plane (two position coordinates) sees the world from above, or cut by its plane; see `World.seen_by`.
+
+    Args:
+      world: the obstacles. radius: of the robot, in metres.
+      sharpness: in 1/m. weight: cost of touching one obstacle for one step.
+    """
+
+    def __init__(self, world: World, *, radius: float, sharpness: float = 10.0, weight: float = 1.0) -> None:
+        if not isinstance(world, World):
+            raise InputError(f"ObstacleCost: world: got {excerpt(world)}, want a World, such as scene.world")
+        self.world = world
+        self.radius = check_number("ObstacleCost: radius", radius, at_least=0.0)
+        self.sharpness = check_number("ObstacleCost: sharpness", sharpness, above=0.0)
+        self.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
+
+    def bind(self, dynamics: Dynamics) -> Term:
+        space = dynamics.state_coordinates
+        position = space.position
+        if not position:
+            raise InputError("ObstacleCost: got dynamics without a position, want Dynamics(..., position=(names))")
+        world = self.world.seen_by(space.plane, space.offset)
+        place = [f"x[{i}]" for i in position] + (["0.0"] if len(position) == 2 else [])
+        source = _OBSTACLES.format(place=", ".join(place), axes=repr(position), size=len(position), row=ROW)
+        data = np.concatenate([[self.radius, self.sharpness, self.weight, len(world)], world.table.ravel()])
+        return Term(source, data, bends=position, factor=2)
+
+
+class SymbolicCost(Cost):
+    """A cost stated as a formula.
+
+    Args:
+      function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns one expression. For an initial or final
+        cost it must not depend on u.
+      parameters: name -> value, as in `Dynamics`.
+      convex: set it where the Hessian is positive semidefinite everywhere, to save the projection.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any, Any, Any], Any],
+        *,
+        parameters: Mapping[str, float] | None = None,
+        convex: bool = False,
+    ) -> None:
+        if level_of(function, None) == "compiled":
+            raise InputError(f"SymbolicCost: got the numba function {name_of(function)}, want FunctionCost for it")
+        self.function = function
+        check_signature(function, ("x", "u", "p"))
+        self.parameters = symbolic.check_parameters(parameters)
+        self.convex = check_flag("SymbolicCost: convex", convex)
+
+    @property
+    def name(self) -> str:
+        """The name of its function."""
+        return f"{name_of(self.function)}(x, u, p)"
+
+    def bind(self, dynamics: Dynamics) -> Term:
+        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        details = ("cost", n, m, tuple(self.parameters))
+        made = symbolic.kept(self.function, details, lambda: self._trace(n, m))
+        return Term(
+            made["source"],
+            np.array(list(self.parameters.values()), dtype=np.float64),
+            bends=None if self.convex or not made["bends"] else tuple(made["bends"]),
+            uses_control=made["uses_control"],
+        )
+
+    def _trace(self, n: int, m: int) -> dict[str, Any]:
+        traced, x, u = symbolic.trace(self.function, n, m, list(self.parameters))
+        if len(traced) != 1:
+            raise InputError(f"{self.name}: got {len(traced)} entries, want one: the cost")
+        cost, z = traced[0], [*x, *u]
+        slopes = [cost.diff(symbol) for symbol in z]
+        curves = {(i, j): slope.diff(symbol) for i, slope in enumerate(slopes) for j, symbol in enumerate(z)}
+        targets = {"cost": cost}
+        targets |= {f"gradient[{i}]+": slope for i, slope in enumerate(slopes) if slope != 0}
+        targets |= {f"hessian[{i}, {j}]+": curve for (i, j), curve in curves.items() if curve != 0}
+        value = symbolic.write_function("value", "x, u, t, data", "data", {"cost": cost}, of=self.name, returns="cost")
+        derivatives = symbolic.write_function(
+            "derivatives", "x, u, t, data, hessian, gradient", "data", targets, of=self.name, returns="cost"
+        )
+        return {
+            "source": f"{value}\n\n{derivatives}",
+            "bends": sorted({i for (i, _), curve in curves.items() if curve != 0}),
+            "uses_control": bool(cost.free_symbols & set(u)),
+        }
+
+
+class FunctionCost(Cost):
+    """A cost given as a numba or a plain Python function, for what `SymbolicCost` can not express.
+
+    Args:
+      function: `function(x, u, p)` of NumPy arrays x (n,) and u (m,), which must not be changed; returns the cost.
+      derivatives: `derivatives(x, u, p, gradient, hessian)`, which writes to gradient (n+m,) and hessian (n+m, n+m),
+        states before controls; it gets them as zeros. Without it, both are central differences, good to some six
+        digits, at two evaluations for every pair of entries in `depends_on`.
+      depends_on: names of the states and controls that it depends on; all by default. The fewer, the faster.
+      parameters: name -> value, as in `Dynamics`.
+      convex: set it where the Hessian is positive semidefinite everywhere, to save the projection.
+      level: "compiled" or "plain"; by default compiled if the function is numba's, and plain otherwise.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any, Any, Any], float],
+        *,
+        derivatives: Callable[..., None] | None = None,
+        depends_on: Sequence[str] | None = None,
+        parameters: Mapping[str, float] | None = None,
+        convex: bool = False,
+        level: str | None = None,
+    ) -> None:
+        self.function, self.derivatives = function, derivatives
+        self.convex = check_flag("FunctionCost: convex", convex)
+        self.level = level_of(function, level)
+        if self.level == "symbolic":
+            if level is not None:
+                raise InputError("FunctionCost: level: got 'symbolic', want 'compiled', 'plain', or a SymbolicCost")
+            self.level = "plain"
+        if isinstance(depends_on, str):
+            said = excerpt(depends_on)
+            raise InputError(f"FunctionCost: depends_on: got {said}, want a tuple of names: ({said},)")
+        self.depends_on = None
+        if depends_on is not None:
+            wanted = "a tuple of names of states and controls, at least one"
+            self.depends_on = check_items("FunctionCost: depends_on", depends_on, str, wanted)
+            if not self.depends_on:  # a constant: nothing to minimise
+                raise InputError(f"FunctionCost: depends_on: got none, want {wanted}, or None for all of them")
+        self.parameters = symbolic.check_parameters(parameters)
+        check_signature(function, ("x", "u", "p"))
+        if derivatives is not None:
+            check_function("FunctionCost: derivatives", derivatives, "a function of (x, u, p, gradient, hessian)")
+            level_of(derivatives, self.level)
+            check_signature(derivatives, ("x", "u", "p", "gradient", "hessian"))
+
+    @property
+    def name(self) -> str:
+        """The name of its function."""
+        return f"{name_of(self.function)}(x, u, p)"
+
+    def bind(self, dynamics: Dynamics) -> Term:
+        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
+        wanted = names if self.depends_on is None else self.depends_on
+        axes = tuple(sorted({names.index(check_name("FunctionCost: depends_on", name, names)) for name in wanted}))
+        rest: dict[str, Any] = {"level": self.level, "states": n, "controls": m, "parameters": tuple(self.parameters)}
+        rest["offset"] = 1 if self.derivatives is None else 2
+        unused = tuple((i, name) for i, name in enumerate(names) if i not in axes)
+        functions = (External(function=self.function, values=1, unused=unused, **rest),)
+        if self.derivatives is not None:
+            functions += (External(function=self.derivatives, writes=((n + m,), (n + m, n + m)), **rest),)
+        source = _FUNCTION + (_DIFFERENCES if self.derivatives is None else _DERIVATIVES)
+        return Term(
+            source.format(axes=f"({''.join(f'{axis}, ' for axis in axes)})", count=len(axes)),
+            np.array(list(self.parameters.values()), dtype=np.float64),
+            bends=None if self.convex else axes,
+            uses_control=any(axis >= n for axis in axes),
+            functions=functions,
+        )
+
+
+def check_source(field: str, source: object, functions: Mapping[str, int]) -> None:
+    """Raises InputError unless it is source text that defines these functions, of so many arguments, and can compile.
+
+    What there is besides Python's own arithmetic is named without its module: cos, not math.cos or np.cos.
+    """
+    wanted = " and ".join(f"{name}(...)" for name in functions)
+    check_kind(f"{field}: source", source, str, f"text that defines {wanted}")
+    wrong = _wrong(str(source), tuple(functions.items()))
+    if wrong:
+        raise InputError(f"{field}: source: {wrong}")
+
+
+@functools.lru_cache(maxsize=256)  # a problem that is stated again and again has the same sources
+def _wrong(source: str, functions: tuple[tuple[str, int], ...]) -> str:
+    """What is wrong with a source; see `check_source`."""
+    try:
+        tree = ast.parse(source)
+    except Exception as error:  # SyntaxError, or what nesting, null characters and the like lead to
+        return f"got {excerpt(source)}, which is no Python ({error}), want functions"
+    defined = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    for name, count in functions:
+        found = defined.get(name)
+        if found is None:
+            return f"got {excerpt(source)}, want it to define {name}(...)"
+        if len(found.args.args) != count:
+            return f"got {name} of {len(found.args.args)} arguments, want {count}"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            return f"got an import in line {node.lineno}, want none: sqrt, exp, cos and the like are at hand"
+        if isinstance(node, ast.Attribute):
+            return f"got {ast.unparse(node)} in line {node.lineno}, want {node.attr}: modules are not at hand"
+    return ""
+
+
+def _check_size(field: str, weight: Array, want: int, what: str) -> None:
+    if len(weight) != want:
+        raise InputError(f"{field}: got size {len(weight)}, want {want}, the number of {what}")
+
+
+_QUADRATIC = """\
+def value(x, u, t, data):
+    total = 0.0
+    for i in range({size}):
+        slope = 0.0
+        for j in range({size}):
+            slope += data[{size} + {size} * i + j] * ({z}[j] - data[j])
+        total += 0.5 * slope * ({z}[i] - data[i])
+    return total
+
+
+def derivatives(x, u, t, data, hessian, gradient):
+    total = 0.0
+    for i in range({size}):
+        slope = 0.0
+        for j in range({size}):
+            weight = data[{size} + {size} * i + j]
+            slope += weight * ({z}[j] - data[j])
+            hessian[{first} + i, {first} + j] += weight
+        gradient[{first} + i] += slope
+        total += 0.5 * slope * ({z}[i] - data[i])
+    return total
+"""
+
+_OBSTACLES = """\
+def value(x, u, t, data):
+    total = 0.0
+    if t > 0:
+        for i in range(int(data[3])):
+            distance = signed_distance(data, 4 + {row} * i, {place})
+            total += exp(-data[1] * (distance - data[0]))
+    return data[2] * total
+
+
+def derivatives(x, u, t, data, hessian, gradient):
+    total = 0.0
+    if t > 0:
+        axes = {axes}
+        slope, curve, slopes, curves = stack(3), stack(3, 3), stack(3), stack(3, 3)
+        clear(curves, 3, 3)
+        for j in range(3):
+            slopes[j] = 0.0
+        for i in range(int(data[3])):
+            distance = signed_distance_derivatives(data, 4 + {row} * i, {place}, slope, curve)
+            cost = data[2] * exp(-data[1] * (distance - data[0]))
+            total += cost
+            for j in range(3):
+                slopes[j] -= cost * slope[j]
+                for k in range(3):
+                    curves[j, k] += cost * (data[1] * slope[j] * slope[k] - curve[j, k])
+        for j in range({size}):
+            gradient[axes[j]] += data[1] * slopes[j]
+            for k in range({size}):
+                hessian[axes[j], axes[k]] += data[1] * curves[j, k]
+    return total
+"""
+
+_FUNCTION = """\
+def value(x, u, t, data):
+    out = stack(1)
+    out[0] = nan
+    invoke(data[0], x, u, data, out)
+    return out[0]
+
+
+"""
+
+_DERIVATIVES = """\
+def derivatives(x, u, t, data, hessian, gradient):
+    slope, curve = stack(W), stack(W, W)
+    clear(curve, W, W)
+    for i in range(W):
+        slope[i] = 0.0
+    invoke_writing(data[1], x, u, data, slope, curve)
+    for i in range(W):
+        gradient[i] += slope[i]
+        for j in range(W):
+            hessian[i, j] += 0.5 * (curve[i, j] + curve[j, i])
+    return value(x, u, t, data)
+"""
+
+# The step is the fourth root of the machine's precision, as a second derivative wants it.
+_DIFFERENCES = """\
+def derivatives(x, u, t, data, hessian, gradient):
+    axes = {axes}
+    z, h, ahead, behind = stack(W), stack(W), stack(W), stack(W)
+    for i in range(W):
+        z[i] = x[i] if i < N else u[i - N]
+        h[i] = 1.2e-4 * max(1.0, abs(z[i]))
+    middle = value(x, u, t, data)
+    for i in range({count}):
+        a = axes[i]
+        ahead[a] = shifted(z, a, h[a], a, 0.0, t, data)
+        behind[a] = shifted(z, a, -h[a], a, 0.0, t, data)
+        gradient[a] += (ahead[a] - behind[a]) / (2 * h[a])
+        hessian[a, a] += (ahead[a] - 2 * middle + behind[a]) / (h[a] * h[a])
+    for i in range({count}):
+        for j in range(i):
+            a, b = axes[i], axes[j]
+            both = shifted(z, a, h[a], b, h[b], t, data) + shifted(z, a, -h[a], b, -h[b], t, data)
+            bend = (both + 2 * middle - ahead[a] - behind[a] - ahead[b] - behind[b]) / (2 * h[a] * h[b])
+            hessian[a, b] += bend
+            hessian[b, a] += bend
+    return middle
+
+
+def shifted(z, i, a, j, b, t, data):
+    x, u = stack(N), stack(M)
+    for k in range(N):
+        x[k] = z[k]
+    for k in range(M):
+        u[k] = z[N + k]
+    if i < N:
+        x[i] += a
+    else:
+        u[i - N] += a
+    if j < N:
+        x[j] += b
+    else:
+        u[j - N] += b
+    return value(x, u, t, data)
+"""

@@ -1,0 +1,234 @@
+"""Looks at what a user's functions return: before the first iteration, and where derivatives are in doubt."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lqrsim.codegen.user_functions import External, brief, plain_names
+from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, check_text, excerpt, real, shaped
+from lqrsim.problem.costs import Term, terms_of
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.problem import FixedState, Problem
+
+
+def functions_of(problem: Problem) -> list[External]:
+    """The numba and plain Python functions of a problem."""
+    terms = [term for name in ("initial", "stage_cost", "final_cost") for term in problem.terms(name)]
+    return [function for part in (problem.dynamics, *terms) for function in part.functions]
+
+
+def check_functions(problem: Problem, x: Array, u: Array) -> None:
+    """Call each numba and plain Python function once. Raises InputError if one does not return what it should."""
+    for part in (problem.dynamics, *(term for _, term in _terms(problem))):
+        for function in part.functions:
+            parameters = dict(zip(function.parameters, part.data.tolist(), strict=True))
+            values = function.call(x, u, parameters)
+            for i, name in function.unused:
+                z = np.concatenate([x, u])
+                z[i] += 1e-2 * max(1.0, abs(z[i]))
+                if not np.array_equal(function.call(z[: len(x)], z[len(x) :], parameters), values, equal_nan=True):
+                    raise InputError(f"{function.name}: got a value that depends on {name}, want it in depends_on")
+
+
+def check_start(problem: Problem, x: Array, u: Array) -> None:
+    """Raises InputError if the dynamics or a cost is not finite at a state (n,) and control (m,)."""
+    where = f"at the start, x = {brief(x)}, u = {brief(u)}"
+    names = problem.dynamics.state_coordinates.names
+    with np.errstate(all="ignore"):
+        for i, rate in enumerate(problem.dynamics.rate(x, u)):
+            if not np.isfinite(rate):
+                raise InputError(
+                    f"{problem.dynamics.name}(x, u, p): got {rate:g} as entry {i} ({names[i]}) {where},"
+                    " want a finite number"
+                )
+        columns = names, problem.dynamics.control_coordinates.names
+        for what, slopes, column in zip(("df/dx", "df/du"), problem.dynamics.rate_jacobian(x, u), columns, strict=True):
+            for i, j in np.argwhere(~np.isfinite(slopes)):
+                raise InputError(
+                    f"{problem.dynamics.name}(x, u, p): got {slopes[i, j]:g} in {what}, row {names[i]}, column"
+                    f" {column[j]}, {where}, want finite derivatives"
+                )
+        for cost, term in _terms(problem):
+            value, gradient, hessian = evaluate(term, problem.dynamics, x, u)
+            for what, array in (("value", np.array(value)), ("gradient", gradient), ("Hessian", hessian)):
+                if not np.isfinite(array).all():
+                    entry = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
+                    place = f" at {entry}" if entry else ""
+                    raise InputError(
+                        f"{cost}: got {array[tuple(entry)]:g} as its {what}{place} {where}, want finite numbers"
+                    )
+
+
+def _terms(problem: Problem) -> Iterator[tuple[str, Term]]:
+    """The cost terms, with what messages call them."""
+    for name in ("initial", "stage_cost", "final_cost"):
+        cost = getattr(problem, name)
+        if not isinstance(cost, FixedState):
+            yield from ((f"{name}: {c.name}", t) for c, t in zip(terms_of(cost), problem.terms(name), strict=True))
+
+
+def evaluate(term: Term, dynamics: Dynamics, x: Array, u: Array) -> tuple[float, Array, Array]:
+    """A cost term in plain Python: its value, gradient (n+m,) and Hessian (n+m, n+m), before any projection."""
+    n, m = len(x), len(u)
+    parameters = dict(zip(term.functions[0].parameters, term.data.tolist(), strict=True)) if term.functions else {}
+    names = plain_names(n, m, term.functions, parameters)
+    exec(compile(term.source, "<cost>", "exec"), names)
+    gradient, hessian = np.zeros(n + m), np.zeros((n + m, n + m))
+    data = np.concatenate([np.arange(len(term.functions), dtype=np.float64), term.data])
+    return float(names["derivatives"](x, u, 1, data, hessian, gradient)), gradient, hessian
+
+
+def _constraints(
+    problem: Problem,
+) -> Iterator[tuple[str, Callable[[Array, Array], float], Callable[[Array, Array], Array]]]:
+    """The constraints' numbers in plain Python: what messages call each, its value and its slope (n+m,) at (x, u)."""
+    n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
+    for inequalities in problem.inequalities:
+        names = plain_names(n, m, (), {})
+        exec(compile(inequalities.source, "<constraint>", "exec"), names)
+        for row in range(inequalities.rows):
+
+            def value(x: Array, u: Array, row: int = row, names: Any = names, data: Array = inequalities.data) -> float:
+                return float(names["value"](x, u, 1, row, data))
+
+            def slope(x: Array, u: Array, row: int = row, names: Any = names, data: Array = inequalities.data) -> Array:
+                gradient = np.zeros(n + m)
+                names["slope"](x, u, 1, row, data, gradient)
+                return gradient
+
+            yield inequalities.says(row), value, slope
+
+
+@dataclass(frozen=True)
+class DerivativeCheck:
+    """How far derivatives are from central differences, where they are furthest.
+
+    Attributes:
+      what: which derivative: `df/dx of ...`, say.
+      error: largest difference over entries and samples, relative to the entry and the differences' own rounding.
+      row, column: the names at that entry.
+      stated, difference: the two values there. state (n,), control (m,): where that was.
+      tolerance: what the error must not exceed.
+    """
+
+    what: str
+    error: float
+    row: str
+    column: str
+    stated: float
+    difference: float
+    state: Array
+    control: Array
+    tolerance: float
+
+    def __post_init__(self) -> None:
+        for name in ("what", "row", "column"):
+            check_text(f"DerivativeCheck: {name}", getattr(self, name), at_most=1000)
+        for name in ("error", "stated", "difference", "tolerance"):
+            object.__setattr__(self, name, float(shaped(f"DerivativeCheck: {name}", getattr(self, name), ())))
+        for name in ("state", "control"):
+            numbers = real(f"DerivativeCheck: {name}", getattr(self, name))
+            object.__setattr__(self, name, shaped(f"DerivativeCheck: {name}", numbers, (None,)))
+
+    @property
+    def good(self) -> bool:
+        """Whether the error is within the tolerance; a NaN is not."""
+        return self.error <= self.tolerance
+
+    def __str__(self) -> str:
+        verdict = "agrees" if self.good else "DISAGREES"
+        return (
+            f"{self.what}: {verdict}; worst at row {self.row}, column {self.column}: {self.stated:.8g} stated,"
+            f" {self.difference:.8g} by central differences (error {self.error:.1e}, tolerance {self.tolerance:.0e};"
+            f" x = {brief(self.state)}, u = {brief(self.control)})"
+        )
+
+
+def check_derivatives(
+    subject: Problem | Dynamics, *, samples: int = 20, spread: float = 0.3, tolerance: float = 1e-5, seed: int = 0
+) -> list[DerivativeCheck]:
+    """Compare derivatives with central differences: of dynamics, or of a problem's dynamics, costs and constraints.
+
+    Derivatives of symbolic functions are exact, but a formula can still be singular where the robot goes; those of
+    compiled and plain functions are as right as who wrote them. Costs without derivatives are left out, for theirs are
+    central differences themselves.
+
+    Args:
+      subject: dynamics, looked at around zero, or a problem, around its start and nominal control.
+      samples: how many points. spread: their standard deviation, in the units of states and controls.
+      tolerance: of the error, relative to each entry. seed: of the points.
+
+    Returns:
+      One check a matrix of derivatives, with the worst entry by row and column; print it. `check.good` is the verdict.
+
+    Raises:
+      InputError: a function fails, or an argument is not as described.
+    """
+    check_count("samples", samples, at_most=10_000)
+    spread = check_number("spread", spread, at_least=0.0)
+    tolerance = check_number("tolerance", tolerance, above=0.0)
+    dynamics = subject.dynamics if isinstance(subject, Problem) else subject
+    if not isinstance(dynamics, Dynamics):
+        raise InputError(f"subject: got {excerpt(subject)}, want a Problem or Dynamics")
+    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+    x0, u0 = np.zeros(n), np.zeros(m)
+    if isinstance(subject, Problem):
+        x0, u0 = x0 if subject.start is None else subject.start, subject.nominal_control
+    rng = np.random.default_rng(check_seed("seed", seed))
+    points = [(x0 + spread * rng.normal(size=n), u0 + spread * rng.normal(size=m)) for _ in range(samples)]
+    states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
+    found: dict[str, list[DerivativeCheck]] = {}
+
+    def compare(
+        what: str, stated: Array, differences: tuple[Array, Array], rows: Any, columns: Any, x: Array, u: Array
+    ) -> None:
+        difference, noise = differences
+        size = np.maximum(np.abs(stated), np.abs(difference)) + noise / tolerance
+        apart = np.abs(stated - difference) / np.maximum(size, np.finfo(float).tiny)
+        worst = int(np.argmax(np.where(np.isnan(apart), np.inf, apart)))
+        i, j = (int(k) for k in np.unravel_index(worst, apart.shape))
+        check = DerivativeCheck(
+            what, float(apart[i, j]), rows[i], columns[j], float(stated[i, j]), float(difference[i, j]), x, u, tolerance
+        )
+        found.setdefault(what, []).append(check)
+
+    with np.errstate(all="ignore"):
+        for x, u in points:
+            fx, fu = dynamics.rate_jacobian(x, u)
+            joint = _differences(lambda z: dynamics.rate(z[:n], z[n:]), np.concatenate([x, u]), 6e-6)
+            left, right = (joint[0][:, :n], joint[1][:, :n]), (joint[0][:, n:], joint[1][:, n:])
+            compare(f"df/dx of {dynamics.name}", fx, left, states, states, x, u)
+            compare(f"df/du of {dynamics.name}", fu, right, states, controls, x, u)
+        for cost, term in _terms(subject) if isinstance(subject, Problem) else ():
+            names = (*states, *controls)
+            for x, u in points if len(term.functions) != 1 else ():
+                _, gradient, hessian = evaluate(term, dynamics, x, u)
+                z = np.concatenate([x, u])
+                slope = _differences(lambda z, t=term: np.array([evaluate(t, dynamics, z[:n], z[n:])[0]]), z, 6e-6)
+                curve = _differences(lambda z, t=term: evaluate(t, dynamics, z[:n], z[n:])[1], z, 6e-6)
+                compare(f"gradient of {cost}", gradient[None], slope, ("cost",), names, x, u)
+                compare(f"Hessian of {cost}", hessian, curve, names, names, x, u)
+        for name, value, slope in _constraints(subject) if isinstance(subject, Problem) else ():
+            for x, u in points:
+                differences = _differences(lambda z, f=value: np.array([f(z[:n], z[n:])]), np.concatenate([x, u]), 6e-6)
+                compare(f"slope of {name}", slope(x, u)[None], differences, ("value",), (*states, *controls), x, u)
+    return [
+        max(checks, key=lambda check: np.inf if np.isnan(check.error) else check.error) for checks in found.values()
+    ]
+
+
+def _differences(function: Any, z: Array, step: float) -> tuple[Array, Array]:
+    """The Jacobian of a function of a vector by central differences, and what rounding may have done to each entry."""
+    columns, noise = [], []
+    for i in range(len(z)):
+        h = step * max(1.0, abs(z[i]))
+        ahead, behind = z.copy(), z.copy()
+        ahead[i] += h
+        behind[i] -= h
+        above, below = function(ahead), function(behind)
+        columns.append((above - below) / (2 * h))
+        # A thousand roundings of a number of that size, or of one.
+        noise.append(1e3 * np.finfo(float).eps * np.maximum(np.maximum(np.abs(above), np.abs(below)), 1.0) / h)
+    return np.stack(columns, axis=1), np.stack(noise, axis=1)

@@ -1,0 +1,296 @@
+"""The dynamics of a system, stated as a function: of symbols, of arrays for numba, or of NumPy arrays."""
+
+import copy
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen import symbolic
+from lqrsim.codegen.user_functions import External, check_signature, level_of, name_of, plain_names
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_function,
+    check_items,
+    check_name,
+    check_number,
+    excerpt,
+    numbers_of,
+)
+from lqrsim.kernels import finite_differences, runge_kutta
+from lqrsim.results.coordinates import Coordinates
+
+Limits = tuple[npt.ArrayLike, npt.ArrayLike]
+
+
+class Dynamics:
+    """`xdot = f(x, u)`: Eq. (1), with what its states and controls mean.
+
+    A pendulum, swung by a motor:
+
+        def pendulum(x, u, p):
+            from sympy import sin
+            angle, speed = x
+            return [speed, u[0] / p.inertia - p.gravity / p.length * sin(angle)]
+
+        ls.Dynamics(
+            pendulum,
+            states={"angle": "rad", "speed": "rad/s"}, controls={"torque": "N m"},
+            parameters={"inertia": 0.02, "gravity": 9.81, "length": 0.2}, angles=("angle",),
+        )
+
+    The same function can be stated at three levels, which differ in speed and in what the function may contain:
+
+      symbolic  called once with SymPy symbols; exact derivatives follow. As fast as it gets, and the default.
+      compiled  a numba function, or one that numba can compile, of arrays. Without `jacobian`, derivatives are central
+                differences, good to some eight digits, and an iteration takes longer.
+      plain     any Python function of NumPy arrays, called back through Python at every evaluation, and slow.
+
+    Args:
+      f: `f(x, u, p)`; returns one entry a state. x (n,) and u (m,) must not be changed; p has the parameters as
+        attributes.
+      states, controls: name -> unit, in order.
+      parameters: name -> value. Values are data: changing one compiles nothing.
+      position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
+        x, y and z, in this order.
+      plane, offset: in which plane a position of 2 states is, as "xz", and where that is along the third axis, in
+        metres: see `Coordinates`. By default the plane is that of the names, if they say two of x, y and z.
+      angles: names of the states that are angles in radians, equal up to whole turns.
+      rotation_vectors: names, by threes, of the states that are rotation vectors.
+      control_limits: lowest and highest control, numbers or (m,); what the actuators can do, for execution.
+      jacobian: `jacobian(x, u, p, fx, fu)`, for the compiled and the plain level: writes df/dx and df/du, the entries
+        that are not zero, to fx (n, n) and fu (n, m), which it gets as zeros. numba's if f is, Python's if f is.
+      level: "symbolic", "compiled" or "plain"; by default compiled if f is a numba function, and symbolic otherwise.
+
+    Raises:
+      InputError: a name does not exist, a parameter is not finite, or the level does not fit the function. What f
+        returns is looked at when it is first needed.
+    """
+
+    def __init__(
+        self,
+        f: Callable[[Any, Any, Any], Any],
+        *,
+        states: Mapping[str, str],
+        controls: Mapping[str, str],
+        parameters: Mapping[str, float] | None = None,
+        position: Sequence[str] = (),
+        plane: str = "",
+        offset: float | None = None,
+        angles: Sequence[str] = (),
+        rotation_vectors: Sequence[Sequence[str]] = (),
+        control_limits: Limits | None = None,
+        jacobian: Callable[..., None] | None = None,
+        level: str | None = None,
+    ) -> None:
+        for field, given in (("states", states), ("controls", controls)):
+            if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
+                raise InputError(f"{field}: got {excerpt(given)}, want a dictionary of name: unit")
+        if not states or not controls:
+            raise InputError(
+                f"dynamics: got {len(states)} states and {len(controls)} controls, want at least one of each"
+            )
+        names = tuple(states)
+        for field, listed in (("position", position), ("angles", angles), ("rotation_vectors", rotation_vectors)):
+            if isinstance(listed, str):
+                raise InputError(f"{field}: got {excerpt(listed)}, want a tuple of names: ({excerpt(listed)},)")
+        position, angles = (
+            check_items(field, listed, str, f"a tuple of names of states, of {', '.join(names)}")
+            for field, listed in (("position", position), ("angles", angles))
+        )
+        triples = [
+            check_items("rotation_vectors", triple, str, "tuples of three names of states")
+            for triple in check_items("rotation_vectors", rotation_vectors, (tuple, list), "a tuple of threes of names")
+        ]
+
+        def index(field: str, name: str) -> int:
+            return names.index(check_name(field, name, names))
+
+        starts = []
+        for triple in triples:
+            indices = [index("rotation_vectors", name) for name in triple]
+            if len(indices) != 3 or indices != list(range(indices[0], indices[0] + 3)):
+                raise InputError(f"rotation_vectors: got {excerpt(tuple(triple))}, want three neighbouring states")
+            starts.append(indices[0])
+        limits = control_limits if control_limits is not None else (-np.inf, np.inf)
+        try:
+            low, high = (np.broadcast_to(numbers_of("control_limits", side), len(controls)).tolist() for side in limits)
+        except Exception:  # no pair, no numbers, another number of them
+            wanted = f"(lowest, highest), each a number or ({len(controls)},)"
+            raise InputError(f"control_limits: got {excerpt(control_limits)}, want {wanted}") from None
+        self.f, self.jacobian = f, jacobian
+        self.level = level_of(f, level)
+        if jacobian is not None and self.level == "symbolic":
+            raise InputError(
+                f"jacobian: got one for {name_of(f)}, which is symbolic, want none (it is derived) or level='compiled'"
+                " or 'plain'"
+            )
+        check_signature(f, ("x", "u", "p"))
+        if jacobian is not None:
+            check_function("jacobian", jacobian, "a function of (x, u, p, fx, fu)")
+            level_of(jacobian, self.level)
+            check_signature(jacobian, ("x", "u", "p", "fx", "fu"))
+        self.parameters = symbolic.check_parameters(parameters)
+        self.state_coordinates = Coordinates(
+            names=names,
+            units=tuple(states.values()),
+            position=tuple(index("position", name) for name in position),
+            plane=plane,
+            offset=offset,
+            angles=tuple(index("angles", name) for name in angles),
+            rotation_vectors=tuple(starts),
+        )
+        self.control_coordinates = Coordinates(
+            names=tuple(controls),
+            units=tuple(controls.values()),
+            low=tuple(low),
+            high=tuple(high),
+        )
+        # At once and not when first needed: several threads may need them, and addresses are not to change.
+        self.functions = self._functions()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is derived and can not be pickled."""
+        return {name: value for name, value in vars(self).items() if name != "_plain"}
+
+    @property
+    def name(self) -> str:
+        """What messages call the dynamics: the name of `f`."""
+        return name_of(self.f)
+
+    def with_parameters(self, **values: float) -> "Dynamics":
+        """The same with other values of some parameters: `dynamics.with_parameters(mass=0.6)`. Nothing compiles again.
+
+        Raises:
+          InputError: there is no such parameter, or the value is not finite.
+        """
+        for name in values:
+            check_name("parameters", name, self.parameters)
+        other = copy.copy(self)  # without `_plain`, which has the old values
+        other.parameters = self.parameters | symbolic.check_parameters(values)
+        return other
+
+    @property
+    def data(self) -> Array:
+        """The parameters' values, in order."""
+        return np.array(list(self.parameters.values()), dtype=np.float64)
+
+    def _functions(self) -> tuple[External, ...]:
+        """What compiled code calls: nothing if the dynamics are symbolic, else f and the Jacobian, if there is one."""
+        if self.level == "symbolic":
+            return ()
+        n, m, names = len(self.state_coordinates), len(self.control_coordinates), tuple(self.parameters)
+        rest: dict[str, Any] = {"level": self.level, "states": n, "controls": m, "parameters": names}
+        rest["offset"] = 1 if self.jacobian is None else 2
+        rate = External(function=self.f, values=n, entries=self.state_coordinates.names, **rest)
+        if self.jacobian is None:
+            return (rate,)
+        return rate, External(function=self.jacobian, writes=((n, n), (n, m)), **rest)
+
+    @cached_property
+    def source(self) -> str:
+        """Source of `rate` and `rate_jacobian` of `kernels/interface.py`; symbolic dynamics are traced for it, once."""
+        if self.level != "symbolic":
+            return _CALL + (
+                inspect.getsource(finite_differences.rate_jacobian) if self.jacobian is None else _CALL_JACOBIAN
+            )
+        names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
+        details = ("dynamics", *names)
+        return symbolic.kept(self.f, details, lambda: {"source": self._trace()})["source"]
+
+    def _trace(self) -> str:
+        n, m = len(self.state_coordinates), len(self.control_coordinates)
+        rates, x, u = symbolic.trace(self.f, n, m, list(self.parameters))
+        if len(rates) != n:
+            states = ", ".join(self.state_coordinates.names)
+            raise InputError(f"{self.name}(x, u, p): got {len(rates)} entries, want {n}: one for each of {states}")
+        values = {f"out[{i}]": rate for i, rate in enumerate(rates)}
+        slopes = {f"fx[{i}, {j}]": rate.diff(xj) for i, rate in enumerate(rates) for j, xj in enumerate(x)}
+        slopes |= {f"fu[{i}, {j}]": rate.diff(uj) for i, rate in enumerate(rates) for j, uj in enumerate(u)}
+        slopes = {target: slope for target, slope in slopes.items() if slope != 0}
+        of = f"{self.name}(x, u, p)"
+        return "\n\n".join(
+            [
+                symbolic.write_function("rate", "x, u, p, out", "p", values, of=of),
+                symbolic.write_function("rate_jacobian", "x, u, p, out, fx, fu", "p", values | slopes, of=of),
+                symbolic.write_chain(n, slopes),
+            ]
+        )
+
+    def rate(self, state: npt.ArrayLike, control: npt.ArrayLike) -> Array:
+        """`xdot` (n,) at one state (n,) and control (m,), in plain Python."""
+        x, u = self._check(state, control)
+        out = np.zeros(len(x))
+        self._plain["rate"](x, u, self._numbers(), out)
+        return out
+
+    def rate_jacobian(self, state: npt.ArrayLike, control: npt.ArrayLike) -> tuple[Array, Array]:
+        """df/dx (n, n) and df/du (n, m) at one state and control, in plain Python."""
+        x, u = self._check(state, control)
+        n, m = len(x), len(u)
+        fx, fu = np.zeros((n, n)), np.zeros((n, m))
+        self._plain["rate_jacobian"](x, u, self._numbers(), np.zeros(n), fx, fu)
+        return fx, fu
+
+    def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
+        """The state (n,) after `dt` seconds (negative: before), control held: one Runge-Kutta step, in plain Python."""
+        x, u = self._check(state, control)
+        out = np.zeros(len(x))
+        self._plain["step"](x, u, self._numbers(), check_number("dt", dt), out)
+        return out
+
+    def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
+        """A (n, n), B (n, m) and c (n,) of the step about a state and control: x' = A x + B u + c. Eqs. (24)-(25)."""
+        x, u = self._check(state, control)
+        n, m = len(x), len(u)
+        out, jacobian = np.zeros(n), np.zeros((n, n + m))
+        self._plain["step_jacobian"](
+            x, u, self._numbers(), check_number("dt", dt), np.zeros((n, n)), np.zeros((n, m)), out, jacobian
+        )
+        a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
+        return a, b, out - a @ x - b @ u
+
+    def _check(self, state: npt.ArrayLike, control: npt.ArrayLike) -> tuple[Array, Array]:
+        return (
+            check_array("state", state, (len(self.state_coordinates),)),
+            check_array("control", control, (len(self.control_coordinates),)),
+        )
+
+    @cached_property
+    def _plain(self) -> dict[str, Any]:
+        """The very source that gets compiled, run as plain Python."""
+        n, m = len(self.state_coordinates), len(self.control_coordinates)
+        names = plain_names(n, m, self.functions, self.parameters)
+        exec(compile(self.source, f"<{self.name}>", "exec"), names)
+        for function in (runge_kutta.step, runge_kutta.step_jacobian):
+            exec(compile(inspect.getsource(function), "<integration>", "exec"), names)
+        if "chain" not in names:
+            exec(compile(inspect.getsource(runge_kutta.chain), "<integration>", "exec"), names)
+        return names
+
+    def _numbers(self) -> Array:
+        """What `p` is in the compiled functions, with the places of the functions for their addresses."""
+        return np.concatenate([np.arange(len(self.functions), dtype=np.float64), self.data])
+
+
+_CALL = """\
+def rate(x, u, p, out):
+    for i in range(N):
+        out[i] = nan
+    invoke(p[0], x, u, p, out)
+
+
+"""
+
+_CALL_JACOBIAN = """\
+def rate_jacobian(x, u, p, out, fx, fu):
+    rate(x, u, p, out)
+    clear(fx, N, N)
+    clear(fu, N, M)
+    invoke_writing(p[1], x, u, p, fx, fu)
+"""

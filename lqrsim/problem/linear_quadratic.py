@@ -1,0 +1,102 @@
+"""The linear-quadratic problem of Sec. IV: what `smooth_lq` solves, and an iteration of `smooth` sets up."""
+
+import contextlib
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array, InputError, check_array, check_memory, excerpt
+from lqrsim.results.value_functions import Quadratic
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """Linear dynamics and a quadratic cost.
+
+        step (discrete) or rate (continuous) of x:   A x + B u + c
+        cost of the step, or a second of it:         1/2 x'Q x + 1/2 u'R u + u'P x + q'x + r'u + constant
+
+    A leading axis of T, if there is one, is time: one stage a step; what has none is the same at each. Everything but
+    A, B and R may be left out and is zero then. Paper: Eqs. (4), (7).
+
+    Attributes:
+      A: (..., n, n). B: (..., n, m). c: (..., n).
+      Q: (..., n, n) symmetric. P: (..., m, n). R: (..., m, m) symmetric, positive definite.
+      q: (..., n). r: (..., m). constant: (...).
+
+    Raises:
+      InputError: shapes that do not fit together, numbers that are not finite, Q or R not symmetric.
+    """
+
+    A: npt.ArrayLike
+    B: npt.ArrayLike
+    R: npt.ArrayLike
+    c: npt.ArrayLike | None = None
+    Q: npt.ArrayLike | None = None
+    P: npt.ArrayLike | None = None
+    q: npt.ArrayLike | None = None
+    r: npt.ArrayLike | None = None
+    constant: npt.ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        shape = _shape(self.B)
+        if len(shape) not in (2, 3):
+            raise InputError(f"Stage: B: got {excerpt(self.B)}, want an array (n, m) or, one a step, (T, n, m)")
+        if 0 in shape:
+            raise InputError(f"Stage: B: got shape {shape}, want at least one of each")
+        n, m = shape[-2:]
+        check_memory("Stage: B", n, 8 * n * (shape[0] if len(shape) == 3 else 1), "whose A")
+        shapes = {
+            "A": (n, n), "B": (n, m), "c": (n,), "Q": (n, n), "P": (m, n), "R": (m, m), "q": (n,), "r": (m,),
+            "constant": (),
+        }  # fmt: skip
+        # Time is the leading axis of any of them, and those without one are the same at each step.
+        given = {name: _shape(getattr(self, name)) for name in shapes if getattr(self, name) is not None}
+        time = max((shape[:1] for name, shape in given.items() if len(shape) == len(shapes[name]) + 1), default=())
+        for field in fields(self):
+            value, want = getattr(self, field.name), shapes[field.name]
+            if value is None:
+                if field.name in ("A", "R"):
+                    raise InputError(f"Stage: {field.name}: got None, want an array of shape {shapes[field.name]}")
+                value = np.zeros(want)
+            with contextlib.suppress(Exception):  # what is ragged or no array has no shape, and is refused below
+                if time and np.ndim(value) == len(want):  # the same at each step
+                    value = np.broadcast_to(value, (*time, *np.shape(value)))
+            array = check_array(f"Stage: {field.name}", value, (*time, *want))
+            if field.name in ("Q", "R") and not np.allclose(array, np.swapaxes(array, -1, -2), rtol=1e-9, atol=0):
+                raise InputError(f"Stage: {field.name}: got a matrix that is not symmetric, want a symmetric one")
+            object.__setattr__(self, field.name, array)
+
+    @property
+    def states(self) -> int:
+        """n, the number of states."""
+        return np.shape(self.B)[-2]
+
+    @property
+    def controls(self) -> int:
+        """m, the number of controls."""
+        return np.shape(self.B)[-1]
+
+
+def check_end(field: str, cost: Quadratic, n: int) -> tuple[Array, Array, float]:
+    """Hessian (n, n), gradient (n,) and constant of an initial or final cost.
+
+    Raises:
+      InputError: it is no Quadratic of n states, or its Hessian is not symmetric.
+    """
+    if not isinstance(cost, Quadratic):
+        raise InputError(f"{field}: got {excerpt(cost)}, want a Quadratic")
+    hessian = check_array(f"{field}: hessian", cost.hessian, (n, n))
+    if not np.allclose(hessian, hessian.T, rtol=1e-9, atol=0):
+        raise InputError(f"{field}: hessian: got a matrix that is not symmetric, want a symmetric one")
+    gradient = check_array(f"{field}: gradient", cost.gradient, (n,))
+    return hessian, gradient, float(check_array(f"{field}: constant", cost.constant, ()))
+
+
+def _shape(value: npt.ArrayLike) -> tuple[int, ...]:
+    """() for what is ragged and has none."""
+    try:
+        return np.asarray(value).shape
+    except Exception:  # or raises whatever it likes when it is asked
+        return ()

@@ -1,0 +1,215 @@
+"""The optimal control problem of Eqs. (1)-(2), in discrete time."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_items,
+    check_kind,
+    check_memory,
+    check_name,
+    check_number,
+    excerpt,
+)
+from lqrsim.problem.constraints import Constraint, Inequalities
+from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost, Term, terms_of
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results.coordinates import Coordinates
+
+
+@dataclass(frozen=True)
+class FixedState:
+    """An initial state (n,) that is given exactly, in place of an initial cost."""
+
+    state: npt.ArrayLike
+
+    def __post_init__(self) -> None:
+        state = check_array("FixedState: state", self.state, (None,))
+        if not len(state):
+            raise InputError("FixedState: state: got no numbers, want one a state")
+        object.__setattr__(self, "state", state)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """Minimise `c_0(x_0) + sum_t c(x_t, u_t, t) + c_T(x_T)` subject to `x_{t+1} = g(x_t, u_t)`.
+
+    Attributes:
+      dynamics: whose Runge-Kutta step over `dt`, control held, is g.
+      dt: the control period in seconds. steps: T, the number of them.
+      initial: c_0, the cost of starting elsewhere than wished (the paper's soft start); or `FixedState(x)`.
+      stage_cost: c, per step: it is *not* multiplied by dt.
+      final_cost: c_T.
+      control_limits: (lowest, highest) control, each a number or (m,); by default what the actuators can do. Infinite
+        ones plan as if there were none. Plan and policy keep them exactly, and the policy keeps the actuators', too.
+      constraints: what the plan must keep to at the steps; see `Clearance`.
+
+    Raises:
+      InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
+        cost that depends on the control, control limits out of order or beyond what the actuators can do, or a start
+        that collides.
+    """
+
+    dynamics: Dynamics
+    dt: float
+    steps: int
+    initial: Cost | FixedState
+    stage_cost: Cost
+    final_cost: Cost
+    control_limits: tuple[npt.ArrayLike, npt.ArrayLike] | None = None
+    constraints: Sequence[Constraint] = ()
+    _terms: dict[str, tuple[Term, ...]] = field(init=False, repr=False, compare=False)
+    _inequalities: tuple[Inequalities, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "dt", check_number("dt", self.dt, above=0.0))
+        object.__setattr__(self, "steps", check_count("steps", self.steps))
+        if not isinstance(self.dynamics, Dynamics):
+            raise InputError(f"dynamics: got {excerpt(self.dynamics)}, want Dynamics(...), such as robot.dynamics")
+        check_memory("steps", self.steps, self.bytes_per_step)
+        costs = {name: terms_of(getattr(self, name), name) for name in ("stage_cost", "final_cost")}
+        if isinstance(self.initial, FixedState):
+            state = check_array("initial: FixedState", self.initial.state, (len(self.dynamics.state_coordinates),))
+            # Costs nothing, and lets a fixed and a soft start share what is compiled.
+            costs["initial"] = (QuadraticCost(np.zeros(len(state)), about=state),)
+        else:
+            costs["initial"] = terms_of(self.initial, "initial")
+        bound = {name: tuple(_bound(cost, self.dynamics) for cost in terms) for name, terms in costs.items()}
+        for name in ("initial", "final_cost"):
+            if any(term.uses_control for term in bound[name]):
+                raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
+        object.__setattr__(self, "_terms", bound)
+        wanted = "a list of constraints, such as [Clearance(...)]"
+        object.__setattr__(self, "constraints", check_items("constraints", self.constraints, Constraint, wanted))
+        bound_constraints = tuple(constraint.bind(self.dynamics) for constraint in self.constraints)
+        for constraint, inequalities in zip(self.constraints, bound_constraints, strict=True):
+            if not isinstance(inequalities, Inequalities):
+                name = type(constraint).__name__
+                raise InputError(f"constraints: {name}.bind: got {excerpt(inequalities)}, want Inequalities(...)")
+        object.__setattr__(self, "_inequalities", bound_constraints)
+        if self.control_limits is not None:
+            try:
+                low, high = self.control_limits
+            except Exception:  # no pair, or what raises whatever it likes as one
+                raise InputError(
+                    f"control_limits: got {excerpt(self.control_limits)}, want (lowest, highest)"
+                ) from None
+            limited = self.dynamics.control_coordinates.limited(low, high)
+            _check_within_reach(limited, self.dynamics.control_coordinates)
+            object.__setattr__(self, "control_limits", (limited.low, limited.high))
+        self._check_start_clear()
+
+    @property
+    def bytes_per_step(self) -> int:
+        """Memory that a solver takes for a step, at least, from one start: value functions, laws and trajectories."""
+        n, m = len(self.dynamics.state_coordinates), len(self.dynamics.control_coordinates)
+        return 8 * (3 * n * n + 3 * m * n + 10 * n + 7 * m)
+
+    @property
+    def start(self) -> Array | None:
+        """The state (n,) that the initial cost or FixedState asks for; None where it names none."""
+        if isinstance(self.initial, FixedState):
+            return np.asarray(self.initial.state)
+        abouts = [cost.about for cost in terms_of(self.initial) if isinstance(cost, QuadraticCost)]
+        return abouts[0] if len(abouts) == 1 else None
+
+    @property
+    def goal(self) -> Array | None:
+        """The state (n,) that the final cost asks for; None where it names none."""
+        abouts = [cost.about for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
+        return abouts[0] if len(abouts) == 1 else None
+
+    @property
+    def weighed_goal(self) -> Array | None:
+        """The goal, NaN in the states to which the final cost gives no weight; None where it names no state."""
+        abouts = [cost for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
+        if len(abouts) != 1 or not abouts[0].weight.any():
+            return None
+        return np.where(abouts[0].weight.any(axis=1), abouts[0].about, np.nan)
+
+    @property
+    def control_coordinates(self) -> Coordinates:
+        """Names, units and limits of the controls, as they are planned with."""
+        coordinates = self.dynamics.control_coordinates
+        return coordinates if self.control_limits is None else coordinates.limited(*self.control_limits)
+
+    @property
+    def nominal_control(self) -> Array:
+        """u*, where the control cost is zero, (m,); zeros where there is none."""
+        abouts = [cost.about for cost in terms_of(self.stage_cost) if isinstance(cost, ControlCost)]
+        return abouts[0] if abouts else np.zeros(len(self.dynamics.control_coordinates))
+
+    @property
+    def obstacle_costs(self) -> tuple[ObstacleCost, ...]:
+        """The terms that keep the robot clear of obstacles."""
+        return tuple(cost for cost in terms_of(self.stage_cost) if isinstance(cost, ObstacleCost))
+
+    def terms(self, which: str) -> tuple[Term, ...]:
+        """The bound terms of `initial`, `stage_cost` or `final_cost`."""
+        return self._terms[check_name("which", which, self._terms)]
+
+    @property
+    def inequalities(self) -> tuple[Inequalities, ...]:
+        """The bound constraints."""
+        return self._inequalities
+
+    @property
+    def digest(self) -> str:
+        """Hash of everything that defines the problem: structure and numbers."""
+        hasher = hashlib.sha256(f"{self.dynamics.source} {self.dt!r} {self.steps}".encode())
+        hasher.update(repr(self.dynamics.parameters).encode())
+        hasher.update(repr((self.control_coordinates.low, self.control_coordinates.high)).encode())
+        functions = [*self.dynamics.functions]
+        if isinstance(self.initial, FixedState):
+            hasher.update(np.asarray(self.initial.state).tobytes())
+        for name in ("initial", "stage_cost", "final_cost"):
+            for term in self.terms(name):
+                hasher.update(term.source.encode() + term.data.tobytes())
+                functions += term.functions
+        for inequalities in self.inequalities:
+            hasher.update(inequalities.source.encode() + inequalities.data.tobytes())
+        hasher.update("\n".join(function.identity for function in functions).encode())
+        return hasher.hexdigest()[:16]
+
+    def _check_start_clear(self) -> None:
+        space = self.dynamics.state_coordinates
+        if self.start is None or not space.position:
+            return
+        for cost in self.obstacle_costs:
+            world = cost.world.seen_by(space.plane, space.offset)
+            if not len(world):
+                continue
+            place = self.start[list(space.position)]
+            distances = world.distances(place) - cost.radius
+            if distances.min() < 0:
+                where = ", ".join(f"{value:g}" for value in place)
+                name = world.names[int(distances.argmin())]
+                raise InputError(
+                    f"initial: got a start at ({where}) m, {-distances.min():.3g} m inside obstacle {name!r},"
+                    f" want it clear of obstacles by the robot's radius of {cost.radius:g} m"
+                )
+
+
+def _bound(cost: Cost, dynamics: Dynamics) -> Term:
+    """The cost for a system. Raises InputError if what is bound is no term."""
+    wanted = "a Term"
+    return check_kind(f"{type(cost).__name__}.bind", cost.bind(dynamics), Term, wanted)
+
+
+def _check_within_reach(limits: Coordinates, actuators: Coordinates) -> None:
+    """Raises InputError if the actuators can do nothing of what is within the limits."""
+    sides = zip(limits.names, limits.low, limits.high, actuators.low, actuators.high, strict=True)
+    for name, low, high, lowest, highest in sides:
+        if not max(low, lowest) < min(high, highest):
+            raise InputError(
+                f"control_limits: got {low:g} to {high:g} for {name}, want some of what the actuator can do,"
+                f" {lowest:g} to {highest:g}"
+            )

@@ -1,0 +1,208 @@
+"""Arrays by name and one JSON text in a file: NumPy's .npz, with a hash of all of it inside.
+
+What is read may be anyone's bytes. Nothing in it is run, nothing is unpacked before its size is known to be that of the
+array it says it is, and whatever a parser makes of it, it is refused in one line.
+"""
+
+import contextlib
+import hashlib
+import os
+import re
+import secrets
+import zipfile
+from collections.abc import Iterator, Mapping
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import InputError, check_path, excerpt
+from lqrsim.results.schema import canonical, parse
+
+Arrays = dict[str, npt.NDArray[Any]]
+META, DIGEST = "meta", "sha256"
+
+# What is read is at most so large, in bytes, or so many times larger than its file.
+_LARGEST_TEXT = 1 << 26
+_LARGE, _TIMES = 1 << 30, 100
+# How NumPy begins an array of numbers or a text; nothing else is parsed.
+_HEADER = re.compile(
+    rb"\{'descr': '(<f8|<i8|\|b1|<U[0-9]{1,9})', 'fortran_order': False,"
+    rb" 'shape': \(([0-9]{1,18}(?:, [0-9]{1,18})*,?)?\), \} *\n"
+)
+
+
+class Header(NamedTuple):
+    """What an array says of itself: NumPy's name of its numbers, and its shape."""
+
+    dtype: str
+    shape: tuple[int, ...]
+
+
+class Other(InputError):
+    """A file that is whole, but not what was asked for."""
+
+
+def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> str:
+    """SHA-256 of the content: of the JSON text, but for the hash in it, and of each array with its name and shape."""
+    hasher = hashlib.sha256(canonical({name: value for name, value in meta.items() if name != DIGEST}).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        hasher.update(f"\n{name} {array.dtype.str} {array.shape}\n".encode())
+        hasher.update(array.reshape(-1).view(np.uint8).data)
+    return hasher.hexdigest()
+
+
+def write(path: Path, arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> None:
+    """Write them, sealed; the file is whole or not there. Raises InputError where it cannot be written."""
+    text = np.array(canonical({**meta, DIGEST: digest(arrays, meta)}))
+    if text.nbytes > _LARGEST_TEXT:
+        raise InputError(f"output: got {text.nbytes:,} bytes of text for {path}, want at most {_LARGEST_TEXT:,}")
+    whole: dict[str, Any] = {META: text, **{name: np.ascontiguousarray(array) for name, array in arrays.items()}}
+    with replacing(path) as unfinished:
+        for save in (np.savez_compressed, np.savez):
+            # Through a file object: given a name, NumPy appends .npz to it.
+            with unfinished.open("wb") as file:
+                save(file, allow_pickle=False, **whole)
+            if sum(array.nbytes for array in whole.values()) < _limit(unfinished.stat().st_size):
+                break  # else it compressed so well that it would look like a bomb
+
+
+class Archive:
+    """A file that is open for reading.
+
+    Attributes:
+      meta: the JSON text, still as it was read. headers: of each array, none of which has been read yet.
+    """
+
+    def __init__(self, archive: zipfile.ZipFile, size: int) -> None:
+        self._archive = archive
+        self._members: dict[str, zipfile.ZipInfo] = {}
+        for member in archive.infolist():
+            name = member.filename.removesuffix(".npy")
+            if name == member.filename or member.orig_filename != member.filename:
+                raise InputError(f"{excerpt(member.orig_filename)}: got a part of that name, want arrays alone")
+            if name in self._members:
+                raise InputError(f"{excerpt(name)}: got it twice, want it once")
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or member.flag_bits & 0x1:
+                raise InputError(f"{excerpt(name)}: got it packed in another way, want it deflated or stored")
+            self._members[name] = member
+        if META not in self._members:
+            raise InputError(f"{META}: got none, want it")
+        if (total := sum(member.file_size for member in self._members.values())) > _limit(size):
+            raise InputError(f"size: got {total:,} bytes in a file of {size:,}, want no more than they can come from")
+        self.headers = {name: self._header(name) for name in self._members if name != META}
+        self.meta = self._text()
+
+    def arrays(self) -> Arrays:
+        """All of them. Raises InputError unless they and the text are those that were written."""
+        found = {name: self._array(name) for name in self.headers}
+        if self.meta.get(DIGEST) != digest(found, self.meta):
+            raise InputError(f"{DIGEST}: got another than that of the content, want a file that has not been changed")
+        return found
+
+    def _header(self, name: str) -> Header:
+        with self._archive.open(self._members[name]) as file:
+            start = file.read(10)
+            length = int.from_bytes(start[8:10], "little")
+            match = _HEADER.fullmatch(file.read(length)) if start[:8] == b"\x93NUMPY\x01\x00" else None
+        if match is None:
+            raise InputError(f"{excerpt(name)}: got no array of numbers as lqrsim writes them, want one")
+        shape = tuple(int(length) for length in (match[2] or b"").decode().replace(",", " ").split())
+        dtype = match[1].decode()
+        bytes_each = 4 * int(dtype[2:]) if dtype.startswith("<U") else int(dtype[2:])
+        if 10 + length + prod(shape) * bytes_each != self._members[name].file_size or len(shape) > 32:
+            raise InputError(f"{excerpt(name)}: got a size that is not that of its shape {excerpt(shape)}, want it so")
+        return Header(dtype, shape)
+
+    def _text(self) -> dict[str, Any]:
+        header, size = self._header(META), self._members[META].file_size
+        if not header.dtype.startswith("<U") or header.shape or size > _LARGEST_TEXT:
+            raise InputError(f"{META}: got {header.dtype} of shape {header.shape}, want one text")
+        meta = parse(str(self._array(META)))
+        if not isinstance(meta, dict):
+            raise InputError(f"{META}: got {excerpt(meta)}, want an object")
+        return meta
+
+    def _array(self, name: str) -> npt.NDArray[Any]:
+        with self._archive.open(self._members[name]) as file:
+            array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=1000)
+            if file.read(1):  # its end, where its check sum is looked at
+                raise InputError(f"{excerpt(name)}: got more than its shape takes, want no more")
+        if array.dtype == bool and (array.view(np.uint8) > 1).any():
+            raise InputError(f"{excerpt(name)}: got what is neither true nor false, want one of them")
+        return array
+
+
+@contextlib.contextmanager
+def opened(path: Path, kind: str, version: int) -> Iterator[Archive]:
+    """The file of this kind, while the block lasts; whatever the block raises, the file is to blame.
+
+    Raises:
+      InputError: no such file; not of this kind or version; or anything in it is not as it was written.
+    """
+    with blamed(path, kind), path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        found = Archive(archive, os.fstat(file.fileno()).st_size)
+        if found.meta.get("format") != f"lqrsim {kind}":
+            raise Other(
+                f"{kind}: got {path}, which holds a {excerpt(found.meta.get('format'))}, want a {f'lqrsim {kind}'!r}"
+            )
+        if found.meta.get("version") != version:
+            was = excerpt(found.meta.get("version"))
+            raise Other(f"{kind}: got {path} of version {was}, want version {version}: write it again")
+        yield found
+
+
+@contextlib.contextmanager
+def blamed(path: Path, kind: str) -> Iterator[None]:
+    """Turns whatever is raised while `path` is read into one line about it.
+
+    It is right to catch everything here, and only here: what a parser raises of foreign bytes is without end.
+    """
+    if not os.path.isfile(path):  # not the method, which raises for names that are too long
+        raise InputError(f"{kind}: got {excerpt_of(path)}, want a file that exists")
+    try:
+        yield
+    except Other:
+        raise
+    except OSError as error:
+        raise InputError(f"{kind}: got {path}, want a file that can be read ({error.strerror or error})") from None
+    except Exception as error:
+        reason = f"{error}" if isinstance(error, InputError) else f"{type(error).__name__}: {excerpt(str(error))}"
+        raise InputError(f"{kind}: got {path}, which is damaged ({reason}), want a file that lqrsim wrote") from None
+
+
+def excerpt_of(path: Path) -> str:
+    """A path for a message, cut in the middle where it gets long."""
+    name = str(path)
+    return name if len(name) <= 200 else f"{name[:80]}...{name[-80:]}"
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A name to write to, which takes the place of `path` when the block ends, and disappears if it fails.
+
+    Raises:
+      InputError: the folder or the file cannot be written, or the disk is full.
+    """
+    # A name of its own, so that two writers cannot meet, and known before the file is there, so that Ctrl-C at any
+    # moment removes it; the suffix stays, for it says the format.
+    unfinished = check_path("output", path).parent / f".unfinished-{secrets.token_hex(8)}{path.suffix}"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished.touch(exist_ok=False)
+        yield unfinished
+        unfinished.replace(path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"output: got {excerpt_of(path)}, want a file that can be written ({reason})") from None
+    finally:
+        with contextlib.suppress(OSError):  # that is told already
+            unfinished.unlink(missing_ok=True)
+
+
+def _limit(size: int) -> int:
+    """How many bytes may come from a file of so many."""
+    return max(_LARGE, _TIMES * size)

@@ -1,0 +1,256 @@
+"""What the numbers of a state or control vector mean: names, units, limits, and which of them wrap."""
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_items,
+    check_kind,
+    check_name,
+    check_number,
+    check_text,
+    excerpt,
+    numbers_of,
+    vectors_of,
+)
+from lqrsim.scenes.world import PLANES, SPACE
+
+_FROM_ABOVE = ("xy", "yx")
+_UPWARD = ("height", "altitude", "elevation", "vertical")  # names of what is hardly a plane from above
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coordinates:
+    """The meaning of the entries of a vector.
+
+    Attributes:
+      names: one name an entry.
+      units: one unit an entry ("" where there is none).
+      position: indices of the 2 (planar) or 3 (spatial) entries that are the position in the world, in metres; or none.
+      plane: the world's axes along which the position is measured, in its order: "xyz" for one in space, "" without
+        one. Of a planar one two of x, y and z; where it is not given, it follows from the names that end in these
+        letters or have one on its own, as (x, z), (p_x, p_z) or (x_tip, z_tip), and is "xy" where no name says
+        anything.
+      offset: where the plane is along the third axis, in metres: the y of "xz". Vertical planes have one, 0 unless it
+        is given. Horizontal ones have none unless it is given: without it the world is seen from above. See
+        `World.seen_by`.
+      angles: indices of the entries that are angles in radians, equal up to whole turns.
+      rotation_vectors: index of the first of each three entries that are a rotation vector, axis times angle in rad.
+      low, high: limits of each entry, (len(names),); infinite where there is none.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    position: tuple[int, ...] = ()
+    angles: tuple[int, ...] = ()
+    rotation_vectors: tuple[int, ...] = ()
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+    plane: str = ""
+    offset: float | None = None
+
+    def __post_init__(self) -> None:
+        for field, least in (("names", False), ("units", True)):
+            given = check_items(field, getattr(self, field), str, "a tuple of texts, one an entry", at_most=10_000)
+            one_by_one = tuple(check_text(field, text, "texts", at_most=200, empty=least) for text in given)
+            object.__setattr__(self, field, one_by_one)
+        size = len(self.names)
+        if not size:
+            raise InputError("names: got none, want one an entry, at least one")
+        for field in ("position", "angles", "rotation_vectors"):
+            given = check_items(field, getattr(self, field), (int, np.integer), "a tuple of indices", at_most=size)
+            counted = tuple(check_count(field, index, at_least=0) for index in given)
+            if len(set(counted)) < len(counted):
+                raise InputError(f"{field}: got {excerpt(counted)}, want different indices")
+            object.__setattr__(self, field, counted)
+        if len(self.units) != size:
+            raise InputError(
+                f"units: got {len(self.units)} of them, want {size}, one for each of {', '.join(self.names)}"
+            )
+        if len(set(self.names)) != size:
+            raise InputError(f"names: got a name twice in {', '.join(self.names)}, want different names")
+        if len(self.position) not in (0, 2, 3):
+            raise InputError(f"position: got {len(self.position)} entries, want 2 (a planar robot), 3, or none")
+        spans = {"position": self.position, "angles": self.angles, "rotation_vectors": self.rotation_vectors}
+        for field, indices in spans.items():
+            width = 3 if field == "rotation_vectors" else 1
+            if any(not 0 <= index <= size - width for index in indices):
+                raise InputError(f"{field}: got indices {indices}, want them between 0 and {size - width}")
+        plane = self._plane()
+        if len(plane) != 2 and self.offset is not None:
+            raise InputError(
+                f"offset: got {excerpt(self.offset)} without a plane, want it with a position of two entries"
+            )
+        offset = 0.0 if self.offset is None and len(plane) == 2 and plane not in _FROM_ABOVE else self.offset
+        object.__setattr__(self, "plane", plane)
+        object.__setattr__(self, "offset", None if offset is None else check_number("offset", offset))
+        for field, endless in (("low", -np.inf), ("high", np.inf)):
+            if isinstance(getattr(self, field), tuple) and not getattr(self, field):
+                object.__setattr__(self, field, (endless,) * size)
+        low = check_array("low", self.low, (size,), infinite=True)
+        high = check_array("high", self.high, (size,), infinite=True)
+        if (low >= high).any():
+            i = int(np.argmax(low >= high))
+            raise InputError(
+                f"limits of {self.names[i]}: got {low[i]:g} to {high[i]:g}, want the first below the second"
+            )
+        object.__setattr__(self, "low", tuple(low.tolist()))
+        object.__setattr__(self, "high", tuple(high.tolist()))
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def _plane(self) -> str:
+        """What `plane` is: as given, from the names, or the default. Raises InputError where these contradict."""
+        check_kind("plane", self.plane, str, f"one of: {', '.join(PLANES)}")
+        names = tuple(self.names[index] for index in self.position)
+        said = "".join(_letter(name) for name in names)
+        listed = ", ".join(names)
+        if len(names) == 3:
+            if self.plane not in ("", SPACE):
+                raise InputError(
+                    f"plane: got {excerpt(self.plane)} for the position ({listed}), want none: it is in space"
+                )
+            if sorted(said) == sorted(SPACE) and said != SPACE:
+                want = ", ".join(names[said.index(letter)] for letter in SPACE)
+                raise InputError(f"position: got ({listed}), want it along x, y and z in this order: ({want})")
+            return SPACE
+        if not names:
+            if self.plane:
+                raise InputError(f"plane: got {excerpt(self.plane)} without a position, want position=(names) with it")
+            return ""
+        if self.plane:
+            plane = check_name("plane", self.plane, PLANES)
+            if said in PLANES and plane != said:
+                raise InputError(f"plane: got {plane!r} for the position ({listed}), want {said!r}, or other names")
+            return plane
+        if said in PLANES:
+            return said
+        if said != "??" or any(word in name.lower() for word in _UPWARD for name in names):
+            raise InputError(
+                f"plane: got none for the position ({listed}), whose names do not tell it, want one of:"
+                f" {', '.join(PLANES)}"
+            )
+        return "xy"
+
+    @property
+    def world_axes(self) -> tuple[int, ...]:
+        """Along which of the world's axes, 0 to 2, each entry of the position is."""
+        return tuple(SPACE.index(letter) for letter in self.plane)
+
+    @property
+    def from_above(self) -> bool:
+        """Whether the position is in a horizontal plane of no certain height: on whatever the robot stands on."""
+        return len(self.position) == 2 and self.offset is None
+
+    def in_world(self, places: npt.ArrayLike, *, height: float = 0.0) -> Array:
+        """Points (..., 3) in the world of positions (..., 2 or 3).
+
+        Args:
+          height: in metres, of those that are seen from above; the rest have their own.
+
+        Raises:
+          InputError: not numbers of such a shape, or there is no position.
+        """
+        height = check_number("height", height)
+        if not self.position:
+            raise InputError("places: got them for coordinates without a position, want position=(names) with these")
+        places = vectors_of("places", places, len(self.position))
+        points = np.full((*places.shape[:-1], 3), height if self.offset is None else self.offset)
+        points[..., list(self.world_axes)] = places
+        return points
+
+    def of_world(self, points: npt.ArrayLike) -> Array:
+        """Positions (..., 2 or 3) of points (..., 3) in the world; what is across the plane is left out.
+
+        Raises:
+          InputError: not numbers of such a shape.
+        """
+        return vectors_of("points", points, 3)[..., list(self.world_axes)]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """`name (unit)` for each entry, for axes and tables."""
+        return tuple(f"{n} ({u})" if u else n for n, u in zip(self.names, self.units, strict=True))
+
+    def nearest(self, vector: npt.ArrayLike, near: npt.ArrayLike) -> Array:
+        """The representative of `vector` nearest to `near`; angles and rotation vectors are equal up to whole turns.
+
+        Args:
+          vector, near: (..., n); leading dimensions broadcast.
+
+        Raises:
+          InputError: not numbers of such shapes.
+        """
+        out, near = vectors_of("vector", vector, len(self)), vectors_of("near", near, len(self))
+        try:
+            out, near = np.broadcast_arrays(out, near)
+        except ValueError:
+            raise InputError(f"near: got shape {near.shape}, want one that goes with {out.shape} of vector") from None
+        out = out.copy()
+        for i in self.angles:
+            out[..., i] -= 2 * np.pi * np.round((out[..., i] - near[..., i]) / (2 * np.pi))
+        for i in self.rotation_vectors:
+            out[..., i : i + 3] = _nearest_rotation_vector(out[..., i : i + 3], near[..., i : i + 3])
+        return out
+
+    def difference(self, vector: npt.ArrayLike, near: npt.ArrayLike) -> Array:
+        """`nearest(vector, near) - near`, (..., n): the error of `vector`, with whole turns taken out."""
+        return self.nearest(vector, near) - vectors_of("near", near, len(self))
+
+    def limited(self, low: npt.ArrayLike, high: npt.ArrayLike) -> "Coordinates":
+        """The same with other limits, each a number or one an entry.
+
+        Raises:
+          InputError: not numbers, or not in order.
+        """
+        try:
+            sides = [np.broadcast_to(numbers_of("control_limits", side), len(self)) for side in (low, high)]
+        except ValueError:
+            raise InputError(
+                f"control_limits: got {excerpt((low, high))}, want (lowest, highest), each a number or ({len(self)},)"
+            ) from None
+        for name, lowest, highest in zip(self.names, *sides, strict=True):
+            if not lowest < highest:
+                raise InputError(
+                    f"control_limits: got {lowest:g} to {highest:g} for {name}, want the first below the second"
+                )
+        return replace(self, low=tuple(sides[0].tolist()), high=tuple(sides[1].tolist()))
+
+    def within(self, other: "Coordinates") -> "Coordinates":
+        """The same with limits that are also the other's. Raises InputError where nothing is within both."""
+        check_kind("other", other, Coordinates, f"Coordinates of {len(self)} entries")
+        if len(other) != len(self):
+            raise InputError(f"other: got {len(other)} entries, want {len(self)}: {', '.join(self.names)}")
+        low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)
+        return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
+
+    def clip(self, vector: npt.ArrayLike) -> Array:
+        """`vector` (..., n) held within the limits."""
+        return np.clip(vectors_of("vector", vector, len(self)), self.low, self.high)
+
+
+def _letter(name: str) -> str:
+    """Which of the world's axes a name says: the letter in which it ends, or the one that is on its own; or `?`."""
+    if name[-1:].lower() in tuple(SPACE):
+        return name[-1].lower()
+    alone = set(re.findall(r"(?<![a-z])[xyz](?![a-z])", name.lower()))
+    return alone.pop() if len(alone) == 1 else "?"
+
+
+def _nearest_rotation_vector(vector: Array, near: Array) -> Array:
+    """Of the vectors `(angle + 2 pi k) axis`, which are all one rotation, the one nearest to `near`; both (..., 3)."""
+    angle = np.linalg.norm(vector, axis=-1, keepdims=True)
+    distance = np.linalg.norm(near, axis=-1, keepdims=True)
+    # The identity has every axis: take the one that `near` points along.
+    small = angle < 1e-12
+    axis = np.where(small, near / np.where(distance > 0, distance, 1.0), vector / np.where(small, 1.0, angle))
+    turns = np.round((np.sum(axis * near, axis=-1, keepdims=True) - angle) / (2 * np.pi))
+    return np.where(turns == 0, vector, (angle + 2 * np.pi * turns) * axis)

@@ -1,0 +1,158 @@
+"""How a trial ends, for every robot: what it is to reach, how near counts, and which event comes first. NumPy only.
+
+Robots with a position are measured in metres, all others by a scaled error: of the states that count, the largest
+difference, each relative to the state's range along the plan (at least 1 unit), with whole turns taken out.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array, InputError, check_number, excerpt, shaped
+from lqrsim.results.coordinates import Coordinates
+
+OUTCOMES = ("reached", "timed out", "collided", "diverged", "error")
+TOLERANCE = 0.1  # of the scaled error, unless something else is asked for
+OF_RANGE = "of the plan's range"
+
+
+def scale_of(plan: Array) -> Array:
+    """What each state's differences are relative to, (n,): its range along a plan (T+1, n), at least 1 unit."""
+    return np.maximum(np.ptp(plan, axis=0), 1.0)
+
+
+def tracking_error(space: Coordinates, states: Array, plan: Array) -> Array:
+    """How far states (..., T+1, n) are from those of the plan (T+1, n), (..., T+1): see `tracking_unit`."""
+    if space.position:
+        place = list(space.position)
+        return np.linalg.norm(states[..., place] - plan[..., place], axis=-1)
+    return np.max(np.abs(space.difference(states, plan)) / scale_of(plan), axis=-1)
+
+
+def tracking_unit(space: Coordinates) -> str:
+    """The unit of `tracking_error`: m, or OF_RANGE for robots without a position."""
+    return "m" if space.position else OF_RANGE
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a run is to reach: the goal, or the plan's end where the final cost names no state.
+
+    Args:
+      space: of the states.
+      goal: (n,), NaN in the states that do not count; None where there is none.
+      plan: (T+1, n), states that are meant to lead there.
+
+    Attributes:
+      state: (n,), the goal, or the end of the plan; NaN in the states that do not count.
+      name: "goal" or "plan's end".
+
+    Raises:
+      InputError: the goal has another shape, or names no state.
+    """
+
+    space: Coordinates
+    goal: Array | None
+    plan: Array
+
+    def __post_init__(self) -> None:
+        if self.goal is None:
+            return
+        goal = shaped("goal", self.goal, (len(self.space),))
+        if np.isinf(goal).any():
+            raise InputError(f"goal: got {excerpt(goal.tolist())}, want finite numbers, NaN in what does not count")
+        if np.isnan(goal).all():
+            raise InputError("goal: got NaN for every state, want a number for one at least, or None without a goal")
+        object.__setattr__(self, "goal", goal)
+
+    @property
+    def state(self) -> Array:
+        return self.plan[-1] if self.goal is None else self.goal
+
+    @property
+    def name(self) -> str:
+        return "plan's end" if self.goal is None else "goal"
+
+    @property
+    def places(self) -> list[int]:
+        """The entries of the position that count; none where it is the scaled error that is measured."""
+        return [i for i in self.space.position if np.isfinite(self.state[i])]
+
+    @property
+    def unit(self) -> str:
+        """Of `distance`: m, or OF_RANGE."""
+        return "m" if self.places else OF_RANGE
+
+    def distance(self, states: Array) -> Array:
+        """How far states (..., n) are from it, (...); NaN for states that are not finite."""
+        state = self.state
+        if self.places:
+            return np.linalg.norm(states[..., self.places] - state[self.places], axis=-1)
+        counts = np.isfinite(state)
+        # What does not count is left where it is: a rotation vector's turns are those of all three entries.
+        apart = self.space.difference(states, np.where(counts, state, states)) / scale_of(self.plan)
+        return np.max(np.abs(apart[..., counts]), axis=-1)
+
+    def radius(self, robot_radius: float | None, goal_radius: float | None, goal_tolerance: float | None) -> float:
+        """Within which distance it counts as reached.
+
+        Args:
+          robot_radius: in metres, the default where distances are in metres.
+          goal_radius: in metres. goal_tolerance: of the scaled error, TOLERANCE by default.
+
+        Raises:
+          InputError: one of them is out of range, or it is the other one that this goal is judged by.
+        """
+        if self.places:
+            if goal_tolerance is not None:
+                raise InputError(
+                    f"goal_tolerance: got {goal_tolerance}, want goal_radius, in metres: the {self.name} has a position"
+                )
+            return check_number("goal_radius", robot_radius if goal_radius is None else goal_radius, above=0.0)
+        if goal_radius is not None:
+            names = ", ".join(self.space.names)
+            raise InputError(
+                f"goal_radius: got {goal_radius}, want goal_tolerance, relative to the plan's range: the {self.name}"
+                f" has no position among {names}"
+            )
+        return check_number("goal_tolerance", TOLERANCE if goal_tolerance is None else goal_tolerance, above=0.0)
+
+    def told(self, distance: float) -> str:
+        """A distance with its unit and what it is from."""
+        return f"{distance:.3g} {self.unit} from the {self.name}"
+
+    def misses(self, radius: float | None) -> bool:
+        """Whether the plan itself ends outside the radius; never where the radius is not known."""
+        return radius is not None and not float(self.distance(self.plan[-1])) <= radius
+
+    def of_plan(self, radius: float | None) -> list[str]:
+        """What there is to say of where the plan ends: how far from the goal, and in a line of its own if it misses."""
+        if self.goal is None:
+            return ["the final cost names no goal; the plan's end stands in for it"]
+        away = float(self.distance(self.plan[-1]))
+        lines = [f"the plan ends {self.told(away)}"]
+        if radius is not None and self.misses(radius):
+            lines.append(f"the plan MISSES the goal: it ends {away - radius:.3g} {self.unit} outside {radius:g}")
+        return lines
+
+
+def endings(
+    *, collided_at: Array, diverged_at: Array, failed_at: Array, distance: Array, radius: float, horizon: float
+) -> tuple[npt.NDArray[np.str_], Array]:
+    """How trials ended, and when: the first event in time ends a trial, and nothing after it counts.
+
+    Args:
+      collided_at, diverged_at, failed_at: (K,) seconds, infinite where it did not happen. Of what happens at the same
+        time the earlier named counts.
+      distance: (K,) from the target at the end. radius: within which it counts as reached. horizon: in seconds.
+
+    Returns:
+      one of OUTCOMES for each, (K,), and the time in seconds at which it ended, (K,).
+    """
+    events = np.stack([collided_at, diverged_at, failed_at])
+    first = np.argmin(events, axis=0)
+    happened = np.isfinite(events.min(axis=0))
+    arrived = np.where(np.asarray(distance) <= radius, "reached", "timed out")
+    outcome = np.where(happened, np.array(["collided", "diverged", "error"])[first], arrived)
+    return outcome, np.where(happened, events.min(axis=0), horizon)

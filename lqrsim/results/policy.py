@@ -1,0 +1,93 @@
+"""The feedback law, and how it is run on a robot. NumPy only."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_count,
+    check_flag,
+    check_kind,
+    check_number,
+    excerpt,
+    shaped,
+    vectors_of,
+)
+from lqrsim.results.coordinates import Coordinates
+
+
+@dataclass(frozen=True, kw_only=True)
+class AffinePolicy:
+    """The feedback law `u_t = gain_t x + offset_t`, with what is needed to run it on a robot.
+
+    Calling it needs NumPy alone. Paper: Eq. (13); for the inverse policy, which takes the state of *arrival*, Eq. (19).
+
+    Attributes:
+      gain: (T, m, n); L.
+      offset: (T, m); bold l.
+      nominal: (T, n), the state that each law was made about. Angles of a measured state are taken nearest to it.
+      dt: seconds between two laws.
+      state_coordinates, control_coordinates: names and units; which states wrap; the limits that the actuators keep.
+    """
+
+    gain: Array
+    offset: Array
+    nominal: Array
+    dt: float
+    state_coordinates: Coordinates
+    control_coordinates: Coordinates
+
+    def __post_init__(self) -> None:
+        for name in ("state_coordinates", "control_coordinates"):
+            check_kind(f"AffinePolicy: {name}", getattr(self, name), Coordinates, "Coordinates")
+        n, m = len(self.state_coordinates), len(self.control_coordinates)
+        for name, shape in (("gain", (m, n)), ("offset", (m,)), ("nominal", (n,))):
+            array = shaped(
+                f"AffinePolicy: {name}", getattr(self, name), (self.steps if name != "gain" else None, *shape)
+            )
+            if not len(array):
+                raise InputError(f"AffinePolicy: {name}: got none, want one a step, at least one")
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "dt", check_number("AffinePolicy: dt", self.dt, above=0.0))
+
+    @property
+    def steps(self) -> int:
+        """T, the number of laws."""
+        return len(self.gain)
+
+    def control(self, state: npt.ArrayLike, step: int) -> Array:
+        """The law of one step before saturation, (..., m), at states (..., n) given in the nominal's representative.
+
+        Raises:
+          InputError: no such step, counted from 0, or no such states.
+        """
+        step = check_count("step", step, at_least=0, at_most=self.steps - 1)
+        return vectors_of("state", state, self.gain.shape[-1]) @ self.gain[step].T + self.offset[step]
+
+    def __call__(self, state: npt.ArrayLike, t: float, *, interpolate: bool = False) -> Array:
+        """The control (..., m) to apply in a measured state (..., n), `t` seconds after the start.
+
+        Angles and rotation vectors may be given in any representative. The result is held within the control
+        limits. Between two knots the earlier law is held, as it is in the plan; `interpolate=True` blends the two
+        instead, for controllers that run faster than the plan. After the horizon the last law stays in force.
+
+        Raises:
+          InputError: `t` is negative or not finite, or the state is not finite or not of length n.
+        """
+        state, t = vectors_of("state", state, self.gain.shape[-1]), check_number("t", t, at_least=0.0)
+        if not np.isfinite(state).all():
+            raise InputError(f"state: got {excerpt(state)}, want finite numbers")
+        # A time that is a knot up to rounding belongs to the law that begins there.
+        knot = t / self.dt + 1e-9
+        step = int(min(knot, self.steps - 1))
+        gain, offset, nominal = self.gain[step], self.offset[step], self.nominal[step]
+        if check_flag("interpolate", interpolate) and step + 1 < self.steps:
+            weight = max(knot - 1e-9 - step, 0.0)
+            gain = (1 - weight) * gain + weight * self.gain[step + 1]
+            offset = (1 - weight) * offset + weight * self.offset[step + 1]
+            nominal = (1 - weight) * nominal + weight * self.nominal[step + 1]
+        control = self.state_coordinates.nearest(state, nominal) @ gain.T + offset
+        return self.control_coordinates.clip(control)

@@ -1,0 +1,286 @@
+"""What comes out of running a policy: a `Rollout`. NumPy only; `files.py` writes it to disk and reads it back."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_items,
+    check_kind,
+    check_number,
+    check_seed,
+    check_shape,
+    check_text,
+    excerpt,
+    numbers_of,
+    shaped,
+)
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.goal import Target, endings, tracking_error, tracking_unit
+from lqrsim.results.solution import Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rollout:
+    """Closed-loop runs of one policy in MuJoCo, with everything that a picture of them needs.
+
+    K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, to the last bit
+    on equal processors.
+
+    Attributes:
+      robot, scene: their names. body: the robot's in the MJCF. model: the MJCF that was run, as text.
+      plan: what the policy meant to do. policy_digest: hash of the policy.
+      goal: (n,) the state that the plan was to reach, NaN in states that do not count; None where it is the plan's end.
+      goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: metres, or of the
+        scaled error where the goal has no position.
+      radius: of the robot's collision circle or sphere, in metres.
+      states: (K, T+1, n) true states; angles in the representative nearest the plan.
+      measured: (K, T+1, n) the states that the policy was shown.
+      commanded: (K, T, m) what the policy asked for. applied: (K, T, m) what the actuators got, within
+        the robot's limits.
+      forces: (K, T, 3) disturbing force at the robot's centre of mass in N, world axes. torques: the same in N m.
+      displaced: (K, obstacles, 3) by how much each obstacle is away from where the plan believes it, in metres.
+      clearance: (K, T+1) signed distance to the nearest obstacle minus the radius in metres; infinite without any.
+      contacts: (K,) control periods from the collision on in which MuJoCo reported a contact of the robot with an
+        obstacle; 0 where the robot goes through them.
+      collided_at: (K,) seconds to the first collision, at a knot or between two; infinite where there was none.
+      obstacles: (K) names of what they collided with; empty where there was none.
+      diverged_at: (K,) seconds to the knot from which on the simulation was unstable, or what the policy was shown was
+        not finite; infinite where neither was. The states are NaN from there on.
+      failed_at: (K,) seconds to the knot at which the controller failed; infinite where it did not. From there on, too.
+      reasons: (K) why it failed; empty where it did not.
+      frame_times: (F,) seconds; frames: (K, F, nq) MuJoCo's qpos then, for drawing.
+      disturbances: one description each. seed, first_trial: what the draws came from.
+      versions: of lqrsim and the libraries that the bits depend on, and the processor.
+    """
+
+    robot: str
+    body: str
+    scene: str
+    model: str
+    plan: Trajectory
+    policy_digest: str
+    state_coordinates: Coordinates
+    control_coordinates: Coordinates
+    goal: Array | None
+    goal_radius: float
+    radius: float
+    states: Array
+    measured: Array
+    commanded: Array
+    applied: Array
+    forces: Array
+    torques: Array
+    displaced: Array
+    clearance: Array
+    contacts: npt.NDArray[np.int64]
+    collided_at: Array
+    obstacles: tuple[str, ...]
+    diverged_at: Array
+    failed_at: Array
+    reasons: tuple[str, ...]
+    frame_times: Array
+    frames: Array
+    disturbances: tuple[str, ...]
+    seed: int
+    first_trial: int = 0
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_kind("Rollout: plan", self.plan, Trajectory, "a Trajectory")
+        for name in ("state_coordinates", "control_coordinates"):
+            check_kind(f"Rollout: {name}", getattr(self, name), Coordinates, "Coordinates")
+        for name in ("robot", "body", "scene", "policy_digest"):
+            check_text(f"Rollout: {name}", getattr(self, name), "a name", empty=True)
+        check_kind("Rollout: model", self.model, str, "the MJCF as text")
+        said = check_items("Rollout: disturbances", self.disturbances, str, "a description of each, as text")
+        object.__setattr__(self, "disturbances", said)
+        for name, above in (("radius", None), ("goal_radius", 0.0)):
+            least = 0.0 if above is None else None
+            number = check_number(f"Rollout: {name}", getattr(self, name), above=above, at_least=least)
+            object.__setattr__(self, name, number)
+        for name in ("seed", "first_trial"):
+            object.__setattr__(self, name, check_seed(f"Rollout: {name}", getattr(self, name)))
+        given = check_kind("Rollout: versions", self.versions, Mapping, "a dictionary of name: version")
+        if not all(isinstance(one, str) for item in given.items() for one in item):
+            raise InputError(f"Rollout: versions: got {excerpt(given)}, want a dictionary of name: version")
+        self._check_shapes()
+
+    def _check_shapes(self) -> None:
+        """Raises InputError for arrays that do not fit together."""
+        n, m, steps = len(self.state_coordinates), len(self.control_coordinates), self.plan.steps
+        check_shape("Rollout: plan.states", self.plan.states, (steps + 1, n))
+        check_shape("Rollout: plan.controls", self.plan.controls, (steps, m))
+        states = shaped("Rollout: states", self.states, (None, steps + 1, n))
+        trials, times = len(states), shaped("Rollout: frame_times", self.frame_times, (None,))
+        if not trials:
+            raise InputError("Rollout: states: got no trial, want at least one")
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "states": states.shape, "measured": states.shape, "commanded": (trials, steps, m),
+            "applied": (trials, steps, m), "forces": (trials, steps, 3), "torques": (trials, steps, 3),
+            "displaced": (trials, None, 3), "clearance": (trials, steps + 1), "frame_times": (None,),
+            "frames": (trials, len(times), None),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, shaped(f"Rollout: {name}", getattr(self, name), shape))
+        numbers = numbers_of("Rollout: contacts", self.contacts)
+        check_shape("Rollout: contacts", numbers, (trials,))
+        if not ((numbers >= 0) & (numbers <= steps) & (numbers == np.floor(numbers))).all():
+            raise InputError(
+                f"Rollout: contacts: got {excerpt(numbers.tolist())}, want whole numbers from 0 to {steps}"
+            )
+        object.__setattr__(self, "contacts", numbers.astype(np.int64))
+        self._check_endings(trials)
+        if self.goal is not None:
+            object.__setattr__(self, "goal", shaped("Rollout: goal", self.goal, (n,)))
+        _ = self.target  # which refuses what is no goal
+
+    def _check_endings(self, trials: int) -> None:
+        """Raises InputError unless what ended trials has its time within the run, and its words."""
+        horizon = self.plan.horizon
+        for name, words in (("collided_at", "obstacles"), ("diverged_at", ""), ("failed_at", "reasons")):
+            times = shaped(f"Rollout: {name}", getattr(self, name), (trials,))
+            if not (((times >= 0) & (times <= horizon)) | (times == np.inf)).all():
+                wanted = f"seconds from 0 to {horizon:g}, infinite where it did not happen"
+                raise InputError(f"Rollout: {name}: got {excerpt(times.tolist())}, want {wanted}")
+            object.__setattr__(self, name, times)
+            if not words:
+                continue
+            said = check_items(f"Rollout: {words}", getattr(self, words), str, "a text for each trial")
+            if len(said) != trials:
+                raise InputError(f"Rollout: {words}: got {len(said)}, want one for each of the {trials} trials")
+            for text, time in zip(said, times.tolist(), strict=True):
+                if bool(text) != np.isfinite(time):
+                    wanted = "a text where it is finite, and none elsewhere"
+                    raise InputError(f"Rollout: {words}: got {excerpt(text)} at {name} {time:g}, want {wanted}")
+            object.__setattr__(self, words, said)
+
+    @property
+    def trials(self) -> int:
+        """K, the number of runs."""
+        return len(self.states)
+
+    @property
+    def times(self) -> Array:
+        """Times of the states in seconds, (T+1,)."""
+        return self.plan.times
+
+    @property
+    def target(self) -> Target:
+        """What the trials were to reach."""
+        return Target(self.state_coordinates, self.goal, self.plan.states)
+
+    @property
+    def goal_distance(self) -> Array:
+        """Distance from the target at the end, (K,), in `target.unit`."""
+        return self.target.distance(self.states[:, -1])
+
+    @cached_property
+    def tracking_error(self) -> Array:
+        """Distance from the plan's position in metres, (K, T+1); for robots without one see `tracking_unit`."""
+        return tracking_error(self.state_coordinates, self.states, self.plan.states)
+
+    @property
+    def tracking_unit(self) -> str:
+        """Of `tracking_error`: m; or of the scaled error that `goal.py` describes, for robots without a position."""
+        return tracking_unit(self.state_coordinates)
+
+    @property
+    def saturated(self) -> npt.NDArray[np.bool_]:
+        """Whether a command stood at a limit, (K, T)."""
+        low, high = np.array(self.control_coordinates.low), np.array(self.control_coordinates.high)
+        return np.any((self.commanded <= low) | (self.commanded >= high), axis=-1)
+
+    @cached_property
+    def _endings(self) -> tuple[npt.NDArray[np.str_], Array]:
+        return endings(
+            collided_at=self.collided_at,
+            diverged_at=self.diverged_at,
+            failed_at=self.failed_at,
+            distance=self.goal_distance,
+            radius=self.goal_radius,
+            horizon=self.plan.horizon,
+        )
+
+    @property
+    def outcome(self) -> tuple[str, ...]:
+        """`reached`, `timed out`, `collided`, `diverged` or `error` for each trial: the first event ends it."""
+        return tuple(self._endings[0].tolist())
+
+    @property
+    def ended(self) -> Array:
+        """When each trial ended, (K,), in seconds; the horizon where nothing ended it before."""
+        return self._endings[1]
+
+    @property
+    def counts(self) -> npt.NDArray[np.bool_]:
+        """Which knots count, (K, T+1): those before a trial ended, the last one if nothing ended it, the first always.
+
+        They are the same whether obstacles stop the robot or not.
+        """
+        ran = ~np.isin(self._endings[0], ("collided", "diverged", "error"))
+        counted = (self.times < self.ended[:, None]) | ran[:, None]
+        counted[:, 0] = True
+        return counted & np.isfinite(self.states).all(axis=2)
+
+    @property
+    def collided(self) -> npt.NDArray[np.bool_]:
+        """Whether a collision ended a trial, (K,)."""
+        return self._endings[0] == "collided"
+
+    @property
+    def diverged(self) -> npt.NDArray[np.bool_]:
+        """Whether a trial ended as its simulation became unstable, (K,)."""
+        return self._endings[0] == "diverged"
+
+    @property
+    def reached(self) -> npt.NDArray[np.bool_]:
+        """Whether a trial ran to its end, and that is within `goal_radius` of the goal, (K,)."""
+        return self._endings[0] == "reached"
+
+    def least_clearance(self) -> Array:
+        """The least clearance of each trial until it ended, (K,), in metres: not above 0 where it collided."""
+        least = np.where(self.counts, self.clearance, np.inf).min(axis=1)
+        return np.where(self.collided, np.minimum(least, 0.0), least)
+
+    def tally(self) -> str:
+        """How many of the trials reached the target, in a line."""
+        return f"{self.reached.sum()} of {self.trials} trials reached the {self.target.name}"
+
+    def summary(self) -> str:
+        """One line a trial: outcome, tracking error, clearance, saturation; before that, where the plan ends."""
+        what = "; ".join(self.disturbances) or "undisturbed"
+        lines = [f"{self.robot} in {self.scene}, {what}, seed {self.seed}"]
+        lines += [f"  {line}" for line in self.target.of_plan(self.goal_radius)]
+        return "\n".join([*lines, *(f"  {self._line(k)}" for k in range(self.trials))])
+
+    def _line(self, k: int) -> str:
+        outcome, counts, name = self.outcome[k], self.counts[k], f"trial {self.first_trial + k}"
+        when = f"after {self.ended[k]:.2f} s" if self.ended[k] > 0 else "at once"
+        if outcome == "error":
+            return f"{name}: error {when}: {self.reasons[k]}"
+        if not counts.any():
+            return f"{name}: {outcome} {when}"
+        if outcome in ("collided", "diverged"):
+            what = f" with {self.obstacles[k]}" if outcome == "collided" else ""
+            how, final = f"{outcome}{what} {when}", ""
+        else:
+            how = f"{outcome}, {self.target.told(float(self.goal_distance[k]))}"
+            final = f", final {self.tracking_error[k, -1]:.3g}"
+        error, unit = self.tracking_error[k, counts], self.tracking_unit
+        rms = float(np.sqrt(np.mean(error**2)))
+        begun = counts[:-1]
+        saturated = 100 * np.where(begun, self.saturated[k], False).sum() / max(begun.sum(), 1)
+        clearance = self.least_clearance()[k]
+        near = f"; clearance {clearance:.3f} m" if np.isfinite(clearance) else ""
+        return (
+            f"{name}: {how}; tracking error rms {rms:.3g}, max {error.max():.3g}{final} {unit}{near};"
+            f" {self.contacts[k]} periods in contact; {saturated:.0f} % saturated"
+        )
+
+    __str__ = summary

@@ -1,0 +1,179 @@
+"""The named problems: a robot in a scene, with start, goal and weights. Adding one is adding a function here."""
+
+import inspect
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lqrsim.errors import check_count, check_items, check_kind, check_name, check_number, check_seed, check_text
+from lqrsim.problem.costs import ControlCost, ObstacleCost, QuadraticCost
+from lqrsim.problem.problem import Problem
+from lqrsim.results.goal import Target
+from lqrsim.robots.base import Robot
+from lqrsim.robots.differential_drive import DifferentialDrive
+from lqrsim.robots.quadrotor import Quadrotor
+from lqrsim.scenes.scene import Scene, load_scene
+from lqrsim.simulation.disturbances import ControlNoise, Disturbance, ForceNoise, MeasurementNoise, Push
+from lqrsim.simulation.plant import Plant
+from lqrsim.solvers.initial_guess import InitialPrior
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """A robot in a scene with something to do.
+
+    Attributes:
+      name: what the command line calls it. summary: what it is, in a line.
+      problem: what to solve; ready to change with `dataclasses.replace(scenario.problem, ...)`.
+      tracking_bound: how far in metres an undisturbed run may be from its plan, at any time.
+      disturbances: what the demo's disturbed run meets: plain to see, and no more than the policy copes with.
+      goal_radius: how near the goal counts as having reached it, in metres; by default the robot's radius.
+      goal_tolerance: the same for goals without a position; both as in `simulate`.
+      paper_start: how the paper begins, for `smooth(problem, start=...)`; by default several starts are tried.
+    """
+
+    name: str
+    summary: str
+    robot: Robot
+    scene: Scene
+    problem: Problem
+    tracking_bound: float
+    disturbances: tuple[Disturbance, ...] = ()
+    paper_start: InitialPrior | None = None
+    goal_radius: float | None = None
+    goal_tolerance: float | None = None
+
+    def near_enough(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> dict[str, Any]:
+        """These options of `simulate`, or the scenario's own where neither is given."""
+        if goal_radius is None and goal_tolerance is None:
+            goal_radius, goal_tolerance = self.goal_radius, self.goal_tolerance
+        return {"goal_radius": goal_radius, "goal_tolerance": goal_tolerance}
+
+    def reach(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> float:
+        """Within which distance the goal counts as reached, in `Target.unit`. Raises InputError as `simulate` does."""
+        dynamics, goal = self.problem.dynamics, self.problem.weighed_goal
+        target = Target(dynamics.state_coordinates, goal, np.zeros((1, len(dynamics.state_coordinates))))
+        return target.radius(self.robot.radius, **self.near_enough(goal_radius, goal_tolerance))
+
+    def __post_init__(self) -> None:
+        check_text("Scenario: name", self.name, "a name")
+        check_text("Scenario: summary", self.summary, "what it is", at_most=1000, empty=True)
+        check_kind("Scenario: robot", self.robot, Robot, "a Robot, such as Quadrotor()")
+        check_kind("Scenario: scene", self.scene, Scene, "a Scene, such as load_scene('cage')")
+        check_kind("Scenario: problem", self.problem, Problem, "a Problem")
+        check_number("Scenario: tracking_bound", self.tracking_bound, above=0.0)
+        for name in ("goal_radius", "goal_tolerance"):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, check_number(f"Scenario: {name}", value, above=0.0))
+        wanted = "disturbances, such as ControlNoise(0.05)"
+        found = check_items("Scenario: disturbances", self.disturbances, Disturbance, wanted)
+        object.__setattr__(self, "disturbances", found)
+        check_kind("Scenario: paper_start", self.paper_start, (InitialPrior, type(None)), "an InitialPrior or None")
+
+    def plant(self) -> Plant:
+        """The robot in its scene as a MuJoCo model that is ready to run."""
+        return Plant(self.robot, self.scene)
+
+
+def names() -> list[str]:
+    """Names of the scenarios."""
+    return sorted(_functions())
+
+
+def get(name: str) -> Scenario:
+    """The scenario of that name, with its default settings. Raises InputError for an unknown name."""
+    return _functions()[check_name("scenario", name, names())]()
+
+
+def _functions() -> dict[str, Callable[..., Scenario]]:
+    """Every public function of this module that returns a Scenario."""
+    functions = inspect.getmembers(sys.modules[__name__], inspect.isfunction)
+    return {
+        name: f
+        for name, f in functions
+        if f.__annotations__.get("return") is Scenario and name[0] != "_" and name != "get"
+    }
+
+
+def differential_drive() -> Scenario:
+    """The iRobot Create among eleven pillars: Fig. 2, with the authors' weights."""
+    robot, scene = DifferentialDrive(), load_scene("arena")
+    start, goal, nominal = (0.0, -2.5, np.pi), (0.0, 2.5, np.pi), (0.25, 0.25)
+    weight = (5000.0, 5000.0, 50.0)
+    problem = Problem(
+        dynamics=robot.dynamics,
+        dt=1 / 6,
+        steps=150,
+        initial=QuadraticCost(weight, about=start),
+        stage_cost=ControlCost((60.0, 60.0), about=nominal)
+        + ObstacleCost(scene.world, radius=robot.radius, sharpness=10.0),
+        final_cost=QuadraticCost(weight, about=goal),
+    )
+    return Scenario(
+        name="differential_drive",
+        summary="the iRobot Create through an arena of pillars (Fig. 2)",
+        robot=robot,
+        scene=scene,
+        problem=problem,
+        tracking_bound=0.01,
+        disturbances=(ControlNoise(0.05), ForceNoise((3.0, 3.0, 0.0)), MeasurementNoise((0.01, 0.01, 0.02))),
+        # Facing the goal keeps the first linearisations sensible; the start faces sideways.
+        paper_start=InitialPrior((0.0, 0.0, 0.4), about=(0.0, 0.0, np.pi / 2), iterations=2),
+    )
+
+
+def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
+    """The quadrotor through a cage of twelve beams, from one edge to the antipode: Fig. 3.
+
+    Args:
+      query, seed: which of the random starts and goals; see `quadrotor_queries`.
+    """
+    starts, goals = quadrotor_queries(check_count("query", query, at_least=0, at_most=999_999) + 1, seed=seed)
+    robot, scene = Quadrotor(), load_scene("cage")
+    weight = np.full(12, 500.0)
+    problem = Problem(
+        dynamics=robot.dynamics,
+        dt=1 / 30,
+        steps=150,
+        initial=QuadraticCost(weight, about=starts[query]),
+        stage_cost=ControlCost(np.full(4, 20.0), about=np.full(4, robot.hover_force))
+        + ObstacleCost(scene.world, radius=robot.radius, sharpness=10.0),
+        final_cost=QuadraticCost(weight, about=goals[query]),
+    )
+    return Scenario(
+        name="quadrotor",
+        summary="the quadrotor through a cage of beams (Fig. 3)",
+        robot=robot,
+        scene=scene,
+        problem=problem,
+        tracking_bound=1e-6,
+        disturbances=(
+            ControlNoise(0.05),
+            ForceNoise(0.1),
+            MeasurementNoise(np.repeat((0.01, 0.02, 0.01, 0.02), 3).tolist()),
+            Push((0.2, 0.0, 0.0), at=3.0),
+        ),
+        # Upright keeps the first linearisations sensible.
+        paper_start=InitialPrior(np.repeat((0.0, 0.0, 0.3, 0.0), 3), about=np.zeros(12)),
+    )
+
+
+def quadrotor_queries(count: int, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Random starts and goals, each (count, 12), at rest. The first `count` of a seed do not depend on `count`.
+
+    A start lies on an edge of the cube of half-side 2.25 m: one coordinate uniform, the others at +-2.25 m with a
+    jitter of +-0.01 m; its goal is the antipode.
+    """
+    check_count("count", count, at_least=0, at_most=1_000_000)
+    rng = np.random.default_rng(check_seed("seed", seed))
+    goals = np.zeros((count, 12))
+    for goal in goals:
+        edge = int(rng.integers(12))
+        along, first, second = (edge // 4 + np.arange(3)) % 3
+        goal[along] = rng.uniform(-2.25, 2.25)
+        goal[first] = (2.25 if edge % 4 < 2 else -2.25) + rng.uniform(-0.01, 0.01)
+        goal[second] = (2.25 if edge % 2 == 0 else -2.25) + rng.uniform(-0.01, 0.01)
+    return -goals, goals

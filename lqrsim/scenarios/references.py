@@ -1,0 +1,119 @@
+"""A scenario by what someone types: a registered name, or a function of their own, with settings.
+
+quadrotor                     a name that `lqrsim list` prints
+quadrotor,query=3,seed=1      the same with settings: the keyword arguments of the scenario's function
+my_robot.py:hallway,width=2   a function in a file of yours that returns a Scenario
+my_package.robots:hallway     a function in a module of yours
+"""
+
+import ast
+import importlib
+import importlib.util
+import inspect
+import os
+import re
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from lqrsim.errors import InputError, check_name
+
+if TYPE_CHECKING:
+    from lqrsim.scenarios.packaged import Scenario
+
+
+def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
+    """The scenario that `reference` names; see the top of this file for its forms.
+
+    Args:
+      registered_only: refuse a function that is not lqrsim's own. For references that come out of a file: a file is
+        data, and may not choose which code runs.
+
+    Raises:
+      InputError: nothing of that name, a setting that it does not have, or something that is not a Scenario.
+    """
+    from lqrsim.scenarios.packaged import Scenario
+
+    target, settings = _parts(reference)
+    if ":" in target:
+        if registered_only:
+            option = shlex.join(["--scenario", reference])
+            raise InputError(f"scenario: got a file made with {target!r}, want {option} to run that code")
+        make = _own_function(target)
+    else:
+        make = _registered_function(target)
+    scenario = make(**_keywords(target, make, settings))
+    if not isinstance(scenario, Scenario):
+        raise InputError(f"scenario: got a {type(scenario).__name__} from {target}, want a lqrsim Scenario")
+    return scenario
+
+
+def from_anywhere(reference: str) -> str:
+    """The same reference, as it can be given in any working directory: a file's path is made absolute."""
+    target, settings = _parts(reference)
+    place, colon, name = target.rpartition(":")
+    if colon and place.endswith(".py"):
+        target = f"{Path(place).absolute()}:{name}"
+    return ",".join([target, *settings])
+
+
+def folder_name(scenario: "Scenario") -> str:
+    """The scenario's name, as a folder may be called on any system."""
+    return re.sub(r"[^\w.-]+", "_", scenario.name)[:100].strip("._ ") or "scenario"
+
+
+def _parts(reference: str) -> tuple[str, list[str]]:
+    """What is named, and its settings; a comma inside a value, as in `goal=(1, 2)`, does not part them."""
+    target, *settings = re.split(r",(?=\s*\w+=)", reference)
+    return target, settings
+
+
+def _registered_function(name: str) -> Callable[..., object]:
+    from lqrsim import scenarios
+
+    return getattr(scenarios, check_name("scenario", name, scenarios.names()))
+
+
+def _own_function(target: str) -> Callable[..., object]:
+    place, _, name = target.rpartition(":")  # the last colon: C:\robots\mine.py:hallway
+    module = _load_file(Path(place)) if place.endswith(".py") else _import(place)
+    functions = {key: value for key, value in vars(module).items() if inspect.isfunction(value) and key[0] != "_"}
+    return functions[check_name(f"function in {place}", name, functions)]
+
+
+def _load_file(path: Path) -> ModuleType:
+    if not os.path.isfile(path):  # not the method, which raises for names that are too long
+        raise InputError(f"scenario: got {path}, want a Python file that exists")
+    name = str(path.resolve())  # not the stem, which may be that of another module
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up while it is being run
+    spec.loader.exec_module(module)
+    return module
+
+
+def _import(name: str) -> ModuleType:
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())  # as `python -m` does; an installed command does not
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise InputError(f"scenario: got module {name!r}, want one that can be imported ({error})") from None
+
+
+def _keywords(target: str, make: Callable[..., object], settings: list[str]) -> dict[str, object]:
+    valid = [name for name, p in inspect.signature(make).parameters.items() if p.kind is not p.VAR_KEYWORD]
+    keywords: dict[str, object] = {}
+    for setting in settings:
+        name, _, text = setting.strip().partition("=")
+        check_name(f"setting of {target}", name, valid)
+        try:
+            keywords[name] = ast.literal_eval(text)
+        except (ValueError, SyntaxError):
+            keywords[name] = text
+    return keywords

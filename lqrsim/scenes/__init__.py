@@ -1,0 +1,1 @@
+"""From MJCF to the obstacles that the planner sees."""

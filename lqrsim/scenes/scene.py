@@ -1,0 +1,279 @@
+"""Scenes: MJCF in, a MuJoCo model and the obstacles that a robot must keep clear of out.
+
+The one rule for obstacles, which anyone can apply to their own file: **every geom that is fixed to the world and can
+collide is an obstacle.** Fixed to the world: no joint and no mocap between the geom and the world. Can collide:
+contype or conaffinity is not zero. So
+
+- geoms that are only drawn (both zero) are no obstacles, nor is anything that can move, the robot included;
+- planes are walls, floors and ceilings, infinite whatever size they are drawn with, solid behind. One that is parallel
+  to the plane in which a robot moves does not bound it: the floor that it drives on, for one (`World.seen_by`);
+- plane, sphere, capsule, cylinder and box have a distance. Any other type is refused by name, not left out;
+- a cylinder or capsule whose ends both lie on or behind planes has no ends that anything can reach, and is infinite.
+"""
+
+import contextlib
+import os
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lqrsim.errors import InputError, check_kind, check_name, check_path, check_text
+from lqrsim.scenes.world import KINDS, Obstacle, World
+
+try:
+    import mujoco
+except Exception as error:
+    # MuJoCo chooses its OpenGL while it is imported: told to take one that is not there, it raises what comes along.
+    if "MUJOCO_GL" not in os.environ:
+        raise
+    raise InputError(
+        f"MUJOCO_GL: got {os.environ['MUJOCO_GL']!r}, with which MuJoCo cannot be imported here"
+        f" ({' '.join(str(error).split())}), want it unset: lqrsim finds an OpenGL by itself"
+    ) from None
+
+# In the wheel models/ lies inside the package, in the repository beside it.
+_PACKAGED = [Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models"]
+DEEPEST = 490  # MuJoCo's reader refuses a little more
+MOST_CELLS = 4096**2  # of a height field; MuJoCo crashes with far more
+
+MODELS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A place for a robot to move in.
+
+    Attributes:
+      name: of the packaged scene, or the stem of the file.
+      xml: the whole MJCF as text, includes resolved. It alone makes the model again.
+      model: compiled from `xml`.
+      world: the obstacles, as the module's docstring defines them.
+    """
+
+    name: str
+    xml: str
+    model: mujoco.MjModel
+    world: World
+
+    def __post_init__(self) -> None:
+        check_text("Scene: name", self.name, "a name", at_most=1000)
+        check_kind("Scene: xml", self.xml, str, "the MJCF as text")
+        check_kind("Scene: model", self.model, mujoco.MjModel, "a mujoco.MjModel")
+        check_kind("Scene: world", self.world, World, "a World")
+        if len(self.world) != (count := len(obstacle_geoms(self.model))):
+            raise InputError(f"Scene: world: got {len(self.world)} obstacles, want {count}, those of the model")
+
+
+def names() -> list[str]:
+    """The packaged scenes: the files in models/ that include a robot."""
+    return sorted(path.stem for path in MODELS.glob("*.xml") if "<include" in path.read_text(encoding="utf-8"))
+
+
+def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
+    """A packaged scene by name, or any MJCF by path. It may include the packaged robots, e.g. `create.xml`, by name.
+
+    Raises:
+      InputError: no such scene or file; it does not parse or compile; an obstacle is of a type without a distance.
+    """
+    path = check_path("scene", name_or_path, "the name of a packaged scene, or the path of an .xml file")
+    if path.suffix.lower() != ".xml":
+        packaged = names()
+        try:
+            path = MODELS / f"{check_name('scene', os.fspath(name_or_path), packaged)}.xml"
+        except InputError as error:
+            raise InputError(f"{error}; or the path of an .xml file") from None
+    elif not os.path.isfile(path):
+        packaged = ", ".join(names())
+        raise InputError(f"scene: got {os.fspath(name_or_path)!r}, want a file that exists, or one of: {packaged}")
+    try:
+        xml = _flatten(path)
+    except RecursionError:
+        raise InputError(f"scene: got {path.name} with elements nested deeper than {DEEPEST}, want fewer") from None
+    return scene_from_xml(xml, path.stem)
+
+
+def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
+    """The model of an MJCF given as text, without includes.
+
+    Args:
+      what: it is, for messages.
+
+    Raises:
+      InputError: MuJoCo refuses it, or would not survive it, or it has a NaN.
+    """
+    _check_elements(xml, what)
+    try:
+        with unlogged():
+            model = mujoco.MjModel.from_xml_string(xml)
+    except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
+        raise InputError(f"{what}: got an MJCF that MuJoCo refuses: {' '.join(str(error).split())}") from None
+    _check_numbers(model, what)
+    return model
+
+
+def scene_from_xml(xml: str, name: str) -> Scene:
+    """The scene of an MJCF given as text, without includes. Raises InputError as `load_scene` does."""
+    model = model_from_xml(xml, f"scene {name}")
+    if mujoco.mj_isSparse(model) and mujoco.__version__ == "4.0.0":
+        # Newton on a sparse Jacobian gives wrong forces in 4.0.0 (fixed in 4.0.1).
+        raise InputError(
+            f"scene {name}: got a sparse constraint Jacobian, which MuJoCo 4.0.0 solves wrongly;"
+            ' want <option jacobian="dense"/> or a newer MuJoCo'
+        )
+    return Scene(name, xml, model, World(_obstacles(model, name)))
+
+
+@contextlib.contextmanager
+def unlogged() -> Iterator[None]:
+    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder about what is told or recorded otherwise."""
+    before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    quiet.logto_file = quiet.logto_console = False
+    quiet.set()
+    try:
+        yield
+    finally:
+        before.set()
+
+
+def free_name(name: str, taken: Collection[str]) -> str:
+    """The name, with underscores after it if it is taken: for what has none in the MJCF."""
+    while name in taken:
+        name += "_"
+    return name
+
+
+def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
+    """Ids of the geoms that are obstacles by the module's rule, in the order of `Scene.world`."""
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    return np.flatnonzero(fixed & collides).tolist()
+
+
+def _check_elements(xml: str, what: str) -> None:
+    """Raises InputError for what would end the process: too deep elements, too large height fields."""
+    reader, depth = ElementTree.XMLPullParser(["start", "end"]), 0
+    try:
+        reader.feed(xml)
+        events: Any = reader.read_events()
+        for event, element in events:
+            depth += 1 if event == "start" else -1
+            if depth > DEEPEST:
+                raise InputError(f"{what}: got elements nested deeper than {DEEPEST}, want fewer bodies in bodies")
+            if event == "start" and element.tag == "hfield":
+                sizes = [element.attrib.get(key, "") for key in ("nrow", "ncol")]
+                cells = int(sizes[0]) * int(sizes[1]) if all(size.strip().isdecimal() for size in sizes) else 0
+                if cells > MOST_CELLS:
+                    got = f"{sizes[0]} x {sizes[1]} heights in the height field {element.attrib.get('name', '')!r}"
+                    raise InputError(f"{what}: got {got}, want {MOST_CELLS:,} at most")
+    except (ElementTree.ParseError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise  # the rest is for MuJoCo to say
+
+
+def _check_numbers(model: mujoco.MjModel, what: str) -> None:
+    """Raises InputError if the model has a NaN, which MuJoCo only warns about."""
+    for field in (name for name in dir(model) if not name.startswith("_")):
+        array = getattr(model, field)
+        if isinstance(array, np.ndarray) and array.dtype.kind == "f" and np.isnan(array).any():
+            element = int(np.argwhere(np.isnan(array))[0][0])
+            raise InputError(f"{what}: got NaN in the MJCF (MuJoCo's {field}[{element}]), want numbers")
+
+
+def _obstacles(model: mujoco.MjModel, scene: str) -> list[Obstacle]:
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    taken = {model.geom(geom).name for geom in range(model.ngeom)}
+    found: list[Obstacle] = []
+    for geom in obstacle_geoms(model):
+        kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+        name = model.geom(geom).name or free_name(f"{kind} {geom}", taken)
+        if kind not in KINDS:
+            raise InputError(
+                f"scene {scene}: got the obstacle {name!r} of type {kind}, want one of: {', '.join(KINDS)};"
+                ' or contype="0" conaffinity="0" if it is only to be drawn'
+            )
+        size = np.zeros(3) if kind == "plane" else model.geom_size[geom].copy()
+        found.append(Obstacle(name, kind, data.geom_xpos[geom].copy(), data.geom_xmat[geom].reshape(3, 3).copy(), size))
+    planes = [obstacle for obstacle in found if obstacle.kind == "plane"]
+    return [_endless(obstacle, planes) if obstacle.kind in ("capsule", "cylinder") else obstacle for obstacle in found]
+
+
+def _endless(bar: Obstacle, planes: list[Obstacle]) -> Obstacle:
+    """The cylinder or capsule, infinite if both its ends are walled off."""
+    if all(_walled_off(bar, end, planes) for end in (-1, 1)):
+        return replace(bar, size=np.array([bar.size[0], np.inf, 0.0]))
+    return bar
+
+
+def _walled_off(bar: Obstacle, end: int, planes: list[Obstacle]) -> bool:
+    """Whether the end of a cylinder or capsule, as a disc across its axis, lies wholly on or behind a plane."""
+    radius, half_length, _ = bar.size
+    axis = end * bar.rotation[:, 2]
+    centre = bar.position + half_length * axis
+
+    def height(plane: Obstacle) -> float:
+        normal = plane.rotation[:, 2]
+        return normal @ (centre - plane.position) + radius * np.linalg.norm(np.cross(normal, axis))
+
+    return any(height(plane) <= 1e-6 for plane in planes)
+
+
+def _flatten(path: Path) -> str:
+    """The MJCF at `path` as one text: includes in place, files of meshes and textures by their full path.
+
+    MuJoCo can write a model as text too, but with six digits, which is another model.
+    """
+    seen: set[Path] = set()
+
+    def read(file: Path) -> ElementTree.Element:
+        seen.add(file.resolve())
+        try:
+            root = ElementTree.parse(file).getroot()
+        except ElementTree.ParseError as error:
+            raise InputError(f"scene: got {file.name}, which is not XML ({error}), want an MJCF file") from None
+        except OSError as error:
+            raise InputError(f"scene: got {file.name}, which cannot be read ({error.strerror}), want a file") from None
+        expand(root)
+        return root
+
+    def expand(element: ElementTree.Element) -> None:
+        children = list(element)
+        for child in children:
+            element.remove(child)
+        for child in children:
+            if child.tag == "include":
+                element.extend(read(find(child.get("file", ""))))
+            else:
+                expand(child)
+                element.append(child)
+
+    def find(name: str) -> Path:
+        # MuJoCo's rule, relative to the main file, and then the packaged models.
+        file = next((file for file in (path.parent / name, MODELS / name) if os.path.isfile(file)), None)
+        if file is None:
+            packaged = ", ".join(sorted(file.name for file in MODELS.glob("*.xml")))
+            raise InputError(f"scene: got an include of {name!r}, want a file beside {path.name} or one of: {packaged}")
+        if file.resolve() in seen:
+            raise InputError(f"scene: got {name} included twice in {path.name}, want each file once")
+        return file
+
+    root = read(path)
+    if root.tag != "mujoco":
+        raise InputError(f"scene: got {path.name} with <{root.tag}> at its root, want <mujoco>")
+    if any("file" in asset.attrib for asset in root.iterfind("asset/*")):
+        folder = path.parent.resolve()
+        settings = {key: value for compiler in root.iterfind("compiler") for key, value in compiler.attrib.items()}
+        common = settings.get("assetdir", "")
+        root.append(
+            ElementTree.Element(
+                "compiler",
+                {kind: str(folder / settings.get(kind, common)) for kind in ("meshdir", "texturedir")},
+            )
+        )
+    text = ElementTree.tostring(root, encoding="unicode")
+    return re.sub(r"\n\s*\n+", "\n", text) + "\n"

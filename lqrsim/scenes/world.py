@@ -1,0 +1,178 @@
+"""Obstacles as primitives, and the one place where the distance to each is written down.
+
+`signed_distance` and `signed_distance_derivatives` are scalar functions in the subset of Python that numba compiles:
+they run here as they are, and `solvers/compiled.py` puts the same text into every compiled core.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array, InputError, check_array, check_items, check_name, check_number, check_text, real
+from lqrsim.kernels.interface import ROW
+from lqrsim.kernels.signed_distance import signed_distance
+
+# What a position may be of: space, or a plane by its two axes in their order.
+SPACE = "xyz"
+PLANES = tuple(a + b for a in SPACE for b in SPACE if a != b)
+
+KINDS = ("plane", "sphere", "capsule", "cylinder", "box")
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """One primitive; sizes and axes as MuJoCo has them.
+
+    Attributes:
+      kind: one of `KINDS`.
+      position: (3,) in metres. rotation: (3, 3), whose columns are the local axes; a plane's free side is its local +z,
+        capsules and cylinders lie along their local z.
+      size: (3,) in metres: sphere (radius, 0, 0); capsule and cylinder (radius, half length, 0), the latter infinite if
+        the half length is; box half lengths; plane (0, 0, 0).
+    """
+
+    name: str
+    kind: str
+    position: Array
+    rotation: Array
+    size: Array
+
+    def __post_init__(self) -> None:
+        check_text("obstacle: name", self.name, "a name", at_most=1000)
+        check_name(f"obstacle {self.name!r}: kind", self.kind, KINDS)
+        object.__setattr__(self, "position", check_array(f"obstacle {self.name!r}: position", self.position, (3,)))
+        rotation = check_array(f"obstacle {self.name!r}: rotation", self.rotation, (3, 3))
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+            raise InputError(f"obstacle {self.name!r}: rotation: got {rotation.tolist()}, want orthonormal axes")
+        object.__setattr__(self, "rotation", rotation)
+        size = check_array(f"obstacle {self.name!r}: size", self.size, (3,), infinite=True)
+        used = {"plane": 0, "sphere": 1, "capsule": 2, "cylinder": 2, "box": 3}[self.kind]
+        if (size[:used] <= 0).any():
+            raise InputError(f"obstacle {self.name!r}: size: got {size[:used].tolist()}, want lengths above 0")
+        object.__setattr__(self, "size", size)
+
+    @property
+    def row(self) -> Array:
+        """This obstacle as `ROW` numbers."""
+        return np.concatenate([[KINDS.index(self.kind)], self.position, self.rotation.ravel(), self.size])
+
+
+@dataclass(frozen=True)
+class World:
+    """The obstacles that a robot must stay clear of."""
+
+    obstacles: Sequence[Obstacle] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "obstacles", check_items("obstacles", self.obstacles, Obstacle, "a list of Obstacle"))
+
+    def __len__(self) -> int:
+        return len(self.obstacles)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(obstacle.name for obstacle in self.obstacles)
+
+    @cached_property
+    def table(self) -> Array:
+        """The obstacles as numbers, (len(self), ROW)."""
+        return np.array([obstacle.row for obstacle in self.obstacles]).reshape(len(self), ROW)
+
+    def seen_by(self, plane: str, offset: float | None = None) -> "World":
+        """The world of a robot whose position is in that plane, in the plane's coordinates: see `Coordinates`.
+
+        In space ("xyz") it is this one. A plane has its two axes as x and y, in their order; its third axis is across.
+
+        With an offset it is this world cut there: distances are those in space, from the points of the plane. The robot
+        is a ball, obstacles beside the plane are beside it, and a floor is a wall. Without one, in a horizontal plane,
+        it is this world seen from above: the robot is as high as everything, upright obstacles reach from the floor to
+        the sky, and a sphere counts with its equator. Either way planes parallel to the robot's bound nothing: in the
+        horizontal one that is the floor.
+
+        Raises:
+          InputError: there is no such plane, a vertical one has no offset; or, seen from above, an obstacle is tilted,
+            so that it has no outline among the primitives.
+        """
+        check_name("plane", plane, (SPACE, *PLANES))
+        offset = None if offset is None else check_number("offset", offset)
+        if plane == SPACE:
+            return self
+        if offset is None and plane not in ("xy", "yx"):
+            raise InputError(
+                f"offset: got none for the plane {plane!r}, want where it is along its third axis, in metres"
+            )
+        seen = self.obstacles if offset is not None else [_from_above(obstacle) for obstacle in self.obstacles]
+        if plane == "xy" and offset is None:
+            return World([obstacle for obstacle in seen if not _parallel(obstacle, 2)])
+        first, second = (SPACE.index(letter) for letter in plane)
+        across = 3 - first - second
+        turn = np.zeros((3, 3))  # to the plane's axes: a rotation, which only exchanges the world's axes
+        turn[0, first] = turn[1, second] = 1.0
+        turn[2] = np.cross(turn[0], turn[1])
+        origin = np.zeros(3)
+        origin[across] = 0.0 if offset is None else offset
+        return World(
+            [
+                replace(obstacle, position=turn @ (obstacle.position - origin), rotation=turn @ obstacle.rotation)
+                for obstacle in seen
+                if not _parallel(obstacle, across)
+            ]
+        )
+
+    def distances(self, point: npt.ArrayLike) -> Array:
+        """Signed distances in metres to each obstacle, (len(self),), of one point (2,) or (3,); negative inside.
+
+        Points (2,) are for a world that is seen by a robot in the plane, and in its coordinates.
+        """
+        x, y, z = (*_places("point", point, one=True).tolist(), 0.0)[:3]
+        data = self.table.ravel()
+        return np.array([signed_distance(data, ROW * i, x, y, z) for i in range(len(self))])
+
+    def distance(self, points: npt.ArrayLike) -> Array:
+        """Signed distance in metres to the nearest obstacle, (...), of points (..., 2 or 3); infinite without any."""
+        points = _places("points", points)
+        flat = [self.distances(point).min(initial=np.inf) for point in points.reshape(-1, points.shape[-1])]
+        return np.array(flat).reshape(points.shape[:-1])
+
+    def nearest(self, points: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Which obstacle is nearest, (...), at points (..., 2 or 3). Raises InputError in an empty world."""
+        if not self.obstacles:
+            raise InputError("nearest: got a world without obstacles, want at least one")
+        points = _places("points", points)
+        flat = [int(self.distances(point).argmin()) for point in points.reshape(-1, points.shape[-1])]
+        return np.array(flat, dtype=np.int64).reshape(points.shape[:-1])
+
+
+def _places(field: str, points: npt.ArrayLike, *, one: bool = False) -> Array:
+    """Points (..., 2 or 3), or only one of them, as an array. Raises InputError for what is none."""
+    array = real(field, points)
+    if array.shape[-1:] not in ((2,), (3,)) or (one and array.ndim > 1):
+        raise InputError(f"{field}: got shape {array.shape}, want {'' if one else '..., '}2 or 3 coordinates")
+    return array
+
+
+def _parallel(obstacle: Obstacle, across: int) -> bool:
+    """Whether it is a plane whose normal is along that axis of the world."""
+    return obstacle.kind == "plane" and bool(abs(abs(obstacle.rotation[across, 2]) - 1) < 1e-9)
+
+
+def _from_above(obstacle: Obstacle) -> Obstacle:
+    """The obstacle with infinite height; planes are as they are. Raises InputError if it is tilted."""
+    upright = np.abs(np.abs(obstacle.rotation[2]) - 1) < 1e-9  # which local axis is vertical, if one is
+    size = obstacle.size.copy()
+    match obstacle.kind:
+        case "sphere":
+            return replace(obstacle, kind="cylinder", rotation=np.eye(3), size=np.array([size[0], np.inf, 0.0]))
+        case "plane" if upright[2] or abs(obstacle.rotation[2, 2]) < 1e-9:
+            return obstacle
+        case "capsule" | "cylinder" if upright[2]:
+            return replace(obstacle, kind="cylinder", size=np.array([size[0], np.inf, 0.0]))
+        case "box" if upright.any():
+            size[upright] = np.inf
+            return replace(obstacle, size=size)
+    raise InputError(
+        f"obstacle {obstacle.name!r}: got a tilted {obstacle.kind}, want it upright for a robot that moves in the plane"
+    )

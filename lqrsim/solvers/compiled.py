@@ -1,0 +1,208 @@
+"""From a problem to its compiled core and back: which text, which numbers.
+
+The text is the structure: the sources that the dynamics and the cost terms wrote, and those of the package's own
+numba-subset modules, joined, with the sizes as constants. Everything that is a number (goal, weights, masses,
+obstacles, horizon) is an argument.
+"""
+
+import hashlib
+import re
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order, source_of
+from lqrsim.errors import Array
+from lqrsim.kernels import (
+    augmented_lagrangian,
+    certificate,
+    control_limits,
+    damped_iterations,
+    dual_form,
+    entry_points,
+    interface,
+    iterations,
+    linear_algebra,
+    linear_quadratic_passes,
+    passes,
+    primal_form,
+    projection,
+    rollouts,
+    rotation_ratios,
+    runge_kutta,
+    signed_distance,
+)
+from lqrsim.problem.constraints import Inequalities
+from lqrsim.problem.costs import Term
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.problem import FixedState, Problem
+
+# The terms of a cost as far as they are structure: the source of each, and what it may bend in (see `Term`).
+Structure = tuple[tuple[str, tuple[int, ...] | None], ...]
+# The constraints: the source of each, and whether it uses the control.
+Constraints = tuple[tuple[str, bool], ...]
+
+_FIELDS = {"initial": "initial", "stage": "stage_cost", "final": "final_cost"}
+
+
+# The forms of the cost-to-come, and what brings each.
+FORMS = {"dual": dual_form, "primal": primal_form}
+
+
+def core(problem: Problem, form: str = "dual") -> Core:
+    """The compiled passes for problems of this structure; `kernels/` has what it offers."""
+    with compiling:  # not only against doing it twice: Python 3.11 can not parse in two threads at once
+        return _core(form, *_structure(problem))
+
+
+def _structure(problem: Problem) -> tuple[Any, ...]:
+    dynamics = problem.dynamics
+    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+    costs = [(name, tuple((t.source, t.bends) for t in problem.terms(field))) for name, field in _FIELDS.items()]
+    constraints = tuple((inequalities.source, inequalities.uses_control) for inequalities in problem.inequalities)
+    return n, m, dynamics.source, tuple(costs), constraints, f"{dynamics.name} ({n} states, {m} controls)"
+
+
+@cache
+def _core(
+    form: str,
+    n: int,
+    m: int,
+    dynamics: str,
+    costs: tuple[tuple[str, Structure], ...],
+    constraints: Constraints,
+    what: str,
+) -> Core:
+    parts = [source_of(module) for module in (*_BASE, FORMS[form], *_SHARED)]
+    parts += [dynamics, _constraint_source(constraints, len(dict(costs)["stage"]))]
+    parts += [_cost_source(name, terms, () if name == "initial" else constraints) for name, terms in costs]
+    sizes = {"N": n, "M": m, "W": n + m, "LIMITS": len(dict(costs)["stage"]) + 2 * len(constraints)}
+    return Core("\n\n".join(parts), {**_NAMES, **sizes}, what)
+
+
+_BASE = rotation_ratios, signed_distance, linear_algebra, runge_kutta
+_SHARED = control_limits, passes, rollouts, iterations, damped_iterations, certificate, entry_points
+
+
+@cache
+def linear_quadratic(n: int, m: int, form: str) -> Core:
+    """Those for linear-quadratic problems of that size; see `kernels/linear_quadratic_passes.py`."""
+    with compiling:
+        parts = [source_of(module) for module in (linear_algebra, FORMS[form], linear_quadratic_passes)]
+        return Core("\n\n".join(parts), {"N": n, "M": m, "W": n + m}, f"linear-quadratic, {n} states, {m} controls")
+
+
+# The numbers that have names: outcomes, methods, and the places of what is remembered.
+_NAMES = {name: value for name, value in vars(interface).items() if name.isupper() and len(name) > 1}
+
+
+def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> dict[str, Any]:
+    """The problem's numbers, as the passes take them: before its own, each part has the addresses of its functions.
+
+    Args:
+      multipliers: of each constraint, as `augmented_lagrangian.py` has them; by default none act.
+    """
+
+    def numbers(part: Dynamics | Term) -> Array:
+        return np.array([*(address_of(function) for function in part.functions), *part.data], dtype=np.float64)
+
+    data = {name: tuple(numbers(term) for term in problem.terms(field)) for name, field in _FIELDS.items()}
+    multipliers = multipliers or [no_multipliers(problem, inequalities) for inequalities in problem.inequalities]
+    pairs = [(part.data.copy(), own) for part, own in zip(problem.inequalities, multipliers, strict=True)]
+    data["stage"] += tuple(array for pair in pairs for array in pair)
+    data["final"] += tuple(array for pair in pairs for array in pair)
+    data["stage"] += (np.array([*problem.control_coordinates.low, *problem.control_coordinates.high]),)
+    return {"p": numbers(problem.dynamics), "dt": problem.dt, **data}
+
+
+def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
+    """Stage and final cost (K,) of each of K trajectories, states (K, T+1, n) and controls (K, T, m)."""
+    costs = np.empty(len(states))
+    told = arguments(problem)
+    flat = (in_c_order(array).reshape(-1, array.shape[2]) for array in (states, controls))
+    core(problem).costs_of(len(states), problem.steps, *flat, told["stage"], told["final"], costs)
+    return costs
+
+
+def rollout(problem: Problem, gain: Array, offset: Array, state: Array) -> tuple[Array, Array]:
+    """Where the laws u_t = gain_t x + offset_t lead from a state, by the model: states (T+1, n) and controls (T, m)."""
+    states, controls = np.empty((problem.steps + 1, len(state))), np.empty((problem.steps, offset.shape[1]))
+    told, law = arguments(problem), (in_c_order(gain), in_c_order(offset))
+    costs = (told[name] for name in ("initial", "stage", "final"))
+    core(problem).rollout(problem.steps, state, *law, told["p"], told["dt"], *costs, states, controls)
+    return states, controls
+
+
+def no_multipliers(problem: Problem, inequalities: Inequalities, tolerance: float = 0.0) -> Array:
+    """Those of a constraint that does not act yet; see `kernels/augmented_lagrangian.py`."""
+    rows = inequalities.rows
+    # Nothing can be done about a start that is given; but about its control.
+    first = 1 if isinstance(problem.initial, FixedState) and not inequalities.uses_control else 0
+    return np.concatenate([[0.0, rows, first, tolerance], np.zeros((problem.steps + 1) * rows)])
+
+
+def _constraint_source(constraints: Constraints, terms: int) -> str:
+    """Source of what the augmented Lagrangian needs of each constraint, and to look at them from outside."""
+    parts = []
+    look = "def look_at_constraints(steps, states, controls, data, values):\n    for t in range(steps + 1):\n"
+    look += "        u = controls[min(t, steps - 1)]\n"
+    slope = "def slope_of_constraint(which, row, x, u, t, data, gradient):\n"
+    for k, (source, uses_control) in enumerate(constraints):
+        prefix = _prefix(source)
+        names = {"constraint_value": f"{prefix}_value", "constraint_slope": f"{prefix}_slope"}
+        names |= {name: f"{prefix}_{name}" for name in ("augment", "augmentation", "look")}
+        parts += [_own(source), _rename(source_of(augmented_lagrangian), names)]
+        at = terms + 2 * k
+        slope += f"    if which == {k}:\n        {prefix}_slope(x, u, t, row, data[{at}], gradient)\n"
+        acts = "t < steps" if uses_control else "True"  # there is no last control
+        look += f"        {prefix}_look(states[t], u, t, {acts}, data[{at}], data[{at + 1}], values[{k}])\n"
+    return "\n\n".join([*parts, look, slope] if constraints else [])
+
+
+def _prefix(source: str) -> str:
+    # Terms of the same source are the same functions: those of an initial and a final cost, say.
+    return f"term_{hashlib.sha256(source.encode()).hexdigest()[:8]}"
+
+
+def _own(source: str) -> str:
+    """A source with its functions renamed, so that several can stand side by side."""
+    own = re.findall(r"^def (\w+)\(", source, flags=re.MULTILINE)
+    return _rename(source, {name: f"{_prefix(source)}_{name}" for name in own})
+
+
+def _cost_source(name: str, terms: Structure, constraints: Constraints) -> str:
+    """Source of `<name>_value`, the sum of the terms, of `<name>_added`, what the augmented Lagrangian adds, and of
+    `<name>_quadratic`, which models both.
+    """
+    parts, values, convex, bent = [], [], [], []
+    for i, (source, bends) in enumerate(terms):
+        prefix = _prefix(source)
+        parts.append(_own(source))
+        values.append(f"    total += {prefix}_value(x, u, t, data[{i}])")
+        call = f"    total += {prefix}_derivatives(x, u, t, data[{i}], hessian, gradient)"
+        (convex if bends is None else bent).append(call)
+    support = tuple(sorted({i for _, bends in terms for i in bends or ()}))
+    if support:
+        # The sum of what may be indefinite is projected once; what is convex is added after.
+        parts.append(_rename(source_of(projection), {"project": f"{name}_project", "K": str(len(support))}))
+        bent.append(f"    {name}_project(hessian, {support})")
+    added = []
+    for k, (source, uses_control) in enumerate(constraints):
+        if not (uses_control and name == "final"):
+            pair = f"data[{len(terms) + 2 * k}], data[{len(terms) + 2 * k + 1}]"
+            convex.append(f"    total += {_prefix(source)}_augment(x, u, t, {pair}, hessian, gradient)")
+            added.append(f"    total += {_prefix(source)}_augmentation(x, u, t, {pair})")
+    if name != "initial":
+        parts.append("\n".join([f"def {name}_added(x, u, t, data):\n    total = 0.0", *added, "    return total"]))
+    summed = f"def {name}_value(x, u, t, data):\n    total = 0.0\n" + "\n".join(values)
+    parts.append(f"{summed}\n    return total")
+    modelled = f"def {name}_quadratic(x, u, t, data, hessian, gradient):\n    clear(hessian, W, W)\n"
+    modelled += "    for i in range(W):\n        gradient[i] = 0.0\n    total = 0.0\n"
+    parts.append("\n".join([modelled.rstrip(), *bent, *convex, "    return total"]))
+    return "\n\n".join(parts)
+
+
+def _rename(source: str, names: dict[str, str]) -> str:
+    return re.sub(r"\b(" + "|".join(names) + r")\b", lambda match: names[match.group(1)], source)

@@ -1,0 +1,175 @@
+"""What a solver may begin with: nothing, controls, a prior, a policy, a trajectory or a solution."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, excerpt, numbers_of
+from lqrsim.problem.problem import Problem
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.solution import Multipliers, Solution, Trajectory
+from lqrsim.results.value_functions import Quadratic
+
+
+class InitialPrior:
+    """`1/2 (x - about)' diag(weight) (x - about)` at all steps but the first, in the first iterations only.
+
+    It is no part of the cost: it keeps the first linearisations of the smoother sensible, and so has a say in which
+    local optimum is found.
+
+    Args:
+      weight: (n,) not negative. iterations: how many it acts in.
+      about: where it is zero: (n,), or (T+1, n) for a trajectory to be drawn to.
+      obstacles: the shares of the obstacle costs that the first iterations see, one an iteration; then it is all.
+      controls: what the first pass applies, (m,) or (T, m); by default the problem's nominal control.
+    """
+
+    def __init__(
+        self,
+        weight: npt.ArrayLike,
+        *,
+        about: npt.ArrayLike,
+        iterations: int = 1,
+        obstacles: Sequence[float] = (),
+        controls: npt.ArrayLike | None = None,
+    ) -> None:
+        self.weight = check_array("InitialPrior: weight", weight, (None,))
+        if not len(self.weight) or (self.weight < 0).any():
+            raise InputError(
+                f"InitialPrior: weight: got {excerpt(self.weight.tolist())}, want numbers >= 0, one a state"
+            )
+        given = numbers_of("InitialPrior: about", about, f"numbers ({len(self.weight)},) or (T+1, {len(self.weight)})")
+        self.about = check_array("InitialPrior: about", given, (*[None] * (given.ndim == 2), len(self.weight)))
+        if len(self.about) < 2 and self.about.ndim == 2:
+            raise InputError(
+                f"InitialPrior: about: got {len(self.about)} rows, want one for each of at least two times"
+            )
+        self.iterations = check_count("InitialPrior: iterations", iterations)
+        shares = check_array("InitialPrior: obstacles", obstacles, (None,))
+        if ((shares < 0) | (shares > 1)).any():
+            raise InputError(f"InitialPrior: obstacles: got {excerpt(obstacles)}, want numbers from 0 to 1")
+        self.obstacles = tuple(shares.tolist())
+        self.controls = controls
+        if controls is not None:
+            self.controls = numbers_of("InitialPrior: controls", controls, "controls (m,) or (T, m)")
+
+    def at(self, step: float) -> Array:
+        """Where it is zero, (n,), at a step or between two. Raises InputError for what is none."""
+        most = None if self.about.ndim == 1 else len(self.about) - 1
+        step = check_number("step", step, at_least=0.0, at_most=most)
+        if self.about.ndim == 1:
+            return self.about
+        before = min(int(step), len(self.about) - 2)
+        share = step - before
+        return (1 - share) * self.about[before] + share * self.about[before + 1]
+
+    def fitting(self, problem: Problem) -> "InitialPrior":
+        """Itself. Raises InputError if it does not fit the problem."""
+        check_kind("problem", problem, Problem, "a Problem")
+        n = len(problem.dynamics.state_coordinates)
+        check_array("start: InitialPrior: weight", self.weight, (n,))
+        if self.about.ndim == 2:
+            check_array("start: InitialPrior: about", self.about, (problem.steps + 1, n))
+        return self
+
+
+# Controls (m,) or (T, m), or what has more to say; or a function that makes one of these for a problem.
+Beginning = npt.ArrayLike | InitialPrior | AffinePolicy | Trajectory | Solution | None
+StartLike = Beginning | Callable[[Problem], Beginning]
+
+
+@dataclass(frozen=True)
+class Start:
+    """The beginning of the first pass.
+
+    Attributes:
+      gain, offset: (T, m, n) and (T, m), the policy to begin with.
+      cost_to_go: what is known of it; None for nothing.
+      trajectory: what the first pass linearises about, feasible or not; None to leave that to the policy.
+      summary: what a solution's options say of it.
+      prior: what acts in the first iterations besides the cost.
+      multipliers: of the constraints, where they are known.
+    """
+
+    gain: Array
+    offset: Array
+    cost_to_go: Quadratic | None
+    trajectory: Trajectory | None
+    summary: object
+    prior: InitialPrior | None = None
+    multipliers: tuple[Multipliers, ...] = ()
+
+    def rolled_out(self, problem: Problem, x: Array) -> "Start":
+        """With the trajectory of the policy from a state (n,): what a backward pass that comes first is about.
+
+        Where it leaves all numbers, the last state and control stay: the trajectory need not be feasible.
+        """
+        states, controls = [x], []
+        with np.errstate(all="ignore"):
+            for gain, offset in zip(self.gain, self.offset, strict=True):
+                control = gain @ states[-1] + offset
+                state = (
+                    problem.dynamics.step(states[-1], control, problem.dt) if np.isfinite(control).all() else control
+                )
+                finite = np.isfinite(state).all()
+                controls.append(control if finite else controls[-1] if controls else offset)
+                states.append(state if finite else states[-1])
+        return replace(self, trajectory=Trajectory(np.array(states), np.array(controls), problem.dt))
+
+
+def resolve(start: StartLike, problem: Problem) -> Start:
+    """The beginning that a caller asked for; by default the problem's nominal control, held.
+
+    Raises:
+      InputError: it does not fit the problem.
+    """
+    n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
+    if callable(start) and not isinstance(start, AffinePolicy):
+        start = start(problem)
+    if isinstance(start, InitialPrior):
+        prior, controls = start.fitting(problem), resolve(start.controls, problem)
+        acting = np.array([prior.iterations, *prior.obstacles])
+        return replace(
+            controls, prior=prior, summary=_summary(start, prior.weight, prior.about, controls.offset, acting)
+        )
+    if isinstance(start, Solution):
+        policy, value = resolve(start.policy, problem), start.cost_to_go
+        if value is not None:
+            hessian = check_array("start: cost_to_go.hessian", value.hessian, (steps + 1, n, n))
+            value = Quadratic(hessian, check_array("start: cost_to_go.gradient", value.gradient, (steps + 1, n)),
+                              check_array("start: cost_to_go.constant", value.constant, (steps + 1,)))  # fmt: skip
+        multipliers = start.multipliers
+        if [one.values.shape for one in multipliers] != [(steps + 1, one.rows) for one in problem.inequalities]:
+            multipliers = ()  # of other constraints
+        summary = _summary(start, policy.gain, policy.offset)
+        return Start(policy.gain, policy.offset, value, None, summary, multipliers=multipliers)
+    if isinstance(start, AffinePolicy):
+        gain = check_array("start: gain", start.gain, (steps, m, n))
+        offset = check_array("start: offset", start.offset, (steps, m))
+        return Start(gain, offset, None, None, _summary(start, gain, offset))
+    if isinstance(start, Trajectory):
+        states = check_array("start: states", start.states, (steps + 1, n))
+        controls = check_array("start: controls", start.controls, (steps, m))
+        given = Trajectory(states, controls, problem.dt)
+        return Start(np.zeros((steps, m, n)), controls, None, given, _summary(start, states, controls))
+    wanted, given = problem.nominal_control if start is None else start, None
+    try:
+        given = numbers_of("start", wanted)
+        controls = np.broadcast_to(given, (steps, m))
+    except ValueError:  # InputError too
+        got = excerpt(wanted) if given is None else f"shape {given.shape}"
+        raise InputError(
+            f"start: got {got}, want controls ({m},) or ({steps}, {m}), an InitialPrior, a Trajectory, an AffinePolicy"
+            " or a Solution"
+        ) from None
+    controls = check_array("start", controls, (steps, m))
+    summary = controls[0] if (controls == controls[0]).all() else controls
+    return Start(np.zeros((steps, m, n)), controls, None, None, summary.tolist())
+
+
+def _summary(start: object, *arrays: Array) -> str:
+    digest = hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
+    return f"{type(start).__name__} {digest.hexdigest()[:16]}"

@@ -1,0 +1,235 @@
+"""Which optimum: where `smooth` starts if nobody says where, and which of several starts it goes on with.
+
+A continuation draws the first iteration along a smooth path from start to goal, blind to obstacles, and lets the
+obstacles come in by and by; it ends in a good optimum far more often than a start from the nominal control does. Other
+paths, bent to the sides, lead to other optima. Which start is best shows after a few iterations, long before it ends.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+
+from lqrsim.errors import Array, InputError
+from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, terms_of
+from lqrsim.problem.derivative_check import functions_of
+from lqrsim.problem.problem import Problem
+from lqrsim.results.solution import Candidate
+from lqrsim.solvers.attempt import Attempt, Found
+from lqrsim.solvers.common import Callback, SmootherSettings, Stop, clearance_of, workers
+from lqrsim.solvers.constrained import finish, refine
+from lqrsim.solvers.initial_guess import InitialPrior, Start, resolve
+
+# `python experiments/benchmark_quality.py --sections ingredients` shows what each of these choices brings.
+STARTS = 7
+SHARES = (0.0, 0.1, 0.4, 0.7)  # of the obstacle costs, in the first iterations
+PULL = 0.1  # of the path, relative to the curvature of an obstacle's cost where it is touched
+RING, STEP, WIDEST = 0.3, 0.2, 0.6  # how far paths bend, relative to the distance from start to goal
+HALVE, CHOOSE = 3, 4  # the iterations after which half of the starts are left, and one
+# Where what these lead to is poor: how much heavier obstacles and goal are made to find another way.
+BOLD = (10.0, 100.0)
+
+
+def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior | None]]:
+    """What to start from, each with what to call it: paths to the goal, the straight one first.
+
+    Problems without obstacles, or without a position to start from and one to go to, have nothing to go round: there
+    is one start, the nominal control.
+
+    Args:
+      count: how many; by default `STARTS` where there are obstacles.
+    """
+    pull = _pull(problem)
+    if pull == 0 or problem.start is None or problem.goal is None:
+        return [("nominal control", None)]
+    position = list(problem.dynamics.state_coordinates.position)
+    ends = problem.start[position], problem.goal[position]
+    weight = np.zeros(len(problem.start))
+    weight[position] = pull
+    found = []
+    for name, bend in bends(ends[1] - ends[0], STARTS if count is None else count):
+        about = np.zeros((problem.steps + 1, len(weight)))
+        about[:, position] = path(*ends, bend, problem.steps)
+        found.append((name, InitialPrior(weight, about=about, obstacles=SHARES)))
+    return found
+
+
+def bold(problem: Problem, times: float) -> Problem:
+    """The same with obstacles and goal that weigh more: it goes round and gets there, whatever the controls cost.
+
+    Only numbers change, so nothing is compiled; the constraints are there, and are not made to act.
+    """
+
+    def heavier(cost: Cost) -> Cost:
+        if isinstance(cost, ObstacleCost):
+            return ObstacleCost(cost.world, radius=cost.radius, sharpness=cost.sharpness, weight=times * cost.weight)
+        return QuadraticCost(times * cost.weight, about=cost.about) if isinstance(cost, QuadraticCost) else cost
+
+    stage = [heavier(cost) if isinstance(cost, ObstacleCost) else cost for cost in terms_of(problem.stage_cost)]
+    final = [heavier(cost) for cost in terms_of(problem.final_cost)]
+    return dataclasses.replace(problem, stage_cost=CostSum(tuple(stage)), final_cost=CostSum(tuple(final)))
+
+
+def check_starts(problem: Problem, count: int | None) -> None:
+    """Raises InputError if more than one start is asked for where there is nothing to go round."""
+    if count is not None and count > 1 and _pull(problem) == 0:
+        raise InputError(
+            f"starts: got {count}, want 1 without an ObstacleCost, a start and a goal some way apart: there is nothing"
+            " to go round; or give a start"
+        )
+
+
+def _pull(problem: Problem) -> float:
+    """The weight of the paths; 0 where there is nothing to go round."""
+    position = list(problem.dynamics.state_coordinates.position)
+    if not position or problem.start is None or problem.goal is None:
+        return 0.0
+    if np.array_equal(problem.start[position], problem.goal[position]):
+        return 0.0
+    costs = [cost for cost in problem.obstacle_costs if len(cost.world)]
+    return max((PULL * cost.weight * cost.sharpness**2 for cost in costs), default=0.0)
+
+
+def bends(way: Array, count: int) -> list[tuple[str, Array]]:
+    """How far the middle of each path is from that of the straight one, and a name: none, then to the sides.
+
+    In space the others are a ring about the straight one, in the plane pairs to the left and the right.
+    """
+    distance = float(np.linalg.norm(way))
+    straight: list[tuple[str, Array]] = [("straight", np.zeros(len(way)))]
+    if count == 1:
+        return straight
+    ahead, others = way / distance, count - 1
+    if len(way) == 2:
+        left, step = np.array([-ahead[1], ahead[0]]), min(STEP, WIDEST / ((others + 1) // 2))
+        sides = [((i // 2 + 1) * step, i % 2) for i in range(others)]
+        return straight + [
+            (f"{far * distance:.3g} m to the {('left', 'right')[side]}", far * distance * (1 - 2 * side) * left)
+            for far, side in sides
+        ]
+    across = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
+    across /= np.linalg.norm(across)
+    upright = np.cross(ahead, across)
+    angles = 2 * np.pi * np.arange(others) / others
+    return straight + [
+        (
+            f"{RING * distance:.3g} m aside at {np.degrees(angle):.0f} degrees",
+            RING * distance * (np.cos(angle) * across + np.sin(angle) * upright),
+        )
+        for angle in angles
+    ]
+
+
+def path(start: Array, goal: Array, bend: Array, steps: int) -> Array:
+    """Positions (T+1, 2 or 3): from rest to rest with the least jerk, and aside by a sine."""
+    time = np.linspace(0, 1, steps + 1)[:, None]
+    way = time**3 * (10 - 15 * time + 6 * time**2)
+    return start + way * (goal - start) + np.sin(np.pi * way) * bend
+
+
+class Search:
+    """Several attempts, run a few iterations each, and the most promising to their end.
+
+    Attributes:
+      best: the attempt that found the best so far, and what it found.
+    """
+
+    def __init__(self, names: Sequence[str], attempts: Sequence[Attempt], *, each: bool, callback: Callback | None):
+        self._named = list(zip(names, attempts, strict=True))
+        self._each, self._callback = each, callback
+        self._finished: list[tuple[Attempt, Found]] = []
+
+    @property
+    def best(self) -> tuple[Attempt, Found]:
+        return self._finished[0]
+
+    def run(self, threads: int) -> None:
+        """Choose one and finish it; with constraints, others too, as long as they could do better."""
+        chosen, *others = choose([attempt for _, attempt in self._named], self._advance, threads)
+        self._finish(chosen)
+        if chosen.problem.constraints:
+            # Constraints can make the best way round the worst, or close it. What the others cost without them is about
+            # the least that they can cost with them.
+            for attempt in sorted(others, key=lambda attempt: attempt.cost):
+                best = self.best[1]
+                if attempt.stop.due or best.final or (best.success and not attempt.cost < best.cost):
+                    break
+                self._finish(attempt)
+
+    def poor(self, problem: Problem) -> bool:
+        """Whether the best plan so far is one that nobody would want: far from the goal, or through an obstacle.
+
+        Far is further than the robot's radius, through is deeper than half of it.
+        """
+        position = list(problem.dynamics.state_coordinates.position)
+        if _pull(problem) == 0 or problem.goal is None:
+            return False
+        (attempt, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
+        if not found.success:
+            return attempt.left(found.iterations) > 0
+        places = found.states[:, position]
+        if not np.linalg.norm(places[-1] - problem.goal[position]) <= max(radius, 1e-3):
+            return True
+        clearance = clearance_of(problem, found.states)
+        return clearance is not None and not clearance.min() >= -0.5 * radius
+
+    def widen(self, problem: Problem, settings: SmootherSettings, start: Array, stop: Stop, threads: int) -> None:
+        """Look for another way round: of bold plans, go on from the best by steps that lower the true cost alone."""
+        for times in BOLD:
+            harder = bold(problem, times)
+            attempts = [
+                Attempt(harder, settings, resolve(guide, harder), start, stop) for _, guide in guides(harder, None)
+            ]
+            boldest = choose(attempts, self._advance, threads)[0].finish(each=False)
+            if stop.due:
+                break
+            begin = Start(boldest.law[0].copy(), boldest.law[1].copy(), None, None, f"a plan {times:g} times as bold")
+            attempt = Attempt(problem, settings, begin, start, stop)
+            self._named.append((f"a plan for {times:g} times the weight of obstacles and goal", attempt))
+            found, best = refine(attempt, each=self._each, callback=self._callback), self.best[1]
+            # The same optimum once more, a little different within the tolerances, is no other way.
+            other = found.rank < best.rank and (not best.success or found.cost < best.cost - 1e-3 * abs(best.cost))
+            self._finished.insert(0 if other else len(self._finished), (attempt, found))
+
+    def candidates(self) -> tuple[Candidate, ...]:
+        """What was tried, where it was more than one."""
+        results = {id(attempt): found for attempt, found in self._finished}
+        found = [attempt.candidate(name, results.get(id(attempt))) for name, attempt in self._named]
+        return tuple(found) if len(found) > 1 else ()
+
+    def _advance(self, attempt: Attempt, *, last: int) -> None:
+        attempt.run(last, each=self._each)
+
+    def _finish(self, attempt: Attempt) -> None:
+        if self._callback is not None:
+            for iteration in attempt.ending.iterations:
+                try:
+                    self._callback(iteration)
+                except BaseException as error:
+                    attempt.stop.error = error
+                    break
+        self._finished.append((attempt, finish(attempt, each=self._each, callback=self._callback)))
+        self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equals, the first
+
+
+def choose(attempts: Sequence[Attempt], advance: Callable[..., None], threads: int) -> list[Attempt]:
+    """Run the attempts a few iterations, the worse ones fewer, and return them with the most promising first.
+
+    What they are judged by is the true cost of the plan that each has so far.
+
+    Args:
+      advance: `advance(attempt, last=...)` runs one up to so many iterations. threads: how many at once.
+    """
+    left, dropped = list(attempts), []
+    for last, keep in ((HALVE, max(len(left) // 2, 1)), (CHOOSE, 1)):
+        if len(left) > 1:
+            if threads > 1:
+                with workers(threads, functions_of(left[0].problem)) as pool:
+                    list(pool.map(partial(advance, last=last), left))
+            else:
+                for attempt in left:
+                    advance(attempt, last=last)
+            left.sort(key=lambda attempt: attempt.cost)  # a stable sort: of equals, the first
+            left, dropped = left[:keep], left[keep:] + dropped
+    return left + dropped

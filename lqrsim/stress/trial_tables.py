@@ -1,0 +1,93 @@
+"""Tables of trials as parquet: written whole or not at all, and checked when they are read.
+
+A file holds the columns of `Outcomes`, and `reason`, which says why a trial is an "error". Its metadata names the
+campaign, the cell and the trials, and has a hash of all that, and of the columns.
+"""
+
+import hashlib
+import io
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from lqrsim.results.files import replacing
+from lqrsim.stress.specification import Shard
+
+Table = dict[str, npt.NDArray[np.generic]]
+_KEY = b"lqrsim shard"
+
+
+class Damaged(Exception):
+    """A file that is not what was written."""
+
+
+def pack(table: Table, shard: Shard, campaign: str) -> bytes:
+    """A table as the bytes of a file; `campaign` is the digest of the one that it belongs to."""
+    about = _about(shard, campaign)
+    meta = json.dumps(about | {"sha256": _digest(table, about)}).encode()
+    arrow = pa.table({name: pa.array(column) for name, column in table.items()}).replace_schema_metadata({_KEY: meta})
+    file = io.BytesIO()
+    pq.write_table(arrow, file, write_page_checksum=True)
+    return file.getvalue()
+
+
+def unpack(contents: bytes, shard: Shard, campaign: str) -> Table:
+    """The table again. Raises Damaged unless it is, to the bit, what `pack` was given for this shard."""
+    about = _about(shard, campaign)
+    try:
+        file = pq.ParquetFile(io.BytesIO(contents), page_checksum_verification=True)
+        if file.metadata.num_rows != shard.count:  # before room for them is taken
+            raise ValueError(f"{file.metadata.num_rows} rows")
+        arrow = file.read(use_threads=False)
+        meta = json.loads((arrow.schema.metadata or {})[_KEY])
+        table = {name: _column(arrow[name]) for name in arrow.column_names}
+        good = meta == about | {"sha256": _digest(table, about)}
+    except Exception as error:  # whatever a parser says of bytes that something else wrote
+        raise Damaged(" ".join(f"{type(error).__name__}: {error}".split())[:200]) from None
+    if not good or any(len(column) != shard.count for column in table.values()):
+        raise Damaged("its contents are not those that were written")
+    return table
+
+
+def write(contents: bytes, path: Path) -> None:
+    """Have the file on the disk, whole or not at all. Raises InputError where it can not be, as on a full disk."""
+    with replacing(path) as unfinished, unfinished.open("wb") as file:
+        file.write(contents)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read(path: Path, shard: Shard, campaign: str) -> Table:
+    """The table of a file. Raises Damaged for what is not to be trusted, or can not be read."""
+    try:
+        contents = path.read_bytes()
+    except OSError as error:
+        raise Damaged(f"it can not be read ({error.strerror or error})") from None
+    return unpack(contents, shard, campaign)
+
+
+def _about(shard: Shard, campaign: str) -> dict[str, Any]:
+    return {"campaign": campaign, "cell": shard.cell, "first": shard.first, "count": shard.count}
+
+
+def _column(column: pa.ChunkedArray) -> npt.NDArray[np.generic]:
+    if pa.types.is_string(column.type):
+        return np.array(column.to_pylist(), dtype=np.str_)
+    return column.to_numpy()
+
+
+def _digest(table: Table, about: Mapping[str, Any]) -> str:
+    hasher = hashlib.sha256(json.dumps(about).encode())
+    for name, column in table.items():
+        text = column.dtype.kind == "U"
+        kind = "text" if text else column.dtype.str
+        data = json.dumps(column.tolist()).encode() if text else np.ascontiguousarray(column).tobytes()
+        hasher.update(f"{name} {kind} {len(data)}:".encode() + data)
+    return hasher.hexdigest()

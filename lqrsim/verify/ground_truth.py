@@ -1,0 +1,95 @@
+"""What the record of a run says: where the robot was and should have been, and whether its parts belong together."""
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.control.controllers import Feedback
+from lqrsim.errors import Array, InputError, check_function, check_kind
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
+from lqrsim.verify.verdict import Test
+from lqrsim.view.recorded import model_of
+
+Progress = Callable[[int, int], object]
+
+
+def check_asked(solution: Solution | None, progress: Progress | None) -> None:
+    """Raises InputError for what is no solution, or can not be called."""
+    check_kind("solution", solution, (Solution, type(None)), "the Solution of the run, or None")
+    check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)
+
+
+def model(rollout: Rollout, trial: int) -> mujoco.MjModel:
+    """The model that was run. Raises InputError unless there is such a trial of it, recorded for drawing."""
+    found = model_of(rollout, trial)
+    if len(rollout.frame_times) < 2:
+        raise InputError(f"rollout.frames: got shape {rollout.frames.shape}, want what simulate(frames=True) records")
+    return found
+
+
+def subject(rollout: Rollout, trial: int) -> str:
+    """What was run, for a reader."""
+    return f"{rollout.robot} in {rollout.scene}, seed {rollout.seed}, trial {rollout.first_trial + trial}"
+
+
+def drawn(rollout: Rollout, trial: int) -> tuple[Array, npt.NDArray[np.intp]]:
+    """The times of states that were recorded for drawing too, and the rows of those in `frames`."""
+    rows = np.abs(rollout.frame_times - rollout.times[:, None]).argmin(axis=1)
+    good = np.abs(rollout.frame_times[rows] - rollout.times) < 1e-6 * rollout.plan.dt
+    good &= np.isfinite(rollout.frames[trial, rows]).all(axis=1) & np.isfinite(rollout.states[trial]).all(axis=1)
+    if good.sum() < 3:
+        raise InputError(f"rollout: got trial {trial} with {good.sum()} frames to draw, want 3 or more")
+    return rollout.times[good], rows[good]
+
+
+def states(rollout: Rollout, trial: int, times: Array) -> Array:
+    """Positions (N, d) of the states at times that are theirs."""
+    rows = np.abs(rollout.times - times[:, None]).argmin(axis=1)
+    return rollout.states[trial, rows][:, list(rollout.state_coordinates.position)]
+
+
+def planned(rollout: Rollout, times: Array) -> Array:
+    """Positions (N, d) of the plan."""
+    columns = [rollout.plan.states[:, column] for column in rollout.state_coordinates.position]
+    return np.stack([np.interp(times, rollout.times, column) for column in columns], axis=1)
+
+
+def between(rollout: Rollout, trial: int, model: mujoco.MjModel, times: Array) -> Array:
+    """Positions (N, d) of the robot's body, as recorded for drawing: closer in time than the states are."""
+    good = np.isfinite(rollout.frames[trial]).all(axis=1)
+    data, body, places = mujoco.MjData(model), int(model.body(rollout.body).id), []
+    for frame in rollout.frames[trial, good]:
+        data.qpos = frame
+        mujoco.mj_kinematics(model, data)
+        places.append(data.xpos[body].copy())
+    columns = rollout.state_coordinates.of_world(places).T
+    return np.stack([np.interp(times, rollout.frame_times[good], column) for column in columns], axis=1)
+
+
+def consistent(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: float) -> Test:
+    """Whether states and what was recorded for drawing are one motion."""
+    times, _ = drawn(rollout, trial)
+    apart = np.linalg.norm(between(rollout, trial, model, times) - states(rollout, trial, times), axis=1).max()
+    said = f"frames and states at most {1e3 * apart:.2f} mm apart, want {1e3 * bound:.2f} at most"
+    return Test("record", bool(apart <= bound), said)
+
+
+def plan(rollout: Rollout, solution: Solution | None) -> Test:
+    """Whether the plan is the solution's, and it was the solution's policy that was run."""
+    if solution is None:
+        return Test("plan", None, "whether it is the one that was followed takes the solution")
+    same = np.array_equal(rollout.plan.states, solution.trajectory.states)
+    same = same and np.array_equal(rollout.plan.controls, solution.trajectory.controls)
+    followed = follows(rollout, solution)
+    said = (
+        f"{'as' if same else 'not as'} the solution has it, {'whose' if followed else 'but not whose'} policy was run"
+    )
+    return Test("plan", same and followed, said)
+
+
+def follows(rollout: Rollout, solution: Solution) -> bool:
+    """Whether the solution's policy was run, with its gains or without."""
+    return rollout.policy_digest in [Feedback(one.policy).digest for one in (solution, solution.open_loop())]

@@ -1,0 +1,107 @@
+"""Verifying a run by drawing it."""
+
+from collections.abc import Iterator, Sequence
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from mujoco import mjtGeom as Geom
+
+from lqrsim.errors import Array, InputError
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
+from lqrsim.verify import ground_truth, pixels
+from lqrsim.verify.ground_truth import Progress
+from lqrsim.verify.verdict import Verification, judge
+from lqrsim.view import cameras, gl
+from lqrsim.view.cameras import Camera
+
+SIZE = (640, 480)
+BOUND = 1 / 60  # the worst error that is allowed, in radii of the robot: 5 and 2.8 mm for the packaged ones
+# Their silhouettes, seen orthographically, are symmetric about their centre, however they are turned.
+SYMMETRIC = (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE, Geom.mjGEOM_ELLIPSOID, Geom.mjGEOM_CYLINDER, Geom.mjGEOM_BOX)
+
+
+def verify_run(
+    rollout: Rollout, trial: int = 0, *, solution: Solution | None = None, progress: Progress | None = None
+) -> Verification:
+    """Draws what a rollout recorded for drawing, reads positions from the pixels, and compares them with its states.
+
+    Each control period is drawn from above if the robot moves on a floor, from the side if it moves in a vertical
+    plane, and from both if it moves in space. The pictures are
+    segmentations that show nothing but a part of the robot that can collide: X-rays, in which obstacles hide nothing.
+
+    Args:
+      trial: row of the rollout.
+      solution: of which the run is, to tell whether the plan in the rollout is the one that was followed.
+      progress: called after each frame with the number of frames done and of all frames.
+
+    Raises:
+      InputError: there is no such trial, nothing to draw, or no OpenGL.
+    """
+    ground_truth.check_asked(solution, progress)
+    model, space = ground_truth.model(rollout, trial), rollout.state_coordinates
+    body = int(model.body(rollout.body).id)
+    geom = _part(model, body)
+    views = [{"top": cameras.top, "side": cameras.side}[name](rollout) for name in cameras.measuring(rollout)]
+    times, rows = ground_truth.drawn(rollout, trial)
+    seen: list[Array] = []
+    offsets: list[Array] = []
+    for masks, offset in _silhouettes(model, geom, body, rollout.frames[trial, rows], views):
+        seen.append(
+            np.array([view.measure(pixels.middle(mask), SIZE) for view, mask in zip(views, masks, strict=True)])
+        )
+        offsets.append(offset)
+        if progress:
+            progress(len(seen), len(rows))
+    places, apart = pixels.place(views, seen, space.plane)
+    name = model.geom(geom).name or model.geom(geom).id
+    return judge(
+        ground_truth.subject(rollout, trial),
+        f"the silhouette of {name} in {SIZE[0]} x {SIZE[1]} pixels from {' and '.join(view.name for view in views)},"
+        " all else left out (X-ray)",
+        times,
+        places - space.of_world(offsets),
+        ground_truth.states(rollout, trial, times),
+        ground_truth.planned(rollout, times),
+        apart,
+        bound=BOUND * rollout.radius,
+        interval=float(rollout.frame_times[1] - rollout.frame_times[0]),
+        others=(ground_truth.plan(rollout, solution),),
+    )
+
+
+def _part(model: mujoco.MjModel, body: int) -> int:
+    """The largest geom of the robot's body that can collide and whose silhouette's middle is its centre."""
+    kinds = [kind.value for kind in SYMMETRIC]
+    fits = (model.geom_bodyid == body) & np.isin(model.geom_type, kinds)
+    fits &= (model.geom_contype | model.geom_conaffinity) != 0
+    if not fits.any():
+        raise InputError("rollout.model: got no sphere, capsule, ellipsoid, cylinder or box that is the robot's")
+    return int(np.argmax(np.where(fits, model.geom_rbound, -1)))
+
+
+def _silhouettes(
+    model: mujoco.MjModel, geom: int, body: int, frames: Array, views: Sequence[Camera]
+) -> Iterator[tuple[list[npt.NDArray[np.bool_]], Array]]:
+    """For each frame (nq,): a mask (height, width) of the geom in each view, and where it is in the robot's body."""
+    gl.bind()
+    model.geom_group[:], model.geom_group[geom] = 1, 0
+    model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0
+    model.vis.global_.offwidth, model.vis.global_.offheight = SIZE
+    data, options = mujoco.MjData(model), mujoco.MjvOption()
+    options.geomgroup[:], options.sitegroup[:] = [1, 0, 0, 0, 0, 0], 0
+    with mujoco.Renderer(model, SIZE[1], SIZE[0]) as renderer:
+        for frame in frames:
+            data.qpos = frame
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_camlight(model, data)
+            masks = []
+            for view in views:
+                renderer.update_scene(data, scene_option=options)
+                view.place(renderer.scene, SIZE[0] / SIZE[1])
+                # Numbers for colours, the renderer's own segmentation, without looking up what the one geom is.
+                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT.value] = 1
+                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR.value] = 1
+                masks.append(renderer.render()[..., 0] > 0)
+            yield masks, data.geom_xpos[geom] - data.xpos[body]

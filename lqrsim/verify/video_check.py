@@ -1,0 +1,127 @@
+"""Verifying the video of a run, from its file."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+import numpy.typing as npt
+from av.error import FFmpegError
+
+from lqrsim.errors import Array, InputError, check_count
+from lqrsim.results import files
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
+from lqrsim.verify import ground_truth, pixels
+from lqrsim.verify.ground_truth import Progress
+from lqrsim.verify.verdict import Test, Verification, judge
+from lqrsim.view import video_metadata
+from lqrsim.view.cameras import Camera
+from lqrsim.view.video_metadata import Pane
+
+BOUND = 1 / 35  # the worst error that is allowed, in radii of the robot: 8.6 and 4.9 mm for the packaged ones
+SAME = 1 / 350  # between what was recorded for drawing and the states
+
+
+def run_beside(path: str | os.PathLike[str]) -> Path:
+    """The rollout's file in the video's folder that the video says it shows. Raises InputError if there is none."""
+    told, folder = video_metadata.read(path), Path(path).parent
+    for found in sorted(folder.glob("*.npz")):
+        with contextlib.suppress(InputError):  # a solution, or what is damaged
+            if video_metadata.digest(files.load_rollout(found)) in told.runs:
+                return found
+    raise InputError(f"run: got none, and none in {folder} is what the video says it shows, want the run's file")
+
+
+def verify_video(
+    path: str | os.PathLike[str],
+    rollout: Rollout,
+    *,
+    trial: int | None = None,
+    solution: Solution | None = None,
+    progress: Progress | None = None,
+) -> Verification:
+    """Reads positions from a video's pixels, by the mark in its calibrated panes, and compares them with a rollout.
+
+    Args:
+      path: what `lqrsim render` wrote with the camera `top`, for robots in a vertical plane `side`, and for those that
+        move in space both, whatever else is in the picture.
+      trial: row of the rollout; by default the first that the video shows.
+      solution, progress: as for `verify_run`.
+
+    Raises:
+      InputError: the file is not lqrsim's, or has not the panes that it takes.
+    """
+    ground_truth.check_asked(solution, progress)
+    trial = None if trial is None else check_count("trial", trial, at_least=0)
+    told = video_metadata.read(path)
+    digest, plane = video_metadata.digest(rollout), rollout.state_coordinates.plane
+    run = told.runs.index(digest) if digest in told.runs else 0
+    panes = [pane for pane in told.panes if pane.run == run and pane.camera is not None]
+    trial = (panes[0].trial if panes and panes[0].trial < rollout.trials else 0) if trial is None else trial
+    panes = [pane for pane in panes if pane.trial == trial] if digest in told.runs else panes
+    views = [pane.camera for pane in panes if pane.camera is not None]
+    pixels.place(views, np.zeros((0, len(views), 2)), plane)  # says what is missing before it takes any time
+    model = ground_truth.model(rollout, trial)
+    seen: list[list[Array]] = []
+    amiss = 0.0  # seconds between when a frame is shown and when it should be, at most
+    for time, image in _decoded(path):
+        amiss = max(amiss, abs(time - len(seen) / float(told.rate)))
+        seen.append([_mark(image, pane, view, told.markers[run]) for pane, view in zip(panes, views, strict=True)])
+        if progress:
+            progress(len(seen), told.frames)
+    count = min(len(seen), told.frames)
+    times = told.times()[:count]
+    places, apart = pixels.place(views, seen[:count], plane)
+    known, interval = digest in told.runs, 1 / float(told.rate)
+    size_of_mark = min(
+        np.pi * (told.markers[run] * pane.height / view.height) ** 2 for pane, view in zip(panes, views, strict=True)
+    )
+    others = (
+        Test("run", known, f"the video says that it shows {', '.join(told.runs)}, this run is {digest}"),
+        Test(
+            "frames",
+            len(seen) == told.frames and amiss < interval / 4,
+            f"got {len(seen)}, want the {told.frames} that were written; {1e3 * amiss:.1f} ms from their times at most",
+        ),
+        Test(
+            "mark",
+            size_of_mark >= pixels.FEWEST,
+            f"{size_of_mark:.0f} pixels in the pane where it is smallest, want {pixels.FEWEST} or more",
+        ),
+        ground_truth.consistent(rollout, trial, model, SAME * rollout.radius),
+        ground_truth.plan(rollout, solution),
+    )
+    spots = " and ".join(f"{view.name} ({pane.width} x {pane.height})" for pane, view in zip(panes, views, strict=True))
+    return judge(
+        f"{Path(path).name}, {ground_truth.subject(rollout, trial)}",
+        f"the green mark in its panes {spots}",
+        times,
+        places,
+        ground_truth.between(rollout, trial, model, times),
+        ground_truth.planned(rollout, times),
+        apart,
+        bound=BOUND * rollout.radius,
+        interval=told.speed * interval,
+        others=others,
+    )
+
+
+def _decoded(path: str | os.PathLike[str]) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
+    """Each frame (height, width, 3), and when a player shows it, in seconds."""
+    try:
+        with av.open(str(path)) as container:
+            for frame in container.decode(video=0):
+                yield frame.time or 0.0, np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
+    except (FFmpegError, OSError, IndexError) as error:
+        raise InputError(f"video: got {path}, want one that can be read ({error})") from None
+
+
+def _mark(image: npt.NDArray[np.uint8], pane: Pane, view: Camera, radius: float) -> Array:
+    """What the view measures (2,) of the mark of that radius in metres."""
+    part = image[pane.top : pane.top + pane.height, pane.left : pane.left + pane.width]
+    if part.shape[:2] != (pane.height, pane.width):
+        raise InputError(f"video: got frames of {image.shape[1]} x {image.shape[0]}, want them as lqrsim wrote them")
+    return view.measure(pixels.mark(part, radius * pane.height / view.height), (pane.width, pane.height))

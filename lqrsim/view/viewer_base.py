@@ -1,0 +1,184 @@
+"""What a viewer shows while time goes by: a moving model with its plan and trace, and a person who interferes."""
+
+import abc
+import copy
+import itertools
+import time as clock
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from mujoco import mjtGeom as Geom
+
+from lqrsim.errors import Array, InputError
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.solution import Trajectory
+from lqrsim.view.decor import PLAN, decorate
+from lqrsim.view.recorded import floor_below
+
+WANTED = (*PLAN, 0.25)
+TRACE = (0.05, 0.35, 0.62, 1.0)
+SEGMENTS = 60  # of the plan; the trace has twice as many
+LIFT = 0.008  # metres between the floor and the lines on it
+HAND = 2.0  # times the robot's weight that someone drags it with at most
+TOO_LATE = 0.2  # s; what a slow machine is behind by more than that is not made up for
+# What a key adds to the velocity of the robot, seen from the camera: right, away, up.
+PUSHES = {
+    "LeftArrow": (-1.0, 0.0, 0.0),
+    "RightArrow": (1.0, 0.0, 0.0),
+    "UpArrow": (0.0, 1.0, 0.0),
+    "DownArrow": (0.0, -1.0, 0.0),
+    "PageUp": (0.0, 0.0, 1.0),
+    "PageDown": (0.0, 0.0, -1.0),
+}
+
+
+class Closed(Exception):
+    """The viewer was closed, or has been open for as long as it should."""
+
+
+class Again(Exception):
+    """Someone wants to see it from the start."""
+
+
+class Screen(abc.ABC):
+    """A viewer. Subclasses say how it draws, and call `push`, `pull` and so on when someone interferes.
+
+    Args:
+      model: what moves. plan: what it should do. space: of the plan's states. body: the robot's in the model.
+      radius: of the robot, in metres. push: what a key adds to its velocity, in m/s.
+      speed: of the time shown, 1 is real. seconds: after which the viewer closes; never by default.
+
+    Attributes:
+      data: what is shown now. caption: says in words what is going on. wrench: force and torque (6,) of a hand.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        plan: Trajectory,
+        space: Coordinates,
+        body: str,
+        *,
+        radius: float,
+        push: float = 0.3,
+        speed: float = 1.0,
+        seconds: float | None = None,
+    ) -> None:
+        if not space.position:
+            raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
+        # A copy: a viewer has sliders for gravity and the like.
+        self.model = copy.copy(model)
+        self.data = mujoco.MjData(self.model)
+        self.space, self.robot = space, int(model.body(body).id)
+        self.radius, self.speed, self.paused, self.caption = radius, speed, False, ""
+        self.wrench = np.zeros(6)
+        self._mass = float(model.body_subtreemass[self.robot])
+        self._push, self._impulse = push * self._mass, np.zeros(3)
+        self._times, self._places = plan.times, plan.states[:, list(space.position)]
+        self._time, self._ahead, self._restart = 0.0, 0.0, False
+        self._until = np.inf if seconds is None else clock.monotonic() + seconds
+        self._trace: list[Array] = []
+        self._floor = 0.0
+
+    @abc.abstractmethod
+    def refresh(self) -> bool:
+        """Draw what there is now and look what the person does; whether the viewer is still open."""
+
+    def show(self, time: float, qpos: Array) -> Array:
+        """Wait until it is `time` and show the model at `qpos`; where it is then, (3,).
+
+        Raises:
+          Closed, Again: the person wants that.
+        """
+        begins = time <= self._time or not self._trace
+        self._wait(max(time - self._time, 0.0))
+        self._time, self.data.time, self.data.qpos[:] = time, time, qpos
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        place = self.data.xpos[self.robot].copy()
+        if begins:
+            self._trace.clear()
+            self._floor = floor_below(self.model, self.data, self.robot)
+        apart = float(np.linalg.norm(np.ptp(self._places, axis=0))) / SEGMENTS
+        on_floor = self._on_floor(self.space.of_world(place))
+        if not self._trace or np.linalg.norm(on_floor - self._trace[-1]) > apart:
+            self._trace = [*self._trace, on_floor][-2 * SEGMENTS :]
+        self.caption = f"{time:.1f} s, {1e3 * np.linalg.norm(on_floor - self.wanted()):.0f} mm from the plan"
+        return place
+
+    def hold(self, seconds: float) -> None:
+        """Stand still for a while. Raises what `show` does."""
+        self._wait(seconds * self.speed)
+
+    def push(self, right_away_up: tuple[float, float, float], azimuth: float) -> None:
+        """Someone has pressed a key while the camera looked along `azimuth`, in degrees."""
+        along, (right, away, up) = np.radians(azimuth), right_away_up
+        x = right * np.sin(along) + away * np.cos(along)
+        y = away * np.sin(along) - right * np.cos(along)
+        self._impulse += self._push * np.array([x, y, up])
+
+    def pull(self, wrenches: Array) -> None:
+        """Someone drags bodies with forces and torques (nbody, 6); a hand is only so strong."""
+        wrench, strength = np.asarray(wrenches).reshape(-1, 6).sum(axis=0), HAND * 9.81 * self._mass
+        for part, most in ((slice(0, 3), strength), (slice(3, 6), strength * self.radius)):
+            wrench[part] *= most / max(float(np.linalg.norm(wrench[part])), most)
+        self.wrench = wrench
+
+    def restart(self) -> None:
+        """Someone wants to see it from the start."""
+        self._restart = True
+
+    def take(self, dt: float) -> Array:
+        """Force and torque (6,) of the person over the next `dt` seconds."""
+        push, self._impulse = np.append(self._impulse / dt, np.zeros(3)), np.zeros(3)
+        return self.wrench + push
+
+    def wanted(self) -> Array:
+        """Where the plan is now, (3,)."""
+        return self._on_floor([np.interp(self._time, self._times, column) for column in self._places.T])
+
+    def draw(self, new: Callable[[], mujoco.MjvGeom]) -> None:
+        """Draw the plan, the trace and where the robot should be; `new` gives what to draw each part with."""
+        knots = np.unique(np.linspace(0, len(self._times) - 1, SEGMENTS + 1).astype(int))
+        plan = [self._on_floor(self._places[knot]) for knot in knots]
+        width = 0.002 * float(self.model.stat.extent)
+        for points, thick, colour in ((plan, 0.6 * width, (*PLAN, 1.0)), (self._trace, width, TRACE)):
+            for ends in itertools.pairwise(points):
+                geom = decorate(new(), Geom.mjGEOM_CAPSULE, [thick] * 3, ends[0], colour)
+                mujoco.mjv_connector(geom, Geom.mjGEOM_CAPSULE, thick, *ends)
+        flat = self.space.from_above
+        shape = (Geom.mjGEOM_CYLINDER, [self.radius, LIFT, 0.0]) if flat else (Geom.mjGEOM_SPHERE, [self.radius] * 3)
+        decorate(new(), *shape, self.wanted(), WANTED)
+
+    def aim(self, camera: mujoco.MjvCamera) -> None:
+        """Let a camera that a person can turn see what the scene's own `overview` sees, if it has one."""
+        mujoco.mjv_defaultFreeCamera(self.model, camera)
+        number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, "overview")
+        if number >= 0:
+            away = np.array(self.model.stat.center) - self.model.cam_pos[number]
+            lenses = np.radians([self.model.cam_fovy[number], self.model.vis.global_.fovy])
+            camera.distance = np.linalg.norm(away) * np.divide(*np.tan(lenses / 2))
+            camera.azimuth = np.degrees(np.arctan2(away[1], away[0]))
+            camera.elevation = np.degrees(np.arctan2(away[2], np.hypot(away[0], away[1])))
+
+    def _on_floor(self, place: Array | list[float]) -> Array:
+        return self.space.in_world(place, height=self._floor + LIFT)
+
+    def _wait(self, left: float) -> None:
+        """Until `left` seconds of the time shown have gone by."""
+        left = max(left - self._ahead, -TOO_LATE)
+        before = clock.perf_counter()
+        while True:
+            if clock.monotonic() > self._until or not self.refresh():
+                raise Closed
+            if self._restart:
+                self._restart = False
+                raise Again
+            now = clock.perf_counter()
+            left -= 0.0 if self.paused else (now - before) * self.speed
+            before = now
+            if left <= 0 and not self.paused:
+                break
+            clock.sleep(float(np.clip(left / self.speed, 0.001, 0.01)))
+        self._ahead = -left
