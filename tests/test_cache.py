@@ -19,7 +19,7 @@ from lqrsim.codegen.fingerprint import fingerprint
 SYSTEM = """
 import sys
 import lqrsim as ls
-from lqrsim import core
+from lqrsim.codegen import jit
 
 def decay(x, u, p):
     from sympy import exp
@@ -31,7 +31,7 @@ problem = ls.Problem(
     final_cost=ls.QuadraticCost([5.0], about=[0.0]),
 )
 solution = ls.smooth(problem)
-print(repr(solution.cost), len(core.compilations), "sympy" in sys.modules, solution.status.name)
+print(repr(solution.cost), len(jit.compilations), "sympy" in sys.modules, solution.status.name)
 """
 
 

@@ -13,6 +13,7 @@ import lqrsim as ls
 from lqrsim import rotations
 from lqrsim.codegen import jit
 from lqrsim.errors import Array
+from lqrsim.kernels import rotation_ratios
 from lqrsim.solvers import compiled
 
 ROBOTS = [ls.DifferentialDrive(), ls.Quadrotor()]
@@ -184,7 +185,7 @@ def test_ratios_are_smooth_at_zero(name: str, order: int) -> None:
         "cosine_ratio": lambda s: (1 - mpmath.cos(mpmath.sqrt(s))) / s,
         "cotangent_ratio": lambda s: (1 - mpmath.sqrt(s) / 2 * mpmath.cot(mpmath.sqrt(s) / 2)) / s,
     }[name]
-    function = getattr(rotations, name + ("" if order == 0 else f"_d{order}"))
+    function = getattr(rotation_ratios, name + ("" if order == 0 else f"_d{order}"))
     tolerance = [1e-13, 1e-11, 1e-8][order]
     with mpmath.workdps(40):
         for s in [*np.logspace(-8, 1.4, 60), 0.2499999, 0.2500001]:

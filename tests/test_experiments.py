@@ -143,7 +143,7 @@ def test_benchmark_of_quality(quality: ModuleType, tmp_path: Path) -> None:
     """On two queries and five worlds, without peers: what solutions claim, recomputed by formulas of nobody's."""
     known = [50.0, 200.0]
     (tmp_path / "best_known.json").write_text(json.dumps({"0": known}), encoding="utf-8")
-    search = quality.ingredients.search
+    search = quality.ingredients.multistart
     before = dict(vars(search))
     result = quality.main(quality.Config(quick=True, queries=2, peers=False, reference=tmp_path))
     assert {name: value for name, value in vars(search).items() if value is not before[name]} == {}

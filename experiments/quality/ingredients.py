@@ -26,13 +26,13 @@ from quality.starts import nearest
 
 
 def linear(start: Array, goal: Array, bend: Array, steps: int) -> Array:
-    """As `search.path`, but at even speed."""
+    """As `multistart.path`, but at even speed."""
     way = np.linspace(0, 1, steps + 1)[:, None]
     return start + way * (goal - start) + np.sin(np.pi * way) * bend
 
 
 LATE = {"HALVE": 1000, "CHOOSE": 1000}  # all run to their end
-# Options of `smooth`, and what `search` has instead of its own.
+# Options of `smooth`, and what `multistart` has instead of its own.
 ROWS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "hover": ({"start": paper_start()}, {}),
     "+ line": ({"starts": 1}, {"SHARES": ()}),
@@ -54,7 +54,7 @@ ROWS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 
 @contextmanager
 def instead(values: dict[str, Any]) -> Iterator[None]:
-    """`search` with other values of its names, within the block only."""
+    """`multistart` with other values of its names, within the block only."""
     before = {name: getattr(multistart, name) for name in values}
     try:
         for name, value in values.items():

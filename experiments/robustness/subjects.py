@@ -22,8 +22,6 @@ from robustness.place import Place
 # Called by lqrsim itself, with what it has checked: what one overrides to add a cost, a disturbance or a controller.
 HOOKS = {"bind", "start", "check", "describe", "blow", "fitting", "actuation", "multiply", "parts", "draw", "limits"}
 HOOKS |= {"displace", "across", "clearance_at"}
-# Text that compiled cores contain: numbers in, numbers out.
-KERNELS = {f"{ratio}{order}" for ratio in ls.rotations.RATIOS for order in ("", "_d1", "_d2")}
 
 RAISES = {"Results.read": (Damaged,)}
 
@@ -48,8 +46,9 @@ def public() -> Iterator[tuple[str, Any]]:
     for name in ls.__all__:
         item = getattr(ls, name)
         if isinstance(item, ModuleType):
-            for key, one in vars(item).items():
-                if inspect.isfunction(one) and one.__module__ == item.__name__ and key[0] != "_" and key not in KERNELS:
+            for key in getattr(item, "__all__", vars(item)):
+                one = getattr(item, key)
+                if inspect.isfunction(one) and one.__module__.startswith(item.__name__) and key[0] != "_":
                     yield f"{name}.{key}", one
         elif not inspect.isclass(item):
             yield name, item
