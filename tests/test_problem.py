@@ -22,11 +22,11 @@ def test_the_stage_model_is_the_cost_to_second_order(quadrotor: ls.Scenario) -> 
     for _ in range(20):
         z = rng.uniform(-1, 1, size=16)
         hessian, gradient = np.zeros((16, 16)), np.zeros(16)
-        value = core.stage_quadratic(z[:12], z[12:], 1, data["stage"], hessian, gradient)
-        assert value == pytest.approx(core.stage_value(z[:12], z[12:], 1, data["stage"]), rel=1e-12)
+        value = core.stage_quadratic(z[:12], z[12:], 1, data.stage, hessian, gradient)
+        assert value == pytest.approx(core.stage_value(z[:12], z[12:], 1, data.stage), rel=1e-12)
         for i, unit in enumerate(np.eye(16)):
             ahead, behind = (
-                core.stage_value((z + s * h * unit)[:12], (z + s * h * unit)[12:], 1, data["stage"]) for s in (1, -1)
+                core.stage_value((z + s * h * unit)[:12], (z + s * h * unit)[12:], 1, data.stage) for s in (1, -1)
             )
             assert gradient[i] == pytest.approx((ahead - behind) / (2 * h), abs=1e-5 * max(1, value))
         assert np.linalg.eigvalsh(hessian).min() > -1e-9 * np.abs(hessian).max()

@@ -212,5 +212,5 @@ def _project(matrix: Array) -> Array:
     )
     hessian, gradient = np.zeros((4, 4)), np.zeros(4)
     core, data = compiled.core(problem), compiled.arguments(problem)
-    core.stage_quadratic(np.zeros(3), np.zeros(1), 1, data["stage"], hessian, gradient)
+    core.stage_quadratic(np.zeros(3), np.zeros(1), 1, data.stage, hessian, gradient)
     return hessian - np.diag([0.0, 0.0, 0.0, 1.0])  # less the control cost, which is convex and added as it is

@@ -26,6 +26,7 @@ from lqrsim.codegen import disk_cache as disk
 from lqrsim.codegen.fingerprint import fingerprint, note_helpers, stale
 from lqrsim.codegen.user_functions import External
 from lqrsim.errors import Array, InputError
+from lqrsim.kernels import records
 
 logger = logging.getLogger("lqrsim")
 
@@ -44,7 +45,8 @@ class Core:
     """The functions of one text, compiled for what they are called with.
 
     Calling `core.name(...)` calls the function of that name: arrays of float64, C-ordered, go in as pointers to blocks
-    of constant shape; numbers and tuples of vectors as they are. `core.entry(name, ...)` only compiles it.
+    of constant shape, alone, in tuples of vectors or in the named tuples of `kernels/records.py`; numbers and rows with
+    fields as they are. `core.entry(name, ...)` only compiles it.
 
     Args:
       what: what it is for, as the progress message and `lqrsim cache` say it.
@@ -103,12 +105,9 @@ class Core:
         """The function of that name under the name `entry`, which turns arrays into pointers first."""
         functions = {node.name: node for node in ast.parse(self.source).body if isinstance(node, ast.FunctionDef)}
         node = functions[name]
-        lines = []
-        for name, kind in zip((argument.arg for argument in node.args.args), kinds, strict=True):
-            if kind[0] == "array":
-                lines.append(f"{name} = pointer({name}, {kind[1:]})")
-            elif kind[0] == "vectors":
-                lines.append(f"{name} = ({' '.join(f'pointer({name}[{i}], ()),' for i in range(kind[1]))})")
+        names = (argument.arg for argument in node.args.args)
+        pairs = [(name, _converted(name, kind)) for name, kind in zip(names, kinds, strict=True)]
+        lines = [f"{name} = {expression}" for name, expression in pairs if expression != name]
         node.name, node.decorator_list = "entry", []
         node.body = [*ast.parse("\n".join(lines)).body, *node.body]
         return ast.unparse(node)
@@ -154,6 +153,7 @@ def _vocabulary() -> dict[str, Any]:
     inner = jit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
     inlined = jit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
     names = {**vars(math), "__name__": __name__, "inner": inner, "inlined": inlined}
+    names |= {name: record for name, record in vars(records).items() if inspect.isclass(record)}
     return names | {name: getattr(pointers, name) for name in ("stack", "pointer", "invoke", "invoke_writing")}
 
 
@@ -270,7 +270,14 @@ def _options() -> dict[str, Any]:
 
 # LLVM finds most of what is worth inlining, and to force all of it takes longer to compile. These are small, and
 # called at every stage of every step.
-_INLINED = ("rate", "rate_jacobian", "signed_distance", "signed_distance_derivatives")
+_INLINED = (
+    "rate",
+    "rate_jacobian",
+    "signed_distance",
+    "signed_distance_derivatives",
+    "eliminate_control",
+    "control_response",
+)
 
 
 @contextlib.contextmanager
@@ -330,22 +337,47 @@ def _as_one() -> Iterator[None]:
 def _kind(argument: Any) -> tuple[Any, ...]:
     """What the type of an argument is to be: an array's is its block, for the number of blocks is not known."""
     if isinstance(argument, np.ndarray):
+        if argument.dtype.names:
+            return ("rows", *argument.dtype.names)
         return ("array", *argument.shape[1:])
+    if isinstance(argument, tuple) and hasattr(argument, "_fields"):
+        return ("record", type(argument).__name__, *map(_kind, argument))
     if isinstance(argument, tuple):
         return ("vectors", len(argument))
     kinds = ((bool, np.bool_), "bool"), ((int, np.integer), "int"), ((float, np.floating), "float")
     return (next(name for types, name in kinds if isinstance(argument, types)),)
 
 
+def _converted(name: str, kind: tuple[Any, ...]) -> str:
+    """The expression that makes of an argument what kernels take: pointers of arrays."""
+    match kind[0]:
+        case "array":
+            return f"pointer({name}, {kind[1:]})"
+        case "vectors":
+            return f"({' '.join(f'pointer({name}[{i}], ()),' for i in range(kind[1]))})"
+        case "record":
+            fields = getattr(records, kind[1])._fields
+            parts = (_converted(f"{name}.{field}", part) for field, part in zip(fields, kind[2:], strict=True))
+            return f"{kind[1]}({', '.join(parts)})"
+    return name
+
+
 def _signature(kinds: tuple[tuple[Any, ...], ...]) -> Any:
+    import numba
     from numba import types
 
     def one(kind: tuple[Any, ...]) -> Any:
         match kind[0]:
             case "array":
                 return types.Array(types.float64, len(kind), "C")
+            case "rows":
+                row = np.dtype([(name, np.float64) for name in kind[1:]])
+                return types.Array(numba.from_dtype(row), 1, "C")
             case "vectors":
-                return types.UniTuple(types.Array(types.float64, 1, "C"), kind[1])
+                vector = types.Array(types.float64, 1, "C")
+                return types.UniTuple(vector, kind[1]) if kind[1] else types.Tuple(())
+            case "record":
+                return types.BaseTuple.from_types([one(part) for part in kind[2:]], getattr(records, kind[1]))
             case "bool":
                 return types.boolean
             case "int":
@@ -365,7 +397,8 @@ def _machine() -> str:
     target: Any = registry.cpu_target
     parts = [version("numba"), version("llvmlite"), platform.python_version(), *_FAST]
     parts.append(repr(target.target_context.codegen().magic_tuple()))
-    return "\n".join([*parts, Path(pointers.__file__).read_text(encoding="utf-8")])
+    texts = (Path(str(module.__file__)).read_text(encoding="utf-8") for module in (pointers, records))
+    return "\n".join([*parts, *texts])
 
 
 def _lasting(dispatcher: Any) -> bool:

@@ -7,7 +7,6 @@ derivatives, and a Cholesky factor. `certify.py` compares with what a solver cla
 from math import nan
 
 from lqrsim.kernels.interface import (
-    LIMITS,
     M,
     N,
     W,
@@ -20,16 +19,17 @@ from lqrsim.kernels.interface import (
     stage_value,
 )
 from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, clear
+from lqrsim.kernels.records import Limits, Slopes, Stage, Step
 from lqrsim.kernels.runge_kutta import step_jacobian
 
 
-def certify(steps, fixed, own, states, controls, gain, offset, hessians, p, dt, initial, stage, final, found):
-    """Write to `found` (6,): cost, its scale, motion, law, limits, and the decrease of cost that is still promised.
+def certify(settings, own, plan, policy, hessians, model, found):
+    """Write to `found`: cost, its scale, motion, law, limits, and the decrease of cost that is still promised.
 
     The scale is what the curved part of the cost would be if nothing in it cancelled: rounding is a share of it.
     Motion is the largest |x_{t+1} - g(x_t, u_t)|, each state relative to its largest size, or to 1. Law is the largest
-    difference of a control from the policy's, `gain` x + `offset` within the limits, relative to the terms of that sum.
-    Limits is by how much a control is beyond one.
+    difference of a control from the policy's, within the limits, relative to the terms of that sum. Limits is by how
+    much a control is beyond one.
 
     The promised decrease is `1/2 sum e' E^-1 e` with the slopes e of the cost in the offsets of the policy, later
     controls responding with its gains, and E = R + B'SB with the Hessians S (T+1, N, N) of the cost-to-go. It is what
@@ -38,116 +38,146 @@ def certify(steps, fixed, own, states, controls, gain, offset, hessians, p, dt, 
     `hessians`: those of a Riccati pass take controls to respond that cannot. The cost includes no augmented Lagrangian,
     the decrease does.
     """
-    hessian, gradient, jacobian = stack(W, W), stack(W), stack(N, W)
-    fx, fu, arrived, none = stack(N, N), stack(N, M), stack(N), stack(M)
-    ahead, costate, size, beyond = stack(N), stack(N), stack(N), stack(N)
-    slope, curve, factor, moved = stack(M), stack(M, N), stack(M, M), stack(M)
-    lowest, highest, response = stack(M), stack(M), stack(M, N)
-    start_factor = stack(N, N)
-    clear(fx, N, N)
-    clear(fu, N, M)
-    motion, law, limits, decrease, scale = 0.0, 0.0, 0.0, 0.0, 0.0
+    stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
+    slopes, room = Slopes(stack(N, N), stack(N, M), stack(N)), Limits(stack(M), stack(M))
+    none, costate, size, beyond = stack(M), stack(N), stack(N), stack(N)
+    states, steps = plan.states, settings.steps
+    clear(slopes.state, N, N)
+    clear(slopes.control, N, M)
+    law, limits, decrease = 0.0, 0.0, 0.0
     for i in range(M):
         none[i] = 0.0
     for i in range(N):
         size[i], beyond[i] = 1.0, 0.0
         for t in range(steps + 1):
             size[i] = max(size[i], abs(states[t, i]))
-    # The end.
-    cost = final_value(states[steps], none, steps, final)
-    final_quadratic(states[steps], none, steps, final, hessian, gradient)
+    cost = final_value(states[steps], none, steps, model.final)
+    final_quadratic(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
+    scale = scale_of(states[steps], none, stage)
     for i in range(N):
-        costate[i] = gradient[i]
+        costate[i] = stage.gradient[i]
         for j in range(N):
-            scale += 0.5 * abs(states[steps, i] * hessian[i, j] * states[steps, j])
             if own:
-                hessians[steps, i, j] = hessian[i, j]
+                hessians[steps, i, j] = stage.hessian[i, j]
     for t in range(steps - 1, -1, -1):
-        x, u = states[t], controls[t]
-        cost += stage_value(x, u, t, stage)
-        step_jacobian(x, u, p, dt, fx, fu, arrived, jacobian)
-        stage_quadratic(x, u, t, stage, hessian, gradient)
+        x, u = states[t], plan.controls[t]
+        cost += stage_value(x, u, t, model.stage)
+        step_jacobian(x, u, model.parameters, model.dt, slopes.state, slopes.control, slopes.arrived, step.jacobian)
+        stage_quadratic(x, u, t, model.stage, stage.hessian, stage.gradient)
+        scale += scale_of(x, u, stage)
         for i in range(N):
-            difference = abs(states[t + 1, i] - arrived[i])
+            difference = abs(states[t + 1, i] - slopes.arrived[i])
             if not difference <= beyond[i]:  # a NaN stays
                 beyond[i] = difference
-            for j in range(N):
-                scale += 0.5 * abs(x[i] * hessian[i, j] * x[j])
         for i in range(M):
-            # The law, and the limits.
-            total, terms = offset[t, i], abs(offset[t, i]) + abs(u[i])
-            for j in range(N):
-                total += gain[t, i, j] * x[j]
-                terms += abs(gain[t, i, j] * x[j])
-            low, high = stage[LIMITS][i], stage[LIMITS][M + i]
-            limits = max(limits, low - u[i], u[i] - high)
-            difference = abs(min(max(total, low), high) - u[i])
-            if not difference <= law * terms:
-                law = difference / max(terms, 1e-300)
-            # The slope in the offset, and the matrix that makes a cost of it.
-            slope[i] = gradient[N + i]
-            for j in range(N):
-                slope[i] += jacobian[j, N + i] * costate[j]
-                total = 0.0
-                for k in range(N):
-                    total += jacobian[k, N + i] * hessians[t + 1, k, j]
-                curve[i, j] = total
-            for j in range(M):
-                total = hessian[N + i, N + j]
-                scale += 0.5 * abs(u[i] * total * u[j])
-                for k in range(N):
-                    total += curve[i, k] * jacobian[k, N + j]
-                factor[i, j] = total
-        for i in range(N):
-            ahead[i] = gradient[i]
-            for j in range(N):
-                ahead[i] += jacobian[j, i] * costate[j]
-        for i in range(M):
-            low, high = stage[LIMITS][i], stage[LIMITS][M + i]
-            if low < u[i] < high:  # at a limit a control does not respond
-                for j in range(N):
-                    ahead[j] += gain[t, i, j] * slope[i]
-            lowest[i], highest[i] = low - u[i], high - u[i]
-        decrease += within_box(factor, slope, lowest, highest, moved)
+            room.low[i], room.high[i] = model.limits.low[i] - u[i], model.limits.high[i] - u[i]
+            limits = max(limits, room.low[i], -room.high[i])
+        law = off_the_law(x, u, policy.gain[t], policy.offset[t], model.limits, law)
+        decrease += promised(step, stage, policy.gain[t], hessians[t + 1], room, costate)
         if own:
-            for i in range(M):
-                for j in range(N):
-                    response[i, j] = gain[t, i, j] if lowest[i] < 0 < highest[i] else 0.0
-            closed_loop_hessian(jacobian, hessian, response, hessians[t + 1], hessians[t])
-        for i in range(N):
-            costate[i] = ahead[i]
-    if not fixed:
-        cost += initial_value(states[0], none, 0, initial)
-        initial_quadratic(states[0], none, 0, initial, hessian, gradient)
-        for i in range(N):
-            costate[i] += gradient[i]
-            ahead[i] = costate[i]
-            for j in range(N):
-                scale += 0.5 * abs(states[0, i] * hessian[i, j] * states[0, j])
-                start_factor[i, j] = hessian[i, j] + hessians[0, i, j]
-            if costate[i] == 0 and start_factor[i, i] == 0:  # a state that nothing weighs may stay
-                start_factor[i, i] = 1.0
-        good = cholesky(start_factor, N)
-        cholesky_solve(start_factor, N, ahead)
-        for i in range(N):
-            decrease += 0.5 * costate[i] * ahead[i] if good else abs(costate[i]) * 1e300
+            closed_loop_hessian(step.jacobian, stage.hessian, policy.gain[t], room, hessians[t + 1], hessians[t])
+    if not settings.fixed:
+        cost += initial_value(states[0], none, 0, model.initial)
+        initial_quadratic(states[0], none, 0, model.initial, stage.hessian, stage.gradient)
+        scale += scale_of(states[0], none, stage)
+        decrease += promised_of_start(stage, hessians[0], costate)
+    motion = 0.0
     for i in range(N):
         if not beyond[i] <= motion * size[i]:
             motion = beyond[i] / size[i]
-    found[0], found[1], found[2], found[3], found[4], found[5] = cost, scale, motion, law, limits, decrease
+    found.cost, found.scale, found.motion = cost, scale, motion
+    found.law, found.limits, found.decrease = law, limits, decrease
 
 
-def closed_loop_hessian(jacobian, cost, gain, ahead, out):
-    """Write the Hessian of what the policy costs from here on, given that from the next step on."""
+def scale_of(x, u, stage):
+    """What the curved part of a cost at (x, u) would be if nothing in it cancelled, states and controls apart."""
+    scale = 0.0
+    for i in range(N):
+        for j in range(N):
+            scale += 0.5 * abs(x[i] * stage.hessian[i, j] * x[j])
+    for i in range(M):
+        for j in range(M):
+            scale += 0.5 * abs(u[i] * stage.hessian[N + i, N + j] * u[j])
+    return scale
+
+
+def off_the_law(x, u, gain, offset, limits, worst):
+    """By how much a control is off the policy's within the limits, or what is worse already."""
+    for i in range(M):
+        total, terms = offset[i], abs(offset[i]) + abs(u[i])
+        for j in range(N):
+            total += gain[i, j] * x[j]
+            terms += abs(gain[i, j] * x[j])
+        difference = abs(min(max(total, limits.low[i]), limits.high[i]) - u[i])
+        if not difference <= worst * terms:
+            worst = difference / max(terms, 1e-300)
+    return worst
+
+
+def promised(step, stage, gain, S, room, costate):
+    """What the controls of a step promise: `1/2 e' E^-1 e` within the room that the limits leave.
+
+    The costate at t + 1 becomes that at t, the controls responding with the gain (M, N); at a limit they do not.
+    """
+    jacobian, hessian, gradient = step.jacobian, stage.hessian, stage.gradient
+    slope, curve, factor, moved, before = stack(M), stack(M, N), stack(M, M), stack(M), stack(N)
+    for i in range(M):
+        slope[i] = gradient[N + i]
+        for j in range(N):
+            slope[i] += jacobian[j, N + i] * costate[j]
+            total = 0.0
+            for k in range(N):
+                total += jacobian[k, N + i] * S[k, j]
+            curve[i, j] = total
+        for j in range(M):
+            total = hessian[N + i, N + j]
+            for k in range(N):
+                total += curve[i, k] * jacobian[k, N + j]
+            factor[i, j] = total
+    for i in range(N):
+        before[i] = gradient[i]
+        for j in range(N):
+            before[i] += jacobian[j, i] * costate[j]
+    for i in range(M):
+        if room.low[i] < 0 < room.high[i]:
+            for j in range(N):
+                before[j] += gain[i, j] * slope[i]
+    for i in range(N):
+        costate[i] = before[i]
+    return within_box(factor, slope, room.low, room.high, moved)
+
+
+def promised_of_start(stage, S, costate):
+    """What a soft start promises, its cost quadratised in `stage`."""
+    factor, direction = stack(N, N), stack(N)
+    for i in range(N):
+        costate[i] += stage.gradient[i]
+        direction[i] = costate[i]
+        for j in range(N):
+            factor[i, j] = stage.hessian[i, j] + S[i, j]
+        if costate[i] == 0 and factor[i, i] == 0:  # a state that nothing weighs may stay
+            factor[i, i] = 1.0
+    good, decrease = cholesky(factor, N), 0.0
+    cholesky_solve(factor, N, direction)
+    for i in range(N):
+        decrease += 0.5 * costate[i] * direction[i] if good else abs(costate[i]) * 1e300
+    return decrease
+
+
+def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):
+    """Write the Hessian of what the policy costs from here on, given that from the next step on.
+
+    A control at a limit, where there is no room on one side, does not respond.
+    """
     closed, both, product = stack(N, N), stack(W, N), stack(W, N)
     for j in range(N):
+        for i in range(M):
+            both[N + i, j] = gain[i, j] if room.low[i] < 0 < room.high[i] else 0.0
         for i in range(N):
             both[i, j] = 1.0 if i == j else 0.0
             closed[i, j] = jacobian[i, j]
             for k in range(M):
-                closed[i, j] += jacobian[i, N + k] * gain[k, j]
-        for i in range(M):
-            both[N + i, j] = gain[i, j]
+                closed[i, j] += jacobian[i, N + k] * both[N + k, j]
     for i in range(W):
         for j in range(N):
             product[i, j] = 0.0

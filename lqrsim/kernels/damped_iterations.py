@@ -9,27 +9,19 @@ from math import inf, isnan, nan
 
 from lqrsim.kernels.interface import (
     DAMPED,
-    FINAL_GAP,
     ILQR,
-    ILQR_LEFT,
-    ILQR_NEXT,
     MAX_ITERATIONS,
-    MERIT,
     PATIENCE,
-    PLAN_COST,
-    REACH,
     REJECTED,
     RUNNING,
-    SINCE_ILQR,
-    SMALL,
     STALLED,
-    WEIGHT,
     M,
     N,
     stack,
 )
 from lqrsim.kernels.iterations import ending, relative_improvement, relative_optimality, write_row
 from lqrsim.kernels.passes import backward_pass, copy, forward_pass, minimizers
+from lqrsim.kernels.records import Linearization
 from lqrsim.kernels.rollouts import (
     about_plan,
     differential_pass,
@@ -42,11 +34,7 @@ from lqrsim.kernels.rollouts import (
 )
 
 
-def damped_iterations(
-    steps, first, last, max_iterations, tolerance, gap_tolerance, optimal, fixed,
-    start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-    no_weight, no_about, plan_x, plan_u, states, controls, memory, log,
-):  # fmt: skip
+def damped_iterations(first, last, settings, model, work, memory, log):
     """Iterations from the best plan so far, each of which lowers its cost or leaves it as it is; with constraints, its
     merit, to which the augmented Lagrangian belongs.
 
@@ -61,64 +49,35 @@ def damped_iterations(
     about the plan and without a weight, to tell how far it is from optimal; that also gives the policy and the value
     functions of the answer.
 
-    After many iterations without an end, too, reach 0 has its turn, each time for twice as long. `memory` (MEMORY,) is
-    what one iteration leaves to the next; see `interface.py`.
+    After many iterations without an end, too, reach 0 has its turn, each time for twice as long.
 
     With `first` of `last`, there is no iteration: only policy and value functions are made, about the plan as it is.
     """
-    shift = stack(N)
     if first == last:
-        relinearize(
-            steps, fixed, tolerance, optimal, False, 0.0,
-            start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-            no_weight, no_about, plan_x, plan_u, memory, log, first,
-        )  # fmt: skip
+        relinearize(settings, False, 0.0, model, work, memory, log[first])
     for done in range(first, last):
-        reach, weight, nothing = memory[REACH], memory[WEIGHT], 0.0
-        copy(start if fixed else plan_x[0], N, x_hat)
-        failed, _ = forward_pass(
-            steps, fixed, True, weight, plan_x, plan_u,
-            x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final, no_weight, no_about,
-        )  # fmt: skip
-        if failed < 0:
-            failed, _, nothing = backward_pass(
-                steps, fixed, reach, weight, plan_x, plan_u, x_hat, x_hats,
-                L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, no_weight, no_about,
-            )  # fmt: skip
-        merit, cost, fraction = inf, inf, 0.0
-        if failed < 0:
-            for i in range(N):
-                shift[i] = x_hat[i] - plan_x[0, i]
-            about_plan(steps, plan_x, plan_u, L, l)
-            smallest = 0.1 if reach > 0 else 1e-8
-            bound = memory[MERIT] + 1e-12 * abs(memory[MERIT])  # what differs by rounding is not refused
-            merit, cost, fraction = line_search(
-                steps, plan_x, plan_u, shift, L, l, p, dt, initial, stage, final, bound, smallest, states, controls
-            )
-        full = done + 1 == max_iterations
+        reach = memory.reach
+        merit, cost, fraction, nothing = damped_step(settings, model, work, memory)
+        full = done + 1 == settings.max_iterations
         if fraction > 0:
-            improvement = relative_improvement(memory[MERIT], merit, nothing)
-            follow(steps, fraction, plan_x, x_hats)
+            improvement = relative_improvement(memory.merit, merit, nothing)
+            follow(settings.steps, fraction, work.plan, work.x_hats)
             # At reach 0 as for iLQR: nothing but a rollout was linearised about.
-            gap = largest_gap(steps, x_hats, states) if reach > 0 else 0.0
-            keep_plan(steps, states, controls, plan_x, plan_u)
-            memory[PLAN_COST], memory[MERIT] = cost, merit
-            small = abs(improvement) < tolerance and (gap < gap_tolerance or not optimal)
-            memory[SMALL] = memory[SMALL] + 1 if small else 0.0
-            settled, stalled = memory[SMALL] > 1, False
+            gap = largest_gap(settings.steps, work.x_hats, work.rollout.states) if reach > 0 else 0.0
+            keep_plan(settings.steps, work.rollout, work.plan)
+            memory.plan_cost, memory.merit = cost, merit
+            small = abs(improvement) < settings.tolerance and (gap < settings.gap_tolerance or not settings.optimal)
+            memory.small_changes = memory.small_changes + 1 if small else 0.0
+            settled, stalled = memory.small_changes > 1, False
             be_bolder(memory, fraction)
-            write_row(log, done, cost, improvement, gap, nan, nan, DAMPED if reach > 0 else ILQR)
+            write_row(log[done], cost, improvement, gap, nan, nan, DAMPED if reach > 0 else ILQR)
         else:
             be_more_careful(memory)
-            stalled = memory[WEIGHT] > 1e12
+            stalled = memory.weight > 1e12
             settled = stalled
-            write_row(log, done, memory[PLAN_COST], 0.0, nan, nan, nan, REJECTED)
+            write_row(log[done], memory.plan_cost, 0.0, nan, nan, nan, REJECTED)
         if settled or full:
-            outcome = relinearize(
-                steps, fixed, tolerance, optimal, settled, nothing,
-                start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-                no_weight, no_about, plan_x, plan_u, memory, log, done,
-            )  # fmt: skip
+            outcome = relinearize(settings, settled, nothing, model, work, memory, log[done])
             if outcome == RUNNING and (stalled or full):
                 outcome = STALLED if stalled else MAX_ITERATIONS
             if outcome != RUNNING:
@@ -126,71 +85,87 @@ def damped_iterations(
     return last, RUNNING, False, -1
 
 
+def damped_step(settings, model, work, memory):
+    """Both passes and the line search. Returns the new merit and cost, the part of the step that was taken, and a cost
+    that is as good as none; see `backward_pass`.
+    """
+    shift, reach = stack(N), memory.reach
+    merit, cost, fraction, nothing = inf, inf, 0.0, 0.0
+    copy(work.start if settings.fixed else work.plan.states[0], N, work.x_hat)
+    about = Linearization(work.plan, True, reach, memory.weight, work.prior)
+    failed, _ = forward_pass(settings, model, about, work)
+    if failed < 0:
+        failed, _, nothing = backward_pass(settings, model, about, work)
+    if failed < 0:
+        for i in range(N):
+            shift[i] = work.x_hat[i] - work.plan.states[0, i]
+        about_plan(settings.steps, work.plan, work.policy)
+        smallest = 0.1 if reach > 0 else 1e-8
+        bound = memory.merit + 1e-12 * abs(memory.merit)  # what differs by rounding is not refused
+        merit, cost, fraction = line_search(
+            settings.steps, work.plan, shift, work.policy, model, bound, smallest, work.rollout
+        )
+    return merit, cost, fraction, nothing
+
+
 def be_bolder(memory, fraction):
     """What the next iteration ventures after one that lowered the cost, by that fraction of its step."""
-    if memory[WEIGHT] > 0:
-        memory[WEIGHT] = 0.1 * memory[WEIGHT] if memory[WEIGHT] > 1e-6 else 0.0
-    elif memory[REACH] > 0:
+    if memory.weight > 0:
+        memory.weight = 0.1 * memory.weight if memory.weight > 1e-6 else 0.0
+    elif memory.reach > 0:
         if fraction == 1:
-            memory[REACH] = min(2 * memory[REACH], 1.0)
-        memory[SINCE_ILQR] += 1
-        if memory[SINCE_ILQR] > PATIENCE:
+            memory.reach = min(2 * memory.reach, 1.0)
+        memory.since_ilqr += 1
+        if memory.since_ilqr > PATIENCE:
             turn_to_ilqr(memory)
     else:
-        memory[ILQR_LEFT] -= 1
-        memory[REACH] = 0.25 if memory[ILQR_LEFT] <= 0 else 0.0
+        memory.ilqr_left -= 1
+        memory.reach = 0.25 if memory.ilqr_left <= 0 else 0.0
 
 
 def be_more_careful(memory):
     """What the next iteration ventures after one that did not lower the cost."""
-    if memory[REACH] > 0.25:
-        memory[REACH] = 0.25
-    elif memory[REACH] > 0:
+    if memory.reach > 0.25:
+        memory.reach = 0.25
+    elif memory.reach > 0:
         turn_to_ilqr(memory)
     else:
-        memory[WEIGHT] = max(10 * memory[WEIGHT], 1e-3)
+        memory.weight = max(10 * memory.weight, 1e-3)
 
 
 def turn_to_ilqr(memory):
     """Reach 0 for a while: each time for twice as long, for what lies beyond has not helped so far."""
-    memory[REACH], memory[SINCE_ILQR] = 0.0, 0.0
-    memory[ILQR_LEFT] = memory[ILQR_NEXT]
-    memory[ILQR_NEXT] *= 2
+    memory.reach, memory.since_ilqr = 0.0, 0.0
+    memory.ilqr_left = memory.ilqr_next
+    memory.ilqr_next *= 2
 
 
-def relinearize(
-    steps, fixed, tolerance, optimal, settled, nothing,
-    start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-    no_weight, no_about, plan_x, plan_u, memory, log, done,
-):  # fmt: skip
+def relinearize(settings, settled, nothing, model, work, memory, row):
     """Policy and value functions about the plan, without a weight. Returns the outcome.
 
-    Writes optimality and residual to the log, and to the memory how far the states of least total cost are from the
-    plan: where motions are unstable, rounding can spoil the cost-to-come while the rest is right.
+    Writes optimality and residual to the row of the log, and to the memory how far the states of least total cost are
+    from the plan: where motions are unstable, rounding can spoil the cost-to-come while the rest is right.
     """
-    shift = stack(N)
-    failed, _, left = differential_pass(steps, plan_x, plan_u, p, dt, stage, final, 0.0, 1, L, l, S, s, k)
+    steps, plan, policy, shift = settings.steps, work.plan, work.policy, stack(N)
+    failed, _, left = differential_pass(steps, plan, model, 0.0, 1, policy, work.to_go)
     if failed >= 0:
         return RUNNING
-    if not fixed:
-        left += initial_step(plan_x[0], initial, S[0], s[0], shift)
-    left = relative_optimality(failed, left, memory[MERIT], nothing)
-    copy(start if fixed else plan_x[0], N, x_hat)
-    failed, _ = forward_pass(
-        steps, fixed, True, 0.0, plan_x, plan_u,
-        x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final, no_weight, no_about,
-    )  # fmt: skip
-    memory[FINAL_GAP] = inf
-    if failed < 0 and minimizers(steps, S, s, C, b, x_hats):
-        memory[FINAL_GAP] = largest_gap(steps, x_hats, plan_x)
+    if not settings.fixed:
+        left += initial_step(plan.states[0], model, work.to_go, shift)
+    left = relative_optimality(failed, left, memory.merit, nothing)
+    copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
+    failed, _ = forward_pass(settings, model, Linearization(plan, True, 1.0, 0.0, work.prior), work)
+    memory.final_gap = inf
+    if failed < 0 and minimizers(steps, work.to_go, work.to_come, work.x_hats):
+        memory.final_gap = largest_gap(steps, work.x_hats, plan.states)
     # The forward pass has left it at the end; what comes next begins at the start.
-    copy(start if fixed else plan_x[0], N, x_hat)
+    copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
     for t in range(steps):
         for i in range(M):  # the policy that makes the plan
-            l[t, i] = plan_u[t, i]
+            policy.offset[t, i] = plan.controls[t, i]
             for j in range(N):
-                l[t, i] -= L[t, i, j] * plan_x[t, j]
-    log[done, 3], log[done, 4] = left, dynamics_residual(steps, x_hats, L, l, p, dt, stage, plan_x)
-    if isnan(log[done, 2]):  # of an iteration that was rejected
-        log[done, 2] = 0.0
-    return ending(settled and left < tolerance, optimal, left, tolerance, memory[PLAN_COST], False)
+                policy.offset[t, i] -= policy.gain[t, i, j] * plan.states[t, j]
+    row.optimality, row.residual = left, dynamics_residual(steps, work.x_hats, policy, model, plan.states)
+    if isnan(row.gap):  # of an iteration that was rejected
+        row.gap = 0.0
+    return ending(settled and left < settings.tolerance, settings, left, memory.plan_cost, False)

@@ -12,16 +12,18 @@ from math import sqrt
 
 from lqrsim.kernels.interface import M, N, stack
 from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, offset, within
+from lqrsim.kernels.records import Reduced
 from lqrsim.kernels.runge_kutta import step_jacobian
 
 
-def begin(Q, q, constant, x, S, covariance, mean):
+def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
     """Write the cost-to-come at 0, given c_0 about the origin, quadratised at x; return its constant.
 
     Where c_0 has no curvature, there is no covariance, and it gets a little about x, relative to that of the cost-to-go
     S where there is one by now. An optimum stays one, and the next iteration moves x on. What is little is told in
     units of each state's own curvature.
     """
+    S, covariance, mean = to_go.hessian[0], to_come.matrix[0], to_come.vector[0]
     factor, column, slope = stack(N, N), stack(N), stack(N)
     largest = 0.0
     for i in range(N):
@@ -66,53 +68,31 @@ def begin(Q, q, constant, x, S, covariance, mean):
     return constant, True
 
 
-def linearize(x, u, p, dt, fx, fu, x_next, jacobian, c):
-    """Write where (x, u) leads, and the step linearised there: x_next = jacobian (x, u) + c."""
-    step_jacobian(x, u, p, dt, fx, fu, x_next, jacobian)
-    offset(jacobian, x, u, x_next, c)
+def linearize(x, u, model, slopes, step):
+    """Write where (x, u) leads, and the step linearised there: x_next = jacobian (x, u) + offset."""
+    step_jacobian(x, u, model.parameters, model.dt, slopes.state, slopes.control, slopes.arrived, step.jacobian)
+    offset(step.jacobian, x, u, slopes.arrived, step.offset)
 
 
-def riccati_forward(
-    jacobian, c, cost, slope, constant, V0, x0, k0, smoothing, updated, gain, feedforward, V, x
-):  # fmt: skip
-    """One step of the cost-to-come, in moments: from (V0, x0, k0) at t to (V, x) at t + 1.
+def riccati_forward(t, step, stage, constant, to_come, smoothing):
+    """One step of the cost-to-come, in moments: from t to t + 1. Returns whether it succeeded.
 
-    `jacobian` = [A B] and c are the linearised step; the cost is as in `riccati_backward`. What the backward pass needs
-    is written, too: given the costate at t + 1, the minimiser at t is `updated - smoothing costate` and the control
-    `gain costate + feedforward`. Returns the constant and whether the step succeeded.
+    The stage is as in `riccati_backward`. What the backward pass needs is written, too; see `Smoothing`.
     """
-    factor, F, h, BT = stack(M, M), stack(M, N), stack(M), stack(M, N)
-    Q, q, AT, slope0, size = stack(N, N), stack(N), stack(N, N), stack(N), stack(N)
+    V0, x0, c, slope = to_come.matrix[t], to_come.vector[t], step.offset, stage.gradient
+    V, x, updated = to_come.matrix[t + 1], to_come.vector[t + 1], smoothing.state[t]
+    reduced = Reduced(
+        stack(M, M), stack(M, N), stack(M), stack(N, N), stack(M, N), stack(N, N), stack(N), stack(N)
+    )  # fmt: skip
+    h, AT, BT, Q, q = reduced.h, reduced.AT, reduced.BT, reduced.Q, reduced.q
+    slope0 = stack(N)
     # Products are formed here, where nothing else can point to, and then copied: only so they become vector code.
     U, G = stack(N, N), stack(N, N)
-    crossed = 0.0
-    for i in range(M):
-        h[i] = slope[N + i]
-        for j in range(M):
-            factor[i, j] = cost[N + i, N + j]
-        for j in range(N):
-            F[i, j] = cost[N + i, j]
-            BT[i, j] = jacobian[j, N + i]
-            crossed += abs(F[i, j])
-    if not cholesky(factor, M):
-        return k0, False
-    cholesky_solve(factor, M, h)
-    for i in range(N):
-        q[i], size[i] = slope[i], abs(cost[i, i])
-        for j in range(N):
-            Q[i, j] = cost[i, j]
-            AT[i, j] = jacobian[j, i]
-    if crossed != 0:
-        forward_substitute(factor, F)
-        back_substitute(factor, F)
-        for k in range(M):
-            for i in range(N):
-                q[i] -= cost[N + k, i] * h[k]
-                for j in range(N):
-                    Q[i, j] -= cost[N + k, i] * F[k, j]
-                    AT[i, j] -= F[k, i] * BT[k, j]
+    good, crossed = eliminate_control(step, stage, reduced)
+    if not good:
+        return False
     # Update: add what the step costs, first its value and slope at the mean.
-    value = k0 + constant
+    value = to_come.constant[t] + constant
     for k in range(M):
         value -= 0.5 * slope[N + k] * h[k]
     for i in range(N):
@@ -122,8 +102,8 @@ def riccati_forward(
             U[i, j] = V0[i, j]
         slope0[i] = curved + q[i]
         value += (0.5 * curved + q[i]) * x0[i]
-    if not update(U, Q, size):
-        return k0, False
+    if not update(U, Q, reduced.size):
+        return False
     for i in range(N):
         moved = 0.0
         for j in range(N):
@@ -143,7 +123,7 @@ def riccati_forward(
         for k in range(M):
             total -= BT[k, i] * h[k]
         x[i] = total
-    forward_substitute(factor, BT)
+    forward_substitute(reduced.factor, BT)
     for i in range(N):
         for j in range(N):
             total = 0.0
@@ -154,9 +134,53 @@ def riccati_forward(
             U[i, j] = total
     for i in range(N):
         for j in range(N):
-            smoothing[i, j] = G[i, j]
+            smoothing.state_gain[t, i, j] = G[i, j]
             V[i, j] = U[i, j] if i <= j else U[j, i]
-    back_substitute(factor, BT)
+    back_substitute(reduced.factor, BT)
+    control_response(reduced, G, updated, crossed, smoothing.control_gain[t], smoothing.control[t])
+    to_come.constant[t + 1] = value
+    return True
+
+
+def eliminate_control(step, stage, reduced):
+    """Write a step and its stage without the control; see `Reduced`.
+
+    Returns whether R is positive definite, and a number that is zero where no cost couples states and controls.
+    """
+    jacobian, cost, slope = step.jacobian, stage.hessian, stage.gradient
+    factor, F, h, AT, BT, Q, q = reduced.factor, reduced.F, reduced.h, reduced.AT, reduced.BT, reduced.Q, reduced.q
+    crossed = 0.0
+    for i in range(M):
+        h[i] = slope[N + i]
+        for j in range(M):
+            factor[i, j] = cost[N + i, N + j]
+        for j in range(N):
+            F[i, j] = cost[N + i, j]
+            BT[i, j] = jacobian[j, N + i]
+            crossed += abs(F[i, j])
+    if not cholesky(factor, M):
+        return False, crossed
+    cholesky_solve(factor, M, h)
+    for i in range(N):
+        q[i], reduced.size[i] = slope[i], abs(cost[i, i])
+        for j in range(N):
+            Q[i, j] = cost[i, j]
+            AT[i, j] = jacobian[j, i]
+    if crossed != 0:
+        forward_substitute(factor, F)
+        back_substitute(factor, F)
+        for k in range(M):
+            for i in range(N):
+                q[i] -= cost[N + k, i] * h[k]
+                for j in range(N):
+                    Q[i, j] -= cost[N + k, i] * F[k, j]
+                    AT[i, j] -= F[k, i] * BT[k, j]
+    return True, crossed
+
+
+def control_response(reduced, G, updated, crossed, gain, feedforward):
+    """Write the control at t as a function of the costate at t + 1."""
+    F, h, BT = reduced.F, reduced.h, reduced.BT
     for k in range(M):
         feedforward[k] = -h[k]
         for j in range(N):
@@ -167,7 +191,6 @@ def riccati_forward(
                 feedforward[k] -= F[k, i] * updated[i]
                 for j in range(N):
                     gain[k, j] += F[k, i] * G[i, j]
-    return value, True
 
 
 def forward_substitute(factor, rows):
@@ -239,11 +262,12 @@ def update(V, Q, size):
     return True
 
 
-def minimizer(S, s, V, x0, costate, x):
-    """Write the minimiser of the total cost and the costate there; False if there is none.
+def minimizer(t, to_go, to_come, costate, x):
+    """Write the minimiser of the total cost at t and the costate there; False if there is none.
 
     costate = (I + S V)^-1 (S x0 + s), x = x0 - V costate.
     """
+    S, s, V, x0 = to_go.hessian[t], to_go.gradient[t], to_come.matrix[t], to_come.vector[t]
     a = stack(N, N)
     for i in range(N):
         for j in range(N):
@@ -297,16 +321,16 @@ def solve(a, b):
     return True
 
 
-def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, low, high, x, u):
+def backtrack(t, x_hat, costate, smoothing, model, x, u):
     """Write the state and control (x, u) on the way to the minimiser at t + 1, whose costate is given."""
     for i in range(N):
-        total = updated[i]
+        total = smoothing.state[t, i]
         for j in range(N):
-            total -= smoothing[i, j] * costate[j]
+            total -= smoothing.state_gain[t, i, j] * costate[j]
         x[i] = total
     for k in range(M):
-        total = feedforward[k]
+        total = smoothing.control[t, k]
         for j in range(N):
-            total += gain[k, j] * costate[j]
+            total += smoothing.control_gain[t, k, j] * costate[j]
         u[k] = total
-    within(u, low, high)
+    within(u, model.limits)

@@ -9,46 +9,24 @@ from lqrsim.kernels.interface import CERTIFY, DAMP, EVALUATE
 from lqrsim.kernels.iterations import ilqr_iterations, smoother_iterations
 
 
-def smoother(
-    task, steps, first, last, max_iterations, tolerance, gap_tolerance, optimal, fixed, guided,
-    start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-    eased, prior_weight, prior_about, prior_iterations, guess_x, guess_u, plan_x, plan_u,
-    states, controls, kept_L, kept_l, memory, log,
-):  # fmt: skip
-    """Undamped or damped iterations; or the certificate of `states`, `controls`, `kept_L` and `kept_l`, in log[0].
+def smoother(task, first, last, settings, model, work, memory, log):
+    """Undamped or damped iterations; or the certificate of the rollout and the policy kept.
 
-    To evaluate is to certify with Hessians of the policy's own, which take the place of S.
+    To evaluate is to certify with Hessians of the policy's own, which take the place of the cost-to-go's.
     """
     if task >= CERTIFY:
         own = task == EVALUATE
-        certify(steps, fixed, own, states, controls, kept_L, kept_l, S, p, dt, initial, stage, final, log[0])
+        certify(settings, own, work.rollout, work.kept, work.to_go.hessian, model, work.certificate[0])
         return 0, 0, False, -1
     if task == DAMP:
-        return damped_iterations(
-            steps, first, last, max_iterations, tolerance, gap_tolerance, optimal, fixed,
-            start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-            prior_weight, prior_about, plan_x, plan_u, states, controls, memory, log,
-        )  # fmt: skip
-    return smoother_iterations(
-        steps, first, last, max_iterations, tolerance, gap_tolerance, optimal, fixed, guided,
-        start, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar, p, dt, initial, stage, final,
-        eased, prior_weight, prior_about, prior_iterations, guess_x, guess_u, plan_x, plan_u,
-        states, controls, kept_L, kept_l, memory, log,
-    )  # fmt: skip
+        return damped_iterations(first, last, settings, model, work, memory[0], log)
+    return smoother_iterations(first, last, settings, model, work, memory[0], log)
 
 
-def ilqr(
-    task, steps, first, last, max_iterations, tolerance, optimal,
-    x0, L, l, S, s, k, p, dt, initial, stage, final,
-    states, controls, new_states, new_controls, damping, log,
-):  # fmt: skip
-    """Iterations of iLQR; or the certificate of `states`, `controls`, `L` and `l`, in log[0]; see `smoother`."""
+def ilqr(task, first, last, settings, model, work, log):
+    """Iterations of iLQR; or the certificate of the plan and the policy; see `smoother`."""
     if task >= CERTIFY:
         own = task == EVALUATE
-        certify(steps, True, own, states, controls, L, l, S, p, dt, initial, stage, final, log[0])
+        certify(settings, own, work.plan, work.policy, work.to_go.hessian, model, work.certificate[0])
         return 0, 0, False, -1
-    return ilqr_iterations(
-        steps, first, last, max_iterations, tolerance, optimal,
-        x0, L, l, S, s, k, p, dt, initial, stage, final,
-        states, controls, new_states, new_controls, damping, log,
-    )  # fmt: skip
+    return ilqr_iterations(first, last, settings, model, work, log)

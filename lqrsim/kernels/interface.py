@@ -12,7 +12,6 @@ N = 0  # states
 M = 0  # controls
 W = N + M  # a state and a control, joined
 K = 0  # of these, how many entries a cost is not convex in
-LIMITS = 0  # which array of `stage` has the limits of the controls: lowest (M,), highest (M,)
 
 # How iterations end; see `Status`. Of those without a status of their own, NO_START is a first trajectory that is not
 # finite, STALLED a line search that found no lower cost, CYCLING that the same costs come again and again, and
@@ -34,14 +33,7 @@ ITERATE, DAMP, CERTIFY, EVALUATE = 0, 1, 2, 3
 # What an iteration was; see `Iteration.method`.
 SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
 
-# The safeguard's memory: the cost of the plan; how far the next iteration reaches, and the weight on changes of the
-# controls; how many small changes there were in a row; of iterations at reach 0, iLQR's, how many are left, how many
-# there will be the next time, and how many others there were since, of which PATIENCE are enough.
-# At the end, how far the states of least total cost are from the plan; at the beginning, whether that was made.
-# MERIT is the cost of the plan, and what the augmented Lagrangian adds to it: what is to be lowered. WATCHED is 1 where
-# the undamped iterations are to end when they make no progress, because there is a safeguard to go on.
-PLAN_COST, REACH, WEIGHT, SMALL, ILQR_LEFT, ILQR_NEXT, SINCE_ILQR, FINAL_GAP, STARTED, MERIT, WATCHED = range(11)
-MEMORY = 11
+# After how many damped iterations without an end iLQR has its turn.
 PATIENCE = 50
 
 
@@ -107,29 +99,27 @@ def final_quadratic(x, u, t, data, hessian, gradient) -> float:
     return 0.0
 
 
-# What the form of the cost-to-come brings; see `dual_form.py` and `primal_form.py`.
+# What the form of the cost-to-come brings; see `dual_form.py`, `primal_form.py` and `records.py`.
 
 
-def begin(Q, q, constant, x, S, C, b) -> tuple[float, bool]:
+def initial_cost_to_come(Q, q, constant, x, to_go, to_come) -> tuple[float, bool]:
     """Write the cost-to-come at 0."""
     return 0.0, True
 
 
-def linearize(x, u, p, dt, fx, fu, x_next, jacobian, c) -> None:
+def linearize(x, u, model, slopes, step) -> None:
     """Write where (x, u) leads, and the linearised step that `riccati_forward` takes."""
 
 
-def riccati_forward(
-    jacobian, c, cost, slope, constant, C0, b0, k0, smoothing, updated, gain, feedforward, C, b
-) -> tuple[float, bool]:
-    """One step of the cost-to-come."""
-    return 0.0, True
-
-
-def minimizer(S, s, C, b, costate, x) -> bool:
-    """Write the minimiser of the total cost, and the costate there."""
+def riccati_forward(t, step, stage, constant, to_come, smoothing) -> bool:
+    """One step of the cost-to-come, from t to t + 1."""
     return True
 
 
-def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, low, high, x, u) -> None:
+def minimizer(t, to_go, to_come, costate, x) -> bool:
+    """Write the minimiser of the total cost at t, and the costate there."""
+    return True
+
+
+def backtrack(t, x_hat, costate, smoothing, model, x, u) -> None:
     """Write the state and control, within its limits, on the way to the minimiser at t + 1."""

@@ -169,28 +169,30 @@ def quadratic_at(z, v, c):
     return total
 
 
-def riccati_backward(jacobian, c, cost, slope, constant, S1, s1, k1, gain, feedforward, S, s):
-    """One step of the cost-to-go, Eqs. (9)-(11), (13): from (S1, s1, k1) at t + 1 to (S, s) at t.
+def riccati_backward(t, step, stage, constant, policy, to_go):
+    """One step of the cost-to-go, Eqs. (9)-(11), (13): from t + 1 to t. Returns whether it succeeded.
 
-    The rest is as in `ahead`. Returns the constant and whether the step succeeded.
+    The stage, with its constant, is about the origin, and is used up.
     """
-    shifted = ahead(jacobian, c, cost, slope, constant, S1, s1, k1)
-    decrease = minimize_control(cost, slope, gain, feedforward, S, s)
-    return shifted - decrease, decrease >= 0
+    shifted = ahead(t, step, stage, constant, to_go)
+    decrease = minimize_control(
+        stage.hessian, stage.gradient, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]
+    )
+    to_go.constant[t] = shifted - decrease
+    return decrease >= 0
 
 
-def ahead(jacobian, c, cost, slope, constant, S1, s1, k1):
-    """Add to a stage about the origin, `cost` (W, W) and `slope` (W,), the cost-to-go where its step leads.
-
-    `jacobian` = [A B] and c are the linearised step. Returns the sum's constant.
-    """
+def ahead(t, step, stage, constant, to_go):
+    """Add to a stage about the origin the cost-to-go at t + 1, where its step leads. Returns the sum's constant."""
+    S1, s1, k1 = to_go.hessian[t + 1], to_go.gradient[t + 1], to_go.constant[t + 1]
+    c = step.offset
     v = stack(N)
     for i in range(N):
         v[i] = s1[i]
         for j in range(N):
             v[i] += S1[i, j] * c[j]
     shifted = k1 + constant + quadratic_at(S1, s1, c)
-    congruence(jacobian, S1, v, cost, slope)
+    congruence(step.jacobian, S1, v, stage.hessian, stage.gradient)
     return shifted
 
 
@@ -203,8 +205,9 @@ def affine(gain, feedforward, x, u):
         u[i] = total
 
 
-def within(u, low, high):
+def within(u, limits):
     """Cut a control off at its limits; a NaN stays."""
+    low, high = limits.low, limits.high
     for i in range(M):
         if u[i] < low[i]:
             u[i] = low[i]

@@ -1,23 +1,18 @@
-"""The passes of LQR smoothing. The numba subset; see `interface.py`.
+"""The passes of LQR smoothing. The numba subset; see `interface.py`, and `records.py` for what they are given.
 
-Shapes: `states` (T+1, N), `controls` (T, M), Hessians (T+1, N, N), gradients (T+1, N), constants (T+1,), gains
-(T, M, N), feedforwards (T, M). `p` are the parameters of the dynamics; `initial`, `stage`, `final` tuples of arrays,
-one a cost term. A sweep returns the step at which it failed, or -1, and whether all numbers there were finite.
-
-The prior is `1/2 (x - prior_about[t])' diag(prior_weight) (x - prior_about[t])` at t >= 1: no part of the cost, but
-added to its quadratic model in the first iterations, where it keeps the linearisations sensible.
+A pass returns the step at which it failed, or -1, and whether all numbers there were finite.
 """
 
 from math import inf
 
-from lqrsim.kernels.control_limits import hold_those_at_limits, limits, riccati_backward_within
+from lqrsim.kernels.control_limits import fix_controls_at_limits, riccati_backward_within
 from lqrsim.kernels.interface import (
     M,
     N,
     W,
-    begin,
-    depart,
+    backtrack,
     final_quadratic,
+    initial_cost_to_come,
     initial_quadratic,
     linearize,
     minimizer,
@@ -26,35 +21,185 @@ from lqrsim.kernels.interface import (
     stage_quadratic,
 )
 from lqrsim.kernels.linear_algebra import about_origin, affine, cholesky, cholesky_solve, clear, finite, offset, within
-from lqrsim.kernels.runge_kutta import step, step_jacobian
+from lqrsim.kernels.records import Linearization, Slopes, Stage, Step
+from lqrsim.kernels.runge_kutta import advance, step_jacobian
 
 
-def stage_model(x, u, t, stage, prior_weight, prior_about, damping, plan_u, hessian, gradient):
+def forward_pass(settings, model, about, work):
+    """The forward extended LQR pass, Sec. V-B: from the cost-to-go and its policy, the cost-to-come and its own.
+
+    `work.x_hat` is where c_0 is quadratised, and on return the minimiser at T, where c_l was. The cost-to-go at T is
+    set. Where the linearisation is guided, it is about the plan, and not about the minimisers.
+    """
+    stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
+    slopes = Slopes(stack(N, N), stack(N, M), stack(N))
+    clear_slopes(slopes)
+    costate, u, x_hat, to_go, to_come = stack(N), stack(M), work.x_hat, work.to_go, work.to_come
+    good, _ = initial_model(x_hat, settings.fixed, model, about, to_go, to_come)
+    if not good:
+        return 0, finite(to_come.matrix[0], N, N)
+    for t in range(settings.steps):
+        if about.guided:
+            copy(about.plan.states[t], N, x_hat)
+            copy(about.plan.controls[t], M, u)
+        else:
+            affine(work.policy.gain[t], work.policy.offset[t], x_hat, u)
+            within(u, model.limits)
+        linearize(x_hat, u, model, slopes, step)
+        constant = stage_model(x_hat, u, t, model, about, stage)
+        constant += fix_controls_at_limits(u, work.policy.gain[t], model.limits, stage, step)
+        if not riccati_forward(t, step, stage, constant, to_come, work.smoothing):
+            return t, finite(stage.hessian, W, W) and finite(step.jacobian, N, W)
+        if t + 1 < settings.steps and not about.guided and not minimizer(t + 1, to_go, to_come, costate, x_hat):
+            return t + 1, finite(to_go.hessian[t + 1], N, N) and finite(to_come.matrix[t + 1], N, N)
+    steps = settings.steps
+    if about.guided:
+        copy(about.plan.states[steps], N, x_hat)
+    elif not minimizer(steps, to_go, to_come, costate, x_hat):
+        # In the first iteration there may be no minimum without c_l, and the state of arrival is what we have.
+        copy(slopes.arrived, N, x_hat)
+    final_model(x_hat, steps, model, to_go)
+    if not minimizer(steps, to_go, to_come, costate, x_hat):
+        return steps, finite(to_go.hessian[steps], N, N) and finite(to_come.matrix[steps], N, N)
+    return -1, True
+
+
+def backward_pass(settings, model, about, work):
+    """The backward extended LQR pass, Sec. V-A: from the cost-to-come and its policy, the cost-to-go and its own.
+
+    `work.x_hat` is, on return, the minimiser at 0, where c_0 was quadratised anew, and `work.x_hats` has all of them.
+    What is linearised about lies a fraction `about.reach` of the way from the plan to where the minimisers lead: all of
+    it in the paper's method.
+
+    Returns also a cost that is as good as none. Where the least cost is zero, squares of rounding errors remain of it,
+    some 1e-13 of the numbers that cancel: those are in what the quadratic models are at the origin.
+    """
+    stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
+    slopes = Slopes(stack(N, N), stack(N, M), stack(N))
+    clear_slopes(slopes)
+    x, u, costate, x_hat, to_go, to_come = stack(N), stack(M), stack(N), work.x_hat, work.to_go, work.to_come
+    steps = settings.steps
+    if not minimizer(steps, to_go, to_come, costate, x_hat):
+        return steps, finite(to_go.hessian[steps], N, N) and finite(to_come.matrix[steps], N, N), 0.0
+    size = abs(to_go.constant[steps])
+    for t in range(steps - 1, -1, -1):
+        copy(x_hat, N, work.x_hats[t + 1])
+        backtrack(t, x_hat, costate, work.smoothing, model, x, u)
+        if about.reach < 1:
+            towards(x, about.reach, about.plan.states[t], N)
+            towards(u, about.reach, about.plan.controls[t], M)
+        linearize_forward(x, u, model, slopes, step)
+        constant = stage_model(x, u, t, model, about, stage)
+        size += abs(constant)
+        good = riccati_backward_within(t, step, stage, constant, x, model.limits, work.policy, to_go)
+        if not good or not minimizer(t, to_go, to_come, costate, x_hat):
+            return (
+                t,
+                finite(stage.hessian, W, W) and finite(step.jacobian, N, W) and finite(to_come.matrix[t], N, N),
+                0.0,
+            )
+    good = True
+    if not settings.fixed:
+        good, constant = initial_model(x_hat, settings.fixed, model, about, to_go, to_come)
+        size += abs(constant)
+    if not good or not minimizer(0, to_go, to_come, costate, x_hat):
+        return 0, finite(to_go.hessian[0], N, N) and finite(to_come.matrix[0], N, N), 0.0
+    copy(x_hat, N, work.x_hats[0])
+    return -1, True, 1e-26 * size if size < inf else 0.0
+
+
+def opening_pass(steps, guided, guess, prior, model, policy, to_go):
+    """A backward pass before any forward one: there is no cost-to-come, and the minimisers are of the cost-to-go alone.
+
+    Without a plan to be guided by, the dynamics run backwards from the minimiser of c_l, with the controls of the
+    guess; c_l is first quadratised at its last state.
+    """
+    stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
+    slopes = Slopes(stack(N, N), stack(N, M), stack(N))
+    clear_slopes(slopes)
+    x, x_hat, u = stack(N), stack(N), stack(M)
+    about = Linearization(guess, guided, 1.0, 0.0, prior)
+    copy(guess.states[steps], N, x_hat)
+    for _ in range(2):
+        final_model(x_hat, steps, model, to_go)
+        if not guided:
+            lowest(to_go.hessian[steps], to_go.gradient[steps], x_hat)
+    for t in range(steps - 1, -1, -1):
+        copy(guess.controls[t], M, u)
+        if guided:
+            copy(guess.states[t], N, x)
+        else:
+            advance(x_hat, u, model.parameters, -model.dt, x)
+        linearize_forward(x, u, model, slopes, step)
+        constant = stage_model(x, u, t, model, about, stage)
+        if not riccati_backward_within(t, step, stage, constant, x, model.limits, policy, to_go):
+            return t, finite(stage.hessian, W, W) and finite(step.jacobian, N, W)
+        copy(x, N, x_hat)
+        lowest(to_go.hessian[t], to_go.gradient[t], x_hat)
+    return -1, True
+
+
+def linearize_forward(x, u, model, slopes, step):
+    """Write where (x, u) leads, and the step linearised there, Eq. (25): x_next = jacobian (x, u) + offset."""
+    step_jacobian(x, u, model.parameters, model.dt, slopes.state, slopes.control, slopes.arrived, step.jacobian)
+    offset(step.jacobian, x, u, slopes.arrived, step.offset)
+
+
+def stage_model(x, u, t, model, about, stage):
     """Write the stage about (x, u) as a quadratic about the origin, Eqs. (26)-(27); return its constant.
 
-    `damping` weighs how far the control moves from the plan's, in units of the control's own curvature.
+    The prior is no part of the cost, but added to its quadratic model in the first iterations, where it keeps the
+    linearisations sensible. Damping weighs how far the control moves from the plan's.
     """
-    value = stage_quadratic(x, u, t, stage, hessian, gradient)
+    hessian, gradient, prior = stage.hessian, stage.gradient, about.prior
+    value = stage_quadratic(x, u, t, model.stage, hessian, gradient)
     if t > 0:
         for i in range(N):
-            weight, error = prior_weight[i], x[i] - prior_about[t, i]
+            weight, error = prior.weight[i], x[i] - prior.about[t, i]
             hessian[i, i] += weight
             gradient[i] += weight * error
             value += 0.5 * weight * error * error
-    if damping > 0:
+    if about.damping > 0:
         for i in range(M):
-            weight, error = damping * hessian[N + i, N + i], u[i] - plan_u[t, i]
+            weight, error = about.damping * hessian[N + i, N + i], u[i] - about.plan.controls[t, i]
             hessian[N + i, N + i] += weight
             gradient[N + i] += weight * error
             value += 0.5 * weight * error * error
     return about_origin(hessian, gradient, x, u, value)
 
 
-def end_model(hessian, gradient, value, x, S, s):
-    """Write an initial or final cost, quadratised at x, as (S, s) about the origin; return its constant.
+def final_model(x, steps, model, to_go):
+    """Write the cost-to-go at T: c_l quadratised at x. Paper: Eq. (31)."""
+    hessian, gradient, none = stack(W, W), stack(W), stack(M)
+    value = final_quadratic(x, none, steps, model.final, hessian, gradient)
+    to_go.constant[steps] = end_model(hessian, gradient, value, x, to_go.hessian[steps], to_go.gradient[steps])
 
-    Paper: Eqs. (23), (31).
+
+def initial_model(x, fixed, model, about, to_go, to_come):
+    """Write the cost-to-come at 0, with c_0 quadratised at x, Eq. (23); or of a start that is given.
+
+    Returns whether there is one, and what the quadratic of c_0 is at the origin.
     """
+    hessian, gradient, Q, q, none = stack(W, W), stack(W), stack(N, N), stack(N), stack(M)
+    if fixed:
+        clear(to_come.matrix[0], N, N)
+        copy(x, N, to_come.vector[0])
+        to_come.constant[0] = 0.0
+        return True, 0.0
+    value = initial_quadratic(x, none, 0, model.initial, hessian, gradient)
+    if about.damping > 0:
+        for i in range(N):
+            weight, error = about.damping * hessian[i, i], x[i] - about.plan.states[0, i]
+            hessian[i, i] += weight
+            gradient[i] += weight * error
+            value += 0.5 * weight * error * error
+    constant = end_model(hessian, gradient, value, x, Q, q)
+    to_come.constant[0], good = initial_cost_to_come(Q, q, constant, x, to_go, to_come)
+    return good, constant
+
+
+def end_model(hessian, gradient, value, x, S, s):
+    """Write an initial or final cost, quadratised at x, as (S, s) about the origin; return its constant."""
     none = stack(M)
     for i in range(M):
         none[i] = 0.0
@@ -66,172 +211,23 @@ def end_model(hessian, gradient, value, x, S, s):
     return constant
 
 
-def begin_model(x, initial, fixed, damping, plan_x, S, C, b):
-    """Write the cost-to-come at 0, with c_0 quadratised at x, and return its constant; or of a start that is given.
-
-    Returns also whether there is one, and what the quadratic of c_0 is at the origin.
-    """
-    hessian, gradient, Q, q, none = stack(W, W), stack(W), stack(N, N), stack(N), stack(M)
-    if fixed:
-        clear(C, N, N)
-        copy(x, N, b)
-        return 0.0, True, 0.0
-    value = initial_quadratic(x, none, 0, initial, hessian, gradient)
-    if damping > 0:
-        for i in range(N):
-            weight, error = damping * hessian[i, i], x[i] - plan_x[0, i]
-            hessian[i, i] += weight
-            gradient[i] += weight * error
-            value += 0.5 * weight * error * error
-    constant = end_model(hessian, gradient, value, x, Q, q)
-    k, good = begin(Q, q, constant, x, S, C, b)
-    return k, good, constant
+def clear_slopes(slopes):
+    """Set to zero what dynamics leave alone because it is zero everywhere."""
+    clear(slopes.state, N, N)
+    clear(slopes.control, N, M)
 
 
-def forward_pass(
-    steps, fixed, guided, damping, plan_x, plan_u, x_hat, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar,
-    p, dt, initial, stage, final, prior_weight, prior_about,
-):  # fmt: skip
-    """The forward extended LQR pass, Sec. V-B: from the cost-to-go and its policy, the cost-to-come and its own.
-
-    C, b, kbar are the cost-to-come and G, a, Lbar, lbar what `depart` needs, as the form has them. `x_hat` (N,) is
-    where c_0 is quadratised, and on return the minimiser at T, where c_l was. S[T], s[T], k[T] are set. With `guided`
-    the plan is what is linearised about, and not the minimisers.
-    """
-    hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
-    fx, fu, x_next, costate, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(M)
-    low, high = stack(M), stack(M)
-    limits(stage, low, high)
-    clear(fx, N, N)
-    clear(fu, N, M)
-    kbar[0], good, _ = begin_model(x_hat, initial, fixed, damping, plan_x, S[0], C[0], b[0])
-    if not good:
-        return 0, finite(C[0], N, N)
-    for t in range(steps):
-        if guided:
-            copy(plan_x[t], N, x_hat)
-            copy(plan_u[t], M, u)
-        else:
-            affine(L[t], l[t], x_hat, u)
-            within(u, low, high)
-        linearize(x_hat, u, p, dt, fx, fu, x_next, jacobian, c)
-        constant = stage_model(
-            x_hat, u, t, stage, prior_weight, prior_about, damping, plan_u, hessian, gradient
-        )  # fmt: skip
-        constant += hold_those_at_limits(u, L[t], low, high, hessian, gradient, jacobian, c)
-        kbar[t + 1], good = riccati_forward(
-            jacobian, c, hessian, gradient, constant, C[t], b[t], kbar[t], G[t], a[t], Lbar[t], lbar[t],
-            C[t + 1], b[t + 1],
-        )  # fmt: skip
-        if not good:
-            return t, finite(hessian, W, W) and finite(jacobian, N, W)
-        if t + 1 < steps and not guided and not minimizer(S[t + 1], s[t + 1], C[t + 1], b[t + 1], costate, x_hat):
-            return t + 1, finite(S[t + 1], N, N) and finite(C[t + 1], N, N)
-    if guided:
-        copy(plan_x[steps], N, x_hat)
-    elif not minimizer(S[steps], s[steps], C[steps], b[steps], costate, x_hat):
-        # In the first iteration there may be no minimum without c_l, and the state of arrival is what we have.
-        copy(x_next, N, x_hat)
-    value = final_quadratic(x_hat, u, steps, final, hessian, gradient)
-    k[steps] = end_model(hessian, gradient, value, x_hat, S[steps], s[steps])
-    if not minimizer(S[steps], s[steps], C[steps], b[steps], costate, x_hat):
-        return steps, finite(S[steps], N, N) and finite(C[steps], N, N)
-    return -1, True
+def towards(z, fraction, origin, size):
+    """Draw a vector towards another, so that only that fraction of the difference is left."""
+    for i in range(size):
+        z[i] = origin[i] + fraction * (z[i] - origin[i]) if fraction > 0 else origin[i]
 
 
-def backward_pass(
-    steps, fixed, reach, damping, plan_x, plan_u, x_hat, x_hats, L, l, S, s, k, C, b, kbar, G, a, Lbar, lbar,
-    p, dt, initial, stage, prior_weight, prior_about,
-):  # fmt: skip
-    """The backward extended LQR pass, Sec. V-A: from the cost-to-come and its policy, the cost-to-go and its own.
-
-    `x_hat` (N,) is, on return, the minimiser at 0, where c_0 was quadratised anew. Writes all the minimisers to
-    `x_hats` (T+1, N). What is linearised about lies a fraction `reach` of the way from the plan to where the minimisers
-    lead: all of it in the paper's method. The rest is as in `forward_pass`.
-
-    Returns also a cost that is as good as none. Where the least cost is zero, squares of rounding errors remain of it,
-    some 1e-13 of the numbers that cancel: those are in what the quadratic models are at the origin.
-    """
-    hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
-    fx, fu, x_next, x, u, costate = stack(N, N), stack(N, M), stack(N), stack(N), stack(M), stack(N)
-    low, high = stack(M), stack(M)
-    limits(stage, low, high)
-    clear(fx, N, N)
-    clear(fu, N, M)
-    if not minimizer(S[steps], s[steps], C[steps], b[steps], costate, x_hat):
-        return steps, finite(S[steps], N, N) and finite(C[steps], N, N), 0.0
-    size = abs(k[steps])
-    for t in range(steps - 1, -1, -1):
-        copy(x_hat, N, x_hats[t + 1])
-        depart(x_hat, costate, G[t], a[t], Lbar[t], lbar[t], p, dt, low, high, x, u)
-        if reach < 1:
-            for i in range(N):
-                x[i] = plan_x[t, i] + reach * (x[i] - plan_x[t, i]) if reach > 0 else plan_x[t, i]
-            for i in range(M):
-                u[i] = plan_u[t, i] + reach * (u[i] - plan_u[t, i]) if reach > 0 else plan_u[t, i]
-        step_jacobian(x, u, p, dt, fx, fu, x_next, jacobian)
-        offset(jacobian, x, u, x_next, c)
-        constant = stage_model(x, u, t, stage, prior_weight, prior_about, damping, plan_u, hessian, gradient)
-        size += abs(constant)
-        k[t], good = riccati_backward_within(
-            jacobian, c, hessian, gradient, constant, S[t + 1], s[t + 1], k[t + 1], x, low, high, L[t], l[t], S[t], s[t]
-        )
-        if not good or not minimizer(S[t], s[t], C[t], b[t], costate, x_hat):
-            return t, finite(hessian, W, W) and finite(jacobian, N, W) and finite(C[t], N, N), 0.0
-    good = True
-    if not fixed:
-        kbar[0], good, constant = begin_model(x_hat, initial, fixed, damping, plan_x, S[0], C[0], b[0])
-        size += abs(constant)
-    if not good or not minimizer(S[0], s[0], C[0], b[0], costate, x_hat):
-        return 0, finite(S[0], N, N) and finite(C[0], N, N), 0.0
-    copy(x_hat, N, x_hats[0])
-    return -1, True, 1e-26 * size if size < inf else 0.0
-
-
-def opening_pass(
-    steps, guided, plan_x, plan_u, L, l, S, s, k, p, dt, stage, final, prior_weight, prior_about
-):  # fmt: skip
-    """A backward pass before any forward one: there is no cost-to-come, and the minimisers are of the cost-to-go alone.
-
-    Without a plan to be guided by, the dynamics run backwards from the minimiser of c_l, with the controls `plan_u`;
-    c_l is first quadratised at plan_x[T].
-    """
-    hessian, gradient, jacobian, c = stack(W, W), stack(W), stack(N, W), stack(N)
-    fx, fu, x_next, x, x_hat, u = stack(N, N), stack(N, M), stack(N), stack(N), stack(N), stack(M)
-    low, high = stack(M), stack(M)
-    limits(stage, low, high)
-    clear(fx, N, N)
-    clear(fu, N, M)
-    copy(plan_x[steps], N, x_hat)
-    for _ in range(2):
-        value = final_quadratic(x_hat, u, steps, final, hessian, gradient)
-        k[steps] = end_model(hessian, gradient, value, x_hat, S[steps], s[steps])
-        if not guided:
-            lowest(S[steps], s[steps], x_hat)
-    for t in range(steps - 1, -1, -1):
-        copy(plan_u[t], M, u)
-        if guided:
-            copy(plan_x[t], N, x)
-        else:
-            step(x_hat, u, p, -dt, x)
-        step_jacobian(x, u, p, dt, fx, fu, x_next, jacobian)
-        offset(jacobian, x, u, x_next, c)
-        constant = stage_model(x, u, t, stage, prior_weight, prior_about, 0.0, plan_u, hessian, gradient)
-        k[t], good = riccati_backward_within(
-            jacobian, c, hessian, gradient, constant, S[t + 1], s[t + 1], k[t + 1], x, low, high, L[t], l[t], S[t], s[t]
-        )
-        if not good:
-            return t, finite(hessian, W, W) and finite(jacobian, N, W)
-        copy(x, N, x_hat)
-        lowest(S[t], s[t], x_hat)
-    return -1, True
-
-
-def minimizers(steps, S, s, C, b, x_hats):
+def minimizers(steps, to_go, to_come, x_hats):
     """Write the states of least total cost; False if one has none."""
     costate, good = stack(N), True
     for t in range(steps + 1):
-        good = minimizer(S[t], s[t], C[t], b[t], costate, x_hats[t]) and good
+        good = minimizer(t, to_go, to_come, costate, x_hats[t]) and good
     return good
 
 

@@ -15,33 +15,36 @@ from lqrsim.kernels.linear_algebra import (
     quadratic_at,
     within,
 )
-from lqrsim.kernels.runge_kutta import step, step_jacobian
+from lqrsim.kernels.runge_kutta import advance, step_jacobian
 
 
-def begin(Q, q, constant, x, S, Sbar, sbar):
+def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
     """Write the cost-to-come at 0, given c_0 about the origin, quadratised at x; return its constant. Eq. (18)."""
     for i in range(N):
-        sbar[i] = q[i]
+        to_come.vector[0, i] = q[i]
         for j in range(N):
-            Sbar[i, j] = Q[i, j]
+            to_come.matrix[0, i, j] = Q[i, j]
     return constant, True
 
 
-def linearize(x, u, p, dt, fx, fu, x_next, jacobian, c):
-    """Write where (x, u) leads, and the inverse step linearised there: x = jacobian (x_next, u) + c."""
+def linearize(x, u, model, slopes, step):
+    """Write where (x, u) leads, and the inverse step linearised there: x = jacobian (x_next, u) + offset."""
     x_back = stack(N)
-    step(x, u, p, dt, x_next)
-    step_jacobian(x_next, u, p, -dt, fx, fu, x_back, jacobian)
-    offset(jacobian, x_next, u, x_back, c)
+    advance(x, u, model.parameters, model.dt, slopes.arrived)
+    step_jacobian(
+        slopes.arrived, u, model.parameters, -model.dt, slopes.state, slopes.control, x_back, step.jacobian
+    )  # fmt: skip
+    offset(step.jacobian, slopes.arrived, u, x_back, step.offset)
 
 
-def riccati_forward(jacobian, c, cost, slope, constant, S0, s0, k0, smoothing, updated, gain, feedforward, S, s):
-    """One step of the cost-to-come, Eqs. (15)-(17), (19): from (S0, s0, k0) at t to (S, s) at t + 1.
+def riccati_forward(t, step, stage, constant, to_come, smoothing):
+    """One step of the cost-to-come, Eqs. (15)-(17), (19): from t to t + 1. Returns whether it succeeded.
 
-    `jacobian` = [Abar Bbar] and c are the linearised inverse step x_t = Abar x_{t+1} + Bbar u_t + cbar; the rest as in
-    `riccati_backward`. The inverse policy is u_t = gain x_{t+1} + feedforward. Returns the constant and whether the
-    step succeeded.
+    The step is the inverse one linearised, x_t = Abar x_{t+1} + Bbar u_t + cbar; the rest as in `riccati_backward`. The
+    inverse policy is u_t = Lbar x_{t+1} + lbar.
     """
+    S0, s0, jacobian, c = to_come.matrix[t], to_come.vector[t], step.jacobian, step.offset
+    cost, slope = stage.hessian, stage.gradient
     z, a, v, b = stack(N, N), stack(N), stack(N), stack(W)
     joint = stack(W, W)
     crossed = 0.0
@@ -69,14 +72,18 @@ def riccati_forward(jacobian, c, cost, slope, constant, S0, s0, k0, smoothing, u
                 for j in range(W):
                     joint[N + i, j] += factor * jacobian[k, j]
                     joint[j, N + i] += factor * jacobian[k, j]
-    shifted = k0 + constant + quadratic_at(z, a, c)
+    shifted = to_come.constant[t] + constant + quadratic_at(z, a, c)
     congruence(jacobian, z, v, joint, b)
-    decrease = minimize_control(joint, b, gain, feedforward, S, s)
-    return shifted - decrease, decrease >= 0
+    decrease = minimize_control(
+        joint, b, smoothing.control_gain[t], smoothing.control[t], to_come.matrix[t + 1], to_come.vector[t + 1]
+    )
+    to_come.constant[t + 1] = shifted - decrease
+    return decrease >= 0
 
 
-def minimizer(S, s, Sbar, sbar, costate, x):
+def minimizer(t, to_go, to_come, costate, x):
     """Write x = -(S + Sbar)^-1 (s + sbar), Eq. (21), and the costate S x + s; False unless the sum is definite."""
+    S, s, Sbar, sbar = to_go.hessian[t], to_go.gradient[t], to_come.matrix[t], to_come.vector[t]
     total = stack(N, N)
     for i in range(N):
         x[i] = -(s[i] + sbar[i])
@@ -92,8 +99,8 @@ def minimizer(S, s, Sbar, sbar, costate, x):
     return True
 
 
-def depart(x_hat, costate, smoothing, updated, gain, feedforward, p, dt, low, high, x, u):
+def backtrack(t, x_hat, costate, smoothing, model, x, u):
     """Write the state and control (x, u) that lead to x_hat = x_{t+1}: the inverse policy, then the inverse step."""
-    affine(gain, feedforward, x_hat, u)
-    within(u, low, high)
-    step(x_hat, u, p, -dt, x)
+    affine(smoothing.control_gain[t], smoothing.control[t], x_hat, u)
+    within(u, model.limits)
+    advance(x_hat, u, model.parameters, -model.dt, x)

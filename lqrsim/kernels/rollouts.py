@@ -5,7 +5,7 @@ Shapes and names are those of `passes.py`.
 
 from math import isnan, nan
 
-from lqrsim.kernels.control_limits import limits, minimize_within
+from lqrsim.kernels.control_limits import minimize_within
 from lqrsim.kernels.interface import (
     M,
     N,
@@ -20,57 +20,58 @@ from lqrsim.kernels.interface import (
     stage_quadratic,
     stage_value,
 )
-from lqrsim.kernels.linear_algebra import affine, cholesky, cholesky_solve, clear, congruence, finite, within
-from lqrsim.kernels.passes import copy, end_model
-from lqrsim.kernels.runge_kutta import step, step_jacobian
+from lqrsim.kernels.linear_algebra import affine, cholesky, cholesky_solve, congruence, finite, within
+from lqrsim.kernels.passes import clear_slopes, copy, end_model
+from lqrsim.kernels.records import Limits, Slopes, Stage
+from lqrsim.kernels.runge_kutta import advance, step_jacobian
 
 
-def rollout(steps, x0, gain, feedforward, p, dt, initial, stage, final, states, controls):
+def rollout(steps, x0, policy, model, plan):
     """Run the policy from x0 under the true dynamics; write the trajectory and return its true cost."""
-    x, u, low, high = states[0], stack(M), stack(M), stack(M)
-    limits(stage, low, high)
+    x, u = plan.states[0], stack(M)
     for i in range(N):
         x[i] = x0[i]
-    cost = initial_value(x, u, 0, initial)
+    cost = initial_value(x, u, 0, model.initial)
     for t in range(steps):
-        x, u = states[t], controls[t]
-        affine(gain[t], feedforward[t], x, u)
-        within(u, low, high)
-        cost += stage_value(x, u, t, stage)
-        step(x, u, p, dt, states[t + 1])
-    return cost + final_value(states[steps], u, steps, final)
+        x, u = plan.states[t], plan.controls[t]
+        affine(policy.gain[t], policy.offset[t], x, u)
+        within(u, model.limits)
+        cost += stage_value(x, u, t, model.stage)
+        advance(x, u, model.parameters, model.dt, plan.states[t + 1])
+    return cost + final_value(plan.states[steps], u, steps, model.final)
 
 
-def costs_of(count, steps, states, controls, stage, final, costs):
-    """Stage and final cost of trajectories (count (steps + 1), N) and (count steps, M), one after the other."""
+def costs_of(count, steps, plans, model, costs):
+    """Stage and final cost of trajectories, one after the other: states (count (steps + 1), N), controls alike."""
     for k in range(count):
         costs[k] = 0.0
         for t in range(steps):
-            costs[k] += stage_value(states[k * (steps + 1) + t], controls[k * steps + t], t, stage)
-        last = controls[(k + 1) * steps - 1]
-        costs[k] += final_value(states[(k + 1) * (steps + 1) - 1], last, steps, final)
+            x, u = plans.states[k * (steps + 1) + t], plans.controls[k * steps + t]
+            costs[k] += stage_value(x, u, t, model.stage)
+        last = plans.controls[(k + 1) * steps - 1]
+        costs[k] += final_value(plans.states[(k + 1) * (steps + 1) - 1], last, steps, model.final)
 
 
-def differential_pass(steps, states, controls, p, dt, stage, final, damping, keep, L, l, S, s, k):
-    """The backward pass of iLQR about a feasible trajectory; l is relative to it, S, s, k are about the origin.
+def differential_pass(steps, plan, model, damping, keep, policy, to_go):
+    """The backward pass of iLQR about a feasible trajectory; the policy is relative to it, the cost-to-go is about the
+    origin.
 
     `damping` is a weight on changes of the controls. With `keep` of 1 all steps are written; with 0 each overwrites the
     one after it, for those who only ask what the model predicts.
 
-    Returns as every sweep does, and the decrease of cost that the linear-quadratic model predicts.
+    Returns as every pass does, and the decrease of cost that the linear-quadratic model predicts.
     """
-    hessian, gradient, jacobian = stack(W, W), stack(W), stack(N, W)
-    fx, fu, x_next, none = stack(N, N), stack(N, M), stack(N), stack(M)
+    stage, slopes = Stage(stack(W, W), stack(W)), Slopes(stack(N, N), stack(N, M), stack(N))
+    jacobian, none, no_change = stack(N, W), stack(M), stack(N)
     slope, curve = stack(N), stack(N, N)
-    no_change, low, high, lowest, highest = stack(N), stack(M), stack(M), stack(M), stack(M)
-    limits(stage, low, high)
+    hessian, gradient, room = stage.hessian, stage.gradient, Limits(stack(M), stack(M))
+    states, controls, S, s, k = plan.states, plan.controls, to_go.hessian, to_go.gradient, to_go.constant
     for i in range(N):
         no_change[i] = 0.0
-    clear(fx, N, N)
-    clear(fu, N, M)
+    clear_slopes(slopes)
     for i in range(M):
         none[i] = 0.0
-    value = final_quadratic(states[steps], none, steps, final, hessian, gradient)
+    value = final_quadratic(states[steps], none, steps, model.final, hessian, gradient)
     predicted, ahead = 0.0, value
     for i in range(N):
         slope[i] = gradient[i]
@@ -79,14 +80,14 @@ def differential_pass(steps, states, controls, p, dt, stage, final, damping, kee
     last = steps * keep
     k[last] = end_model(hessian, gradient, value, states[steps], S[last], s[last])
     for t in range(steps - 1, -1, -1):
-        at = t * keep
-        step_jacobian(states[t], controls[t], p, dt, fx, fu, x_next, jacobian)
-        ahead += stage_quadratic(states[t], controls[t], t, stage, hessian, gradient)
+        at, x, u = t * keep, states[t], controls[t]
+        step_jacobian(x, u, model.parameters, model.dt, slopes.state, slopes.control, slopes.arrived, jacobian)
+        ahead += stage_quadratic(x, u, t, model.stage, hessian, gradient)
         congruence(jacobian, curve, slope, hessian, gradient)
         for i in range(M):
             hessian[N + i, N + i] += damping
-            lowest[i], highest[i] = low[i] - controls[t, i], high[i] - controls[t, i]
-        decrease, good = minimize_within(hessian, gradient, no_change, lowest, highest, L[at], l[at], curve, slope)
+            room.low[i], room.high[i] = model.limits.low[i] - u[i], model.limits.high[i] - u[i]
+        decrease, good = minimize_within(stage, no_change, room, policy.gain[at], policy.offset[at], curve, slope)
         if not good:
             return t, finite(hessian, W, W) and finite(jacobian, N, W), predicted
         predicted += decrease
@@ -95,20 +96,21 @@ def differential_pass(steps, states, controls, p, dt, stage, final, damping, kee
             moved = slope[i]
             for j in range(N):
                 S[at, i, j] = curve[i, j]
-                moved -= curve[i, j] * states[t, j]
+                moved -= curve[i, j] * x[j]
             s[at, i] = moved
-            constant -= 0.5 * (slope[i] + moved) * states[t, i]
+            constant -= 0.5 * (slope[i] + moved) * x[i]
         k[at] = constant
     return -1, True, predicted
 
 
-def initial_step(x0, initial, S, s, direction):
+def initial_step(x0, model, to_go, direction):
     """Write where the soft start x0 would best move, given the cost-to-go at 0; return what that promises, or NaN."""
+    S, s = to_go.hessian[0], to_go.gradient[0]
     hessian, gradient, none = stack(W, W), stack(W), stack(M)
     total, slope = stack(N, N), stack(N)
     for i in range(M):
         none[i] = 0.0
-    initial_quadratic(x0, none, 0, initial, hessian, gradient)
+    initial_quadratic(x0, none, 0, model.initial, hessian, gradient)
     for i in range(N):
         slope[i] = gradient[i] + s[i]
         for j in range(N):
@@ -142,17 +144,15 @@ def largest_gap(steps, x_hats, states):
     return gap
 
 
-def dynamics_residual(steps, x_hats, L, l, p, dt, stage, states):
+def dynamics_residual(steps, x_hats, policy, model, states):
     """The largest step x_{t+1} - g(x_t, u_t) of a sequence of states under a policy, relative as the gap is."""
     u, ahead, least, most, worst = stack(M), stack(N), stack(N), stack(N), stack(N)
-    low, high = stack(M), stack(M)
-    limits(stage, low, high)
     for i in range(N):
         least[i], most[i], worst[i] = states[0, i], states[0, i], 0.0
     for t in range(steps):
-        affine(L[t], l[t], x_hats[t], u)
-        within(u, low, high)
-        step(x_hats[t], u, p, dt, ahead)
+        affine(policy.gain[t], policy.offset[t], x_hats[t], u)
+        within(u, model.limits)
+        advance(x_hats[t], u, model.parameters, model.dt, ahead)
         for i in range(N):
             difference = abs(x_hats[t + 1, i] - ahead[i])
             if difference > worst[i] or isnan(difference):
@@ -166,69 +166,65 @@ def dynamics_residual(steps, x_hats, L, l, p, dt, stage, states):
     return residual
 
 
-def line_search(
-    steps, states, controls, shift, L, l, p, dt, initial, stage, final, old, smallest, new_states, new_controls
-):  # fmt: skip
-    """Try steps 1, 1/2, 1/4, ... along the changes of start and controls until the merit falls below `old`.
+def line_search(steps, plan, shift, policy, model, bound, smallest, trial):
+    """Try steps 1, 1/2, 1/4, ... along the changes of start and controls until the merit falls below `bound`.
 
     The merit is the true cost and what the augmented Lagrangian adds to it. Writes the trajectory. Returns its merit,
     its cost, and the step, which is 0 if none down to `smallest` lowers the merit.
     """
-    low, high = stack(M), stack(M)
-    limits(stage, low, high)
     fraction = 1.0
     while fraction >= smallest:
         for i in range(N):
-            new_states[0, i] = states[0, i] + fraction * shift[i]
-        cost, added = initial_value(new_states[0], new_controls[0], 0, initial), 0.0
+            trial.states[0, i] = plan.states[0, i] + fraction * shift[i]
+        cost, added = initial_value(trial.states[0], trial.controls[0], 0, model.initial), 0.0
         for t in range(steps):
-            x, u = new_states[t], new_controls[t]
+            x, u = trial.states[t], trial.controls[t]
             for i in range(M):
-                total = controls[t, i] + fraction * l[t, i]
+                total = plan.controls[t, i] + fraction * policy.offset[t, i]
                 for j in range(N):
-                    total += L[t, i, j] * (x[j] - states[t, j])
+                    total += policy.gain[t, i, j] * (x[j] - plan.states[t, j])
                 u[i] = total
-            within(u, low, high)
-            cost += stage_value(x, u, t, stage)
-            added += stage_added(x, u, t, stage)
-            step(x, u, p, dt, new_states[t + 1])
-        cost += final_value(new_states[steps], new_controls[steps - 1], steps, final)
-        added += final_added(new_states[steps], new_controls[steps - 1], steps, final)
-        if cost + added < old:
+            within(u, model.limits)
+            cost += stage_value(x, u, t, model.stage)
+            added += stage_added(x, u, t, model.stage)
+            advance(x, u, model.parameters, model.dt, trial.states[t + 1])
+        cost += final_value(trial.states[steps], trial.controls[steps - 1], steps, model.final)
+        added += final_added(trial.states[steps], trial.controls[steps - 1], steps, model.final)
+        if cost + added < bound:
             return cost + added, cost, fraction
         fraction *= 0.5
-    return old, old, 0.0
+    return bound, bound, 0.0
 
 
-def keep_plan(steps, states, controls, plan_x, plan_u):
+def keep_plan(steps, source, target):
     """Copy a trajectory."""
     for t in range(steps + 1):
-        copy(states[t], N, plan_x[t])
+        copy(source.states[t], N, target.states[t])
     for t in range(steps):
-        copy(controls[t], M, plan_u[t])
+        copy(source.controls[t], M, target.controls[t])
 
 
-def keep_law(steps, L, l, kept_L, kept_l):
+def keep_policy(steps, source, target):
     """Copy a policy."""
     for t in range(steps):
         for i in range(M):
-            kept_l[t, i] = l[t, i]
+            target.offset[t, i] = source.offset[t, i]
             for j in range(N):
-                kept_L[t, i, j] = L[t, i, j]
+                target.gain[t, i, j] = source.gain[t, i, j]
 
 
-def follow(steps, fraction, plan_x, x_hats):
+def follow(steps, fraction, plan, x_hats):
     """Make of the states that a whole step was to lead to those that a part of it was."""
     if fraction < 1:
         for t in range(steps + 1):
             for i in range(N):
-                x_hats[t, i] = plan_x[t, i] + fraction * (x_hats[t, i] - plan_x[t, i])
+                x_hats[t, i] = plan.states[t, i] + fraction * (x_hats[t, i] - plan.states[t, i])
 
 
-def about_plan(steps, plan_x, plan_u, L, l):
+def about_plan(steps, plan, policy):
     """Make the policy relative to the plan: l becomes L x + l - u, the change of the controls that it asks for."""
     u = stack(M)
     for t in range(steps):
-        affine(L[t], l[t], plan_x[t], u)
+        affine(policy.gain[t], policy.offset[t], plan.states[t], u)
         for i in range(M):
-            l[t, i] = u[i] - plan_u[t, i]
+            policy.offset[t, i] = u[i] - plan.controls[t, i]

@@ -6,7 +6,7 @@ A negative `h` steps backwards in time: the approximate inverse `gbar` of the st
 from lqrsim.kernels.interface import M, N, W, rate, rate_jacobian, stack
 
 
-def step(x, u, p, h, out):
+def advance(x, u, p, h, out):
     """Write x after `h` seconds, (N,)."""
     z, k = stack(N), stack(N)
     for i in range(N):

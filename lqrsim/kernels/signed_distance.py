@@ -61,7 +61,8 @@ def signed_distance_derivatives(data, row: int, x: float, y: float, z: float, gr
         side, end = length - radius, abs(along) - half
         sign = 1.0 if along > 0 else -1.0
         if side > 0 and end > 0:
-            return rim_derivatives(data, row, side, end * sign, vx, vy, vz, gradient, hessian)
+            gradient[0], gradient[1], gradient[2] = vx, vy, vz
+            return rim_derivatives(data, row, side, end * sign, gradient, hessian)
         if end > side:
             return flat_derivatives(end, sign, nx, ny, nz, gradient, hessian)
     inverse = 1 / length if length >= 1e-12 else 0.0
@@ -82,13 +83,12 @@ def flat_derivatives(distance: float, sign: float, nx: float, ny: float, nz: flo
     return distance
 
 
-def rim_derivatives(
-    data, row: int, side: float, end: float, vx: float, vy: float, vz: float, gradient, hessian
-) -> float:
-    """The rim of a cylinder, from `side` beyond its side, `end` (signed) along its axis, `v` from its axis.
+def rim_derivatives(data, row: int, side: float, end: float, gradient, hessian) -> float:
+    """The rim of a cylinder, from `side` beyond its side, `end` (signed) along its axis, `gradient` from its axis.
 
     Round in the radial and the axial direction; along the rim it turns with the side.
     """
+    vx, vy, vz = gradient[0], gradient[1], gradient[2]
     radial = sqrt(vx * vx + vy * vy + vz * vz)
     distance = sqrt(side * side + end * end)
     outward = stack(3)

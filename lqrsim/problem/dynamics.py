@@ -241,7 +241,7 @@ class Dynamics:
         """The state (n,) after `dt` seconds (negative: before), control held: one Runge-Kutta step, in plain Python."""
         x, u = self._check(state, control)
         out = np.zeros(len(x))
-        self._plain["step"](x, u, self._numbers(), check_number("dt", dt), out)
+        self._plain["advance"](x, u, self._numbers(), check_number("dt", dt), out)
         return out
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
@@ -267,10 +267,10 @@ class Dynamics:
         n, m = len(self.state_coordinates), len(self.control_coordinates)
         names = plain_names(n, m, self.functions, self.parameters)
         exec(compile(self.source, f"<{self.name}>", "exec"), names)
-        for function in (runge_kutta.step, runge_kutta.step_jacobian):
-            exec(compile(inspect.getsource(function), "<integration>", "exec"), names)
+        for function in (runge_kutta.advance, runge_kutta.step_jacobian):
+            exec(compile(inspect.getsource(function), "<runge_kutta>", "exec"), names)
         if "chain" not in names:
-            exec(compile(inspect.getsource(runge_kutta.chain), "<integration>", "exec"), names)
+            exec(compile(inspect.getsource(runge_kutta.chain), "<runge_kutta>", "exec"), names)
         return names
 
     def _numbers(self) -> Array:

@@ -7,10 +7,11 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels import interface
+from lqrsim.kernels.records import LOG, Plan, Policy, Rows, Settings
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers.certify import certified
-from lqrsim.solvers.common import LOG_COLUMNS, Callback, Ending, SmootherSettings, Stop, check_outcome, iterate
+from lqrsim.solvers.common import Callback, Ending, SmootherSettings, Stop, check_outcome, iterate
 from lqrsim.solvers.initial_guess import Start
 from lqrsim.solvers.workspace import Workspace
 
@@ -61,9 +62,9 @@ class Attempt:
             begin = begin.rolled_out(problem, start)
         self.begin = begin
         self.work = Workspace(problem, settings, begin, start)
-        self.work.memory[interface.WATCHED] = float(settings.safeguard)
+        self.work.memory["watched"] = float(settings.safeguard)
         self.ending = Ending((), interface.RUNNING, False, -1, "")
-        self._log = np.zeros((settings.max_iterations, LOG_COLUMNS))
+        self._log = np.zeros(settings.max_iterations, LOG)
         self._shares = begin.prior.obstacles if begin.prior is not None else ()
         self._loop = self.work.core.entry("smoother", *self._arguments(0, 0, self._log))
 
@@ -90,10 +91,10 @@ class Attempt:
             self.roll_out()
 
     def run_on(
-        self, log: Array, last: int, *, done: tuple[Iteration, ...], each: bool, callback: Callback | None
+        self, log: Rows, last: int, *, done: tuple[Iteration, ...], each: bool, callback: Callback | None
     ) -> Ending:
         """More iterations of the same kind, with a log of their own; the prior has had its time."""
-        self.work.memory[interface.WATCHED] = 0.0  # with constraints the least cost is no measure
+        self.work.memory["watched"] = 0.0  # with constraints the least cost is no measure
         return iterate(
             self.problem, lambda first, last: self._loop(*self._arguments(first, last, log, again=True)), log, last,
             done=done, look=self._violation, each=self._looking(each), stop=self.stop, callback=callback,
@@ -125,14 +126,14 @@ class Attempt:
         work, last = self.work, ending.iterations[-1] if ending.iterations else None
         return Found(
             status=ending.status, detail=ending.detail(self.problem.steps), iterations=ending.iterations,
-            states=work.states, controls=work.controls, law=work.kept, cost=_cost_of(last),
+            states=work.states, controls=work.controls, law=work.arrays.kept, cost=_cost_of(last),
             violation=np.inf if last is None else last.violation, gap=np.nan if last is None else last.gap,
             values={} if ending.pass_failed or last is None else work.value_functions(),
         )  # fmt: skip
 
     def best(self, found: Found) -> Found:
         """The best plan so far in place of the last one, with a policy and value functions about it."""
-        cost = float(self.work.memory[interface.PLAN_COST])
+        cost = float(self.work.memory["plan_cost"])
         if not np.isfinite(cost) or (not cost < found.cost and found.values):
             return found
         optimality = self.look_back()
@@ -142,18 +143,18 @@ class Attempt:
 
     def look_back(self) -> float:
         """Make policy and value functions about the plan in the memory; its optimality, NaN if that fails."""
-        work, log = self.work, np.full((1, LOG_COLUMNS), np.nan)
-        trial = np.zeros_like(work.states), np.zeros_like(work.controls)
-        work.memory[interface.MERIT] = work.memory[interface.PLAN_COST]
+        work, log = self.work, np.full(1, np.nan, LOG)
+        trial = Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
+        work.memory["merit"] = work.memory["plan_cost"]
         self._loop(*self._damped_arguments(0, 0, log, 1, trial))
-        return float(log[0, 3])
+        return float(log["optimality"][0])
 
     def rescue(self, found: Found, *, each: bool, callback: Callback | None = None) -> Found:
         """The safeguard: iterations from the best plan so far."""
         work, detail = self.work, f"the undamped method failed ({found.detail or found.status.meaning})"
-        work.memory[interface.MERIT] = work.memory[interface.PLAN_COST]
+        work.memory["merit"] = work.memory["plan_cost"]
         damped = self.damp(before=found.iterations, each=each, callback=callback)
-        if not np.isfinite(work.memory[interface.PLAN_COST]):
+        if not np.isfinite(work.memory["plan_cost"]):
             # Nothing that was tried leads anywhere. What is left is how it failed.
             status = Status.DIVERGED if found.status is Status.MAX_ITERATIONS else found.status
             return replace(found, status=status, detail=detail, iterations=damped.iterations, values={})
@@ -176,11 +177,11 @@ class Attempt:
           before: the iterations that led there. least: what the tolerances of cost and gap are to be at least.
         """
         work, last = self.work, self.left(before)
-        log = np.zeros((max(last, 1), LOG_COLUMNS))
+        log = np.zeros(max(last, 1), LOG)
         memory = work.memory
-        memory[interface.REACH], memory[interface.WEIGHT], memory[interface.SMALL] = 1.0, 0.0, 0.0
-        memory[interface.ILQR_LEFT], memory[interface.ILQR_NEXT], memory[interface.SINCE_ILQR] = 0.0, 2.0, 0.0
-        trial = np.zeros_like(work.states), np.zeros_like(work.controls)
+        memory["reach"], memory["weight"], memory["small_changes"] = 1.0, 0.0, 0.0
+        memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
+        trial = Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
 
         def run(first: int, to: int) -> tuple[int, int, bool, int]:
             return self._loop(*self._damped_arguments(first, to, log, last, trial, least))
@@ -197,7 +198,7 @@ class Attempt:
             return self.best(
                 Found(
                     status=status, detail=detail, iterations=damped.iterations, states=self.work.states,
-                    controls=self.work.controls, law=self.work.kept, cost=np.inf, violation=np.inf, gap=np.nan,
+                    controls=self.work.controls, law=self.work.arrays.kept, cost=np.inf, violation=np.inf, gap=np.nan,
                 )
             )  # fmt: skip
         return self._about_plan(damped.iterations, optimality, status, detail)
@@ -206,9 +207,9 @@ class Attempt:
         """The plan in the memory, with the policy and the value functions that were made about it last."""
         work = self.work
         states, controls = work.plan
-        values, law, gap = {}, work.law, float(work.memory[interface.FINAL_GAP])
+        values, law, gap = {}, work.arrays.policy, float(work.memory["final_gap"])
         if not np.isfinite(optimality):  # there is no model about the plan, nor a policy
-            law, gap = (np.zeros_like(work.law[0]), controls.copy()), np.nan
+            law, gap = (np.zeros_like(work.arrays.policy.gain), controls.copy()), np.nan
         else:
             values = work.value_functions()
             if not gap < self.settings.gap_tolerance:
@@ -220,7 +221,7 @@ class Attempt:
                 )
         return Found(
             status=status, detail=detail.removeprefix("; "), iterations=iterations, states=states, controls=controls,
-            law=law, cost=float(work.memory[interface.PLAN_COST]), violation=self._violation_of(work.plan), gap=gap,
+            law=law, cost=float(work.memory["plan_cost"]), violation=self._violation_of(work.plan), gap=gap,
             values=values,
         )  # fmt: skip
 
@@ -254,17 +255,17 @@ class Attempt:
             return True
         self.roll_out()  # before the start is forgotten
         work = self.work
-        p, dt, _, _, final = work.model
+        arrays, eased = work.arrays, work.model._replace(stage=work.eased(self._share(0)))
         failed, good = work.core.opening_pass(
-            self.problem.steps, self.begin.trajectory is not None, *work.guess, *work.law, *work.go,
-            p, dt, work.eased(self._share(0)), final, *work.prior[:2],
+            self.problem.steps, self.begin.trajectory is not None, arrays.guess, work.prior, eased, arrays.policy,
+            arrays.to_go,
         )  # fmt: skip
         if failed >= 0:
             outcome = interface.NOT_POSITIVE_DEFINITE if good else interface.NOT_FINITE
             self.ending = Ending((), outcome, True, failed, "")
         return failed < 0
 
-    def _arguments(self, first: int, last: int, log: Array, *, again: bool = False) -> tuple[Any, ...]:
+    def _arguments(self, first: int, last: int, log: Rows, *, again: bool = False) -> tuple[Any, ...]:
         """What the loop takes, for the iterations from `first` up to `last`, or fewer: of a continuation, one."""
         settings, work = self.settings, self.work
         share = 1.0 if again else self._share(first)
@@ -273,39 +274,38 @@ class Attempt:
             last = min(last, first + 1)
             tolerance = 0.0  # what is not all of the cost does not settle
         guided = self.begin.trajectory is not None and settings.first_pass == "forward" and not again
-        prior = (*work.no_prior, 0) if again else work.prior
-        return (
-            interface.ITERATE, self.problem.steps, first, last, len(log), tolerance, settings.gap_tolerance,
-            settings.stop == "optimal", work.fixed, guided, *work.passes, work.eased(share), *prior,
-            *work.guess, *work.plan, work.states, work.controls, *work.kept, work.memory, log,
-        )  # fmt: skip
+        prior, count = (work.no_prior, 0) if again else (work.prior, work.prior_iterations)
+        options = self._settings(len(log), tolerance, settings.gap_tolerance)._replace(
+            guided=guided, prior_iterations=count
+        )
+        arrays = work.arrays._replace(eased=work.eased(share), prior=prior)
+        return interface.ITERATE, first, last, options, work.model, arrays, work.memory_rows, log
 
     def _damped_arguments(
-        self,
-        first: int,
-        last: int,
-        log: Array,
-        most: int,
-        trial: tuple[Array, Array],
-        least: tuple[float, float] = (0.0, 0.0),
+        self, first: int, last: int, log: Rows, most: int, trial: Plan, least: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[Any, ...]:
         """What it takes for damped iterations, of which there are to be `most`; `trial` is written to on the way."""
         settings, work = self.settings, self.work
-        return (
-            interface.DAMP, self.problem.steps, first, last, most, max(settings.tolerance, least[0]),
-            max(settings.gap_tolerance, least[1]),
-            settings.stop == "optimal", work.fixed, False, *work.passes, work.eased(1.0), *work.no_prior, 0,
-            *work.guess, *work.plan, *trial, *work.kept, work.memory, log,
-        )  # fmt: skip
+        options = self._settings(most, max(settings.tolerance, least[0]), max(settings.gap_tolerance, least[1]))
+        arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
+        return interface.DAMP, first, last, options, work.model, arrays, work.memory_rows, log
 
-    def _check_arguments(self, task: int, found: Found, hessians: Array, log: Array) -> tuple[Any, ...]:
+    def _check_arguments(self, task: int, found: Found, hessians: Array, certificate: Rows) -> tuple[Any, ...]:
         """What it takes to certify a plan and its policy, with these Hessians of a cost-to-go."""
         settings, work = self.settings, self.work
-        start, x_hat, x_hats, L, l, _, *rest = work.passes
-        return (
-            task, self.problem.steps, 0, 0, 0, settings.tolerance, settings.gap_tolerance, True,
-            work.fixed, False, start, x_hat, x_hats, L, l, hessians, *rest, work.eased(1.0), *work.no_prior, 0,
-            *work.guess, *work.plan, found.states, found.controls, *found.law, work.memory, log,
+        arrays = work.arrays._replace(
+            to_go=work.arrays.to_go._replace(hessian=hessians), rollout=Plan(found.states, found.controls),
+            kept=Policy(*found.law), certificate=certificate,
+        )  # fmt: skip
+        options = self._settings(0, settings.tolerance, settings.gap_tolerance)
+        return task, 0, 0, options, work.model, arrays, work.memory_rows, self._log
+
+    def _settings(self, most: int, tolerance: float, gap_tolerance: float) -> Settings:
+        """What the iterations go by, of which there are to be `most`."""
+        return Settings(
+            steps=self.problem.steps, max_iterations=most, tolerance=float(tolerance),
+            gap_tolerance=float(gap_tolerance), optimal=self.settings.stop == "optimal", fixed=self.work.fixed,
+            guided=False, prior_iterations=0,
         )  # fmt: skip
 
     def _share(self, iteration: int) -> float:

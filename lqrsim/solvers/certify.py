@@ -10,6 +10,7 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels import interface
+from lqrsim.kernels.records import CERTIFICATE, Rows
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Certificate
 
@@ -23,7 +24,7 @@ REST = 1e-13
 SLACK = 2.0
 
 
-Work = Callable[[int, Array, Array], object]
+Work = Callable[[int, Array, Rows], object]
 
 
 def certified(
@@ -39,13 +40,13 @@ def certified(
     """The certificate of a plan, and what of it contradicts a solver that says it converged.
 
     Args:
-      work: runs the compiled `certify`: of a task, Hessians (T+1, n, n) of the cost-to-go, and where to write (1, 6).
+      work: runs the compiled `certify`: of a task, Hessians (T+1, n, n) of the cost-to-go, and where to write (1,).
       states: (T+1, n) of the plan. hessians: None where there are none.
       violation: by how much the worst constraint is missed.
       claimed: the cost that the log ends with; None where success is not claimed, and nothing can contradict it.
       tolerance: of the optimality; None where only the cost was asked for.
     """
-    numbers, n = np.zeros((1, 6)), states.shape[1]
+    numbers, n = np.zeros(1, CERTIFICATE), states.shape[1]
     given = np.zeros((len(states), n, n)) if hessians is None else hessians
     work(interface.CERTIFY, given, numbers)
     certificate = certificate_of(problem, numbers[0], states, violation=violation)
@@ -57,13 +58,13 @@ def certified(
         # Where controls stand at their limits, the Hessians of the Riccati pass are not those of the policy.
         work(interface.EVALUATE, np.zeros_like(given), numbers)
         certificate = certificate_of(problem, numbers[0], states, violation=violation)
-    rest = REST * float(numbers[0, 1])
+    rest = REST * float(numbers["scale"][0])
     return certificate, faults(certificate, claimed=claimed, rest=rest, tolerance=tolerance)
 
 
-def certificate_of(problem: Problem, found: Array, states: Array, *, violation: float) -> Certificate:
-    """The certificate of a plan with states (T+1, n), given what `certificate.certify` wrote, (6,)."""
-    cost, scale, motion, law, limits, decrease = (float(number) for number in found)
+def certificate_of(problem: Problem, found: np.void, states: Array, *, violation: float) -> Certificate:
+    """The certificate of a plan with states (T+1, n), given what `certificate.certify` wrote."""
+    cost, scale, motion, law, limits, decrease = (float(found[name]) for name in CERTIFICATE.names or ())
     start = 0.0
     if isinstance(problem.initial, FixedState):
         start = float(np.abs(states[0] - np.asarray(problem.initial.state)).max())

@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -24,6 +24,7 @@ from lqrsim.errors import (
     check_number,
 )
 from lqrsim.kernels import interface
+from lqrsim.kernels.records import Rows
 from lqrsim.machine import processors
 from lqrsim.problem.constraints import Clearance
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
@@ -59,7 +60,6 @@ _METHODS = {
     interface.REJECTED: "rejected",
     interface.ILQR: "ilqr",
 }
-LOG_COLUMNS = 6
 MOST_STARTS, MOST_THREADS = 10_000, 1024
 
 
@@ -199,7 +199,7 @@ class Ending:
 def iterate(
     problem: Problem,
     run: Callable[[int, int], tuple[int, int, bool, int]],
-    log: Array,
+    log: Rows,
     last: int,
     *,
     done: tuple[Iteration, ...] = (),
@@ -214,7 +214,7 @@ def iterate(
     Args:
       problem: whose functions may raise meanwhile.
       run: runs the iterations from its first argument up to its second, or fewer.
-      log: (any, LOG_COLUMNS), where `run` writes.
+      log: (any,) rows of `LOG`, where `run` writes.
       last: how many iterations there are to be.
       done: those that there are already.
       before: the iterations of what ran before, which come first in the ending's.
@@ -399,12 +399,6 @@ def _radius(problem: Problem) -> float | None:
         return None
     constraints = [constraint for constraint in problem.constraints if isinstance(constraint, Clearance)]
     return max((one.radius for one in (*problem.obstacle_costs, *constraints)), default=0.0) or None
-
-
-def model(problem: Problem, multipliers: Sequence[Array] = ()) -> tuple[Any, ...]:
-    """The problem's numbers in the order in which the loops take them: p, dt, initial, stage, final."""
-    data = compiled.arguments(problem, multipliers=multipliers)
-    return data["p"], data["dt"], data["initial"], data["stage"], data["final"]
 
 
 def clearance_of(problem: Problem, states: Array) -> Array | None:

@@ -34,6 +34,7 @@ from lqrsim.kernels import (
     runge_kutta,
     signed_distance,
 )
+from lqrsim.kernels.records import Limits, Model, Plan, Policy
 from lqrsim.problem.constraints import Inequalities
 from lqrsim.problem.costs import Term
 from lqrsim.problem.dynamics import Dynamics
@@ -78,8 +79,7 @@ def _core(
     parts = [source_of(module) for module in (*_BASE, FORMS[form], *_SHARED)]
     parts += [dynamics, _constraint_source(constraints, len(dict(costs)["stage"]))]
     parts += [_cost_source(name, terms, () if name == "initial" else constraints) for name, terms in costs]
-    sizes = {"N": n, "M": m, "W": n + m, "LIMITS": len(dict(costs)["stage"]) + 2 * len(constraints)}
-    return Core("\n\n".join(parts), {**_NAMES, **sizes}, what)
+    return Core("\n\n".join(parts), {**_NAMES, "N": n, "M": m, "W": n + m}, what)
 
 
 _BASE = rotation_ratios, signed_distance, linear_algebra, runge_kutta
@@ -98,7 +98,7 @@ def linear_quadratic(n: int, m: int, form: str) -> Core:
 _NAMES = {name: value for name, value in vars(interface).items() if name.isupper() and len(name) > 1}
 
 
-def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> dict[str, Any]:
+def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> Model:
     """The problem's numbers, as the passes take them: before its own, each part has the addresses of its functions.
 
     Args:
@@ -113,25 +113,24 @@ def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> dict[st
     pairs = [(part.data.copy(), own) for part, own in zip(problem.inequalities, multipliers, strict=True)]
     data["stage"] += tuple(array for pair in pairs for array in pair)
     data["final"] += tuple(array for pair in pairs for array in pair)
-    data["stage"] += (np.array([*problem.control_coordinates.low, *problem.control_coordinates.high]),)
-    return {"p": numbers(problem.dynamics), "dt": problem.dt, **data}
+    space = problem.control_coordinates
+    limits = Limits(np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64))
+    return Model(numbers(problem.dynamics), float(problem.dt), limits=limits, **data)
 
 
 def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
     """Stage and final cost (K,) of each of K trajectories, states (K, T+1, n) and controls (K, T, m)."""
     costs = np.empty(len(states))
-    told = arguments(problem)
     flat = (in_c_order(array).reshape(-1, array.shape[2]) for array in (states, controls))
-    core(problem).costs_of(len(states), problem.steps, *flat, told["stage"], told["final"], costs)
+    core(problem).costs_of(len(states), problem.steps, Plan(*flat), arguments(problem), costs)
     return costs
 
 
 def rollout(problem: Problem, gain: Array, offset: Array, state: Array) -> tuple[Array, Array]:
     """Where the laws u_t = gain_t x + offset_t lead from a state, by the model: states (T+1, n) and controls (T, m)."""
     states, controls = np.empty((problem.steps + 1, len(state))), np.empty((problem.steps, offset.shape[1]))
-    told, law = arguments(problem), (in_c_order(gain), in_c_order(offset))
-    costs = (told[name] for name in ("initial", "stage", "final"))
-    core(problem).rollout(problem.steps, state, *law, told["p"], told["dt"], *costs, states, controls)
+    policy, plan = Policy(in_c_order(gain), in_c_order(offset)), Plan(states, controls)
+    core(problem).rollout(problem.steps, state, policy, arguments(problem), plan)
     return states, controls
 
 

@@ -13,12 +13,13 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels import interface
+from lqrsim.kernels.records import LOG
 from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Iteration, Multipliers, Status
 from lqrsim.results.value_functions import Moments
 from lqrsim.solvers.attempt import Attempt, Found
-from lqrsim.solvers.common import LOG_COLUMNS, Callback
+from lqrsim.solvers.common import Callback
 from lqrsim.solvers.initial_guess import Start
 
 PENALTY = 8.0  # at first, relative to what it costs to change what is constrained
@@ -139,8 +140,8 @@ def _undamped(
     callback: Callback | None,
 ) -> Found:
     work, settings = attempt.work, attempt.settings
-    work.memory[interface.PLAN_COST] = -np.inf  # of lower cost is not better now
-    log = np.zeros((min(ITERATIONS, max(attempt.left(before), 1)), LOG_COLUMNS))
+    work.memory["plan_cost"] = -np.inf  # of lower cost is not better now
+    log = np.zeros(min(ITERATIONS, max(attempt.left(before), 1)), LOG)
     done: tuple[Iteration, ...] = ()
     since = 0
     while True:
@@ -189,7 +190,7 @@ def _damped(
         merits.append(cost + lagrangian.added())
     states, controls, cost = plans[int(np.argmin(merits))]
     work.plan[0][:], work.plan[1][:] = states, controls
-    work.memory[interface.PLAN_COST] = cost
+    work.memory["plan_cost"] = cost
     why = "the undamped method failed with the constraints"
     return _rounds(attempt, lagrangian, undamped.iterations, why, each=each, callback=callback)
 
@@ -200,12 +201,12 @@ def refine(attempt: Attempt, *, each: bool, callback: Callback | None = None) ->
     So it stays on the way round that it begins with, which undamped iterations would leave.
     """
     attempt.roll_out()
-    cost = float(attempt.work.memory[interface.PLAN_COST])
+    cost = float(attempt.work.memory["plan_cost"])
     optimality = attempt.look_back() if np.isfinite(cost) else np.nan
     if not np.isfinite(optimality):
         return attempt.certified(attempt.finish(each=each, callback=callback))
     if not attempt.problem.constraints:
-        attempt.work.memory[interface.MERIT] = cost
+        attempt.work.memory["merit"] = cost
         damped = attempt.damp(before=(), each=each, callback=callback)
         found = attempt.found_damped(damped, damped.status, damped.detail(attempt.problem.steps))
         return attempt.certified(found)
@@ -232,7 +233,7 @@ def _rounds(
     rounds, rough = 0, True
     while True:
         rounds += 1
-        work.memory[interface.MERIT] = work.memory[interface.PLAN_COST] + lagrangian.added()
+        work.memory["merit"] = work.memory["plan_cost"] + lagrangian.added()
         # Until the multipliers are about right, there is no point in a minimum to all its digits.
         limits = (ROUGH, ROUGHEST_GAP) if rough else (0.0, 0.0)
         ending = attempt.damp(before=iterations, least=limits, each=each, callback=callback)
@@ -369,7 +370,7 @@ class _Lagrangian:
         except np.linalg.LinAlgError:
             return 1.0
         spread = np.zeros((len(slope), len(slope)))
-        gain = self._work.law[0][min(step, steps - 1)]
+        gain = self._work.arrays.policy.gain[min(step, steps - 1)]
         spread[:n, :n], spread[n:, n:] = given, gain @ given @ gain.T
         spread[:n, n:], spread[n:, :n] = given @ gain.T, gain @ given
         bend = float(slope @ spread @ slope)

@@ -6,6 +6,8 @@ import numpy as np
 
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import interface
+from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Plan, Policy, Rows
+from lqrsim.kernels.records import Settings as KernelSettings
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution, Status
@@ -13,7 +15,6 @@ from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.certify import certified
 from lqrsim.solvers.common import (
-    LOG_COLUMNS,
     Callback,
     Settings,
     assemble,
@@ -22,7 +23,6 @@ from lqrsim.solvers.common import (
     check_problem,
     iterate,
     list_of,
-    model,
     solve_all,
 )
 from lqrsim.solvers.initial_guess import InitialPrior, StartLike, resolve
@@ -112,39 +112,48 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     start, control = problem.start.copy(), begin.offset[0].copy()
     check_functions(problem, start, control)
     n, steps, zeros = len(start), problem.steps, np.zeros
-    L, l = begin.gain.copy(), begin.offset.copy()
-    states, controls = zeros((steps + 1, n)), zeros(l.shape)
-    go = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
-    log = zeros((settings.max_iterations + 1, LOG_COLUMNS))
-    core = compiled.core(problem)
-    options = settings.max_iterations, settings.tolerance, settings.stop == "optimal"
-    arrays = (
-        start, L, l, *go, *model(problem),
-        states, controls, states.copy(), controls.copy(), zeros(1), log,
+    policy = Policy(begin.gain.copy(), begin.offset.copy())
+    plan = Plan(zeros((steps + 1, n)), zeros(begin.offset.shape))
+    states, controls = plan
+    go = CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1))
+    work = Descent(
+        start=start, policy=policy, to_go=go, plan=plan, trial=Plan(states.copy(), controls.copy()), damping=zeros(1),
+        certificate=zeros(1, CERTIFICATE),
     )  # fmt: skip
+    log = zeros(settings.max_iterations + 1, LOG)
+    options = KernelSettings(
+        steps=steps, max_iterations=settings.max_iterations, tolerance=settings.tolerance, gap_tolerance=0.0,
+        optimal=settings.stop == "optimal", fixed=True, guided=False, prior_iterations=0,
+    )  # fmt: skip
+    model = compiled.arguments(problem)
     stop = settings.stop_early()
-    loop = core.entry("ilqr", interface.ITERATE, steps, 0, 0, *options, *arrays)
+    loop = compiled.core(problem).entry("ilqr", interface.ITERATE, 0, 0, options, model, work, log)
     ending = iterate(
         problem,
-        lambda first, last: loop(interface.ITERATE, steps, first, last, *options, *arrays),
+        lambda first, last: loop(interface.ITERATE, first, last, options, model, work, log),
         log, settings.max_iterations, each=each, stop=stop, callback=callback,
     )  # fmt: skip
     ending = check_outcome(problem, ending, start, control, refuse=each)
     whole = ending.iterations != () and ending.failed < 0
     if ending.outcome == interface.TIMED_OUT:  # the last backward pass was about the trajectory before the last one
         count = len(ending.iterations)
-        *_, failed = loop(interface.ITERATE, steps, count, count, *options, *arrays)
+        *_, failed = loop(interface.ITERATE, count, count, options, model, work, log)
         whole = failed < 0 and np.isfinite(states).all()
     if not whole:
-        L[:] = 0  # without a pass about the trajectory there is no feedback; what is left is to play the controls
-    offset = controls - np.einsum("tij,tj->ti", L, states[:-1]) if whole else controls.copy()
+        policy.gain[:] = (
+            0  # without a pass about the trajectory there is no feedback; what is left is to play the controls
+        )
+    offset = controls - np.einsum("tij,tj->ti", policy.gain, states[:-1]) if whole else controls.copy()
     status, detail = ending.status, ending.detail(problem.steps)
 
-    def work(task: int, hessians: Array, out: Array) -> None:
-        loop(task, steps, 0, 0, *options, start, L, offset, hessians, *arrays[4:-1], out)
+    def check(task: int, hessians: Array, out: Rows) -> None:
+        checked = work._replace(
+            policy=Policy(policy.gain, offset), to_go=go._replace(hessian=hessians), certificate=out
+        )  # fmt: skip
+        loop(task, 0, 0, options, model, checked, log)
 
     certificate, wrong = certified(
-        problem, work, states, go[0] if whole else None, violation=0.0,
+        problem, check, states, go.hessian if whole else None, violation=0.0,
         claimed=ending.iterations[-1].cost if status.success else None,
         tolerance=settings.tolerance if status is Status.CONVERGED else None,
     )  # fmt: skip
@@ -152,7 +161,7 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
         status, detail = Status.NOT_CERTIFIED, f"of the plan that converged: {wrong}"
     solution = assemble(
         problem, solver="ilqr", options=settings.options(begin), status=status, detail=detail,
-        iterations=ending.iterations, states=states, controls=controls, law=(L, offset), certificate=certificate,
-        gap=0.0, cost_to_go=Quadratic(*go) if whole else None,
+        iterations=ending.iterations, states=states, controls=controls, law=(policy.gain, offset),
+        certificate=certificate, gap=0.0, cost_to_go=Quadratic(*go) if whole else None,
     )  # fmt: skip
     return stop.settle(solution)

@@ -227,24 +227,24 @@ class System:
         self._f, self._fx, self._fu = np.zeros(n), np.zeros((n, n)), np.zeros((n, m))
         self._hessian, self._gradient = np.zeros((n + m, n + m)), np.zeros(n + m)
         joint = self._hessian, self._gradient
-        self._linearize = core.entry("rate_jacobian", self._f, self._none, data["p"], self._f, self._fx, self._fu)
+        self._linearize = core.entry("rate_jacobian", self._f, self._none, data.parameters, self._f, self._fx, self._fu)
         self._quadratize = {
-            name: core.entry(f"{name}_quadratic", self._f, self._none, 1, data[name], *joint)
+            name: core.entry(f"{name}_quadratic", self._f, self._none, 1, getattr(data, name), *joint)
             for name in ("initial", "stage", "final")
         }
 
     def _look(self, t: float, x: Array, u: Array) -> float:
         """Take the derivatives of dynamics and stage cost at (x, u); returns the cost a second. All are per second."""
-        self._linearize(x, u, self._data["p"], self._f, self._fx, self._fu)
+        self._linearize(x, u, self._data.parameters, self._f, self._fx, self._fu)
         step = min(max(int(t / self.dt), 1), self._last)
-        value = self._quadratize["stage"](x, u, step, self._data["stage"], self._hessian, self._gradient)
+        value = self._quadratize["stage"](x, u, step, self._data.stage, self._hessian, self._gradient)
         self._hessian /= self.dt
         self._gradient /= self.dt
         return value / self.dt
 
     def end_value(self, which: str, x: Array) -> float:
         """The `initial` or `final` cost; leaves its derivatives in place."""
-        return self._quadratize[which](x, self._none, 0, self._data[which], self._hessian, self._gradient)
+        return self._quadratize[which](x, self._none, 0, getattr(self._data, which), self._hessian, self._gradient)
 
     def end_model(self, which: str, x: Array) -> Array:
         """The `initial` or `final` cost, quadratised at x, as V. Paper: Eqs. (23), (31)."""

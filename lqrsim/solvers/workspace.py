@@ -1,4 +1,4 @@
-"""The memory of one solve, and what can be read from it."""
+"""The arrays of one solve, and what can be read from them."""
 
 import contextlib
 from typing import Any
@@ -6,20 +6,32 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import Array
-from lqrsim.kernels import interface
+from lqrsim.kernels import interface, records
+from lqrsim.kernels.records import (
+    CERTIFICATE,
+    MEMORY,
+    CostToCome,
+    CostToGo,
+    Plan,
+    Policy,
+    Prior,
+    Smoothing,
+)
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
-from lqrsim.solvers.common import SmootherSettings, model
+from lqrsim.solvers.common import SmootherSettings
 from lqrsim.solvers.initial_guess import Start
 
 
 class Workspace:
-    """What the loops read and write; see `kernels/iterations.py` and `damped_iterations.py` for what each is.
+    """What the iterations read and write.
 
     Attributes:
-      multipliers: of each constraint, as `kernels/augmented_lagrangian.py` has them; changes act at once.
-      core: the compiled loops.
+      arrays: what is in `records.Workspace`. model: the problem's numbers.
+      memory: what one iteration of the safeguard leaves to the next, a row of `MEMORY`; memory_rows: (1,) that row.
+      multipliers: of each constraint, as `augmented_lagrangian.py` has them; changes act at once.
+      core: the compiled iterations. fixed: whether the start is given exactly. dual: which form it is.
     """
 
     def __init__(self, problem: Problem, settings: SmootherSettings, begin: Start, start: Array) -> None:
@@ -28,61 +40,74 @@ class Workspace:
         self.dual = settings.form == "dual"
         self.fixed = isinstance(problem.initial, FixedState)
         self.start = start
-        self.x_hat, self.x_hats = self.start.copy(), zeros((steps + 1, n))
-        self.law = begin.gain.copy(), begin.offset.copy()
-        self.go = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
+        go = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
         if begin.cost_to_go is not None:
             value = begin.cost_to_go
-            self.go = value.hessian.copy(), value.gradient.copy(), np.array(value.constant)
-        self.come = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
+            go = value.hessian.copy(), value.gradient.copy(), np.array(value.constant)
+        come = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
         kept = steps if self.dual else 1  # the primal form finds its way back without
-        self.back = zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))
-        self.no_prior = zeros(n), zeros((steps + 1, n))
-        self.prior = (*self.no_prior, 0)
+        back = zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))
+        self.no_prior = Prior(zeros(n), zeros((steps + 1, n)))
+        self.prior, self.prior_iterations = self.no_prior, 0
         if begin.prior is not None:
             about = np.broadcast_to(begin.prior.about, (steps + 1, n)).copy()
-            self.prior = begin.prior.weight.copy(), about, begin.prior.iterations
+            self.prior, self.prior_iterations = Prior(begin.prior.weight.copy(), about), begin.prior.iterations
         # Without a trajectory to begin with: the start, and the controls with which the dynamics can run backwards.
-        self.guess = np.tile(self.start, (steps + 1, 1)), begin.offset.copy()
+        guess = Plan(np.tile(start, (steps + 1, 1)), begin.offset.copy())
         if begin.trajectory is not None:
-            self.guess = begin.trajectory.states.copy(), begin.trajectory.controls.copy()
-        self.plan = self.guess[0].copy(), self.guess[1].copy()
-        self.states, self.controls = zeros((steps + 1, n)), zeros((steps, m))
-        self.kept = zeros((steps, m, n)), zeros((steps, m))
-        self.memory = zeros(interface.MEMORY)
+            guess = Plan(begin.trajectory.states.copy(), begin.trajectory.controls.copy())
+        self.memory_rows = zeros(1, MEMORY)
+        self.memory = self.memory_rows[0]
         spare = settings.constraint_tolerance
         self.multipliers = [compiled.no_multipliers(problem, one, spare) for one in problem.inequalities]
         for array, known in zip(self.multipliers, begin.multipliers, strict=False):
             array[0], array[interface.HEADER :] = known.penalty, known.values.ravel()
         self.core = compiled.core(problem, settings.form)
-        self.model = model(problem, self.multipliers)
+        self.model = compiled.arguments(problem, multipliers=self.multipliers)
         self._problem = problem
+        self.arrays = records.Workspace(
+            start=start, x_hat=start.copy(), x_hats=zeros((steps + 1, n)),
+            policy=Policy(begin.gain.copy(), begin.offset.copy()), to_go=CostToGo(*go), to_come=CostToCome(*come),
+            smoothing=Smoothing(*back), eased=self.model.stage, prior=self.prior, guess=guess,
+            plan=Plan(guess.states.copy(), guess.controls.copy()),
+            rollout=Plan(zeros((steps + 1, n)), zeros((steps, m))),
+            kept=Policy(zeros((steps, m, n)), zeros((steps, m))), certificate=zeros(1, CERTIFICATE),
+        )  # fmt: skip
 
     @property
-    def passes(self) -> tuple[Any, ...]:
-        """The part that all loops have."""
-        return (
-            self.start, self.x_hat, self.x_hats, *self.law, *self.go, *self.come, *self.back, *self.model
-        )  # fmt: skip
+    def plan(self) -> Plan:
+        """The best so far."""
+        return self.arrays.plan
+
+    @property
+    def states(self) -> Array:
+        """Where the last policy led, (T+1, n)."""
+        return self.arrays.rollout.states
+
+    @property
+    def controls(self) -> Array:
+        """Those of that, (T, m)."""
+        return self.arrays.rollout.controls
 
     def value_functions(self) -> dict[str, Any]:
         """Cost-to-go, cost-to-come and inverse law of the last passes, as `assemble` takes them."""
+        to_go, to_come = Quadratic(*self.arrays.to_go), self.arrays.to_come
+        inverse = self.arrays.smoothing.control_gain, self.arrays.smoothing.control
         if not self.dual:
-            inverse = self.back[2], self.back[3]
-            return {"cost_to_go": Quadratic(*self.go), "cost_to_come": Quadratic(*self.come), "inverse_law": inverse}
-        covariance, mean, _ = self.come
-        inverse = None
+            return {"cost_to_go": to_go, "cost_to_come": Quadratic(*to_come), "inverse_law": inverse}
+        covariance, mean, _ = to_come
+        law = None
         if not self.fixed:  # or the first covariances are singular
             # u = gain costate + offset, where the costate at a state of arrival x is -covariance^-1 (x - mean).
             with contextlib.suppress(np.linalg.LinAlgError):
-                gain = -np.linalg.solve(covariance[1:], np.swapaxes(self.back[2], 1, 2))
+                gain = -np.linalg.solve(covariance[1:], np.swapaxes(inverse[0], 1, 2))
                 gain = np.ascontiguousarray(np.swapaxes(gain, 1, 2))
-                inverse = gain, self.back[3] - np.einsum("tij,tj->ti", gain, mean[1:])
-        return {"cost_to_go": Quadratic(*self.go), "cost_to_come": Moments(*self.come), "inverse_law": inverse}
+                law = gain, inverse[1] - np.einsum("tij,tj->ti", gain, mean[1:])
+        return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_law": law}
 
     def eased(self, share: float) -> Any:
         """The stage cost with that share of what may be eased; see `Term.factor`."""
-        stage = list(self.model[3])
+        stage = list(self.model.stage)
         for i, term in enumerate(self._problem.terms("stage_cost")):
             if share != 1 and term.factor is not None:
                 stage[i] = stage[i].copy()
@@ -93,13 +118,13 @@ class Workspace:
         """Of each constraint (T+1, rows): not to be negative; infinite where it does not act."""
         values = [np.empty(len(multipliers) - interface.HEADER) for multipliers in self.multipliers]
         if values:
-            self.core.look_at_constraints(self._problem.steps, states, controls, self.model[3], tuple(values))
+            self.core.look_at_constraints(self._problem.steps, states, controls, self.model.stage, tuple(values))
         return [one.reshape(self._problem.steps + 1, -1) for one in values]
 
     def constraint_slope(self, which: int, row: int, x: Array, u: Array, step: int) -> Array:
         """Gradient (n+m,) of one of a constraint's numbers."""
         slope = np.zeros(len(x) + len(u))
-        self.core.slope_of_constraint(which, row, x, u, step, self.model[3], slope)
+        self.core.slope_of_constraint(which, row, x, u, step, self.model.stage, slope)
         return slope
 
     @staticmethod

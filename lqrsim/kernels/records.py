@@ -1,0 +1,226 @@
+"""What kernels are given: named tuples of arrays and numbers, and rows with fields for what is remembered or logged.
+
+T is the number of steps. Kernels see an array as a pointer to blocks of constant shape; see `codegen/jit.py`.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Arrays = Any  # an ndarray for Python, a pointer for compiled code
+Rows = npt.NDArray[np.void]  # with fields by name, of one of the types below
+
+
+class Limits(NamedTuple):
+    """Of the controls, (M,) each; infinite where there is none."""
+
+    low: Arrays
+    high: Arrays
+
+
+class Model(NamedTuple):
+    """A problem as numbers: of the dynamics (any,), the time step in s, of each cost one array (any,) a term."""
+
+    parameters: Arrays
+    dt: float
+    initial: Any
+    stage: Any
+    final: Any
+    limits: Limits
+
+
+class Plan(NamedTuple):
+    """States (T+1, N) and controls (T, M)."""
+
+    states: Arrays
+    controls: Arrays
+
+
+class Policy(NamedTuple):
+    """The law u = L x + l: gain L (T, M, N) and offset l (T, M)."""
+
+    gain: Arrays
+    offset: Arrays
+
+
+class CostToGo(NamedTuple):
+    """1/2 x'S x + s'x + s0: S (T+1, N, N), s (T+1, N) and the constants (T+1,)."""
+
+    hessian: Arrays
+    gradient: Arrays
+    constant: Arrays
+
+
+class CostToCome(NamedTuple):
+    """In the dual form covariances and means, in the primal form Sbar and sbar; (T+1, N, N), (T+1, N), (T+1,)."""
+
+    matrix: Arrays
+    vector: Arrays
+    constant: Arrays
+
+
+class Smoothing(NamedTuple):
+    """What leads from the minimiser at t + 1 to that at t.
+
+    In the dual form the state is `state - state_gain costate` and the control `control_gain costate + control`; in the
+    primal form, the inverse policy: the control is `control_gain x + control`, and the others are not used.
+    """
+
+    state_gain: Arrays
+    state: Arrays
+    control_gain: Arrays
+    control: Arrays
+
+
+class Prior(NamedTuple):
+    """`1/2 (x - about)' diag(weight) (x - about)` at t >= 1: weight (N,), about (T+1, N)."""
+
+    weight: Arrays
+    about: Arrays
+
+
+class Linearization(NamedTuple):
+    """What a pass linearises about: a fraction `reach` of the way from the plan to the minimisers.
+
+    With `guided`, the forward pass stays at the plan. `damping` weighs changes of the controls, in units of the
+    control's own curvature.
+    """
+
+    plan: Plan
+    guided: bool
+    reach: float
+    damping: float
+    prior: Prior
+
+
+class Step(NamedTuple):
+    """A linearised step: [A B] (N, W) and c (N,)."""
+
+    jacobian: Arrays
+    offset: Arrays
+
+
+class Slopes(NamedTuple):
+    """What a linearisation works with: df/dx (N, N), df/du (N, M), where a step leads (N,)."""
+
+    state: Arrays
+    control: Arrays
+    arrived: Arrays
+
+
+class Stage(NamedTuple):
+    """A cost about the origin, or about a point: Hessian (W, W) and gradient (W,) in states and controls."""
+
+    hessian: Arrays
+    gradient: Arrays
+
+
+class Reduced(NamedTuple):
+    """A step and its stage with the control eliminated by u = w - F x - h, for the dual form.
+
+    `factor` (M, M) is that of R, AT (N, N) and BT (M, N) the step's matrices transposed, Q (N, N) and q (N,) the cost
+    of the state, `size` (N,) the diagonal of its Hessian before.
+    """
+
+    factor: Arrays
+    F: Arrays
+    h: Arrays
+    AT: Arrays
+    BT: Arrays
+    Q: Arrays
+    q: Arrays
+    size: Arrays
+
+
+class Settings(NamedTuple):
+    """Of a solve: how long, and when it has converged.
+
+    `optimal` asks for more than a cost that has settled; with `fixed` the start is given; with `guided` the first
+    iteration linearises about the guess; the prior acts in the first `prior_iterations`.
+    """
+
+    steps: int
+    max_iterations: int
+    tolerance: float
+    gap_tolerance: float
+    optimal: bool
+    fixed: bool
+    guided: bool
+    prior_iterations: int
+
+
+class Workspace(NamedTuple):
+    """All that a smoother reads and writes.
+
+    Attributes:
+      start: (N,) where it begins. x_hat: (N,) the minimiser that a pass has come to. x_hats: (T+1, N) all of them.
+      eased: the stage cost as the passes see it, which is not yet the true one in the first iterations of a
+        continuation.
+      guess: what the first pass can be guided by. plan: the best so far. rollout: where the last policy leads.
+      kept: that policy. certificate: (1,) rows of `CERTIFICATE`.
+    """
+
+    start: Arrays
+    x_hat: Arrays
+    x_hats: Arrays
+    policy: Policy
+    to_go: CostToGo
+    to_come: CostToCome
+    smoothing: Smoothing
+    eased: Any
+    prior: Prior
+    guess: Plan
+    plan: Plan
+    rollout: Plan
+    kept: Policy
+    certificate: Arrays
+
+
+class Passes(NamedTuple):
+    """What the passes of a linear-quadratic problem write; x_hats (T+1, N) are the minimisers."""
+
+    policy: Policy
+    to_go: CostToGo
+    to_come: CostToCome
+    smoothing: Smoothing
+    x_hats: Arrays
+
+
+class Descent(NamedTuple):
+    """All that iLQR reads and writes: the plan is the best so far, `trial` what a line search tries.
+
+    `damping` (1,) is the weight on changes of the controls; `certificate` (1,) rows of `CERTIFICATE`.
+    """
+
+    start: Arrays
+    policy: Policy
+    to_go: CostToGo
+    plan: Plan
+    trial: Plan
+    damping: Arrays
+    certificate: Arrays
+
+
+def _row(*names: str) -> np.dtype[np.void]:
+    return np.dtype([(name, np.float64) for name in names])
+
+
+# What one iteration of the safeguard leaves to the next: cost of the plan, and its merit, to which what the augmented
+# Lagrangian adds belongs; how far the next iteration reaches, and the weight on changes of the controls; how many small
+# changes there were in a row; of iterations at reach 0, iLQR's, how many are left, how many there will be the next
+# time, and how many others there were since. At the end, how far the states of least total cost are from the plan; at
+# the beginning, whether that was made. `watched` is 1 where undamped iterations are to end when they make no progress,
+# because there is a safeguard to go on.
+MEMORY = _row(
+    "plan_cost", "merit", "reach", "weight", "small_changes", "ilqr_left", "ilqr_next", "since_ilqr", "final_gap",
+    "started", "watched",
+)  # fmt: skip
+
+# A line of the log: NaN where something was not worked out.
+LOG = _row("cost", "improvement", "gap", "optimality", "residual", "method")
+
+# What `certificate.certify` writes; see there.
+CERTIFICATE = _row("cost", "scale", "motion", "law", "limits", "decrease")
+
+ROWS = {"MEMORY": MEMORY, "LOG": LOG, "CERTIFICATE": CERTIFICATE}
