@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim.codegen import disk_cache as disk
+from lqrsim.codegen.arguments import converted, kind_of, signature_of
 from lqrsim.codegen.fingerprint import fingerprint, note_helpers, stale
 from lqrsim.codegen.user_functions import External
 from lqrsim.errors import Array, InputError
@@ -65,7 +66,7 @@ class Core:
 
     def entry(self, name: str, *arguments: Any) -> Callable[..., Any]:
         """The compiled function for arguments like these."""
-        kinds = tuple(_kind(argument) for argument in arguments)
+        kinds = tuple(kind_of(argument) for argument in arguments)
         found = self._entries.get((name, kinds))
         if found is None:
             with compiling:
@@ -93,7 +94,7 @@ class Core:
             clock = time.perf_counter()
             namespace.update(self._namespace())
             with _uncollected(), _as_one():
-                dispatcher.compile(_signature(kinds))
+                dispatcher.compile(signature_of(kinds))
             if name in LONG:
                 disk.note(name, time.perf_counter() - clock)
             if _lasting(dispatcher):
@@ -106,7 +107,7 @@ class Core:
         functions = {node.name: node for node in ast.parse(self.source).body if isinstance(node, ast.FunctionDef)}
         node = functions[name]
         names = (argument.arg for argument in node.args.args)
-        pairs = [(name, _converted(name, kind)) for name, kind in zip(names, kinds, strict=True)]
+        pairs = [(name, converted(name, kind)) for name, kind in zip(names, kinds, strict=True)]
         lines = [f"{name} = {expression}" for name, expression in pairs if expression != name]
         node.name, node.decorator_list = "entry", []
         node.body = [*ast.parse("\n".join(lines)).body, *node.body]
@@ -268,8 +269,8 @@ def _options() -> dict[str, Any]:
     return {"fastmath": set(_FAST), "error_model": "numpy"}
 
 
-# LLVM finds most of what is worth inlining, and to force all of it takes longer to compile. These are small, and
-# called at every stage of every step.
+# LLVM finds most of what is worth inlining, and to force all of it takes longer to compile. These are called at every
+# stage of every step: the first four are small, the others parts of one function that read better apart.
 _INLINED = (
     "rate",
     "rate_jacobian",
@@ -332,59 +333,6 @@ def _as_one() -> Iterator[None]:
             yield
         finally:
             generator._library_class, generator.set_env = usual, set_env
-
-
-def _kind(argument: Any) -> tuple[Any, ...]:
-    """What the type of an argument is to be: an array's is its block, for the number of blocks is not known."""
-    if isinstance(argument, np.ndarray):
-        if argument.dtype.names:
-            return ("rows", *argument.dtype.names)
-        return ("array", *argument.shape[1:])
-    if isinstance(argument, tuple) and hasattr(argument, "_fields"):
-        return ("record", type(argument).__name__, *map(_kind, argument))
-    if isinstance(argument, tuple):
-        return ("vectors", len(argument))
-    kinds = ((bool, np.bool_), "bool"), ((int, np.integer), "int"), ((float, np.floating), "float")
-    return (next(name for types, name in kinds if isinstance(argument, types)),)
-
-
-def _converted(name: str, kind: tuple[Any, ...]) -> str:
-    """The expression that makes of an argument what kernels take: pointers of arrays."""
-    match kind[0]:
-        case "array":
-            return f"pointer({name}, {kind[1:]})"
-        case "vectors":
-            return f"({' '.join(f'pointer({name}[{i}], ()),' for i in range(kind[1]))})"
-        case "record":
-            fields = getattr(records, kind[1])._fields
-            parts = (_converted(f"{name}.{field}", part) for field, part in zip(fields, kind[2:], strict=True))
-            return f"{kind[1]}({', '.join(parts)})"
-    return name
-
-
-def _signature(kinds: tuple[tuple[Any, ...], ...]) -> Any:
-    import numba
-    from numba import types
-
-    def one(kind: tuple[Any, ...]) -> Any:
-        match kind[0]:
-            case "array":
-                return types.Array(types.float64, len(kind), "C")
-            case "rows":
-                row = np.dtype([(name, np.float64) for name in kind[1:]])
-                return types.Array(numba.from_dtype(row), 1, "C")
-            case "vectors":
-                vector = types.Array(types.float64, 1, "C")
-                return types.UniTuple(vector, kind[1]) if kind[1] else types.Tuple(())
-            case "record":
-                return types.BaseTuple.from_types([one(part) for part in kind[2:]], getattr(records, kind[1]))
-            case "bool":
-                return types.boolean
-            case "int":
-                return types.int64
-        return types.float64
-
-    return tuple(one(kind) for kind in kinds)
 
 
 @cache
