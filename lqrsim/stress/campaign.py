@@ -21,12 +21,13 @@ import numpy as np
 from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path, check_text, excerpt
 from lqrsim.machine import description, processors
 from lqrsim.results import files
+from lqrsim.results.hashing import sha256
 from lqrsim.results.solution import Trajectory
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.stress import cluster, executors
 from lqrsim.stress.lock import sole_writer
-from lqrsim.stress.manifest import NAME, digest_of, digest_of_solution, read_manifest, write_manifest
+from lqrsim.stress.manifest import NAME, digest_of_solution, read_manifest, write_manifest
 from lqrsim.stress.results import Results
 from lqrsim.stress.specification import POLICIES as POLICIES
 from lqrsim.stress.specification import Campaign as Campaign
@@ -156,7 +157,7 @@ def _begin(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
     """Solve and write the policies, and then the manifest; or see that it is the same campaign that was begun."""
     asked = {
         "campaign": json.loads(json.dumps(campaign.as_json())),
-        "model": digest_of(scenario.scene.xml.encode()),
+        "model": sha256(scenario.scene.xml),
         "problem": scenario.problem.digest,
         "code": _code(campaign),
     }
@@ -166,7 +167,7 @@ def _begin(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
     policies = {}
     for policy, solution in solve(campaign.policies, scenario).items():
         path = files.save(solution, folder / "policies" / f"{policy}.npz")
-        policies[policy] = {"digest": digest_of_solution(solution), "sha256": digest_of(path.read_bytes())}
+        policies[policy] = {"digest": digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
     about = {"versions": versions(), "machine": description(), "left_out": left_out(campaign.policies, scenario)}
     write_manifest(folder, asked | {"policies": policies} | about)
 
@@ -194,7 +195,7 @@ def _code(campaign: Campaign) -> dict[str, str | None]:
     for kind in sorted(kinds, key=lambda kind: kind.__qualname__):
         if kind.__module__.partition(".")[0] != "lqrsim":
             file = getattr(sys.modules.get(kind.__module__), "__file__", None)
-            found[kind.__qualname__] = None if file is None else digest_of(Path(file).read_bytes())
+            found[kind.__qualname__] = None if file is None else sha256(Path(file).read_bytes())
     return found
 
 

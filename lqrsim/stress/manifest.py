@@ -4,7 +4,6 @@ It has two hashes. `sha256` is of all of it: whatever is edited is refused. `dig
 shard has it too: a manifest that is sealed anew, with other numbers, has shards that are not its own.
 """
 
-import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ import numpy as np
 from lqrsim.errors import InputError, excerpt
 from lqrsim.results import schema
 from lqrsim.results.archive import Other, blamed
+from lqrsim.results.hashing import sha256
 from lqrsim.results.solution import Solution
 from lqrsim.stress.specification import POLICIES, Campaign, Cell
 from lqrsim.stress.trial_tables import write
@@ -103,7 +103,7 @@ def cells_of(manifest: Mapping[str, Any]) -> list[Cell]:
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:
-    return digest_of(schema.canonical({name: one for name, one in manifest.items() if name != "sha256"}).encode())
+    return sha256(schema.canonical({name: one for name, one in manifest.items() if name != "sha256"}))
 
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
@@ -112,12 +112,7 @@ def digest_of_rows(manifest: Mapping[str, Any]) -> str:
         "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},
         "policies": {policy: hashes["digest"] for policy, hashes in manifest["policies"].items()},
     }
-    return digest_of(schema.canonical(lasting).encode())
-
-
-def digest_of(contents: bytes) -> str:
-    """Hash of a file's contents."""
-    return hashlib.sha256(contents).hexdigest()
+    return sha256(schema.canonical(lasting))
 
 
 def digest_of_solution(solution: Solution) -> str:
@@ -125,4 +120,4 @@ def digest_of_solution(solution: Solution) -> str:
     plan, policy = solution.trajectory, solution.policy
     goal = np.zeros(0) if solution.goal is None else solution.goal
     arrays = plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt]), goal
-    return digest_of(b"".join(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes() for array in arrays))
+    return sha256(*(part for array in arrays for part in (f"{array.shape}", array)))

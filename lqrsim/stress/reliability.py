@@ -28,12 +28,13 @@ from lqrsim.errors import (
 )
 from lqrsim.machine import description
 from lqrsim.results import files
+from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effects, smallest_failure
-from lqrsim.stress.manifest import digest_of, digest_of_solution
+from lqrsim.stress.manifest import digest_of_solution
 from lqrsim.stress.multilevel_splitting import MOST, SplittingResult, split
 from lqrsim.stress.specification import POLICIES, described
 from lqrsim.stress.statistics import Estimate
@@ -359,7 +360,7 @@ def _write(
         "version": 1,
         "asked": {field.name: getattr(problem, field.name) for field in fields(problem)} | dict(options),
         "disturbances": [described(one) for one in problem.disturbances],
-        "model": digest_of(problem.resolved.scene.xml.encode()),
+        "model": sha256(problem.resolved.scene.xml),
         "problem": problem.resolved.problem.digest,
         "policy": digest_of_solution(problem.score.solution),
         "versions": versions(),
