@@ -1,4 +1,10 @@
-"""A running dask cluster that does a campaign's work. Tables come back as bytes, so that no folder need be shared."""
+"""A running dask cluster that does a campaign's work. Tables come back as bytes, so that no folder need be shared.
+
+Dask itself starts workers, hands out the work, and does that of a dead worker again, up to its `allowed-failures`. What
+is added is what it does not have: a time limit of a task that counts from when a worker begins it, and the end of one
+that hangs, for `cancel()` leaves a task that runs running; one task at a time in a worker; and a window of two tasks a
+worker, so that the scheduler does not hold a whole campaign.
+"""
 
 import asyncio
 import contextlib

@@ -1,6 +1,10 @@
 """Processes of this machine that do a campaign's work, watched over: they may die, or hang, and the work goes on.
 
-Python's own pools give all work up when one process dies, and do not say on what it died; hence this one.
+What there is does not do that. A `ProcessPoolExecutor` of which one process is killed gives up every task that is not
+done, and does not tell which one was at fault; a task that hangs cannot be cancelled, and before Python 3.14 no process
+of it can be ended without reaching into private fields. A `LocalCluster` of dask does the work of dead workers again,
+but its tasks have no time limit either and go on after `cancel()`; it does not say by which signal a worker ended,
+takes seconds to start and is an extra to install. For clusters of machines see cluster.py.
 """
 
 import contextlib
