@@ -84,15 +84,15 @@ def progress(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
 
     watched = sys.stderr.isatty()
     begun = time.monotonic()
-    told = False
+    announced = False
     with tqdm(desc=what, unit=unit, leave=False, delay=1.0, disable=not watched) as bar:
 
         def update(done: int, total: int) -> None:
-            nonlocal told
+            nonlocal announced
             bar.total = total
             bar.update(done - bar.n)
-            if not (watched or told) and time.monotonic() - begun > 1.0:
-                told = True
+            if not (watched or announced) and time.monotonic() - begun > 1.0:
+                announced = True
                 say(f"{what} {total} {unit}s ...")
 
         yield update

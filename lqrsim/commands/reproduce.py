@@ -33,7 +33,7 @@ SCRIPTS = (
     "stress_test",
 )
 
-Found = dict[str, Any]
+ScriptResult = dict[str, Any]
 TIDYING = 20.0  # s
 
 # A script as it runs by itself, but that signals let it remove what it has not finished, and without a word.
@@ -62,10 +62,10 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
     Raises:
       InputError: an unknown script, or a folder that cannot be written.
     """
-    asked = {check_name("results", name, SCRIPTS) for name in scripts} or set(SCRIPTS)
-    chosen = [name for name in SCRIPTS if name in asked]
+    named = {check_name("results", name, SCRIPTS) for name in scripts} or set(SCRIPTS)
+    chosen = [name for name in SCRIPTS if name in named]
     console.check_output("--out", out)
-    found: dict[str, Found] = {}
+    results: dict[str, ScriptResult] = {}
     failures: list[Failure] = []
     begun = time.monotonic()
     with tqdm(total=len(chosen), desc="reproducing", unit="result", leave=False, disable=None) as bar:
@@ -78,23 +78,23 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
                 failures.append(outcome)
                 console.say(f"{name}: FAILED with exit code {outcome.code} after {seconds:.0f} s; see above")
             else:
-                found[name] = outcome | {"seconds": round(seconds)}
+                results[name] = outcome | {"seconds": round(seconds)}
                 console.say(f"{name}: {seconds:.0f} s, {len(outcome['result']['figures'])} figures")
             bar.update()
-    if found:
-        saved = {"machine": description(), "quick": quick, "results": found}
+    if results:
+        saved = {"machine": description(), "quick": quick, "results": results}
         with replacing(out / "results.json") as unfinished:
             unfinished.write_text(json.dumps(saved, allow_nan=False) + "\n", encoding="utf-8")
         with replacing(out / "results.md") as unfinished:
             unfinished.write_text(page(saved), encoding="utf-8")
-        console.say("\n" + "\n".join(_verdicts(found, out)))
+        console.say("\n" + "\n".join(_verdicts(results, out)))
         console.say(f"\nwrote {out / 'results.md'} and {out / 'results.json'} in {time.monotonic() - begun:.0f} s")
     for failure in failures:
         console.say(f"FAILED {failure.script}: exit code {failure.code}")
     return 1 if failures else 0
 
 
-def _run(name: str, out: Path, *, quick: bool) -> Found | Failure:
+def _run(name: str, out: Path, *, quick: bool) -> ScriptResult | Failure:
     """What a script prints. It is a process of its own, so that none of them finds what another left behind."""
     script = EXPERIMENTS / f"{name}.py"
     command = [sys.executable, "-c", _START, script, "--json", "--out", out, *(["--quick"] if quick else [])]
@@ -123,9 +123,9 @@ def _end(running: subprocess.Popen[str]) -> None:
 
 def page(saved: Mapping[str, Any]) -> str:
     """All results in Markdown: what holds, what was run, and each script's report."""
-    found: dict[str, Found] = saved["results"]
-    statements = [statement for one in found.values() for statement in one["statements"]]
-    versions = next(iter(found.values()))["result"]["versions"]
+    results: dict[str, ScriptResult] = saved["results"]
+    statements = [statement for one in results.values() for statement in one["statements"]]
+    versions = next(iter(results.values()))["result"]["versions"]
     rows = [
         f"| {one['paper']} ({one['where']}) | {one['test']} | {one['ours']} | {VERDICTS[one['holds']]}"
         f" | [{one['figure']}](figures/{one['figure']}.png) |"
@@ -150,7 +150,7 @@ def page(saved: Mapping[str, Any]) -> str:
             " is this project's choice.",
             "\n".join([head, "| --- " * 5 + "|", *rows]),
         ]
-    for name, one in found.items():
+    for name, one in results.items():
         options = "" if not saved["quick"] else " --quick"
         parts += [one["report"], f"`python experiments/{name}.py{options}`, {one['seconds']} s."]
     return "\n\n".join(parts) + "\n"
@@ -163,9 +163,9 @@ def _count(statements: Sequence[Mapping[str, Any]]) -> str:
     return f"{said}; {counts[None]} could not be tested here." if counts[None] else f"{said}."
 
 
-def _verdicts(found: Mapping[str, Found], out: Path) -> Iterable[str]:
+def _verdicts(results: Mapping[str, ScriptResult], out: Path) -> Iterable[str]:
     """A paragraph each of the statements, for the terminal."""
-    statements = [statement for one in found.values() for statement in one["statements"]]
+    statements = [statement for one in results.values() for statement in one["statements"]]
     for one in statements:
         yield f"{VERDICTS[one['holds']].strip('*').upper():<14} {one['where']}: {one['paper']}"
         yield f"{'':<14} {one['ours']}  [want: {one['test']}]"

@@ -81,20 +81,20 @@ def _check(manifest: dict[str, Any]) -> None:
     _MANIFEST("manifest", manifest)
     if manifest["sha256"] != _seal(manifest):
         raise InputError("sha256: got another than that of the content, want a file that has not been changed")
-    asked = manifest["campaign"]
-    if schema.canonical(manifest["cells"]) != schema.canonical(_cells(asked)):
+    campaign = manifest["campaign"]
+    if schema.canonical(manifest["cells"]) != schema.canonical(_cells(campaign)):
         raise InputError("cells: got others than those of the campaign, want each sweep, strength and policy")
-    if set(manifest["policies"]) != set(asked["policies"]):
-        raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(asked['policies'])}")
+    if set(manifest["policies"]) != set(campaign["policies"]):
+        raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(campaign['policies'])}")
     if manifest["digest"] != digest_of_rows(manifest):
         raise InputError("digest: got another than that of the campaign, want a file that has not been changed")
 
 
-def _cells(asked: Mapping[str, Any]) -> list[list[Any]]:
+def _cells(campaign: Mapping[str, Any]) -> list[list[Any]]:
     """Each policy, sweep and strength, in the order of their numbers. Raises InputError if it is no campaign."""
     # Its disturbances may be a user's, and are made only where that user's file was named.
-    plainly = Campaign(**{**asked, "sweeps": dict.fromkeys(asked["sweeps"], ())})
-    return [[cell.policy, cell.sweep, cell.strength] for cell in plainly.cells]
+    bare = Campaign(**{**campaign, "sweeps": dict.fromkeys(campaign["sweeps"], ())})
+    return [[cell.policy, cell.sweep, cell.strength] for cell in bare.cells]
 
 
 def cells_of(manifest: Mapping[str, Any]) -> list[Cell]:

@@ -36,7 +36,7 @@ from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effects, smallest_failure
 from lqrsim.stress.manifest import digest_of_solution
 from lqrsim.stress.multilevel_splitting import MOST, SplittingResult, split
-from lqrsim.stress.specification import POLICIES, described
+from lqrsim.stress.specification import POLICIES, disturbance_as_json
 from lqrsim.stress.statistics import Estimate
 from lqrsim.stress.sweeps import sweep
 from lqrsim.stress.trial_score import TrialScore, collision, miss
@@ -359,7 +359,7 @@ def _write(
         "format": f"lqrsim {name}",
         "version": 1,
         "asked": {field.name: getattr(problem, field.name) for field in fields(problem)} | dict(options),
-        "disturbances": [described(one) for one in problem.disturbances],
+        "disturbances": [disturbance_as_json(one) for one in problem.disturbances],
         "model": sha256(problem.resolved.scene.xml),
         "problem": problem.resolved.problem.digest,
         "policy": digest_of_solution(problem.score.solution),
