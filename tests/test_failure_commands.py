@@ -189,7 +189,7 @@ def test_a_problem_that_is_not_one_is_refused(asked: dict[str, Any], says: str) 
     ("options", "says"),
     [({"particles": 19}, "particles: got 19"), ({"repetitions": 1}, "repetitions: got 1"), ({"seed": -1}, "seed")],
 )
-def test_options_are_refused_before_anything_is_solved(options: dict[str, int], says: str) -> None:
+def test_options_are_refused_before_anything_is_solved(options: dict[str, Any], says: str) -> None:
     problem = ls.ReliabilityProblem("quadrotor")
     with pytest.raises(ls.InputError, match=says):
         problem.rare_failures(**options)

@@ -148,9 +148,11 @@ class ReliabilityProblem:
           InputError: an option is out of range, or as `score` does.
           NoFailure: none was found.
         """
-        check_count("particles", particles, at_least=20)
-        check_count("repetitions", repetitions, at_least=2, at_most=MOST)
-        options = {"seed": check_seed("seed", seed), "particles": particles, "repetitions": repetitions}
+        options: dict[str, Any] = {
+            "seed": check_seed("seed", seed),
+            "particles": check_count("particles", particles, at_least=20),
+            "repetitions": check_count("repetitions", repetitions, at_least=2, at_most=MOST),
+        }
         self._check_callbacks(report, progress)
         score = self._reported(report)
         splitting = split(score, score.size, level=self._level(report), progress=progress, **options)
@@ -176,16 +178,15 @@ class ReliabilityProblem:
           InputError: an option is out of range, the policy fails with nothing random, or as `score` does.
           NoFailure: none was found.
         """
-        options = {"seed": check_seed("seed", seed)}
-        check_count("rounds", rounds, at_least=0, at_most=MOST)
+        seed, rounds = check_seed("seed", seed), check_count("rounds", rounds, at_least=0, at_most=MOST)
         self._check_callbacks(report, progress)
         score = self._reported(report)
         before = score.simulations
         if score(np.zeros((1, score.size)))[0] > 0:
             raise InputError(f"scenario: got {self.scenario}, where {self.policy} fails with nothing random, want else")
-        first = split(score, score.size, particles=200, keep=0.2, repetitions=2, level=self._level(report), **options)
+        first = split(score, score.size, particles=200, keep=0.2, repetitions=2, level=self._level(report), seed=seed)
         point = smallest_failure(
-            score, score.size, failures=first.failures, rounds=rounds, progress=progress, **options
+            score, score.size, failures=first.failures, rounds=rounds, progress=progress, seed=seed
         )
         simulations = score.simulations - before
         rollout = score.rollout(point.numbers[None], frames=False)
@@ -197,7 +198,7 @@ class ReliabilityProblem:
             disturbances=tuple(rollout.disturbances),
             shares=tuple(float(part @ part) / point.distance**2 for part in np.split(point.numbers, ends)),
             largest=tuple(largest_effects(rollout)),
-            options=options | {"rounds": rounds},
+            options={"seed": seed, "rounds": rounds},
         )
 
     def _reported(self, report: Report | None) -> TrialScore:
