@@ -53,7 +53,7 @@ class Rare(Search):
     """Measure how likely a failure is that is seldom seen.
 
     It takes far fewer trials than would have to be run to see it by chance. Trials are split through levels of how near
-    they come to failing, each not so rare given the one before. Prints the levels as a first run finds them, and then
+    they come to failing, each not so rare given the one before. Prints the levels as a pilot run finds them, and then
     the probability with its interval, from repetitions that are independent and without bias. Writes rollout.npz, with
     the worst failure and others as they are typical, to be looked at with `lqrsim render`, and rare.json, with what was
     asked and found.
