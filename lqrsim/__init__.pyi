@@ -94,6 +94,7 @@ from .stress.campaign import run_campaign as run_campaign
 from .stress.design_point import smallest_failure as smallest_failure
 from .stress.multilevel_splitting import NoFailure as NoFailure
 from .stress.multilevel_splitting import split as split
+from .stress.reliability import ReliabilityProblem as ReliabilityProblem
 from .stress.results import Results as Results
 from .stress.results import replay as replay
 from .stress.specification import Campaign as Campaign

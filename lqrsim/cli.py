@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     own = arguments is None
     if own:
-        process.surround("lqrsim: stopped")
+        process.handle_signals("lqrsim: stopped")
     try:
         try:
             code = _run(list(sys.argv[1:] if arguments is None else arguments))
@@ -48,16 +48,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
     except KeyboardInterrupt:
         if own:
-            process.leave()
-        process.complain("lqrsim: stopped")
+            process.end_stopped()
+        process.print_error("lqrsim: stopped")
         return 130
     except (BrokenPipeError, process.Unprintable) as error:
-        process.nothing_to_print_to()
+        process.discard_output()
         cause = error.__cause__ if isinstance(error, process.Unprintable) else error
         if isinstance(cause, BrokenPipeError):  # whoever reads what is printed, such as `head`, has had enough
             return 141
         why = cause.strerror if isinstance(cause, OSError) else cause
-        process.complain(f"lqrsim: error: standard output: got {why}, want one that can be written")
+        process.print_error(f"lqrsim: error: standard output: got {why}, want one that can be written")
         return 2
 
 
@@ -88,10 +88,10 @@ def _run(arguments: list[str]) -> int:
     logger.addHandler(notices)
     logger.setLevel(logging.INFO)
     try:
-        with process.tidying():
+        with process.interruptible():
             return command.run()
     except InputError as error:
-        process.complain(f"lqrsim: error: {error}")
+        process.print_error(f"lqrsim: error: {error}")
         return 2
     finally:
         logger.removeHandler(notices)

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 import lqrsim as ls
-from lqrsim.stress.design_point import in_words, smallest_failure
+from lqrsim.stress.design_point import largest_effects, smallest_failure
 from lqrsim.stress.trial_score import TrialScore
 
 
@@ -19,8 +19,8 @@ def test_beyond_a_plane_the_nearest_failure_and_its_estimate_are_exact(size: int
     found = smallest_failure(lambda z: z @ normal - 4.0, size, seed=1)
     assert 4.0 < found.distance < 4.04
     assert normal @ found.numbers / found.distance > 0.99
-    assert found.form == pytest.approx(stats.norm.sf(4.0), rel=0.16)
-    assert found.form == pytest.approx(stats.norm.sf(found.distance), rel=1e-9)
+    assert found.first_order_probability == pytest.approx(stats.norm.sf(4.0), rel=0.16)
+    assert found.first_order_probability == pytest.approx(stats.norm.sf(found.distance), rel=1e-9)
 
 
 def test_many_numbers_take_longer_but_get_there() -> None:
@@ -41,8 +41,8 @@ def test_it_goes_on_until_little_is_left(seed: int) -> None:
 
     stopped = smallest_failure(score, 200, rounds=8, seed=seed)
     assert not stopped.converged
-    assert stopped.left > 0.02
-    assert 1 - 4.0 / stopped.distance == pytest.approx(stopped.left, rel=0.2)
+    assert stopped.remaining > 0.02
+    assert 1 - 4.0 / stopped.distance == pytest.approx(stopped.remaining, rel=0.2)
     found = smallest_failure(score, 200, rounds=100, seed=seed)
     assert found.converged
     assert 4.0 < found.distance < 4.0 * 1.013
@@ -93,7 +93,7 @@ def test_a_quadrotor_is_broken_by_less_than_what_broke_it(
     assert found.distance < 0.5 * np.linalg.norm(failures, axis=1).min()
     rollout = trials.rollout(found.numbers[None], frames=False)
     assert rollout.outcome == ("collided",)
-    force, *others = in_words(rollout)
+    force, *others = largest_effects(rollout)
     assert (force.what, force.unit) == ("force", "N")
     assert not [one for one in others if "measured" in one.what]
     forces = np.linalg.norm(0.2 * found.numbers.reshape(-1, 3), axis=1)
@@ -104,7 +104,7 @@ def test_a_quadrotor_is_broken_by_less_than_what_broke_it(
 
 def test_disturbances_in_physical_units(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     push = ls.Push((0.0, 0.3, 0.4), at=2.0)
-    force, *rest = in_words(
+    force, *rest = largest_effects(
         ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[push, ls.ControlNoise(0.01)], frames=False)
     )
     assert (force.size, force.time) == (pytest.approx(0.5 * 30), pytest.approx(2.0))

@@ -409,6 +409,18 @@ def test_one_writer_at_a_time(tmp_path: Path) -> None:
     assert run_campaign(campaign, tmp_path, workers=0).complete  # the lock of a dead process is none
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows locks in another way")
+def test_a_file_system_without_locks_is_not_another_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import fcntl
+
+    def missing(handle: int, operation: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", missing)  # as NFS does whose server has no lock daemon
+    with pytest.raises(InputError, match=r"want one whose files can be locked \(No locks available\)"):
+        run_campaign(replace(CAMPAIGN, trials=2), tmp_path, workers=0)
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

@@ -134,6 +134,68 @@ def test_break_finds_a_distance_that_is_known(own: str, tmp_path: Path, capsys: 
     assert -0.001 < rollout.clearance[0].min() < 0
 
 
+def same_files(one: Path, other: Path, name: str) -> None:
+    assert (one / name).read_bytes() == (other / name).read_bytes()
+    runs = [ls.load_rollout(folder / "rollout.npz") for folder in (one, other)]
+    np.testing.assert_array_equal(runs[0].states, runs[1].states)
+
+
+def test_python_and_the_commands_give_the_same(own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One problem is asked twice: what the first search simulated does not count for the second."""
+    reference = f"{own}:shifted"
+    command, python = tmp_path / "command", tmp_path / "python"
+    more = [*OPEN, "--strength", "0.9", "--out", str(command)]
+    assert main(["rare", reference, "--particles", "40", "--repetitions", "3", "--shown", "2", *more]) == 0
+    rare_says = capsys.readouterr().out
+    problem = ls.ReliabilityProblem(reference, strength=0.9, policy="open_loop")
+    told: list[str] = []
+    rare = problem.rare_failures(particles=40, repetitions=3, report=told.append)
+    shown = rare.save(python, shown=2)
+    assert (shown.trials, shown.outcome) == (2, ("collided",) * 2)
+    assert rare_says.startswith("\n".join([*told, str(rare)]))
+    numbers = found(command / "rare.json")["found"]
+    assert (rare.probability.value, rare.probability.high) == (numbers["probability"], numbers["high"])
+    assert rare.splitting.simulations == numbers["simulations"]
+    same_files(command, python, "rare.json")
+    assert main(["break", reference, "--rounds", "1", "--seed", "3", *more]) == 0
+    break_says = capsys.readouterr().out
+    told.clear()
+    smallest = problem.smallest_failure(rounds=1, seed=3, report=told.append)
+    assert smallest.save(python).outcome == ("collided",)
+    assert break_says.startswith("\n".join([*told, str(smallest)]))
+    numbers = found(command / "break.json")["found"]
+    assert (smallest.point.distance, smallest.simulations) == (numbers["distance"], numbers["simulations"])
+    assert list(smallest.shares) == numbers["shares"] == pytest.approx([1.0])
+    same_files(command, python, "break.json")
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        ({"scenario": 3}, "scenario: got 3"),
+        ({"sweep": ""}, "sweep: got"),
+        ({"strength": 0.0}, "strength: got 0"),
+        ({"policy": "open"}, "policy: got 'open', want .*open_loop"),
+        ({"failure": "crash"}, "failure: got 'crash', want .*collision"),
+        ({"goal_radius": -1.0}, "goal_radius: got -1"),
+    ],
+)
+def test_a_problem_that_is_not_one_is_refused(asked: dict[str, Any], says: str) -> None:
+    with pytest.raises(ls.InputError, match=says):
+        ls.ReliabilityProblem(**{"scenario": "quadrotor", **asked})
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [({"particles": 19}, "particles: got 19"), ({"repetitions": 1}, "repetitions: got 1"), ({"seed": -1}, "seed")],
+)
+def test_options_are_refused_before_anything_is_solved(options: dict[str, Any], says: str) -> None:
+    problem = ls.ReliabilityProblem("quadrotor")
+    with pytest.raises(ls.InputError, match=says):
+        problem.rare_failures(**options)
+    assert "score" not in vars(problem)
+
+
 def test_where_there_is_no_failure_it_says_so(own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for command in ("rare", "break"):
         small = SMALL if command == "rare" else []

@@ -17,6 +17,7 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.commands import reproduce
+from lqrsim.reports.paper import results_page
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "experiments"
@@ -121,7 +122,7 @@ def same_page(folder: Path) -> dict[str, Any]:
             assert file.endswith(".pdf") or (folder / "figures" / file).stat().st_size > 0
         for statement in found["statements"]:
             assert f"{statement['figure']}.png" in found["result"]["figures"]
-    assert (folder / "results.md").read_text(encoding="utf-8") == reproduce.page(saved)
+    assert (folder / "results.md").read_text(encoding="utf-8") == results_page(saved)
     return saved
 
 

@@ -11,7 +11,7 @@ import lqrsim as ls
 from lqrsim.simulation.disturbances import preset
 from lqrsim.stress.multilevel_splitting import NoFailure, split
 from lqrsim.stress.statistics import rate
-from lqrsim.stress.trial_score import Given, TrialScore, collision, miss
+from lqrsim.stress.trial_score import PrescribedDraws, TrialScore, collision, miss
 
 
 def along(size: int, distance: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -34,34 +34,34 @@ def along(size: int, distance: float) -> Callable[[np.ndarray], np.ndarray]:
 )
 def test_numbers_have_the_distribution_that_was_asked_for(draw: Callable[..., Any], distribution: Any) -> None:
     numbers = np.random.default_rng(5).standard_normal(4000)
-    assert stats.kstest(draw(Given(numbers), 4000), distribution.cdf).pvalue > 0.001
+    assert stats.kstest(draw(PrescribedDraws(numbers), 4000), distribution.cdf).pvalue > 0.001
 
 
 def test_whole_numbers_and_choices_have_their_shares() -> None:
-    given = Given(np.random.default_rng(5).standard_normal(9000))
-    assert stats.chisquare(np.bincount(given.integers(2, 5, size=3000))[2:]).pvalue > 0.001
-    assert stats.chisquare(np.bincount(given.choice(3, 3000, p=(0.2, 0.5, 0.3))), (600, 1500, 900)).pvalue > 0.001
-    assert sorted(given.choice([4, 5, 6], 3, replace=False)) == [4, 5, 6]
-    assert given.used == 6003
+    draws = PrescribedDraws(np.random.default_rng(5).standard_normal(9000))
+    assert stats.chisquare(np.bincount(draws.integers(2, 5, size=3000))[2:]).pvalue > 0.001
+    assert stats.chisquare(np.bincount(draws.choice(3, 3000, p=(0.2, 0.5, 0.3))), (600, 1500, 900)).pvalue > 0.001
+    assert sorted(draws.choice([4, 5, 6], 3, replace=False)) == [4, 5, 6]
+    assert draws.used == 6003
 
 
 def test_sizes_are_those_of_numpy() -> None:
     numpy = np.random.default_rng(0)
-    given: Any = Given(np.random.default_rng(1).standard_normal(100))
+    draws: Any = PrescribedDraws(np.random.default_rng(1).standard_normal(100))
     for name, arguments in (
         ("standard_normal", {}), ("standard_normal", {"size": (2, 3)}), ("random", {}), ("random", {"size": 4}),
         ("normal", {"loc": [0.0, 1.0]}), ("normal", {"scale": 2.0}), ("uniform", {"low": [0.0, 1.0], "high": 2.0}),
         ("integers", {"low": 4}), ("integers", {"low": 1, "high": 3, "size": 5}), ("choice", {"a": 3}),
         ("choice", {"a": [1.5, 2.5], "size": (2, 2)}), ("choice", {"a": 4, "size": 2, "replace": False}),
     ):  # fmt: skip
-        assert np.shape(getattr(given, name)(**arguments)) == np.shape(getattr(numpy, name)(**arguments)), name
+        assert np.shape(getattr(draws, name)(**arguments)) == np.shape(getattr(numpy, name)(**arguments)), name
 
 
 def test_what_can_not_be_given_is_named() -> None:
     with pytest.raises(ls.InputError, match="got draws by poisson"):
-        Given(np.zeros(3)).poisson(2.0)
+        PrescribedDraws(np.zeros(3)).poisson(2.0)
     with pytest.raises(ls.InputError, match="numbers: got 3"):
-        Given(np.zeros(3)).standard_normal(4)
+        PrescribedDraws(np.zeros(3)).standard_normal(4)
 
 
 # Trials of a robot
@@ -219,7 +219,7 @@ def test_failures_are_failures_and_simulations_are_counted() -> None:
 def test_plain_trials_for_the_same_certainty() -> None:
     """By their definition: so many of a known rate have the standard error that was found."""
     found = split(along(3, 3.0), 3, particles=200, repetitions=8)
-    p, n = found.probability.value, found.plain
+    p, n = found.probability.value, found.plain_trials
     assert np.sqrt(p * (1 - p) / n) == pytest.approx(found.standard_error)
     assert n > found.simulations
 

@@ -169,6 +169,8 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
         "simulations",
     )
     searching = {"score": line, "size": 3, "seed": 0}
+    # One in five or so fails.
+    reliability = ls.ReliabilityProblem(reference, policy="open_loop", failure="miss", goal_radius=0.0565)
     return {
         "Campaign": (asked,),
         "Campaign.disturbances": ({"self": campaign, "cell": cell},),
@@ -207,6 +209,18 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
             "failures": [[2.0, 0.0, 0.0]], "rounds": 1, "pairs": 4, "spread": 0.5, "tolerance": 1e-3,
             "progress": print_nothing,
         },),
+        "ReliabilityProblem": ({
+            "scenario": reference, "sweep": "light", "strength": 1.0, "policy": "smooth", "failure": "miss",
+            "goal_radius": 0.1, "goal_tolerance": None,
+        },),
+        **{
+            f"ReliabilityProblem.{name}": ({
+                "self": reliability, **more, "seed": 0, "report": print_nothing, "progress": print_nothing
+            }, 0.1)
+            for name, more in {
+                "rare_failures": {"particles": 20, "repetitions": 2}, "smallest_failure": {"rounds": 0}
+            }.items()
+        },
         "report": ({
             "results": results, "out": place.folder / "report.html", "videos": 0, "progress": print_nothing
         }, 0.05),

@@ -9,7 +9,6 @@ not people. Who can write the folder can have code run by whoever reads it: shar
 """
 
 import contextlib
-import hashlib
 import json
 import os
 import time
@@ -20,6 +19,7 @@ import platformdirs
 
 from lqrsim.errors import InputError
 from lqrsim.results.files import replacing
+from lqrsim.results.hashing import sha256
 
 LIMIT = 256 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about one megabyte
 _SUFFIX = ".item"
@@ -44,11 +44,8 @@ def folder() -> Path:
 
 def key(*parts: str | bytes) -> str:
     """A name for what is made of these parts, in this order."""
-    hasher = hashlib.sha256()
-    for part in parts:
-        encoded = part.encode() if isinstance(part, str) else part
-        hasher.update(f"{len(encoded)}:".encode() + encoded)
-    return hasher.hexdigest()[:32]
+    encoded = [part.encode() if isinstance(part, str) else part for part in parts]
+    return sha256(*(piece for part in encoded for piece in (f"{len(part)}:", part)))[:32]
 
 
 def load(name: str) -> bytes | None:
@@ -56,7 +53,7 @@ def load(name: str) -> bytes | None:
     path = folder() / f"{name}{_SUFFIX}"
     try:
         header, _, contents = path.read_bytes().partition(b"\n")
-        good = json.loads(header)["sha256"] == hashlib.sha256(contents).hexdigest()
+        good = json.loads(header)["sha256"] == sha256(contents)
     except (OSError, ValueError, KeyError, TypeError):
         return None
     if not good:
@@ -68,7 +65,7 @@ def load(name: str) -> bytes | None:
 
 def save(name: str, contents: bytes, what: str) -> None:
     """Keep an item if that is possible; two processes that keep the same one do not disturb each other."""
-    header = json.dumps({"what": what, "sha256": hashlib.sha256(contents).hexdigest()}).encode()
+    header = json.dumps({"what": what, "sha256": sha256(contents)}).encode()
     with contextlib.suppress(OSError, InputError):
         with replacing(folder() / f"{name}{_SUFFIX}") as unfinished:
             unfinished.write_bytes(header + b"\n" + contents)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lqrsim import process
 from lqrsim.errors import InputError
@@ -84,15 +84,15 @@ def progress(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
 
     watched = sys.stderr.isatty()
     begun = time.monotonic()
-    told = False
+    announced = False
     with tqdm(desc=what, unit=unit, leave=False, delay=1.0, disable=not watched) as bar:
 
         def update(done: int, total: int) -> None:
-            nonlocal told
+            nonlocal announced
             bar.total = total
             bar.update(done - bar.n)
-            if not (watched or told) and time.monotonic() - begun > 1.0:
-                told = True
+            if not (watched or announced) and time.monotonic() - begun > 1.0:
+                announced = True
                 say(f"{what} {total} {unit}s ...")
 
         yield update
@@ -102,26 +102,30 @@ def progress(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
 def long_progress(what: str, unit: str, every: float = 10.0) -> Iterator[Callable[[int, int], None]]:
     """For what takes minutes or hours, and may have been begun before: how fast it goes, and how long it will take.
 
-    A bar on a terminal; elsewhere a line now and then. The first call says how many are done already.
+    A bar on a terminal; elsewhere a line now and then. The first call says how many are done already, and starts the
+    clock: what is prepared before it, such as compiling, is not counted.
     """
     from tqdm import tqdm
 
     watched = sys.stderr.isatty()
-    begun = told = time.monotonic()
-    before: int | None = None
-    with tqdm(desc=what, unit=f" {unit}s", leave=False, delay=1.0, disable=not watched) as bar:
+    bar: tqdm[Any] | None = None
+    begun = last_line = 0.0
+    before = 0
+    with contextlib.ExitStack() as stack:
 
         def update(done: int, total: int) -> None:
-            nonlocal before, told
-            if before is None:
-                before = bar.initial = bar.n = done
+            nonlocal bar, begun, before, last_line
+            now = time.monotonic()
+            if bar is None:
+                begun, last_line, before = now, now, done
+                options: dict[str, Any] = {"initial": done, "leave": False, "delay": 1.0, "disable": not watched}
+                bar = stack.enter_context(tqdm(desc=what, unit=f" {unit}s", total=total, **options))
                 if done and done < total:
                     say(f"{done} of {total} {unit}s are there, {total - done} to go")
-            bar.total = total
             bar.update(done - bar.n)
-            now = time.monotonic()
-            if not watched and done > before and (now - told > every or (done == total and now - begun > every)):
-                told = now
+            finished = done == total and now - begun > every
+            if not watched and done > before and (now - last_line > every or finished):
+                last_line = now
                 rate = (done - before) / (now - begun)
                 left = tqdm.format_interval((total - done) / rate)
                 say(f"{what}: {done} of {total} {unit}s, {rate:.3g} {unit}s/s, {left} left")

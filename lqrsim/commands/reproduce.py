@@ -5,16 +5,16 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
 from lqrsim.commands import console
 from lqrsim.errors import check_name
 from lqrsim.machine import description
+from lqrsim.reports.paper import ScriptResult, results_page, verdicts
 from lqrsim.results.files import replacing
 
 # In the wheel experiments/ lies inside the package, in the repository beside it.
@@ -33,12 +33,10 @@ SCRIPTS = (
     "stress_test",
 )
 
-Found = dict[str, Any]
 TIDYING = 20.0  # s
 
 # A script as it runs by itself, but that signals let it remove what it has not finished, and without a word.
 _START = "import sys; from lqrsim.process import run_script; run_script(sys.argv[1:])"
-VERDICTS = {True: "holds", False: "**does not hold**", None: "not tested"}
 
 
 @dataclass(frozen=True)
@@ -62,10 +60,10 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
     Raises:
       InputError: an unknown script, or a folder that cannot be written.
     """
-    asked = {check_name("results", name, SCRIPTS) for name in scripts} or set(SCRIPTS)
-    chosen = [name for name in SCRIPTS if name in asked]
+    named = {check_name("results", name, SCRIPTS) for name in scripts} or set(SCRIPTS)
+    chosen = [name for name in SCRIPTS if name in named]
     console.check_output("--out", out)
-    found: dict[str, Found] = {}
+    results: dict[str, ScriptResult] = {}
     failures: list[Failure] = []
     begun = time.monotonic()
     with tqdm(total=len(chosen), desc="reproducing", unit="result", leave=False, disable=None) as bar:
@@ -78,23 +76,23 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
                 failures.append(outcome)
                 console.say(f"{name}: FAILED with exit code {outcome.code} after {seconds:.0f} s; see above")
             else:
-                found[name] = outcome | {"seconds": round(seconds)}
+                results[name] = outcome | {"seconds": round(seconds)}
                 console.say(f"{name}: {seconds:.0f} s, {len(outcome['result']['figures'])} figures")
             bar.update()
-    if found:
-        saved = {"machine": description(), "quick": quick, "results": found}
+    if results:
+        saved = {"machine": description(), "quick": quick, "results": results}
         with replacing(out / "results.json") as unfinished:
             unfinished.write_text(json.dumps(saved, allow_nan=False) + "\n", encoding="utf-8")
         with replacing(out / "results.md") as unfinished:
-            unfinished.write_text(page(saved), encoding="utf-8")
-        console.say("\n" + "\n".join(_verdicts(found, out)))
+            unfinished.write_text(results_page(saved), encoding="utf-8")
+        console.say("\n" + "\n".join(verdicts(results, out)))
         console.say(f"\nwrote {out / 'results.md'} and {out / 'results.json'} in {time.monotonic() - begun:.0f} s")
     for failure in failures:
         console.say(f"FAILED {failure.script}: exit code {failure.code}")
     return 1 if failures else 0
 
 
-def _run(name: str, out: Path, *, quick: bool) -> Found | Failure:
+def _run(name: str, out: Path, *, quick: bool) -> ScriptResult | Failure:
     """What a script prints. It is a process of its own, so that none of them finds what another left behind."""
     script = EXPERIMENTS / f"{name}.py"
     command = [sys.executable, "-c", _START, script, "--json", "--out", out, *(["--quick"] if quick else [])]
@@ -119,56 +117,3 @@ def _end(running: subprocess.Popen[str]) -> None:
         running.wait(TIDYING)
     except subprocess.TimeoutExpired:
         running.kill()
-
-
-def page(saved: Mapping[str, Any]) -> str:
-    """All results in Markdown: what holds, what was run, and each script's report."""
-    found: dict[str, Found] = saved["results"]
-    statements = [statement for one in found.values() for statement in one["statements"]]
-    versions = next(iter(found.values()))["result"]["versions"]
-    rows = [
-        f"| {one['paper']} ({one['where']}) | {one['test']} | {one['ours']} | {VERDICTS[one['holds']]}"
-        f" | [{one['figure']}](figures/{one['figure']}.png) |"
-        for one in statements
-    ]
-    size = "a quick run, on a small part of the problems" if saved["quick"] else "a full run"
-    command = "lqrsim reproduce --quick" if saved["quick"] else "lqrsim reproduce"
-    parts = [
-        "# The paper's results, reproduced",
-        f"Written by `{command}`, {size}: every number and picture on this page is. Each section is one script of"
-        " `experiments/`, which also runs by itself; the numbers query by query are in"
-        " [results.json](results.json), beside this page.",
-        "The paper: J. van den Berg, *Iterated LQR Smoothing for Locally-Optimal Feedback Control of Systems with"
-        " Non-Linear Dynamics and Non-Quadratic Cost*, American Control Conference, 2014.",
-        f"Computed with {', '.join(f'{name} {version}' for name, version in versions.items())} on {saved['machine']}.",
-    ]
-    if statements:
-        head = "| the paper says | counts as holding | what came out | verdict | figure |"
-        parts += [
-            "## Which of the paper's statements hold",
-            f"{_count(statements)} A statement can have several tests; what counts as holding"
-            " is this project's choice.",
-            "\n".join([head, "| --- " * 5 + "|", *rows]),
-        ]
-    for name, one in found.items():
-        options = "" if not saved["quick"] else " --quick"
-        parts += [one["report"], f"`python experiments/{name}.py{options}`, {one['seconds']} s."]
-    return "\n\n".join(parts) + "\n"
-
-
-def _count(statements: Sequence[Mapping[str, Any]]) -> str:
-    """How many hold, in words."""
-    counts = {verdict: sum(one["holds"] is verdict for one in statements) for verdict in VERDICTS}
-    said = f"Of {len(statements)} tests of what the paper says, {counts[True]} hold and {counts[False]} do not"
-    return f"{said}; {counts[None]} could not be tested here." if counts[None] else f"{said}."
-
-
-def _verdicts(found: Mapping[str, Found], out: Path) -> Iterable[str]:
-    """A paragraph each of the statements, for the terminal."""
-    statements = [statement for one in found.values() for statement in one["statements"]]
-    for one in statements:
-        yield f"{VERDICTS[one['holds']].strip('*').upper():<14} {one['where']}: {one['paper']}"
-        yield f"{'':<14} {one['ours']}  [want: {one['test']}]"
-        yield f"{'':<14} {out / 'figures' / one['figure']}.png"
-    if statements:
-        yield _count(statements)

@@ -176,7 +176,7 @@ class Simulate:
             rollout = simulate(
                 scenario.plant(),
                 solution.open_loop() if self.open_loop else solution,
-                disturbances=[*named, *self._own()],
+                disturbances=[*named, *self._single_disturbances()],
                 seed=self.seed,
                 trials=self.trials,
                 first_trial=self.first_trial,
@@ -188,18 +188,18 @@ class Simulate:
         console.say(rollout.tally())
         return 0
 
-    def _own(self) -> "list[Disturbance]":
+    def _single_disturbances(self) -> "list[Disturbance]":
         from lqrsim.simulation.disturbances import ControlNoise, ForceNoise, MeasurementNoise, Push
 
-        found: list[Disturbance] = []
+        disturbances: list[Disturbance] = []
         if self.control_noise:
-            found.append(ControlNoise(self.control_noise))
+            disturbances.append(ControlNoise(self.control_noise))
         if self.force_noise:
-            found.append(ForceNoise(self.force_noise))
+            disturbances.append(ForceNoise(self.force_noise))
         if self.measurement_noise:
             std = self.measurement_noise
-            found.append(MeasurementNoise(std[0] if len(std) == 1 else std))
+            disturbances.append(MeasurementNoise(std[0] if len(std) == 1 else std))
         if self.push:
             *impulse, at = self.push
-            found.append(Push(impulse, at=at))
-        return found
+            disturbances.append(Push(impulse, at=at))
+        return disturbances

@@ -65,7 +65,7 @@ class Stress:
         from lqrsim.stress.campaign import Campaign, run_campaign
         from lqrsim.stress.results import Results
         from lqrsim.stress.sweeps import sweep
-        from lqrsim.stress.trials import possible
+        from lqrsim.stress.trials import possible_policies
 
         scenario = resolve(self.scenario)
         folder = self.out or Path("runs/stress") / folder_name(scenario)
@@ -76,7 +76,7 @@ class Stress:
                 scenario=self.scenario,
                 sweeps={name: sweep(name, scenario) for name in self.sweep},
                 strengths=self.strengths,
-                policies=possible(scenario) if self.policies is None else self.policies,
+                policies=possible_policies(scenario) if self.policies is None else self.policies,
                 trials=self.trials,
                 seed=self.seed,
                 replan_every=self.replan_every,

@@ -1,7 +1,6 @@
 """What decides on the controls in the loop: a policy, or solving again. Subclass `Controller` for another way."""
 
 import abc
-import hashlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +11,7 @@ from lqrsim.control.law import evaluator
 from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.hashing import sha256
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution, Trajectory
 from lqrsim.solvers import compiled
@@ -59,10 +59,7 @@ class Feedback(Controller):
 
     @property
     def digest(self) -> str:
-        hasher = hashlib.sha256()
-        for array in (self.policy.gain, self.policy.offset, self.policy.nominal, np.float64(self.policy.dt)):
-            hasher.update(np.ascontiguousarray(array).tobytes())
-        return hasher.hexdigest()[:16]
+        return sha256(self.policy.gain, self.policy.offset, self.policy.nominal, np.float64(self.policy.dt))[:16]
 
     @property
     def spaces(self) -> tuple[Coordinates, Coordinates]:
@@ -156,8 +153,7 @@ class Replanning(Controller):
 
     @property
     def digest(self) -> str:
-        text = f"{Feedback(self.solution.policy).digest} {self.problem.digest} {self._periods}"
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return sha256(f"{Feedback(self.solution.policy).digest} {self.problem.digest} {self._periods}")[:16]
 
     @property
     def spaces(self) -> tuple[Coordinates, Coordinates]:

@@ -1,6 +1,5 @@
 """The optimal control problem of Eqs. (1)-(2), in discrete time."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -23,6 +22,7 @@ from lqrsim.problem.constraints import Constraint, Inequalities
 from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost, Term, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.hashing import sha256
 
 
 @dataclass(frozen=True)
@@ -164,20 +164,18 @@ class Problem:
     @property
     def digest(self) -> str:
         """Hash of everything that defines the problem: structure and numbers."""
-        hasher = hashlib.sha256(f"{self.dynamics.source} {self.dt!r} {self.steps}".encode())
-        hasher.update(repr(self.dynamics.parameters).encode())
-        hasher.update(repr((self.control_coordinates.low, self.control_coordinates.high)).encode())
+        parts: list[str | Array] = [f"{self.dynamics.source} {self.dt!r} {self.steps}", repr(self.dynamics.parameters)]
+        parts.append(repr((self.control_coordinates.low, self.control_coordinates.high)))
         functions = [*self.dynamics.functions]
         if isinstance(self.initial, FixedState):
-            hasher.update(np.asarray(self.initial.state).tobytes())
+            parts.append(np.asarray(self.initial.state))
         for name in ("initial", "stage_cost", "final_cost"):
             for term in self.terms(name):
-                hasher.update(term.source.encode() + term.data.tobytes())
+                parts += [term.source, term.data]
                 functions += term.functions
         for inequalities in self.inequalities:
-            hasher.update(inequalities.source.encode() + inequalities.data.tobytes())
-        hasher.update("\n".join(function.identity for function in functions).encode())
-        return hasher.hexdigest()[:16]
+            parts += [inequalities.source, inequalities.data]
+        return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
 
     def _check_start_clear(self) -> None:
         space = self.dynamics.state_coordinates

@@ -5,7 +5,6 @@ array it says it is, and whatever a parser makes of it, it is refused in one lin
 """
 
 import contextlib
-import hashlib
 import os
 import re
 import secrets
@@ -19,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import InputError, check_path, excerpt
+from lqrsim.results.hashing import sha256
 from lqrsim.results.schema import canonical, parse
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -47,12 +47,11 @@ class Other(InputError):
 
 def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> str:
     """SHA-256 of the content: of the JSON text, but for the hash in it, and of each array with its name and shape."""
-    hasher = hashlib.sha256(canonical({name: value for name, value in meta.items() if name != DIGEST}).encode())
+    parts: list[str | npt.NDArray[Any]] = [canonical({name: value for name, value in meta.items() if name != DIGEST})]
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
-        hasher.update(f"\n{name} {array.dtype.str} {array.shape}\n".encode())
-        hasher.update(array.reshape(-1).view(np.uint8).data)
-    return hasher.hexdigest()
+        parts += [f"\n{name} {array.dtype.str} {array.shape}\n", array]
+    return sha256(*parts)
 
 
 def write(path: Path, arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> None:

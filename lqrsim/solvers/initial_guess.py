@@ -1,6 +1,5 @@
 """What a solver may begin with: nothing, controls, a prior, a policy, a trajectory or a solution."""
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -9,6 +8,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, excerpt, numbers_of
 from lqrsim.problem.problem import Problem
+from lqrsim.results.hashing import sha256
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Multipliers, Solution, Trajectory
 from lqrsim.results.value_functions import Quadratic
@@ -171,5 +171,4 @@ def resolve(start: StartLike, problem: Problem) -> Start:
 
 
 def _summary(start: object, *arrays: Array) -> str:
-    digest = hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
-    return f"{type(start).__name__} {digest.hexdigest()[:16]}"
+    return f"{type(start).__name__} {sha256(*arrays)[:16]}"

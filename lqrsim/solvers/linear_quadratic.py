@@ -1,6 +1,5 @@
 """LQR smoothing of linear-quadratic problems: Sec. IV of the paper."""
 
-import hashlib
 import time
 
 import numpy as np
@@ -11,6 +10,7 @@ from lqrsim.kernels.records import Stage as QuadraticStage
 from lqrsim.problem.linear_quadratic import Stage, check_end
 from lqrsim.problem.problem import FixedState
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.hashing import sha256
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Certificate, Iteration, Solution, Status, Trajectory
 from lqrsim.results.value_functions import Moments, Quadratic
@@ -156,11 +156,12 @@ def _coordinates(letter: str, size: int) -> Coordinates:
 
 
 def _digest(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Quadratic) -> str:
-    hasher = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
-    for end in (initial, final):
-        for part in (end.state,) if isinstance(end, FixedState) else (end.hessian, end.gradient, end.constant):
-            hasher.update(np.asarray(part, dtype=np.float64).tobytes())
-    return hasher.hexdigest()[:16]
+    ends = [
+        np.asarray(part, dtype=np.float64)
+        for end in (initial, final)
+        for part in ((end.state,) if isinstance(end, FixedState) else (end.hessian, end.gradient, end.constant))
+    ]
+    return sha256(*parts, *ends)[:16]
 
 
 def _begin(initial: Quadratic | FixedState, n: int, form: str) -> tuple[Array, Array, float]:

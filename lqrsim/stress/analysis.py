@@ -72,7 +72,7 @@ def degradation(table: Table, policy: str, sweep: str, *, confidence: float = CO
 
 
 @dataclass(frozen=True)
-class Break:
+class BreakingPoint:
     """Where a policy breaks.
 
     Attributes:
@@ -87,7 +87,7 @@ class Break:
     success: Estimate | None
 
 
-def breaks(table: Table, *, below: float = 0.95, confidence: float = CONFIDENCE) -> list[Break]:
+def breaks(table: Table, *, below: float = 0.95, confidence: float = CONFIDENCE) -> list[BreakingPoint]:
     """What breaks first: for each policy and sweep, the least strength with less success than `below`, surely so.
 
     What breaks at the least strength comes first, what does not break last.
@@ -96,13 +96,13 @@ def breaks(table: Table, *, below: float = 0.95, confidence: float = CONFIDENCE)
       InputError: `below` is no rate.
     """
     check_number("below", below, above=0.0, at_most=1.0)
-    found = []
+    breaking_points = []
     for policy, sweep in dict.fromkeys((cell.policy, cell.sweep) for cell in table):
         points = degradation(table, policy, sweep, confidence=confidence)
         first = next((point for point in points if point.exact.high < below), None)
         strength, exact = (None, None) if first is None else (first.cell.strength, first.exact)
-        found.append(Break(policy, sweep, below, strength, exact))
-    return sorted(found, key=lambda one: np.inf if one.strength is None else one.strength)
+        breaking_points.append(BreakingPoint(policy, sweep, below, strength, exact))
+    return sorted(breaking_points, key=lambda one: np.inf if one.strength is None else one.strength)
 
 
 @dataclass(frozen=True)
@@ -135,18 +135,18 @@ def comparisons(table: Table) -> list[Comparison]:
       InputError: two policies ran other trials.
     """
     policies = list(dict.fromkeys(cell.policy for cell in table))
-    found: list[Comparison] = []
+    compared: list[Comparison] = []
     for other in policies[1:]:
         for cell in table:
             second = Cell(other, cell.sweep, cell.strength)
             if cell.policy != policies[0] or second not in table:
                 continue
             if not (alike(table[cell]) and alike(table[second])):
-                found.append(_compared(cell, second, table[cell], table[second]))
-    adjusted = holm([one.pairs.p_value for one in found])
+                compared.append(_compared(cell, second, table[cell], table[second]))
+    adjusted = holm([one.pairs.p_value for one in compared])
     return [
         Comparison(one.first, one.second, one.pairs, one.success, one.rms, one.both, float(p))
-        for one, p in zip(found, adjusted, strict=True)
+        for one, p in zip(compared, adjusted, strict=True)
     ]
 
 
@@ -200,7 +200,7 @@ class Trial:
 def worst(table: Table, count: int = 10) -> list[Trial]:
     """The worst trials of all cells, ranked as RANKING says."""
     check_count("count", count)
-    found: list[tuple[tuple[float, ...], Trial]] = []
+    ranked: list[tuple[tuple[float, ...], Trial]] = []
     for cell, outcomes in table.items():
         over = np.isin(outcomes.outcome, ("collided", "diverged"))
         keys = (
@@ -217,5 +217,5 @@ def worst(table: Table, count: int = 10) -> list[Trial]:
                 str(outcomes.obstacle[row]),
                 *(float(values[row]) for values in (outcomes.ended, outcomes.clearance, outcomes.worst)),
             )
-            found.append((tuple(float(key[row]) for key in keys), trial))
-    return [trial for _, trial in sorted(found, key=lambda one: one[0])[:count]]
+            ranked.append((tuple(float(key[row]) for key in keys), trial))
+    return [trial for _, trial in sorted(ranked, key=lambda one: one[0])[:count]]

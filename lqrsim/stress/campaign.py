@@ -21,25 +21,26 @@ import numpy as np
 from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path, check_text, excerpt
 from lqrsim.machine import description, processors
 from lqrsim.results import files
+from lqrsim.results.hashing import sha256
 from lqrsim.results.solution import Trajectory
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.stress import cluster, executors
 from lqrsim.stress.lock import sole_writer
-from lqrsim.stress.manifest import NAME, digest_of, digest_of_solution, read_manifest, write_manifest
+from lqrsim.stress.manifest import NAME, digest_of_solution, read_manifest, write_manifest
 from lqrsim.stress.results import Results
 from lqrsim.stress.specification import POLICIES as POLICIES
 from lqrsim.stress.specification import Campaign as Campaign
 from lqrsim.stress.specification import Cell as Cell
 from lqrsim.stress.specification import Shard
 from lqrsim.stress.trial_tables import Damaged, write
-from lqrsim.stress.trials import Job, lean, left_out, possible, solve
+from lqrsim.stress.trials import Job, left_out, possible_policies, solve, without_diagnostics
 from lqrsim.versions import changed, versions
 
 _log = logging.getLogger("lqrsim")
 
 MOST_WORKERS = 1024
-_OWN = {NAME, "campaign.lock", "policies", "shards", "damaged"}
+_CAMPAIGN_FILES = {NAME, "campaign.lock", "policies", "shards", "damaged"}
 
 
 def run_campaign(
@@ -72,41 +73,41 @@ def run_campaign(
         check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
     check_function("progress", progress, "a function of how many trials are done, of how many", arguments=2)
     scenario = resolve(campaign.scenario)
-    _rehearse(campaign, scenario)
-    _look_at(folder)
+    _check_runnable(campaign, scenario)
+    _check_folder(folder)
     with contextlib.ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(cluster.connected(scheduler))
         stack.enter_context(sole_writer(folder))
-        _begin(campaign, scenario, folder)
+        _write_or_check_manifest(campaign, scenario, folder)
         results = Results(folder, scenario=campaign.scenario)
-        left = _left(results)
-        if left:
+        unfinished = _unfinished(results)
+        if unfinished:
             _check_versions(results)
             results.trials.warm_up()  # so that what is compiled is there for the workers
         job = _job(results, campaign, batch)
         total = campaign.trials * len(results.cells)
-        done = total - sum(shard.count for shard in left)
+        done = total - sum(shard.count for shard in unfinished)
         if progress is not None:
             progress(done, total)
         if client is not None:
-            work = cluster.spread(job, left, client, campaign.time_limit)
+            work = cluster.run_on_cluster(job, unfinished, client, campaign.time_limit)
         elif workers:
-            work = executors.local(job, left, min(workers, len(left)), campaign.time_limit)
+            work = executors.run_in_processes(job, unfinished, min(workers, len(unfinished)), campaign.time_limit)
         else:
-            work = executors.here(job, left)
+            work = executors.run_here(job, unfinished)
         for shard, contents in stack.enter_context(contextlib.closing(work)):
             write(contents, results.path(shard))
             done += shard.count
             if progress is not None:
                 progress(done, total)
         for cell in results.cells:
-            if (found := results.tally(cell).total()) != campaign.trials:
-                raise InputError(f"folder: got {found} trials of {cell}, want {campaign.trials}: {results.command}")
+            if (counted := results.tally(cell).total()) != campaign.trials:
+                raise InputError(f"folder: got {counted} trials of {cell}, want {campaign.trials}: {results.command}")
     return results
 
 
 def _job(results: Results, campaign: Campaign, batch: int) -> Job:
-    solutions = {policy: lean(solution) for policy, solution in results.trials.solutions.items()}
+    solutions = {policy: without_diagnostics(solution) for policy, solution in results.trials.solutions.items()}
     return Job(campaign.as_json(), results.manifest["digest"], solutions, batch)
 
 
@@ -118,12 +119,12 @@ def _check_versions(results: Results) -> None:
         )
 
 
-def _rehearse(campaign: Campaign, scenario: Scenario) -> None:
+def _check_runnable(campaign: Campaign, scenario: Scenario) -> None:
     """Raise InputError now for what every trial would raise it for, before anything is solved or written."""
     problem, plant = scenario.problem, scenario.plant()
     for policy in campaign.policies:
-        if policy not in possible(scenario):
-            those = ", ".join(possible(scenario))
+        if policy not in possible_policies(scenario):
+            those = ", ".join(possible_policies(scenario))
             raise InputError(
                 f"policies: got {policy}, which cannot keep the scenario's constraints, want some of {those}"
             )
@@ -139,40 +140,42 @@ def _rehearse(campaign: Campaign, scenario: Scenario) -> None:
             except InputError as error:
                 raise InputError(f"sweeps: {cell.sweep} at strength {cell.strength:g}: {error}") from None
             except Exception:  # may depend on the trial, or on the plan; then it is those trials' error
-                _log.debug("%s can not be rehearsed", disturbance, exc_info=True)
+                _log.debug("%s cannot be started beforehand", disturbance, exc_info=True)
     if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
         raise InputError(f"replan_every: got {campaign.replan_every:g} s, want at least {problem.dt:g}")
 
 
-def _look_at(folder: Path) -> None:
+def _check_folder(folder: Path) -> None:
     """Raise InputError for a folder that is not empty, and no campaign's."""
     if os.path.isdir(folder) and not os.path.exists(folder / NAME):
-        others = sorted(name for name in os.listdir(folder) if name not in _OWN and not name.startswith(".unfinished-"))
+        others = sorted(
+            name for name in os.listdir(folder) if name not in _CAMPAIGN_FILES and not name.startswith(".unfinished-")
+        )
         if others:
             raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty one or a campaign's")
 
 
-def _begin(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
+def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
     """Solve and write the policies, and then the manifest; or see that it is the same campaign that was begun."""
-    asked = {
+    specification = {
         "campaign": json.loads(json.dumps(campaign.as_json())),
-        "model": digest_of(scenario.scene.xml.encode()),
+        "model": sha256(scenario.scene.xml),
         "problem": scenario.problem.digest,
         "code": _code(campaign),
     }
     if os.path.exists(folder / NAME):
-        _compare(asked, read_manifest(folder), folder)
+        _check_same_campaign(specification, read_manifest(folder), folder)
         return
     policies = {}
     for policy, solution in solve(campaign.policies, scenario).items():
         path = files.save(solution, folder / "policies" / f"{policy}.npz")
-        policies[policy] = {"digest": digest_of_solution(solution), "sha256": digest_of(path.read_bytes())}
+        policies[policy] = {"digest": digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
     about = {"versions": versions(), "machine": description(), "left_out": left_out(campaign.policies, scenario)}
-    write_manifest(folder, asked | {"policies": policies} | about)
+    write_manifest(folder, specification | {"policies": policies} | about)
 
 
-def _compare(asked: dict[str, Any], manifest: dict[str, Any], folder: Path) -> None:
-    now, before = (_flat(one["campaign"]) for one in (asked, manifest))
+def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any], folder: Path) -> None:
+    now, before = (_flat(one["campaign"]) for one in (specification, manifest))
     for field in [*now, *before]:
         value, was = now.get(field), before.get(field)
         if field != "time_limit" and value != was:
@@ -180,9 +183,9 @@ def _compare(asked: dict[str, Any], manifest: dict[str, Any], folder: Path) -> N
                 f"{field}: got {excerpt(value)}, want {excerpt(was)}, as {folder} has it, or another folder"
             )
     for field, what in (("model", "MJCF"), ("problem", "problem")):
-        if asked[field] != manifest[field]:
+        if specification[field] != manifest[field]:
             raise InputError(f"scenario: got a {what} that is not the one {folder} was begun with, want another folder")
-    for kind, digest in asked["code"].items():
+    for kind, digest in specification["code"].items():
         if digest != manifest["code"].get(kind):
             raise InputError(f"{kind}: got a file that has changed since {folder} was begun, want it as it was then")
 
@@ -190,12 +193,12 @@ def _compare(asked: dict[str, Any], manifest: dict[str, Any], folder: Path) -> N
 def _code(campaign: Campaign) -> dict[str, str | None]:
     """Hash of the file of each disturbance that is not lqrsim's own; None where it is in none."""
     kinds = {type(one) for sweep in campaign.sweeps.values() for one in sweep}
-    found: dict[str, str | None] = {}
+    hashes: dict[str, str | None] = {}
     for kind in sorted(kinds, key=lambda kind: kind.__qualname__):
         if kind.__module__.partition(".")[0] != "lqrsim":
             file = getattr(sys.modules.get(kind.__module__), "__file__", None)
-            found[kind.__qualname__] = None if file is None else digest_of(Path(file).read_bytes())
-    return found
+            hashes[kind.__qualname__] = None if file is None else sha256(Path(file).read_bytes())
+    return hashes
 
 
 def _flat(campaign: dict[str, Any]) -> dict[str, Any]:
@@ -204,20 +207,20 @@ def _flat(campaign: dict[str, Any]) -> dict[str, Any]:
     return sweeps | {name: value for name, value in campaign.items() if name != "sweeps"}
 
 
-def _left(results: Results) -> list[Shard]:
+def _unfinished(results: Results) -> list[Shard]:
     """What is to be done; what is damaged is moved aside, and remains of writing are removed."""
     for remains in results.folder.glob("**/.unfinished-*"):
         remains.unlink(missing_ok=True)
-    there = results.there()
-    return [shard for shard in results.shards() if shard not in there or not _good(results, shard)]
+    on_disk = results.there()
+    return [shard for shard in results.shards() if shard not in on_disk or not _is_intact(results, shard)]
 
 
-def _good(results: Results, shard: Shard) -> bool:
+def _is_intact(results: Results, shard: Shard) -> bool:
     try:
         results.read(shard)
     except Damaged as error:
         path = results.path(shard)
-        aside = next(name for name in _names(results.folder / "damaged" / path.name) if not name.exists())
+        aside = next(name for name in _numbered_names(results.folder / "damaged" / path.name) if not name.exists())
         try:
             aside.parent.mkdir(exist_ok=True)
             path.replace(aside)
@@ -228,7 +231,7 @@ def _good(results: Results, shard: Shard) -> bool:
     return True
 
 
-def _names(path: Path) -> Iterator[Path]:
+def _numbered_names(path: Path) -> Iterator[Path]:
     yield path
     number = 1
     while True:

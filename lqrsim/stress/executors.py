@@ -1,6 +1,10 @@
 """Processes of this machine that do a campaign's work, watched over: they may die, or hang, and the work goes on.
 
-Python's own pools give all work up when one process dies, and do not say on what it died; hence this one.
+What there is does not do that. A `ProcessPoolExecutor` of which one process is killed gives up every task that is not
+done, and does not tell which one was at fault; a task that hangs cannot be cancelled, and before Python 3.14 no process
+of it can be ended without reaching into private fields. A `LocalCluster` of dask does the work of dead workers again,
+but its tasks have no time limit either and go on after `cancel()`; it does not say by which signal a worker ended,
+takes seconds to start and is an extra to install. For clusters of machines see cluster.py.
 """
 
 import contextlib
@@ -20,21 +24,21 @@ from lqrsim.errors import InputError
 from lqrsim.stress.specification import Shard
 from lqrsim.stress.trials import Job, failed_work, prepare, work
 
-Done = Generator[tuple[Shard, bytes]]
+FinishedShards = Generator[tuple[Shard, bytes]]
 
 ATTEMPTS = 3  # of a shard, and to start a process
-_START = 300.0  # s; a process that is not ready by then never will be
+_START_TIMEOUT = 300.0  # s; a process that is not ready by then never will be
 _ONE_THREAD = ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMBA")
 _context = multiprocessing.get_context("spawn")  # forking a process that has threads is not safe
 
 
-def here(job: Job, shards: Iterable[Shard]) -> Done:
+def run_here(job: Job, shards: Iterable[Shard]) -> FinishedShards:
     """This process does the work; what ends it ends the campaign, until it is resumed."""
     for shard in shards:
         yield shard, work(job, shard)
 
 
-def local(job: Job, shards: list[Shard], workers: int, time_limit: float) -> Done:
+def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: float) -> FinishedShards:
     """Processes do the work; the files of shards as they come.
 
     A process that dies is replaced, and its shard done again; a shard on which it dies thrice, or that takes longer
@@ -43,7 +47,7 @@ def local(job: Job, shards: list[Shard], workers: int, time_limit: float) -> Don
     Raises:
       InputError: processes can not be started.
     """
-    queue, attempts, stillborn = deque(shards), Counter[Shard](), 0
+    queue, attempts, failed_starts = deque(shards), Counter[Shard](), 0
     busy: list[_Worker] = []
     idle: list[_Worker] = []
     try:
@@ -65,8 +69,8 @@ def local(job: Job, shards: list[Shard], workers: int, time_limit: float) -> Don
                     continue
                 worker.end()
                 attempts[shard] += worker.ready
-                stillborn = 0 if worker.ready else stillborn + 1
-                if stillborn == ATTEMPTS:
+                failed_starts = 0 if worker.ready else failed_starts + 1
+                if failed_starts == ATTEMPTS:
                     raise InputError(
                         f"workers: got processes that do not start ({answer}), want a script to call run() under"
                         ' `if __name__ == "__main__":`, or workers=0'
@@ -90,7 +94,7 @@ class _Worker:
             self.process.start()
         theirs.close()  # so that its death is an end of file here
         self.ready = self.late = False
-        self.deadline = time.monotonic() + _START
+        self.deadline = time.monotonic() + _START_TIMEOUT
 
     def take(self, shard: Shard, time_limit: float) -> None:
         """Give it work."""

@@ -4,7 +4,6 @@ It has two hashes. `sha256` is of all of it: whatever is edited is refused. `dig
 shard has it too: a manifest that is sealed anew, with other numbers, has shards that are not its own.
 """
 
-import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ import numpy as np
 from lqrsim.errors import InputError, excerpt
 from lqrsim.results import schema
 from lqrsim.results.archive import Other, blamed
+from lqrsim.results.hashing import sha256
 from lqrsim.results.solution import Solution
 from lqrsim.stress.specification import POLICIES, Campaign, Cell
 from lqrsim.stress.trial_tables import write
@@ -81,20 +81,20 @@ def _check(manifest: dict[str, Any]) -> None:
     _MANIFEST("manifest", manifest)
     if manifest["sha256"] != _seal(manifest):
         raise InputError("sha256: got another than that of the content, want a file that has not been changed")
-    asked = manifest["campaign"]
-    if schema.canonical(manifest["cells"]) != schema.canonical(_cells(asked)):
+    campaign = manifest["campaign"]
+    if schema.canonical(manifest["cells"]) != schema.canonical(_cells(campaign)):
         raise InputError("cells: got others than those of the campaign, want each sweep, strength and policy")
-    if set(manifest["policies"]) != set(asked["policies"]):
-        raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(asked['policies'])}")
+    if set(manifest["policies"]) != set(campaign["policies"]):
+        raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(campaign['policies'])}")
     if manifest["digest"] != digest_of_rows(manifest):
         raise InputError("digest: got another than that of the campaign, want a file that has not been changed")
 
 
-def _cells(asked: Mapping[str, Any]) -> list[list[Any]]:
+def _cells(campaign: Mapping[str, Any]) -> list[list[Any]]:
     """Each policy, sweep and strength, in the order of their numbers. Raises InputError if it is no campaign."""
     # Its disturbances may be a user's, and are made only where that user's file was named.
-    plainly = Campaign(**{**asked, "sweeps": dict.fromkeys(asked["sweeps"], ())})
-    return [[cell.policy, cell.sweep, cell.strength] for cell in plainly.cells]
+    bare = Campaign(**{**campaign, "sweeps": dict.fromkeys(campaign["sweeps"], ())})
+    return [[cell.policy, cell.sweep, cell.strength] for cell in bare.cells]
 
 
 def cells_of(manifest: Mapping[str, Any]) -> list[Cell]:
@@ -103,7 +103,7 @@ def cells_of(manifest: Mapping[str, Any]) -> list[Cell]:
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:
-    return digest_of(schema.canonical({name: one for name, one in manifest.items() if name != "sha256"}).encode())
+    return sha256(schema.canonical({name: one for name, one in manifest.items() if name != "sha256"}))
 
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
@@ -112,12 +112,7 @@ def digest_of_rows(manifest: Mapping[str, Any]) -> str:
         "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},
         "policies": {policy: hashes["digest"] for policy, hashes in manifest["policies"].items()},
     }
-    return digest_of(schema.canonical(lasting).encode())
-
-
-def digest_of(contents: bytes) -> str:
-    """Hash of a file's contents."""
-    return hashlib.sha256(contents).hexdigest()
+    return sha256(schema.canonical(lasting))
 
 
 def digest_of_solution(solution: Solution) -> str:
@@ -125,4 +120,4 @@ def digest_of_solution(solution: Solution) -> str:
     plan, policy = solution.trajectory, solution.policy
     goal = np.zeros(0) if solution.goal is None else solution.goal
     arrays = plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt]), goal
-    return digest_of(b"".join(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes() for array in arrays))
+    return sha256(*(part for array in arrays for part in (f"{array.shape}", array)))

@@ -1,13 +1,14 @@
 """How likely a rare failure is, by splitting: through levels of a score, each not so rare given the one before.
 
 A trial is a function of a vector z of standard normal numbers (trial_score.py), and fails if its score is positive. A
-first run finds levels that about `keep` of the vectors exceed given the level before, and how far to move at each of
+pilot run finds levels that about `keep` of the vectors exceed given the level before, and how far to move at each of
 them. The repetitions that count use these levels and moves: N vectors; those above the level are kept and copied in
 place of the others; each is moved by preconditioned Crank-Nicolson steps, z' = sqrt(1 - b^2) z + b xi, that are refused
 if the score falls below the level, and so leave the distribution above it as it is. The estimate is the product of the
 shares above each level. With levels and moves fixed beforehand its mean is the probability exactly, for any number of
-particles and moves (Del Moral, Feynman-Kac Formulae, 2004, Theorem 7.4.2); levels taken from the particles themselves
-would bias it by the order of 1/N (Cerou, Del Moral, Furon & Guyader, Statistics and Computing 22, 2012).
+particles and moves (Del Moral, Feynman-Kac Formulae, 2004, Theorem 7.4.2); levels taken from the particles themselves,
+as subset simulation takes them, would bias it by the order of 1/N (Cerou, Del Moral, Furon & Guyader, Statistics and
+Computing 22, 2012).
 
 The interval is of the relative error. A product's standard deviation grows with its mean, so repetitions that happen to
 come out low look more alike than they are, and Student's interval about them then misses the probability. How their
@@ -27,7 +28,7 @@ from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate
 
 Score = Callable[[Array], Array]
 MOST = 10_000  # repetitions, moves, levels and rounds
-ACCEPTED = 0.4  # the share of moves for which a first run aims
+ACCEPTANCE = 0.4  # the share of moves for which the pilot run aims
 
 
 class NoFailure(InputError):
@@ -35,15 +36,15 @@ class NoFailure(InputError):
 
 
 @dataclass(frozen=True)
-class Rare:
+class SplittingResult:
     """How likely failure is.
 
     Attributes:
       probability: the mean of the repetitions, with its interval: see the top of this file. Where there is one level
         alone, repetitions are plain trials, and it is the exact one of Clopper and Pearson.
       standard_error: of that mean. repetitions: (R,), independent and each without bias.
-      levels: of the score, the last one 0. sizes: b of the moves at each but the last.
-      simulations: scores that were asked for in all, the first run included.
+      levels: of the score, the last one 0. step_sizes: b of the moves at each but the last.
+      simulations: scores that were computed in all, those of the pilot run included.
       failures: (k, d) vectors that fail, of the repetitions, distributed as failures are. scores: (k,) theirs.
     """
 
@@ -51,13 +52,13 @@ class Rare:
     standard_error: float
     repetitions: Array
     levels: Array
-    sizes: Array
+    step_sizes: Array
     simulations: int
     failures: Array
     scores: Array
 
     @property
-    def plain(self) -> float:
+    def plain_trials(self) -> float:
         """How many plain trials have the same standard error, in the mean; NaN where all repetitions agree."""
         if self.standard_error == 0:
             return float("nan")
@@ -77,15 +78,15 @@ def split(
     most_levels: int = 40,
     level: Callable[[float], object] | None = None,
     progress: Callable[[int, int], object] | None = None,
-) -> Rare:
+) -> SplittingResult:
     """The probability that the score of a standard normal vector is positive.
 
     Args:
       score: of vectors (K, size), (K,); positive is failure.
       particles: N of each repetition. keep: share that exceeds the next level. moves: of each particle at a level.
       repetitions: independent ones; the interval is made of how much they differ.
-      most_levels: with as many the first run gives up.
-      level: called with each level as the first run finds it.
+      most_levels: with as many the pilot run gives up.
+      level: called with each level as the pilot run finds it.
       progress: called with the repetitions that are done, and all of them.
 
     Raises:
@@ -104,124 +105,123 @@ def split(
     confidence = check_number("confidence", confidence, above=0.0, below=1.0)
     check_function("level", level, "a function of a level", arguments=1)
     check_function("progress", progress, "a function of how many repetitions are done, of how many", arguments=2)
-    count = _Count(score)
+    counted = CountedScore(score)
     first, *rest = np.random.SeedSequence(check_seed("seed", seed)).spawn(repetitions + 1)
-    levels, sizes = _levels(count, size, particles, keep, moves, most_levels, np.random.default_rng(first), level)
+    levels, step_sizes = _pilot_run(
+        counted, size, particles, keep, moves, most_levels, np.random.default_rng(first), level
+    )
     shares = np.zeros((repetitions, len(levels)))
     failures, scores = [], []
     for number, key in enumerate(rest):
         if progress is not None:
             progress(number, repetitions)
-        shares[number], failed, theirs = _run(count, size, particles, moves, levels, sizes, np.random.default_rng(key))
+        shares[number], failed, failed_scores = _repetition(
+            counted, size, particles, moves, levels, step_sizes, np.random.default_rng(key)
+        )
         failures.append(failed)
-        scores.append(theirs)
+        scores.append(failed_scores)
     if progress is not None:
         progress(repetitions, repetitions)
-    found = shares.prod(axis=1)
-    if not found.any():
+    estimates = shares.prod(axis=1)
+    if not estimates.any():
         raise NoFailure(f"particles: got {particles}, of which none failed, want more")
-    return Rare(
-        _probability(shares, particles, confidence),
-        float(found.std(ddof=1) / np.sqrt(repetitions)),
-        found,
+    return SplittingResult(
+        _estimate(shares, particles, confidence),
+        float(estimates.std(ddof=1) / np.sqrt(repetitions)),
+        estimates,
         levels,
-        sizes,
-        count.asked,
+        step_sizes,
+        counted.evaluations,
         np.concatenate(failures),
         np.concatenate(scores),
     )
 
 
-def scores_of(score: Score, vectors: Array) -> Array:
-    """The scores (K,) of vectors (K, size). Raises InputError for what is no number for each of them."""
-    # With vectors of its own, for a user's function may write to them.
-    found = shaped("score: returned", score(vectors.copy()), (len(vectors),))
-    if np.isnan(found).any():
-        raise InputError(f"score: got NaN returned, want a number for each of {len(vectors)} vectors")
-    return found
-
-
-def _probability(shares: Array, particles: int, confidence: float) -> Estimate:
+def _estimate(shares: Array, particles: int, confidence: float) -> Estimate:
     """The mean of the repetitions' products of shares (R, levels), none of them NaN, with its interval."""
     count, levels = shares.shape
     if levels == 1:
         return rate(round(float(shares.sum()) * particles), count * particles, confidence=confidence)
-    found = shares.prod(axis=1)
-    mean = float(found.mean())
+    estimates = shares.prod(axis=1)
+    mean = float(estimates.mean())
     # Repetitions may agree by chance. Particles that were independent at each level would differ by so much.
     reached = np.column_stack([np.ones(count), shares[:, :-1]]).cumprod(axis=1) > 0
     typical = shares.sum(axis=0) / reached.sum(axis=0)
     least = np.sqrt(np.sum((1 - typical) / typical) / particles)
-    spread = max(found.std(ddof=1) / mean, least)
-    reach = float(stats.t.ppf(0.5 + confidence / 2, count - 1) * spread / np.sqrt(count))
-    high = mean / (1 - reach) if reach < 1 - mean else 1.0
-    return Estimate(mean, mean / (1 + reach), high, confidence)
+    deviation = max(estimates.std(ddof=1) / mean, least)
+    half_width = float(stats.t.ppf(0.5 + confidence / 2, count - 1) * deviation / np.sqrt(count))
+    high = mean / (1 - half_width) if half_width < 1 - mean else 1.0
+    return Estimate(mean, mean / (1 + half_width), high, confidence)
 
 
-class _Count:
-    """A score that counts how often it is asked."""
+class CountedScore:
+    """A score that is checked, and that counts its evaluations. Raises InputError for what is no number for each."""
 
     def __init__(self, score: Score) -> None:
-        self.score, self.asked = score, 0
+        self.score, self.evaluations = score, 0
 
     def __call__(self, vectors: Array) -> Array:
-        self.asked += len(vectors)
-        return scores_of(self.score, vectors)
+        self.evaluations += len(vectors)
+        # With vectors of its own, for a user's function may write to them.
+        scores = shaped("score: returned", self.score(vectors.copy()), (len(vectors),))
+        if np.isnan(scores).any():
+            raise InputError(f"score: got NaN returned, want a number for each of {len(vectors)} vectors")
+        return scores
 
 
-def _levels(
+def _pilot_run(
     score: Score,
     size: int,
     particles: int,
     keep: float,
     moves: int,
-    most: int,
+    most_levels: int,
     rng: np.random.Generator,
-    tell: Callable[[float], object] | None,
+    on_level: Callable[[float], object] | None,
 ) -> tuple[Array, Array]:
-    """The first run: levels, the last one 0, and how far to move at each but the last."""
+    """Levels, the last one 0, and how far to move at each but the last."""
     vectors = rng.standard_normal((particles, size))
     scores = score(vectors)
     levels: list[float] = []
-    sizes: list[float] = []
+    step_sizes: list[float] = []
     b = 0.5
-    while len(levels) < most:
+    while len(levels) < most_levels:
         level = float(np.quantile(scores, 1 - keep, method="inverted_cdf"))
-        if tell is not None:
-            tell(min(level, 0.0))
+        if on_level is not None:
+            on_level(min(level, 0.0))
         if level >= 0 and (scores > 0).any():
-            return np.array([*levels, 0.0]), np.array(sizes)
+            return np.array([*levels, 0.0]), np.array(step_sizes)
         if not (scores > level).any():
             break
-        vectors, scores = _branch(vectors, scores, level, rng)
+        vectors, scores = _resample(vectors, scores, level, rng)
         for _ in range(moves):
-            vectors, scores, accepted = _move(score, vectors, scores, level, b, rng)
-            b = float(np.clip(b * np.exp(accepted - ACCEPTED), 1e-3, 1.0))
+            vectors, scores, accepted = _crank_nicolson_step(score, vectors, scores, level, b, rng)
+            b = float(np.clip(b * np.exp(accepted - ACCEPTANCE), 1e-3, 1.0))
         levels.append(level)
-        sizes.append(b)
+        step_sizes.append(b)
     raise NoFailure(f"score: got no failure in {len(levels)} levels up to {scores.max():g}, want some")
 
 
-def _run(
-    score: Score, size: int, particles: int, moves: int, levels: Array, sizes: Array, rng: np.random.Generator
+def _repetition(
+    score: Score, size: int, particles: int, moves: int, levels: Array, step_sizes: Array, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
     """One repetition: the share above each level, 0 from where none was; and the failures with their scores."""
     vectors = rng.standard_normal((particles, size))
     scores = score(vectors)
     shares = np.zeros(len(levels))
-    for number, (level, b) in enumerate(zip(levels[:-1], sizes, strict=True)):
+    for number, (level, b) in enumerate(zip(levels[:-1], step_sizes, strict=True)):
         shares[number] = np.mean(scores > level)
         if shares[number] == 0:
             return shares, vectors[:0], scores[:0]
-        vectors, scores = _branch(vectors, scores, level, rng)
+        vectors, scores = _resample(vectors, scores, level, rng)
         for _ in range(moves):
-            vectors, scores, _ = _move(score, vectors, scores, level, b, rng)
+            vectors, scores, _ = _crank_nicolson_step(score, vectors, scores, level, b, rng)
     failed = scores > levels[-1]
     shares[-1] = failed.mean()
     return shares, vectors[failed], scores[failed]
 
 
-def _branch(vectors: Array, scores: Array, level: float, rng: np.random.Generator) -> tuple[Array, Array]:
+def _resample(vectors: Array, scores: Array, level: float, rng: np.random.Generator) -> tuple[Array, Array]:
     """As many as there were, of those above the level: each as often as any other, but for chance where that is odd."""
     above = np.flatnonzero(scores > level)
     times, left = divmod(len(scores), len(above))
@@ -229,15 +229,15 @@ def _branch(vectors: Array, scores: Array, level: float, rng: np.random.Generato
     return vectors[chosen], scores[chosen]
 
 
-def _move(
+def _crank_nicolson_step(
     score: Score, vectors: Array, scores: Array, level: float, b: float, rng: np.random.Generator
 ) -> tuple[Array, Array, float]:
     """One move of each that stays above the level; and the share of those that were accepted."""
     proposed = np.sqrt(1 - b * b) * vectors + b * rng.standard_normal(vectors.shape)
-    theirs = score(proposed)
-    accepted = theirs > level
+    proposed_scores = score(proposed)
+    accepted = proposed_scores > level
     return (
         np.where(accepted[:, None], proposed, vectors),
-        np.where(accepted, theirs, scores),
+        np.where(accepted, proposed_scores, scores),
         float(accepted.mean()),
     )

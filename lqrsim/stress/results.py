@@ -12,12 +12,13 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_count, check_flag, check_kind, check_name, check_path, check_text, excerpt
 from lqrsim.results import files
+from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.references import from_anywhere, resolve
 from lqrsim.simulation.outcomes import OUTCOMES, Outcomes
 from lqrsim.stress.analysis import alike
-from lqrsim.stress.manifest import cells_of, digest_of, digest_of_solution, read_manifest
+from lqrsim.stress.manifest import cells_of, digest_of_solution, read_manifest
 from lqrsim.stress.specification import Campaign, Cell, Shard, shards_of
 from lqrsim.stress.statistics import CONFIDENCE, rate
 from lqrsim.stress.trial_tables import Damaged, Table, read
@@ -43,11 +44,11 @@ class Results:
         self.manifest = read_manifest(self.folder)
         self.cells = cells_of(self.manifest)
         self._scenario = scenario
-        asked = self.manifest["campaign"]["scenario"]
+        reference = self.manifest["campaign"]["scenario"]
         if scenario is not None:
             check_kind("scenario", scenario, str, "the campaign's reference")
-            if from_anywhere(scenario) != from_anywhere(asked):
-                raise InputError(f"scenario: got {excerpt(scenario)}, want {asked}, which {self.folder} was run on")
+            if from_anywhere(scenario) != from_anywhere(reference):
+                raise InputError(f"scenario: got {excerpt(scenario)}, want {reference}, which {self.folder} was run on")
 
     @cached_property
     def campaign(self) -> Campaign:
@@ -70,8 +71,8 @@ class Results:
     @property
     def missing(self) -> list[tuple[Cell, int, int]]:
         """What is still to be run: cell, first trial, how many."""
-        there = self.there()
-        return [(self.cells[shard.cell], shard.first, shard.count) for shard in self.shards() if shard not in there]
+        on_disk = self.there()
+        return [(self.cells[shard.cell], shard.first, shard.count) for shard in self.shards() if shard not in on_disk]
 
     def outcomes(self, cell: Cell, *, partial: bool = False) -> Outcomes:
         """All trials of a cell, in order. Raises InputError for what is damaged, or not finished unless `partial`."""
@@ -84,10 +85,10 @@ class Results:
 
     def tally(self, cell: Cell, *, partial: bool = False) -> Counter[str]:
         """How many trials of a cell ended how; it reads the cell in parts. Raises InputError as `outcomes` does."""
-        found: Counter[str] = Counter()
+        counts: Counter[str] = Counter()
         for _, table in self.tables(cell, partial=partial):
-            found.update(table["outcome"].tolist())
-        return found
+            counts.update(table["outcome"].tolist())
+        return counts
 
     def summary(self) -> str:
         """A line for each cell: how its trials ended, how sure the rate is; then where the plans end, and errors."""
@@ -116,10 +117,10 @@ class Results:
 
     def plans(self) -> list[str]:
         """Where the plan of each policy ends, and whether it misses the goal."""
-        asked, lines = self.manifest["campaign"], []
+        campaign, lines = self.manifest["campaign"], []
         for policy in self.manifest["policies"]:
             solution = self.solution(policy)
-            near, radius = (asked["goal_radius"], asked["goal_tolerance"]), solution.goal_radius
+            near, radius = (campaign["goal_radius"], campaign["goal_tolerance"]), solution.goal_radius
             if near != (None, None):
                 radius = solution.target.radius(None, *near)
             lines += [f"{policy}: {line}" for line in solution.target.of_plan(radius)]
@@ -138,15 +139,15 @@ class Results:
         """What a policy was made from. Raises InputError if its file is damaged."""
         path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
         hashes, solution = self.manifest["policies"][policy], files.load_solution(path)
-        if digest_of(path.read_bytes()) != hashes["sha256"] or digest_of_solution(solution) != hashes["digest"]:
+        if sha256(path.read_bytes()) != hashes["sha256"] or digest_of_solution(solution) != hashes["digest"]:
             raise InputError(f"policy: got {path}, which is damaged, want what the campaign wrote: run it elsewhere")
         return solution
 
     def shards(self, cell: Cell | None = None) -> Iterator[Shard]:
         """The work of a cell, or all of it."""
-        asked = self.manifest["campaign"]
+        campaign = self.manifest["campaign"]
         for number in range(len(self.cells)) if cell is None else [self.number(cell)]:
-            yield from shards_of(number, asked["trials"], asked["shard"])
+            yield from shards_of(number, campaign["trials"], campaign["shard"])
 
     def there(self) -> set[Shard]:
         """The shards that have a file."""
@@ -193,8 +194,8 @@ class Results:
     @property
     def command(self) -> str:
         """The command that goes on with the campaign, and repairs what is damaged; it runs in any working directory."""
-        asked = self.manifest["campaign"]["scenario"]
-        return shlex.join(["lqrsim", "stress", asked, "--resume", "--out", str(self.folder.absolute())])
+        reference = self.manifest["campaign"]["scenario"]
+        return shlex.join(["lqrsim", "stress", reference, "--resume", "--out", str(self.folder.absolute())])
 
     def command_of(self, command: str, *options: str) -> str:
         """`lqrsim report` or `lqrsim replay` of this campaign, which runs in any working directory.
@@ -205,8 +206,8 @@ class Results:
         check_name("command", command, ("report", "replay"))
         for option in options:
             check_text("options", option, "an option, such as --cell", at_most=4000)
-        asked = self.manifest["campaign"]["scenario"]
-        own = ["--scenario", asked] if ":" in asked else []
+        reference = self.manifest["campaign"]["scenario"]
+        own = ["--scenario", reference] if ":" in reference else []
         return shlex.join(["lqrsim", command, str(self.folder.absolute()), *options, *own])
 
 

@@ -85,7 +85,7 @@ def shards_of(cell: int, trials: int, size: int) -> Iterator[Shard]:
 
 @dataclass(frozen=True, kw_only=True)
 class Campaign:
-    """What is asked.
+    """The specification of a stress test.
 
     Attributes:
       scenario: what is run, as `lqrsim solve` takes it.
@@ -170,7 +170,9 @@ class Campaign:
     def as_json(self) -> dict[str, Any]:
         """What `from_json` makes the same campaign of."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        sweeps = {name: [described(disturbance) for disturbance in sweep] for name, sweep in self.sweeps.items()}
+        sweeps = {
+            name: [disturbance_as_json(disturbance) for disturbance in sweep] for name, sweep in self.sweeps.items()
+        }
         return fields | {"sweeps": sweeps, "strengths": list(self.strengths), "policies": list(self.policies)}
 
     @classmethod
@@ -182,7 +184,9 @@ class Campaign:
         """
         check_kind("campaign", fields, Mapping, "what lqrsim wrote")
         try:
-            sweeps = {name: tuple(_made(one) for one in sweep) for name, sweep in fields["sweeps"].items()}
+            sweeps = {
+                name: tuple(_disturbance_from_json(one) for one in sweep) for name, sweep in fields["sweeps"].items()
+            }
             return cls(**{**fields, "sweeps": sweeps})
         except InputError:
             raise
@@ -190,37 +194,37 @@ class Campaign:
             raise InputError(f"campaign: got {excerpt(fields)}, want what lqrsim wrote ({error})") from None
 
 
-def described(disturbance: Disturbance) -> dict[str, Any]:
+def disturbance_as_json(disturbance: Disturbance) -> dict[str, Any]:
     """Its kind and settings, for JSON. Raises InputError where they are not plain."""
     if not dataclasses.is_dataclass(disturbance):
         raise InputError(f"{type(disturbance).__name__}: got a class of its own kind, want a dataclass")
     settings = {field.name: getattr(disturbance, field.name) for field in dataclasses.fields(disturbance) if field.init}
     return {
         "kind": type(disturbance).__qualname__,
-        "settings": {name: _plain(value) for name, value in settings.items()},
+        "settings": {name: _as_json(value) for name, value in settings.items()},
     }
 
 
-def _plain(value: Any) -> Any:
+def _as_json(value: Any) -> Any:
     if isinstance(value, tuple | list):
-        return [_plain(one) for one in value]
+        return [_as_json(one) for one in value]
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {str(name): _plain(one) for name, one in value.items()}
+        return {str(name): _as_json(one) for name, one in value.items()}
     if value is None or isinstance(value, bool | int | float | str):
         return value
     raise InputError(f"sweeps: got {excerpt(value)} in a disturbance, want numbers, strings, and lists of them")
 
 
-def _made(fields: Mapping[str, Any]) -> Disturbance:
+def _disturbance_from_json(fields: Mapping[str, Any]) -> Disturbance:
     kinds = {kind.__qualname__: kind for kind in _kinds(Disturbance)}
-    settings = {name: _restored(value) for name, value in fields["settings"].items()}
+    settings = {name: _with_tuples(value) for name, value in fields["settings"].items()}
     return kinds[check_name("disturbance", fields["kind"], sorted(kinds))](**settings)
 
 
-def _restored(value: Any) -> Any:
-    return tuple(_restored(one) for one in value) if isinstance(value, list) else value
+def _with_tuples(value: Any) -> Any:
+    return tuple(_with_tuples(one) for one in value) if isinstance(value, list) else value
 
 
 def _kinds(base: type[Disturbance]) -> Iterator[type[Disturbance]]:

@@ -167,7 +167,7 @@ def bootstrap(
         raise InputError(f"samples: got shapes {[array.shape for array in arrays]}, want one length of at least 2")
     check_number("confidence", confidence, above=0, below=1)
     check_count("resamples", resamples, at_most=1_000_000)
-    found = stats.bootstrap(
+    interval = stats.bootstrap(
         arrays,
         statistic,
         paired=True,
@@ -178,4 +178,4 @@ def bootstrap(
         method="percentile",  # BCa is undefined for medians of counts, which we have
         rng=np.random.default_rng(seed),
     ).confidence_interval
-    return Estimate(float(statistic(*arrays, axis=0)), float(found.low), float(found.high), confidence)
+    return Estimate(float(statistic(*arrays, axis=0)), float(interval.low), float(interval.high), confidence)

@@ -11,14 +11,14 @@ from lqrsim.simulation.disturbances.presets import PRESETS, preset
 def sweep(name: str, scenario: Scenario) -> tuple[Disturbance, ...]:
     """The disturbances of a name, at strength 1. Raises InputError for an unknown one, or a kind that it has not."""
     whole, colon, kind = name.partition(":")
-    found = tuple(_named(whole, scenario))
-    if not found:
+    disturbances = tuple(_named(whole, scenario))
+    if not disturbances:
         raise InputError(f"sweep: got {name!r}, which has no disturbances, want one that has")
     if not colon:
-        return found
-    kinds = [type(disturbance).__name__ for disturbance in found]
+        return disturbances
+    kinds = [type(disturbance).__name__ for disturbance in disturbances]
     check_name(f"kind of sweep {whole}", kind, dict.fromkeys(kinds))
-    return tuple(disturbance for disturbance in found if type(disturbance).__name__ == kind)
+    return tuple(disturbance for disturbance in disturbances if type(disturbance).__name__ == kind)
 
 
 def _named(name: str, scenario: Scenario) -> Sequence[Disturbance]:

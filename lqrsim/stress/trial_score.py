@@ -1,6 +1,7 @@
 """Trials as a function of the numbers that they draw: a vector of standard normal numbers decides on all of a trial.
 
-So what is rare can be searched for in the space of these vectors, whatever the disturbances are and remember.
+So what is rare can be searched for in the space of these vectors, whatever the disturbances are and remember. It is the
+standard normal space of reliability analysis; the score is its limit-state function, but positive where a trial fails.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -34,7 +35,7 @@ Size = int | Sequence[int] | None
 _LARGEST = np.nextafter(1.0, 0.0)  # of what numpy calls random, which is below 1
 
 
-class Given:
+class PrescribedDraws:
     """What a disturbance uses of NumPy's generators, with numbers that are made of given standard normal ones.
 
     Each number that is drawn takes one of them, in turn. Uniform ones are the normal distribution's function of it.
@@ -48,8 +49,8 @@ class Given:
 
     def standard_normal(self, size: Size = None) -> Any:
         count = 1 if size is None else int(np.prod(size))
-        taken = self._take(count)
-        return float(taken[0]) if size is None else taken.reshape(size).copy()
+        numbers = self._take(count)
+        return float(numbers[0]) if size is None else numbers.reshape(size).copy()
 
     def _take(self, count: int) -> Array:
         if self.used + count > len(self.numbers):
@@ -98,7 +99,7 @@ def _shape(size: Size, *arguments: npt.ArrayLike) -> Size:
     return size if size is not None else (np.broadcast_shapes(*(np.shape(one) for one in arguments)) or None)
 
 
-class _Counting(Given):
+class _CountedDraws(PrescribedDraws):
     """Has as many numbers as are asked for."""
 
     def __init__(self) -> None:
@@ -109,7 +110,7 @@ class _Counting(Given):
         return np.zeros(count)
 
 
-DEPTH = 1e-9  # m; the score of a collision that no knot sees
+LEAST_DEPTH = 1e-9  # m; the score of a collision that no knot sees
 
 
 def collision(rollout: Rollout) -> Array:
@@ -120,9 +121,9 @@ def collision(rollout: Rollout) -> Array:
     infinitely far.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
-    deep = -np.where(np.isnan(rollout.clearance), np.inf, rollout.clearance).min(axis=1)
+    depth = -np.where(np.isnan(rollout.clearance), np.inf, rollout.clearance).min(axis=1)
     outcome = np.array(rollout.outcome)
-    score = np.where(outcome == "collided", np.maximum(deep, DEPTH), -rollout.least_clearance())
+    score = np.where(outcome == "collided", np.maximum(depth, LEAST_DEPTH), -rollout.least_clearance())
     return np.where(np.isin(outcome, ("diverged", "error")), np.inf, score)
 
 
@@ -132,8 +133,8 @@ def miss(rollout: Rollout) -> Array:
     In metres; where the goal has no position, of the scaled error by which it is judged.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
-    away = np.nan_to_num(rollout.goal_distance - rollout.goal_radius, nan=-np.inf)
-    return np.maximum(collision(rollout), away)
+    outside = np.nan_to_num(rollout.goal_distance - rollout.goal_radius, nan=-np.inf)
+    return np.maximum(collision(rollout), outside)
 
 
 @dataclass
@@ -169,9 +170,9 @@ class TrialScore:
         self.contacts = check_flag("contacts", self.contacts)
         check_count("batch", self.batch)
         check_count("simulations", self.simulations, at_least=0)
-        counting = [_Counting() for _ in self.disturbances]
-        self._simulate(1, lambda trial, stream: counting[stream], frames=False)
-        self.sizes = tuple(one.used for one in counting)
+        draws = [_CountedDraws() for _ in self.disturbances]
+        self._simulate(1, lambda trial, stream: draws[stream], frames=False)
+        self.sizes = tuple(one.used for one in draws)
 
     @property
     def size(self) -> int:
@@ -179,10 +180,10 @@ class TrialScore:
         return sum(self.sizes)
 
     def __call__(self, numbers: npt.ArrayLike) -> Array:
-        every = check_array("numbers", numbers, (None, self.size))
-        parts: Iterable[Array] = (every[first : first + self.batch] for first in range(0, len(every), self.batch))
+        vectors = check_array("numbers", numbers, (None, self.size))
+        parts: Iterable[Array] = (vectors[first : first + self.batch] for first in range(0, len(vectors), self.batch))
         scores = [self._score(self.rollout(part, frames=False)) for part in parts]
-        self.simulations += len(every)
+        self.simulations += len(vectors)
         return np.concatenate(scores) if scores else np.zeros(0)
 
     def _score(self, rollout: Rollout) -> Array:
@@ -194,15 +195,15 @@ class TrialScore:
 
     def rollout(self, numbers: npt.ArrayLike, *, frames: bool = True) -> Rollout:
         """The trials with these numbers, (K, size), in full; their `seed` means nothing."""
-        every = check_array("numbers", numbers, (None, self.size))
+        vectors = check_array("numbers", numbers, (None, self.size))
         ends = np.cumsum((0, *self.sizes))
 
-        def given(trial: int, stream: int) -> Given:
-            return Given(every[trial, ends[stream] : ends[stream + 1]])
+        def draws_of(trial: int, stream: int) -> PrescribedDraws:
+            return PrescribedDraws(vectors[trial, ends[stream] : ends[stream + 1]])
 
-        return self._simulate(len(every), given, frames=frames)
+        return self._simulate(len(vectors), draws_of, frames=frames)
 
-    def _simulate(self, trials: int, generators: Callable[[int, int], Given], *, frames: bool) -> Rollout:
+    def _simulate(self, trials: int, generators: Callable[[int, int], PrescribedDraws], *, frames: bool) -> Rollout:
         return simulate(
             self.plant,
             self.solution,

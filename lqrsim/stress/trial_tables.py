@@ -4,7 +4,6 @@ A file holds the columns of `Outcomes`, and `reason`, which says why a trial is 
 campaign, the cell and the trials, and has a hash of all that, and of the columns.
 """
 
-import hashlib
 import io
 import json
 import os
@@ -18,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lqrsim.results.files import replacing
+from lqrsim.results.hashing import sha256
 from lqrsim.stress.specification import Shard
 
 Table = dict[str, npt.NDArray[np.generic]]
@@ -84,10 +84,10 @@ def _column(column: pa.ChunkedArray) -> npt.NDArray[np.generic]:
 
 
 def _digest(table: Table, about: Mapping[str, Any]) -> str:
-    hasher = hashlib.sha256(json.dumps(about).encode())
+    parts: list[str | bytes] = [json.dumps(about)]
     for name, column in table.items():
         text = column.dtype.kind == "U"
         kind = "text" if text else column.dtype.str
         data = json.dumps(column.tolist()).encode() if text else np.ascontiguousarray(column).tobytes()
-        hasher.update(f"{name} {kind} {len(data)}:".encode() + data)
-    return hasher.hexdigest()
+        parts += [f"{name} {kind} {len(data)}:", data]
+    return sha256(*parts)

@@ -41,7 +41,7 @@ class Job:
     run: str = field(default_factory=lambda: f"lqrsim-{uuid.uuid4().hex}")
 
 
-def lean(solution: Solution) -> Solution:
+def without_diagnostics(solution: Solution) -> Solution:
     """What running it takes, without what only tells how it was found: a fifth of the size."""
     return replace(
         solution, inverse_policy=None, cost_to_go=None, cost_to_come=None, iterations=(), candidates=(), multipliers=()
@@ -50,29 +50,29 @@ def lean(solution: Solution) -> Solution:
 
 def solve(policies: tuple[str, ...], scenario: Scenario) -> dict[str, Solution]:
     """The solution behind each policy. Raises InputError if one can not be run at all."""
-    found: dict[str, Solution] = {}
+    solutions: dict[str, Solution] = {}
     if {*policies} - {"ilqr"}:
         smoothed = smooth(scenario.problem)
-        found |= {"smooth": smoothed, "open_loop": smoothed.open_loop(), "replan": smoothed}
+        solutions |= {"smooth": smoothed, "open_loop": smoothed.open_loop(), "replan": smoothed}
     if "ilqr" in policies:
-        found["ilqr"] = ilqr(scenario.problem)
+        solutions["ilqr"] = ilqr(scenario.problem)
     for policy in policies:
-        if not np.isfinite(found[policy].trajectory.states).all():
-            raise InputError(f"policies: got {policy}, whose plan is not finite ({found[policy].status.name})")
-        found[policy] = replace(found[policy], goal_radius=scenario.reach())
-        if not found[policy].success:
-            _log.warning("%s did not converge (%s); its plan is run as it is", policy, found[policy].status.name)
-    return {policy: found[policy] for policy in policies}
+        if not np.isfinite(solutions[policy].trajectory.states).all():
+            raise InputError(f"policies: got {policy}, whose plan is not finite ({solutions[policy].status.name})")
+        solutions[policy] = replace(solutions[policy], goal_radius=scenario.reach())
+        if not solutions[policy].success:
+            _log.warning("%s did not converge (%s); its plan is run as it is", policy, solutions[policy].status.name)
+    return {policy: solutions[policy] for policy in policies}
 
 
-def possible(scenario: Scenario) -> tuple[str, ...]:
+def possible_policies(scenario: Scenario) -> tuple[str, ...]:
     """The policies that the scenario can have: all of POLICIES, but for those that cannot keep its constraints."""
     return tuple(policy for policy in POLICIES if not (policy == "ilqr" and scenario.problem.constraints))
 
 
 def left_out(policies: Sequence[str], scenario: Scenario) -> str:
     """Which policies are not among these for what they cannot do, in a line; empty if there is none."""
-    missing = [policy for policy in POLICIES if policy not in {*policies, *possible(scenario)}]
+    missing = [policy for policy in POLICIES if policy not in {*policies, *possible_policies(scenario)}]
     return f"left out: {', '.join(missing)}, which cannot keep the scenario's constraints" if missing else ""
 
 

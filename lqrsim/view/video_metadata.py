@@ -1,6 +1,5 @@
 """What a video says of itself, in the comment of its file: whose runs it shows, when, and through which cameras."""
 
-import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -12,7 +11,8 @@ import av
 import numpy as np
 from av.error import FFmpegError
 
-from lqrsim.errors import InputError, check_count, check_kind, check_number, check_path
+from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, check_path
+from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.cameras import Camera
 
@@ -118,10 +118,10 @@ def read(path: str | os.PathLike[str]) -> Footage:
 def digest(rollout: Rollout) -> str:
     """What tells a rollout from any other: a hash of its plan, states, controls, and where its draws came from."""
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
-    hasher = hashlib.sha256(f"{rollout.robot} {rollout.scene} {rollout.seed} {rollout.first_trial}".encode())
+    parts: list[str | Array] = [f"{rollout.robot} {rollout.scene} {rollout.seed} {rollout.first_trial}"]
     for array in (rollout.plan.states, rollout.plan.controls, rollout.states, rollout.applied):
-        hasher.update(f"{array.shape}".encode() + np.ascontiguousarray(array, dtype=np.float64).tobytes())
-    return hasher.hexdigest()[:16]
+        parts += [f"{array.shape}", np.asarray(array, dtype=np.float64)]
+    return sha256(*parts)[:16]
 
 
 def _pane(parts: Mapping[str, Any]) -> Pane:

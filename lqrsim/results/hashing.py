@@ -1,0 +1,23 @@
+"""Hashes of what is kept or compared: one way for all of them."""
+
+import hashlib
+
+import numpy as np
+import numpy.typing as npt
+
+
+def sha256(*parts: str | bytes | npt.NDArray[np.generic] | np.generic) -> str:
+    """SHA-256 of the parts one after the other, in hexadecimal: text as UTF-8, arrays as their numbers in C order.
+
+    Nothing is put between the parts, and an array's shape and type do not count: where they may differ, a text in front
+    of it says them.
+    """
+    hasher = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, str):
+            hasher.update(part.encode())
+        elif isinstance(part, bytes):
+            hasher.update(part)
+        else:  # a view of its bytes, for a copy may be large
+            hasher.update(np.ascontiguousarray(part).reshape(-1).view(np.uint8).data)
+    return hasher.hexdigest()
