@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_smoother import same
+from comparing import same
 from whole_problems import kkt
 
 import lqrsim as ls

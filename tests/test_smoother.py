@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import sympy
+from comparing import fixed, same
 from scipy.optimize import minimize
 
 import lqrsim as ls
@@ -13,18 +14,6 @@ from lqrsim.results.solution import Status
 from lqrsim.solvers.initial_guess import StartLike
 
 FORMS = ("dual", "primal")
-
-
-def fixed(problem: ls.Problem) -> ls.Problem:
-    assert problem.start is not None
-    return dataclasses.replace(problem, initial=ls.FixedState(problem.start))
-
-
-def same(one: ls.Solution, other: ls.Solution) -> bool:
-    """To the last bit."""
-    pairs = [(one.policy.gain, other.policy.gain), (one.policy.offset, other.policy.offset)]
-    pairs += [(one.trajectory.states, other.trajectory.states), (one.trajectory.controls, other.trajectory.controls)]
-    return one.status is other.status and all(np.array_equal(a, b) for a, b in pairs)
 
 
 @pytest.fixture(scope="module")
