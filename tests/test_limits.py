@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import systems
 from bounded import DT, bounded, matrices, random_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,10 +19,6 @@ TIGHT: dict[str, Any] = {"tolerance": 1e-12, "gap_tolerance": 1e-9}
 NO_LIMITS = (-np.inf, np.inf)
 
 
-def double_integrator(x, u, p):
-    return [x[1], u[0]]
-
-
 def bang_bang(steps: int) -> ls.Problem:
     """From rest to rest over just the distance that full thrust covers: half of the time ahead, half of it back.
 
@@ -29,9 +26,10 @@ def bang_bang(steps: int) -> ls.Problem:
     """
     time, beyond = steps * DT, 1e-3
     return ls.Problem(
-        dynamics=ls.Dynamics(double_integrator, states={"x": "m", "v": "m/s"}, controls={"a": "m/s^2"}),
-        dt=DT, steps=steps, initial=ls.FixedState([0.0, 0.0]),
-        stage_cost=ls.ControlCost([1e-6], about=[0.0]) + ls.QuadraticCost([0.0, 0.0], about=[0.0, 0.0]),
+        dynamics=systems.DOUBLE_INTEGRATOR, dt=DT, steps=steps, initial=ls.FixedState([0.0, 0.0]),
+        stage_cost=systems.stage_cost(
+            ls.ControlCost([1e-6], about=[0.0]), ls.QuadraticCost([0.0, 0.0], about=[0.0, 0.0])
+        ),
         final_cost=ls.QuadraticCost([1e4, 1e4], about=[time**2 / 4 + beyond, -beyond * time / 2]),
         control_limits=(-1.0, 1.0),
     )  # fmt: skip
