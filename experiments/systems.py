@@ -61,8 +61,8 @@ def stage_cost(control: ls.ControlCost, state: ls.QuadraticCost, cross: Array | 
 
 
 def scalar_rate(x: Any, u: Any, p: Any) -> list[Any]:
-    """Unstable, or escaping to infinity in finite time, as its parameters say."""
-    return [u[0] + p.linear * x[0] + p.cubic * x[0] ** 3]
+    """Unstable, or escaping to infinity in finite time, or with a pole, as its parameters say."""
+    return [u[0] + p.linear * x[0] + p.cubic * x[0] ** 3 + p.pole / (x[0] - p.at)]
 
 
 def bonus(x: Any, u: Any, p: Any) -> Any:
@@ -70,9 +70,10 @@ def bonus(x: Any, u: Any, p: Any) -> Any:
     return p.constant - p.bonus * u[0] ** 2
 
 
-def scalar(*, linear: float = 0.0, cubic: float = 0.0) -> ls.Dynamics:
-    """`x' = linear x + cubic x^3 + u`, of one state and one control."""
-    return ls.Dynamics(scalar_rate, states={"x": ""}, controls={"u": ""}, parameters={"linear": linear, "cubic": cubic})
+def scalar(*, linear: float = 0.0, cubic: float = 0.0, pole: float = 0.0, at: float = 1e300) -> ls.Dynamics:
+    """`x' = linear x + cubic x^3 + pole / (x - at) + u`, of one state and one control."""
+    parameters = {"linear": linear, "cubic": cubic, "pole": pole, "at": at}
+    return ls.Dynamics(scalar_rate, states={"x": ""}, controls={"u": ""}, parameters=parameters)
 
 
 def scalar_cost(effort: float = 1.0, *, weight: float = 0.0, constant: float = 0.0, paid: float = 0.0) -> ls.Cost:

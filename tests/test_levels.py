@@ -226,8 +226,7 @@ def test_what_a_plain_function_raises_ends_the_solve_with_its_words() -> None:
             raise ZeroDivisionError("the angle is beyond me")
         return pendulum(x, u, p)
 
-    # Of a structure that is compiled already; how smooth() takes plain functions is in test_search.py.
-    solution = ls.ilqr(swing(ls.Dynamics(fragile, level="plain", **FIELDS), COSTS["compiled"]))
+    solution = ls.smooth(swing(ls.Dynamics(fragile, level="plain", **FIELDS), COSTS["compiled"]))
     assert solution.status is Status.NOT_FINITE
     assert "fragile(x, u, p) raised ZeroDivisionError: the angle is beyond me" in solution.detail
     assert set(calls) == {threading.get_ident()}
@@ -263,7 +262,7 @@ def test_ctrl_c_stops_plain_functions_in_other_threads() -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        ls.ilqr_many(problems, threads=2, progress=interrupt)
+        ls.smooth_many(problems, threads=2, progress=interrupt)
     stopped = len(calls)
     time.sleep(0.05)
     assert len(calls) == stopped  # nothing runs on
@@ -307,7 +306,7 @@ def test_what_a_function_does_only_later_is_not_taken_for_numbers(level: str) ->
     raising = ls.Dynamics(pendulum, jacobian=_raising_jacobian, level=level, **FIELDS)
     shrinking = ls.Dynamics(_shrinking, level=level, **FIELDS)
     for dynamics in (raising, shrinking):
-        solution = ls.ilqr(swing(dynamics, COSTS["compiled"]))
+        solution = ls.ilqr(swing(dynamics, COSTS["compiled"]), start=(1.0,))
         assert solution.status is Status.NOT_FINITE
 
 

@@ -206,23 +206,15 @@ def test_the_same_problem_gives_the_same_bits(drive_solution: ls.Solution) -> No
     assert again.problem_digest == drive_solution.problem_digest
 
 
-def scalar_problem(*, cubic: float = 0.0, paid: float = 0.0, about: float = 1.0) -> ls.Problem:
-    """A scalar integrator that can be made to escape, or to be paid for effort."""
+def scalar_problem(*, paid: float = 0.0, about: float = 1.0, **rate: float) -> ls.Problem:
+    """A scalar integrator that can be made to escape, to begin at a pole, or to be paid for effort."""
     return ls.Problem(
-        dynamics=systems.scalar(cubic=cubic), dt=0.5, steps=20, initial=ls.QuadraticCost([1.0], about=[about]),
+        dynamics=systems.scalar(**rate), dt=0.5, steps=20, initial=ls.QuadraticCost([1.0], about=[about]),
         stage_cost=systems.scalar_cost(paid=paid), final_cost=ls.QuadraticCost([1.0], about=[0.0]),
     )  # fmt: skip
 
 
-def without_a_root() -> ls.Problem:
-    """The same where the start is outside of the formula's domain."""
-
-    def rate(x, u, p):
-        from sympy import sqrt
-
-        return [u[0] + sqrt(x[0] - 5)]
-
-    return dataclasses.replace(scalar_problem(), dynamics=ls.Dynamics(rate, states={"x": ""}, controls={"u": ""}))
+POLE = {"pole": 1.0, "at": 1.0}  # where it begins
 
 
 class TestEndings:
@@ -245,9 +237,11 @@ class TestEndings:
 
     @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
     def test_a_formula_outside_its_domain_at_the_start(self, solver) -> None:
-        message = r"rate\(x, u, p\): got nan as entry 0 \(x\) at the start, x = \(1\), u = \(0\), want a finite number"
+        message = (
+            r"scalar_rate\(x, u, p\): got inf as entry 0 \(x\) at the start, x = \(1\), u = \(0\), want a finite number"
+        )
         with pytest.raises(ls.InputError, match=message):
-            solver(without_a_root())
+            solver(scalar_problem(**POLE))
 
     @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
     def test_a_cost_of_zero(self, solver) -> None:
@@ -310,10 +304,10 @@ class TestMany:
         with pytest.raises(ls.InputError, match=r"^threads: got 0, want a whole number >= 1"):
             ls.smooth_many([good], threads=0)
         for many in (ls.smooth_many, ls.ilqr_many):
-            good, lost = many([scalar_problem(), without_a_root()])
+            good, lost = many([scalar_problem(), scalar_problem(**POLE)])
             assert good.status is Status.CONVERGED
             assert lost.status is Status.NOT_FINITE
-            assert "rate(x, u, p): got nan as entry 0 (x) at the start" in lost.detail
+            assert "scalar_rate(x, u, p): got inf as entry 0 (x) at the start" in lost.detail
         with pytest.raises(ls.InputError, match=r"^problem: got None, want a Problem"):
             ls.smooth(None)  # pyright: ignore[reportArgumentType]
 
