@@ -189,10 +189,11 @@ class TestWithoutAWay:
         free = bare + ls.ObstacleCost(ls.World(), radius=0.1)
         weightless = bare + ls.ObstacleCost(obstacles.world, radius=0.1, weight=0.0)
         goal = ls.QuadraticCost([1.0, 1.0, 1.0], about=[1.0, 0.0, 0.0])
-        for changes in (
+        changed: list[dict[str, Any]] = [
             {"stage_cost": bare}, {"stage_cost": free}, {"stage_cost": weightless}, {"final_cost": goal + goal},
             {"initial": goal + goal},
-        ):  # fmt: skip
+        ]  # fmt: skip
+        for changes in changed:
             problem = in_the_plane(**changes)
             assert guides(problem, None) == guides(problem, 1) == [("nominal control", None)]
             with pytest.raises(ls.InputError, match="starts: got 2, want 1 without an ObstacleCost, a start"):
