@@ -30,7 +30,7 @@ problem = ls.Problem(
     initial=ls.QuadraticCost([1.0], about=[1.0]), stage_cost=ls.ControlCost([1.0], about=[0.0]),
     final_cost=ls.QuadraticCost([5.0], about=[0.0]),
 )
-solution = ls.smooth(problem)
+solution = ls.ilqr(problem)
 print(repr(solution.cost), len(jit.compilations), "sympy" in sys.modules, solution.status.name)
 """
 
@@ -52,7 +52,7 @@ def finish(process: "subprocess.Popen[str]") -> tuple[list[str], str]:
 def test_two_processes_compile_the_same_at_once_and_the_third_finds_it(tmp_path: Path) -> None:
     folder = tmp_path / "cache"
     first, second = (finish(process) for process in [start(tmp_path, folder), start(tmp_path, folder)])
-    assert "compiling smoother for decay (1 states, 1 controls)" in first[1]
+    assert "compiling ilqr for decay (1 states, 1 controls)" in first[1]
     third, silence = finish(start(tmp_path, folder))
     # The same bits, whether compiled or loaded; loaded without compiling and without SymPy; nothing left over.
     assert first[0][0] == second[0][0] == third[0]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from comparing import assert_white
 from tracking import hover, weave
 
 from lqrsim.errors import InputError
@@ -23,20 +24,6 @@ def arena():
 @pytest.fixture(scope="module")
 def cage():
     return Plant(Quadrotor(), load_scene("cage"))
-
-
-def assert_white(noise, std):
-    """Noise (trials, steps, d): mean 0, the stated std, no correlation in time, across trials or between channels.
-
-    Each within five of its standard errors over N samples: 1 / sqrt(N), for the std 1 / sqrt(2 N). The seed is fixed.
-    """
-    std = np.broadcast_to(std, noise.shape[-1])
-    scaled, root = noise / std, np.sqrt(noise[..., 0].size)
-    assert np.abs(scaled.mean(axis=(0, 1))).max() < 5 / root
-    assert np.abs(scaled.std(axis=(0, 1)) - 1).max() < 5 / (np.sqrt(2) * root)
-    assert np.abs((scaled[:, 1:] * scaled[:, :-1]).mean(axis=(0, 1))).max() < 5 / root
-    assert np.abs((scaled[1:] * scaled[:-1]).mean(axis=(0, 1))).max() < 5 / root
-    assert np.abs((scaled[..., 1:] * scaled[..., :-1]).mean(axis=(0, 1))).max() < 5 / root
 
 
 def test_control_noise(arena, cage):

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from comparing import assert_white
 from scipy.integrate import solve_ivp
-from test_disturbances import assert_white
 from tracking import hover, track
 
 from lqrsim.errors import InputError

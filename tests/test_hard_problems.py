@@ -4,26 +4,20 @@ import dataclasses
 
 import numpy as np
 import pytest
+import systems
 
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.results.solution import Status
 
-CUBIC = ls.Dynamics(lambda x, u, p: [u[0] + x[0] ** 3], states={"x": ""}, controls={"u": ""})
-
 
 def cubic(*, effort: float = 1.0, constant: float = 0.0) -> ls.Problem:
     """A scalar that runs away by itself: the nominal control can not even be rolled out."""
     return ls.Problem(
-        dynamics=CUBIC, dt=0.1, steps=40, initial=ls.QuadraticCost([10.0], about=[1.0]),
-        stage_cost=ls.ControlCost([effort], about=[0.0]) + ls.QuadraticCost([0.1], about=[0.0])
-        + ls.SymbolicCost(_constant, parameters={"constant": constant}, convex=True),
+        dynamics=systems.scalar(cubic=1.0), dt=0.1, steps=40, initial=ls.QuadraticCost([10.0], about=[1.0]),
+        stage_cost=systems.scalar_cost(effort, weight=0.1, constant=constant),
         final_cost=ls.QuadraticCost([10.0], about=[0.5]),
     )  # fmt: skip
-
-
-def _constant(x, u, p):
-    return p.constant + 0 * x[0]
 
 
 def rolled(solution: ls.Solution, problem: ls.Problem) -> Array:
@@ -92,14 +86,17 @@ def test_far_from_the_origin_converged_means_what_it_does_near(offset: float) ->
     assert far.status is not Status.CONVERGED or far.cost < near.cost * (1 + 1e-3)
 
 
+# Of two states and a control, and of nothing else.
+EFFORT = systems.stage_cost(ls.ControlCost([1.0], about=[0.0]), ls.QuadraticCost([0.0, 0.0], about=[0.0, 0.0]))
+
+
 @pytest.mark.parametrize("form", ["dual", "primal"])
 @pytest.mark.parametrize("weights", [(1e8, 1e-3), (1e12, 1.0), (1.0, 1e-12)])
 def test_weights_of_a_soft_start_may_differ_by_any_factor(form: str, weights: tuple[float, float]) -> None:
     """A linear-quadratic problem is solved by one iteration, and the second sees it; the cost is the closed form's."""
-    dynamics = ls.Dynamics(lambda x, u, p: [x[1], u[0]], states={"x": "", "v": ""}, controls={"a": ""})
     problem = ls.Problem(
-        dynamics=dynamics, dt=0.1, steps=20, initial=ls.QuadraticCost(weights, about=(-1.0, 5.0)),
-        stage_cost=ls.ControlCost([1.0], about=[0.0]), final_cost=ls.QuadraticCost([10.0, 10.0], about=(1.0, 0.0)),
+        dynamics=systems.DOUBLE_INTEGRATOR, dt=0.1, steps=20, initial=ls.QuadraticCost(weights, about=(-1.0, 5.0)),
+        stage_cost=EFFORT, final_cost=ls.QuadraticCost([10.0, 10.0], about=(1.0, 0.0)),
     )  # fmt: skip
     solution = ls.smooth(problem, form=form)
     assert solution.status is Status.CONVERGED
@@ -115,10 +112,10 @@ def test_weights_of_a_soft_start_may_differ_by_any_factor(form: str, weights: tu
 
 
 def test_a_state_that_nothing_weighs_may_be_anywhere() -> None:
-    dynamics = ls.Dynamics(lambda x, u, p: [u[0], 0 * x[0]], states={"x": "", "free": ""}, controls={"u": ""})
     problem = ls.Problem(
-        dynamics=dynamics, dt=0.1, steps=10, initial=ls.QuadraticCost([1.0, 0.0], about=(1.0, 3.0)),
-        stage_cost=ls.ControlCost([1.0], about=[0.0]), final_cost=ls.QuadraticCost([1.0, 0.0], about=(0.0, 0.0)),
+        dynamics=systems.linear(np.zeros((2, 2)), [[1.0], [0.0]]), dt=0.1, steps=10,
+        initial=ls.QuadraticCost([1.0, 0.0], about=(1.0, 3.0)), stage_cost=EFFORT,
+        final_cost=ls.QuadraticCost([1.0, 0.0], about=(0.0, 0.0)),
     )  # fmt: skip
     solution = ls.smooth(problem)
     assert solution.status is Status.CONVERGED
@@ -200,10 +197,9 @@ class TestSafeguard:
 
     def test_it_says_when_the_cost_to_come_is_lost(self) -> None:
         """An unstable motion for long: the optimum is that of the Riccati equation, whatever becomes of x_hat."""
-        dynamics = ls.Dynamics(lambda x, u, p: [2 * x[0] + u[0]], states={"x": ""}, controls={"u": ""})
         problem = ls.Problem(
-            dynamics=dynamics, dt=0.1, steps=300, initial=ls.FixedState([1.0]),
-            stage_cost=ls.ControlCost([1.0], about=[0.0]), final_cost=ls.QuadraticCost([1.0], about=[0.0]),
+            dynamics=systems.scalar(linear=2.0), dt=0.1, steps=300, initial=ls.FixedState([1.0]),
+            stage_cost=systems.scalar_cost(), final_cost=ls.QuadraticCost([1.0], about=[0.0]),
         )  # fmt: skip
         solution = ls.smooth(problem)
         assert solution.status is Status.CONVERGED

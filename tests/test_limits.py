@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import systems
 from bounded import DT, bounded, matrices, random_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,10 +19,6 @@ TIGHT: dict[str, Any] = {"tolerance": 1e-12, "gap_tolerance": 1e-9}
 NO_LIMITS = (-np.inf, np.inf)
 
 
-def double_integrator(x, u, p):
-    return [x[1], u[0]]
-
-
 def bang_bang(steps: int) -> ls.Problem:
     """From rest to rest over just the distance that full thrust covers: half of the time ahead, half of it back.
 
@@ -29,9 +26,10 @@ def bang_bang(steps: int) -> ls.Problem:
     """
     time, beyond = steps * DT, 1e-3
     return ls.Problem(
-        dynamics=ls.Dynamics(double_integrator, states={"x": "m", "v": "m/s"}, controls={"a": "m/s^2"}),
-        dt=DT, steps=steps, initial=ls.FixedState([0.0, 0.0]),
-        stage_cost=ls.ControlCost([1e-6], about=[0.0]) + ls.QuadraticCost([0.0, 0.0], about=[0.0, 0.0]),
+        dynamics=systems.DOUBLE_INTEGRATOR, dt=DT, steps=steps, initial=ls.FixedState([0.0, 0.0]),
+        stage_cost=systems.stage_cost(
+            ls.ControlCost([1e-6], about=[0.0]), ls.QuadraticCost([0.0, 0.0], about=[0.0, 0.0])
+        ),
         final_cost=ls.QuadraticCost([1e4, 1e4], about=[time**2 / 4 + beyond, -beyond * time / 2]),
         control_limits=(-1.0, 1.0),
     )  # fmt: skip
@@ -62,39 +60,42 @@ class TestLinearQuadratic:
         assert held.any()
         assert not held.all()
         np.testing.assert_array_equal(held, (gain == 0).all(axis=2))
-        effort, wish = problem.stage_cost.terms  # pyright: ignore[reportAttributeAccessIssue]
+        effort, wish, _ = problem.stage_cost.terms  # pyright: ignore[reportAttributeAccessIssue]
         end: Any = problem.final_cost
         constants = held * plan.controls
-        H = np.zeros((problem.steps, 4, 4))
-        H[:, :2, :2], H[:, [2, 3], [2, 3]] = wish.weight, np.where(held, 1.0, np.diag(effort.weight))
-        h = np.zeros((problem.steps, 4))
-        h[:, :2], h[:, 2:] = -wish.weight @ wish.about, np.where(held, 0.0, -effort.weight @ effort.about)
+        H = np.zeros((problem.steps, 5, 5))
+        H[:, :3, :3], H[:, [3, 4], [3, 4]] = wish.weight, np.where(held, 1.0, np.diag(effort.weight))
+        h = np.zeros((problem.steps, 5))
+        h[:, :3], h[:, 3:] = -wish.weight @ wish.about, np.where(held, 0.0, -effort.weight @ effort.about)
         for t in range(problem.steps):
             count = problem.steps - t
             found = [
                 solve_dense(LinearQuadratic(
                     A=np.tile(A, (count, 1, 1)), B=B * ~held[t:, None], c=constants[t:] @ B.T, H=H[t:], h=h[t:],
-                    k=np.zeros(count), Q0=np.zeros((2, 2)), q0=np.zeros(2), k0=0.0, QT=end.weight,
+                    k=np.zeros(count), Q0=np.zeros((3, 3)), q0=np.zeros(3), k0=0.0, QT=end.weight,
                     qT=-end.weight @ end.about, kT=0.0, fixed=plan.states[t] + moved,
                 ))[1][0]
-                for moved in np.vstack([np.zeros(2), np.eye(2)])
+                for moved in np.vstack([np.zeros(3), np.eye(3)])
             ]  # fmt: skip
             np.testing.assert_allclose(gain[t], np.array(found[1:]).T - found[0][:, None], rtol=0, atol=1e-9)
             np.testing.assert_allclose(~held[t] * plan.controls[t], found[0], rtol=0, atol=1e-8)
 
     @pytest.mark.parametrize("form", ["dual", "primal"])
     def test_the_value_functions_count_what_held_controls_cost(self, form: str) -> None:
-        """Eq. (20): the least total cost is the cost at every step. The primal form's inverse step is O(dt^5) off."""
-        problem = random_problem(3, limit=0.3, fixed=False)
+        """Eq. (20): the least total cost is the cost at every step. The primal form's inverse step is O(dt^5) off.
+
+        No eigenvalue of this system is larger than 1.03 / s, and so little of that is left of the cost.
+        """
+        problem = random_problem(1, limit=0.3, fixed=False)
         solution = ls.smooth(problem, form=form, tolerance=1e-10, gap_tolerance=1e-9 if form == "dual" else 1e-3)
         cost, controls = bounded(problem)
         assert (np.abs(controls) > 0.3 - 1e-9).any()
-        np.testing.assert_allclose(solution.total_cost.minimum(), cost, rtol=1e-9 if form == "dual" else 1e-4)
+        np.testing.assert_allclose(solution.total_cost.minimum(), cost, rtol=1e-9 if form == "dual" else 1e-6)
         assert solution.inverse_policy is not None
         for t in range(problem.steps):
             arrived = solution.trajectory.states[t + 1]
             np.testing.assert_allclose(
-                solution.inverse_policy(arrived, t * DT), controls[t], rtol=0, atol=1e-6 if form == "dual" else 1e-3
+                solution.inverse_policy(arrived, t * DT), controls[t], rtol=0, atol=1e-6 if form == "dual" else 1e-4
             )
 
     @pytest.mark.parametrize("seed", range(4))
@@ -109,8 +110,8 @@ class TestLinearQuadratic:
         """Held from the first pass on, it is let go where that pays. The second control has no limits at all."""
         problem = random_problem(5)
         about = np.array([0.0, 0.1])
-        effort, wish = problem.stage_cost.terms  # pyright: ignore[reportAttributeAccessIssue]
-        problem = replace(problem, stage_cost=ls.ControlCost(effort.weight, about=about) + wish,
+        effort, wish, _ = problem.stage_cost.terms  # pyright: ignore[reportAttributeAccessIssue]
+        problem = replace(problem, stage_cost=systems.stage_cost(ls.ControlCost(effort.weight, about=about), wish),
                           control_limits=((low, -np.inf), (0.5, np.inf)))  # fmt: skip
         cost, controls = bounded(problem)
         solution = ls.smooth(problem, **TIGHT)
@@ -211,10 +212,10 @@ def _cost(scenario: ls.Scenario, plan: ls.Trajectory, controls: Array) -> Array:
 @pytest.mark.parametrize(
     ("limits", "message"),
     [
-        ((1.0, 1.0), "control_limits: got 1 to 1 for u, want the first below the second"),
-        ((-1.0, np.nan), "control_limits: got -1 to nan for u, want the first below the second"),
-        ((np.inf, np.inf), "control_limits: got inf to inf for u, want the first below the second"),
-        (((-1.0, 1.0), (1.0, 0.5)), "control_limits: got 1 to 0.5 for w, want the first below the second"),
+        ((1.0, 1.0), "control_limits: got 1 to 1 for u0, want the first below the second"),
+        ((-1.0, np.nan), "control_limits: got -1 to nan for u0, want the first below the second"),
+        ((np.inf, np.inf), "control_limits: got inf to inf for u0, want the first below the second"),
+        (((-1.0, 1.0), (1.0, 0.5)), "control_limits: got 1 to 0.5 for u1, want the first below the second"),
         ((1.0, 2.0, 3.0), r"control_limits: got \(1.0, 2.0, 3.0\), want \(lowest, highest\)"),
         ((-1.0, (1.0, 2.0, 3.0)), r"control_limits: got .*, want \(lowest, highest\), each a number or \(2,\)"),
         (("low", "high"), r"control_limits: got \('low', 'high'\), want \(lowest, highest\), each a number"),

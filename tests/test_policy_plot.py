@@ -77,12 +77,24 @@ def test_outlines_lie_where_the_total_cost_is_two_above_its_least(
 def test_the_tube_that_is_drawn_is_that_of_every_knot(
     drive_solution: ls.Solution, differential_drive: ls.Scenario
 ) -> None:
+    """Against both value functions, whose minimum and curvature are worked out here: two standard deviations about it.
+
+    Inverting the covariance costs some of the digits.
+    """
     axes = drawn(drive_solution, differential_drive).axes[0]
     tube, _ = [one for one in axes.collections if isinstance(one, PolyCollection)]
-    expected = outlines(drive_solution, (0, 1), np.arange(151))
+    go, come = drive_solution.cost_to_go, drive_solution.cost_to_come
+    assert go is not None
+    assert isinstance(come, ls.Moments)
     assert len(tube.get_paths()) == 151
-    for path, outline in zip(tube.get_paths(), expected, strict=True):
-        np.testing.assert_array_equal(np.asarray(path.vertices)[: len(outline)], outline)
+    for knot, path in enumerate(tube.get_paths()):
+        precise = np.linalg.inv(come.covariance[knot])
+        both = np.linalg.inv(go.hessian[knot] + precise)
+        centre, block = (both @ (precise @ come.mean[knot] - go.gradient[knot]))[:2], both[:2, :2]
+        away = np.unique(np.asarray(path.vertices), axis=0) - centre
+        np.testing.assert_allclose(np.sum(away @ np.linalg.inv(block) * away, axis=1), 4.0, rtol=1e-3)
+        # All the way round: evenly spread over the ellipse, points vary as much as half of its square.
+        np.testing.assert_allclose(away.T @ away / len(away), 2 * block, rtol=0, atol=1e-3 * np.abs(block).max())
 
 
 def test_strength_is_the_answer_in_the_worst_direction(quadrotor_solution: ls.Solution) -> None:

@@ -1,12 +1,11 @@
 """Which start is gone on with, what the others cost, and what is refused."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from test_smoother import same
+from comparing import same
 from whole_problems import kkt
 
 import lqrsim as ls
@@ -139,38 +138,38 @@ class TestPaths:
         assert {id(one) for one in calls} == {id(problem), id(other)}
 
 
-def in_the_plane(f: Callable[..., Any], **changes: Any) -> ls.Problem:
-    """Past a ball, by a body whose speed is the control."""
+def in_the_plane(*, plain: bool = False, **changes: Any) -> ls.Problem:
+    """Past a ball, by the differential drive: of the structure that is packaged, or stated in plain Python."""
     ball = ls.Obstacle("ball", "sphere", np.array([0.0, 0.1, 0.0]), np.eye(3), np.array([0.4, 0, 0]))
-    level = "plain" if f is plain else "symbolic"
-    dynamics = ls.Dynamics(
-        f, states={"x": "m", "y": "m"}, controls={"vx": "m/s", "vy": "m/s"}, position=("x", "y"), level=level
-    )
+    dynamics = ls.DifferentialDrive().dynamics
+    if plain:
+        dynamics = ls.Dynamics(
+            arcs, states={"x": "m", "y": "m", "heading": "rad"}, controls={"left": "m/s", "right": "m/s"},
+            parameters=dynamics.parameters, position=("x", "y"), angles=("heading",), level="plain",
+            control_limits=(-0.5, 0.5),
+        )  # fmt: skip
     fields: dict[str, Any] = {
-        "dynamics": dynamics, "dt": 0.1, "steps": 12, "initial": ls.FixedState([-1.0, 0.0]),
-        "stage_cost": ls.ControlCost([0.5, 0.5], about=[0.0, 0.0])
+        "dynamics": dynamics, "dt": 0.5, "steps": 12, "initial": ls.FixedState([-1.0, 0.0, 0.0]),
+        "stage_cost": ls.ControlCost([0.5, 0.5], about=[0.3, 0.3])
         + ls.ObstacleCost(ls.World([ball]), radius=0.1, sharpness=5.0),
-        "final_cost": ls.QuadraticCost([100.0, 100.0], about=[1.0, 0.0]),
+        "final_cost": ls.QuadraticCost([100.0, 100.0, 1.0], about=[1.0, 0.0, 0.0]),
     }  # fmt: skip
     return ls.Problem(**fields | changes)
 
 
-def plain(x: Array, u: Array, p: Any) -> Array:
+def arcs(x: Array, u: Array, p: Any) -> list[float]:
     if x[1] < -50:
         raise RuntimeError("off the map")
-    return u.copy()
-
-
-def symbolic(x, u, p):
-    return [u[0], u[1]]
+    speed = (u[0] + u[1]) / 2
+    return [speed * np.cos(x[2]), speed * np.sin(x[2]), (u[1] - u[0]) / p.axle_length]
 
 
 class TestWithoutAWay:
     def test_plain_functions_are_searched_with_too(self) -> None:
         """One thread, two, and formulas: all the same."""
-        problem = in_the_plane(plain)
+        problem = in_the_plane(plain=True)
         one, two = (ls.smooth(problem, threads=threads, safeguard=False) for threads in (1, 2))
-        formula = ls.smooth(in_the_plane(symbolic), safeguard=False)
+        formula = ls.smooth(in_the_plane(), safeguard=False)
         assert one.status is Status.CONVERGED
         assert same(one, two)
         for a, b in zip(one.candidates, formula.candidates, strict=True):
@@ -178,23 +177,24 @@ class TestWithoutAWay:
             assert a.cost == pytest.approx(b.cost, rel=1e-6)
 
     def test_a_goal_where_it_starts(self) -> None:
-        here = ls.QuadraticCost([100.0, 100.0], about=[-1.0, 0.0])
-        solution = ls.smooth(in_the_plane(symbolic, final_cost=here), safeguard=False)
+        here = ls.QuadraticCost([100.0, 100.0, 1.0], about=[-1.0, 0.0, 0.0])
+        solution = ls.smooth(in_the_plane(final_cost=here), safeguard=False)
         assert solution.status is Status.CONVERGED
         assert solution.candidates == ()
 
     def test_no_goal_no_obstacles_or_no_start(self, differential_drive) -> None:
-        nowhere = in_the_plane(symbolic, steps=12)
+        nowhere = in_the_plane(steps=12)
         (_, obstacles) = nowhere.stage_cost.terms  # pyright: ignore[reportAttributeAccessIssue]
-        bare = ls.ControlCost([0.5, 0.5], about=[0.0, 0.0])
+        bare = ls.ControlCost([0.5, 0.5], about=[0.3, 0.3])
         free = bare + ls.ObstacleCost(ls.World(), radius=0.1)
         weightless = bare + ls.ObstacleCost(obstacles.world, radius=0.1, weight=0.0)
-        goal = ls.QuadraticCost([1.0, 1.0], about=[1.0, 0.0])
-        for changes in (
+        goal = ls.QuadraticCost([1.0, 1.0, 1.0], about=[1.0, 0.0, 0.0])
+        changed: list[dict[str, Any]] = [
             {"stage_cost": bare}, {"stage_cost": free}, {"stage_cost": weightless}, {"final_cost": goal + goal},
             {"initial": goal + goal},
-        ):  # fmt: skip
-            problem = in_the_plane(symbolic, **changes)
+        ]  # fmt: skip
+        for changes in changed:
+            problem = in_the_plane(**changes)
             assert guides(problem, None) == guides(problem, 1) == [("nominal control", None)]
             with pytest.raises(ls.InputError, match="starts: got 2, want 1 without an ObstacleCost, a start"):
                 ls.smooth(problem, starts=2)
@@ -213,7 +213,7 @@ class TestWithoutAWay:
     )
     def test_what_is_refused(self, options: dict[str, Any], message: str) -> None:
         with pytest.raises(ls.InputError, match=message):
-            ls.smooth(in_the_plane(symbolic), **options)
+            ls.smooth(in_the_plane(), **options)
 
     @pytest.mark.parametrize(
         ("fields", "message"),
@@ -231,7 +231,7 @@ class TestWithoutAWay:
             ls.InitialPrior(**given | fields)
 
     def test_ilqr_has_no_prior_whoever_makes_it(self) -> None:
-        prior = ls.InitialPrior((1.0, 1.0), about=(0.0, 0.0))
+        prior = ls.InitialPrior((1.0, 1.0, 1.0), about=(0.0, 0.0, 0.0))
         for start in (prior, lambda problem: prior):
             with pytest.raises(ls.InputError, match="start: got an InitialPrior, want controls"):
-                ls.ilqr(in_the_plane(symbolic), start=start)
+                ls.ilqr(in_the_plane(), start=start)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import systems
 from scipy.optimize import minimize
 
 import lqrsim as ls
@@ -205,28 +206,15 @@ def test_the_same_problem_gives_the_same_bits(drive_solution: ls.Solution) -> No
     assert again.problem_digest == drive_solution.problem_digest
 
 
-def scalar_problem(
-    *, cubic: float = 0.0, root: float = 0.0, inside: float = 9.0, bonus: float = 0.0, about: float = 1.0
-) -> ls.Problem:
-    """A scalar integrator that can be made to escape, to leave the domain of its formula, or to be paid for effort."""
-
-    def rate(x, u, p):
-        from sympy import sqrt
-
-        return [u[0] + p.cubic * x[0] ** 3 + p.root * sqrt(x[0] + p.inside)]
-
-    dynamics = ls.Dynamics(
-        rate, states={"x": ""}, controls={"u": ""}, parameters={"cubic": cubic, "root": root, "inside": inside}
-    )
+def scalar_problem(*, paid: float = 0.0, about: float = 1.0, **rate: float) -> ls.Problem:
+    """A scalar integrator that can be made to escape, to begin at a pole, or to be paid for effort."""
     return ls.Problem(
-        dynamics=dynamics,
-        dt=0.5,
-        steps=20,
-        initial=ls.QuadraticCost([1.0], about=[about]),
-        stage_cost=ls.ControlCost([1.0], about=[0.0])
-        + ls.SymbolicCost(lambda x, u, p: -p.bonus * u[0] ** 2, parameters={"bonus": bonus}, convex=True),
-        final_cost=ls.QuadraticCost([1.0], about=[0.0]),
-    )
+        dynamics=systems.scalar(**rate), dt=0.5, steps=20, initial=ls.QuadraticCost([1.0], about=[about]),
+        stage_cost=systems.scalar_cost(paid=paid), final_cost=ls.QuadraticCost([1.0], about=[0.0]),
+    )  # fmt: skip
+
+
+POLE = {"pole": 1.0, "at": 1.0}  # where it begins
 
 
 class TestEndings:
@@ -240,7 +228,7 @@ class TestEndings:
         assert solution.status.remedy in str(solution)
 
     def test_a_cost_without_a_minimum(self) -> None:
-        solution = ls.smooth(scalar_problem(bonus=1.0), safeguard=False)
+        solution = ls.smooth(scalar_problem(paid=1.0), safeguard=False)
         assert solution.status is Status.NOT_POSITIVE_DEFINITE
         assert solution.detail == "forward pass of iteration 1, step 0 of 20"
         assert solution.iterations == ()
@@ -249,9 +237,11 @@ class TestEndings:
 
     @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
     def test_a_formula_outside_its_domain_at_the_start(self, solver) -> None:
-        message = r"rate\(x, u, p\): got nan as entry 0 \(x\) at the start, x = \(1\), u = \(0\), want a finite number"
+        message = (
+            r"scalar_rate\(x, u, p\): got inf as entry 0 \(x\) at the start, x = \(1\), u = \(0\), want a finite number"
+        )
         with pytest.raises(ls.InputError, match=message):
-            solver(scalar_problem(root=1.0, inside=-5.0))
+            solver(scalar_problem(**POLE))
 
     @pytest.mark.parametrize("solver", [ls.smooth, ls.ilqr])
     def test_a_cost_of_zero(self, solver) -> None:
@@ -297,7 +287,7 @@ class TestMany:
             np.testing.assert_array_equal(solution.trajectory.states, alone.trajectory.states)
 
     def test_each_has_a_status_of_its_own(self) -> None:
-        problems = [scalar_problem(), scalar_problem(bonus=1.0), scalar_problem(cubic=100.0)]
+        problems = [scalar_problem(), scalar_problem(paid=1.0), scalar_problem(cubic=100.0)]
         first, second, third = ls.smooth_many(problems, max_iterations=30)
         assert first.status is Status.CONVERGED
         assert second.status is Status.NOT_POSITIVE_DEFINITE
@@ -314,10 +304,10 @@ class TestMany:
         with pytest.raises(ls.InputError, match=r"^threads: got 0, want a whole number >= 1"):
             ls.smooth_many([good], threads=0)
         for many in (ls.smooth_many, ls.ilqr_many):
-            good, lost = many([scalar_problem(), scalar_problem(root=1.0, inside=-5.0)])
+            good, lost = many([scalar_problem(), scalar_problem(**POLE)])
             assert good.status is Status.CONVERGED
             assert lost.status is Status.NOT_FINITE
-            assert "rate(x, u, p): got nan as entry 0 (x) at the start" in lost.detail
+            assert "scalar_rate(x, u, p): got inf as entry 0 (x) at the start" in lost.detail
         with pytest.raises(ls.InputError, match=r"^problem: got None, want a Problem"):
             ls.smooth(None)  # pyright: ignore[reportArgumentType]
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_smoother import fixed, same
+from comparing import fixed, same
 
 import lqrsim as ls
 from lqrsim.results.solution import Status

@@ -13,16 +13,24 @@ from whole_problems.claims import contradictions
 import lqrsim as ls
 from lqrsim.results.solution import Status
 
-# Ten kinds of problems are compiled where nothing is cached, some 10 seconds each.
+# Each kind is compiled where nothing is cached, some 5 seconds. Most of these are so by other tests, too; those that
+# are left out have nothing that these have not, and benchmark_claims.py draws them by the hundred.
+KINDS = ("linear", "pendulum", "arm", "car", "planar", "planar_free", "drive", "quadrotor")
 pytestmark = pytest.mark.timeout(900)
 
 
-@settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
-@given(kind=st.sampled_from(sorted(draws.KINDS)), number=st.integers(0, 2**32 - 1))
+@settings(max_examples=220, suppress_health_check=[HealthCheck.too_slow])
+@given(kind=st.sampled_from(KINDS), number=st.integers(0, 2**32 - 1))
 def test_nothing_that_a_solution_claims_is_false(kind: str, number: int) -> None:
     drawn = draws.draw(kind, number)
     for solution in draws.solve(drawn):
         assert contradictions(drawn.problem, solution, drawn.rate) == [], f"{drawn}: {solution.status.name}"
+
+
+def test_every_kind_can_be_drawn() -> None:
+    assert set(KINDS) < set(draws.KINDS)
+    for kind in draws.KINDS:
+        assert draws.draw(kind, 0).problem.steps > 0
 
 
 def test_a_draw_does_not_depend_on_what_else_is_drawn() -> None:

@@ -1,9 +1,7 @@
 """Linear-quadratic problems, stated as any other: stable and unstable, with singular weights, with cross terms."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
+import systems
 from numpy.random import Generator
 
 import lqrsim as ls
@@ -12,37 +10,13 @@ from lqrsim.errors import Array
 SIZES = ((2, 1), (3, 2), (4, 2), (6, 3))  # states and controls; each is compiled once, for matrices are data
 
 
-def linear_rate(x: Any, u: Any, p: Any) -> list[Any]:
-    """`A x + B u + c`; p has the entries row by row, as `draw` names them."""
-    entries = list(p.__dict__.values())
-    n, z = len(x), [*x, *u, 1]
-    return [sum(entries[i * len(z) + j] * z[j] for j in range(len(z))) for i in range(n)]
-
-
-def cross_cost(x: Any, u: Any, p: Any) -> Any:
-    """`1/2 z'K z` with z = (x, u); p has the entries of K on and above the diagonal, row by row."""
-    entries, z, k = list(p.__dict__.values()), [*x, *u], 0
-    total = 0
-    for i in range(len(z)):
-        for j in range(i, len(z)):
-            total += entries[k] * z[i] * z[j] / (2 if i == j else 1)
-            k += 1
-    return total
-
-
 def draw(rng: Generator, states: int, controls: int) -> ls.Problem:
     """One of them. Half have a fixed start, and half a cost in which states and controls are multiplied."""
     n, m = states, controls
     a = rng.normal(size=(n, n))
     # From well damped to doubling in half a second, whatever came out.
     a += (rng.uniform(-2.0, 1.4) - np.linalg.eigvals(a).real.max()) * np.eye(n)
-    numbers = np.hstack([a, rng.normal(size=(n, m)), rng.normal(scale=0.3, size=(n, 1))])
-    dynamics = ls.Dynamics(
-        linear_rate,
-        states={f"x{i}": "" for i in range(n)},
-        controls={f"u{i}": "" for i in range(m)},
-        parameters=_named("a", numbers.ravel()),
-    )
+    dynamics = systems.linear(a, rng.normal(size=(n, m)), rng.normal(scale=0.3, size=n))
     cross = _semidefinite(rng, n + m, rank=int(rng.integers(1, n + m + 1))) * _scale(rng, 0.1, 10)
     if rng.random() < 0.5:
         cross *= 0.0
@@ -54,15 +28,13 @@ def draw(rng: Generator, states: int, controls: int) -> ls.Problem:
         initial=ls.FixedState(start)
         if fixed
         else ls.QuadraticCost(_definite(rng, n) * _scale(rng, 1, 100), about=start),
-        stage_cost=ls.ControlCost(_definite(rng, m) * _scale(rng, 0.01, 10), about=rng.normal(size=m))
-        + ls.QuadraticCost(_state_weight(rng, n) * _scale(rng, 0.1, 10), about=rng.normal(size=n))
-        + ls.SymbolicCost(cross_cost, parameters=_named("k", cross[np.triu_indices(n + m)]), convex=True),
+        stage_cost=systems.stage_cost(
+            ls.ControlCost(_definite(rng, m) * _scale(rng, 0.01, 10), about=rng.normal(size=m)),
+            ls.QuadraticCost(_state_weight(rng, n) * _scale(rng, 0.1, 10), about=rng.normal(size=n)),
+            cross,
+        ),
         final_cost=ls.QuadraticCost(_state_weight(rng, n) * _scale(rng, 1, 1000), about=rng.normal(size=n)),
     )
-
-
-def _named(letter: str, values: Array) -> Mapping[str, float]:
-    return {f"{letter}{i}": float(value) for i, value in enumerate(values)}
 
 
 def _scale(rng: Generator, low: float, high: float) -> float:

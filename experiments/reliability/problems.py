@@ -1,7 +1,7 @@
 """A thousand random problems of eleven kinds. Problem i of a kind and seed is the same however many are drawn."""
 
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from typing import Literal
 
@@ -37,8 +37,8 @@ def draw(kind: str, index: int, seed: int = 0) -> ls.Problem:
     return _DRAW[kind](np.random.default_rng([seed, zlib.crc32(kind.encode()), index]))
 
 
-def thousand(seed: int = 0, *, share: float = 1.0) -> Iterator[tuple[str, ls.Problem]]:
-    """All of them with their kinds, or that share of each kind: the first ones, at least one."""
-    for kind, count in COUNTS.items():
-        for index in range(max(1, round(share * count))):
+def thousand(seed: int = 0, *, share: float = 1.0, kinds: Collection[str] = KINDS) -> Iterator[tuple[str, ls.Problem]]:
+    """All of them with their kinds, or of these kinds that share of each: the first ones, at least one."""
+    for kind in kinds:
+        for index in range(max(1, round(share * COUNTS[kind]))):
             yield kind, draw(kind, index, seed)

@@ -7,7 +7,7 @@ from reliability.problems import thousand
 
 
 def measure(config: Config) -> dict[str, Any]:
-    drawn = [(kind, problem) for kind, problem in thousand(config.seed, share=config.share) if kind in config.kinds]
+    drawn = list(thousand(config.seed, share=config.share, kinds=config.kinds))
     solutions = solve(config, [problem for _, problem in drawn], "random")
     found: dict[str, Any] = {}
     for kind in config.kinds:

@@ -48,7 +48,7 @@ class Config:
     reference: Path | None = None
     """Folder of the C++ reference."""
     quick: bool = False
-    """8 queries, 2 rounds, small sizes."""
+    """8 queries, 2 rounds, small sizes; dynamics by hand with iLQR only."""
     json: bool = False
     """Print everything, query by query, as JSON instead of the tables."""
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import systems
 from numpy.random import Generator
 from reliability import classics
 
@@ -96,28 +97,17 @@ def _ends(rng: Generator, start: np.ndarray) -> ls.QuadraticCost | ls.FixedState
     return ls.FixedState(start) if rng.random() < 0.6 else ls.QuadraticCost(weights, about=start)
 
 
-def _linear_rate(x: Any, u: Any, p: Any) -> list[Any]:
-    return [
-        p.a00 * x[0] + p.a01 * x[1] + p.a02 * x[2] + p.b0 * u[0],
-        p.a10 * x[0] + p.a11 * x[1] + p.a12 * x[2] + p.b1 * u[1],
-        p.a20 * x[0] + p.a21 * x[1] + p.a22 * x[2] + p.c0 * u[0] + p.c1 * u[1],
-    ]
-
-
 def linear(rng: Generator) -> ls.Problem:
     """Three states, two controls, stable or not."""
-    names = [f"a{i}{j}" for i in range(3) for j in range(3)] + ["b0", "b1", "c0", "c1"]
-    dynamics = ls.Dynamics(
-        _linear_rate,
-        states={"x0": "", "x1": "", "x2": ""},
-        controls={"u0": "", "u1": ""},
-        parameters=dict(zip(names, rng.normal(size=13).tolist(), strict=True)),
-    )
+    a, (b0, b1, *c) = rng.normal(size=(3, 3)), rng.normal(size=4)
+    dynamics = systems.linear(a, [[b0, 0.0], [0.0, b1], c])
     return ls.Problem(
         dynamics=dynamics, dt=float(rng.uniform(0.01, 0.2)), steps=int(rng.integers(1, 60)),
         initial=_ends(rng, rng.normal(size=3)),
-        stage_cost=ls.ControlCost(_weights(rng, 2), about=rng.normal(size=2))
-        + ls.QuadraticCost(_weights(rng, 3, 1e-3, 10.0), about=rng.normal(size=3)),
+        stage_cost=systems.stage_cost(
+            ls.ControlCost(_weights(rng, 2), about=rng.normal(size=2)),
+            ls.QuadraticCost(_weights(rng, 3, 1e-3, 10.0), about=rng.normal(size=3)),
+        ),
         final_cost=ls.QuadraticCost(_weights(rng, 3), about=rng.normal(size=3)),
     )  # fmt: skip
 

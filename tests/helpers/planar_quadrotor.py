@@ -4,10 +4,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from whole_problems.planar_quadrotor import ARM, DRAG, INERTIA, MASS, rate
 
 import lqrsim as ls
 
-MASS, INERTIA, ARM, DRAG, GRAVITY = 0.5, 0.005, 0.16, 0.05, 9.8
+GRAVITY = 9.8  # m/s^2, as MuJoCo's models here have it
 BLOCK = '<geom name="block" type="box" size="0.15 0.4 0.8" pos="0 0.1 0.2"/>'
 
 
@@ -27,16 +28,6 @@ class PlanarQuadrotor(ls.Robot):
 
     @cached_property
     def dynamics(self):  # pyright: ignore[reportIncompatibleMethodOverride]
-        def rate(x, u, p):
-            from sympy import cos, sin
-
-            _, _, roll, vx, vz, spin = x
-            lift = (u[0] + u[1]) / p.mass
-            return [
-                vx, vz, spin, lift * sin(roll) - p.drag * vx / p.mass,
-                lift * cos(roll) - p.gravity - p.drag * vz / p.mass, p.arm * (u[0] - u[1]) / p.inertia,
-            ]  # fmt: skip
-
         a, b = self.names
         return ls.Dynamics(
             rate,
@@ -60,8 +51,8 @@ class PlanarQuadrotor(ls.Robot):
 
 
 def mjcf(things: str = BLOCK, *, level: str = "x", y: float = 0.0, before: str = "", flags: str = "") -> str:
-    """The drone in a plane of z and the other axis, among those things; rolls from z towards that axis."""
-    axis, normal = ("1 0 0", "0 1 0") if level == "x" else ("0 1 0", "-1 0 0")
+    """The drone in a plane of z and the other axis, among those things; rolls from that axis towards z."""
+    axis, normal = ("1 0 0", "0 -1 0") if level == "x" else ("0 1 0", "1 0 0")
     place, side = (f"0 {y} 0", "{} 0 0") if level == "x" else (f"{y} 0 0", "0 {} 0")
     return f"""
 <mujoco model="planar">
