@@ -46,7 +46,7 @@ class Physics:
     """K simulations of a plant, in which the robot goes through the obstacles until it is told to run into them.
 
     Until then each is the same to the bit whether it will be told or not. Of a robot that can touch something at a
-    clearance above 0 the contacts are felt, without a force. `begin` must follow `place`.
+    clearance above 0 the contacts are felt, without a force. `prepare` must follow `place`.
 
     Args:
       substeps: physics steps of a control period.
@@ -83,7 +83,7 @@ class Physics:
         qpos, qvel = self.plant.robot.configuration(states)
         self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel] = qpos, qvel
 
-    def begin(self, *, altered: bool) -> None:
+    def prepare(self, *, altered: bool) -> None:
         """Have obstacles without effect; and what follows from fields that were `altered` worked out."""
         model = self.simulations.model
         if altered:
@@ -130,7 +130,7 @@ class Physics:
             self._before, self._was_unstable = self.simulations.state.copy(), self.unstable.copy()
         return self._run(None)
 
-    def collide(self, rows: npt.NDArray[np.intp], period: Period) -> None:
+    def rerun_with_contacts(self, rows: npt.NDArray[np.intp], period: Period) -> None:
         """From the period's start on, let these simulations run into the obstacles; replaces what it came to."""
         self.simulations.state[rows] = self._before[rows]
         self.simulations.warning[rows] = 0

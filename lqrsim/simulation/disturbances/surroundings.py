@@ -23,7 +23,7 @@ class InitialStateError(Spread):
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
         error = std * normal(generators, 1, len(std))[:, 0]
-        return Effect(begin=lambda states: states + error)
+        return Effect(initial_states=lambda states: states + error)
 
 
 class DisplacedObstacles(Spread):
