@@ -7,7 +7,7 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.solution import Status
+from lqrsim.results.records import Status
 
 CUBIC = ls.Dynamics(lambda x, u, p: [u[0] + x[0] ** 3], states={"x": ""}, controls={"u": ""})
 

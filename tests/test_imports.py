@@ -38,7 +38,7 @@ FLOORS_WITHIN = {
     "kernels": (("interface",), ("linear_algebra", "rotation_ratios", "runge_kutta", "signed_distance")),
     "scenes": (("world",),),
     "results": (
-        ("schema", "coordinates", "value_functions"),
+        ("schema", "coordinates", "records", "value_functions"),
         ("archive", "goal", "policy"),
         ("solution",),
         ("rollout",),

@@ -16,7 +16,7 @@ from whole_problems import kkt
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.problem.costs import terms_of
-from lqrsim.results.solution import Status
+from lqrsim.results.records import Status
 
 # Eleven kinds of problems are compiled where nothing is cached, some 10 seconds each, before the first test ends.
 pytestmark = pytest.mark.timeout(900)

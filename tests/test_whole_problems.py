@@ -11,7 +11,7 @@ from whole_problems import draws, planar_quadrotor
 from whole_problems.claims import contradictions
 
 import lqrsim as ls
-from lqrsim.results.solution import Status
+from lqrsim.results.records import Status
 
 # Ten kinds of problems are compiled where nothing is cached, some 10 seconds each.
 pytestmark = pytest.mark.timeout(900)

@@ -13,7 +13,8 @@ from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution import Solution, Trajectory
+from lqrsim.results.records import Trajectory
+from lqrsim.results.solution import Solution
 from lqrsim.solvers import compiled
 from lqrsim.solvers.smoother import smooth
 

@@ -22,7 +22,7 @@ from lqrsim.errors import (
 )
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.goal import Target, endings, tracking_error, tracking_unit
-from lqrsim.results.solution import Trajectory
+from lqrsim.results.records import Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)

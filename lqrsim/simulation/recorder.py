@@ -8,7 +8,7 @@ import numpy.typing as npt
 from lqrsim.control import law
 from lqrsim.errors import Array
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.solution import Trajectory
+from lqrsim.results.records import Trajectory
 
 Mask = npt.NDArray[np.bool_]
 

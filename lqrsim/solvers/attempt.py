@@ -8,7 +8,7 @@ import numpy as np
 from lqrsim.errors import Array
 from lqrsim.kernels import interface
 from lqrsim.problem.problem import Problem
-from lqrsim.results.solution import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
+from lqrsim.results.records import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers.certify import certified
 from lqrsim.solvers.common import LOG_COLUMNS, Callback, Ending, SmootherSettings, Stop, check_outcome, iterate
 from lqrsim.solvers.initial_guess import Start

@@ -28,7 +28,7 @@ from lqrsim.errors import (
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.linear_quadratic import Stage, check_end
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.solution import Iteration, Status
+from lqrsim.results.records import Iteration, Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers.initial_guess import InitialPrior
 from lqrsim.solvers.riccati_ode import (

@@ -8,7 +8,8 @@ from lqrsim.errors import Array, InputError
 from lqrsim.kernels import interface
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.problem import Problem
-from lqrsim.results.solution import Solution, Status
+from lqrsim.results.records import Status
+from lqrsim.results.solution import Solution
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.certify import certified

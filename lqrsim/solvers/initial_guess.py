@@ -10,7 +10,8 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, excerpt, numbers_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution import Multipliers, Solution, Trajectory
+from lqrsim.results.records import Multipliers, Trajectory
+from lqrsim.results.solution import Solution
 from lqrsim.results.value_functions import Quadratic
 
 

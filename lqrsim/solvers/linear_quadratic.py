@@ -10,7 +10,8 @@ from lqrsim.problem.linear_quadratic import Stage, check_end
 from lqrsim.problem.problem import FixedState
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution import Certificate, Iteration, Solution, Status, Trajectory
+from lqrsim.results.records import Certificate, Iteration, Status, Trajectory
+from lqrsim.results.solution import Solution
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.versions import versions

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lqrsim.errors import InputError
-from lqrsim.results.solution import Trajectory
+from lqrsim.results.records import Trajectory
 from lqrsim.simulation.disturbances.base import Effect, Spread, fit, normal, with_units, words
 from lqrsim.simulation.plant import Plant
 
