@@ -60,10 +60,7 @@ class Feedback(Controller):
 
     @property
     def digest(self) -> str:
-        hasher = hashlib.sha256()
-        for array in (self.policy.gain, self.policy.offset, self.policy.nominal, np.float64(self.policy.dt)):
-            hasher.update(np.ascontiguousarray(array).tobytes())
-        return hasher.hexdigest()[:16]
+        return self.policy.digest
 
     @property
     def spaces(self) -> tuple[Coordinates, Coordinates]:
@@ -113,7 +110,7 @@ class Replanning(Controller):
         def control(step: int, shown: Array) -> Array:
             if step > 0 and step % self._periods == 0:
                 for trial, state in enumerate(shown):
-                    laws[trial] = self._again(*laws[trial], step, state)
+                    laws[trial] = self._replan(*laws[trial], step, state)
             commands = np.empty((trials, len(policy.control_coordinates)))
             for trial, (law, first) in enumerate(laws):
                 t = min(step - first, law.steps - 1)
@@ -123,7 +120,7 @@ class Replanning(Controller):
 
         return control
 
-    def _again(self, law: AffinePolicy, first: int, step: int, state: Array) -> tuple[AffinePolicy, int]:
+    def _replan(self, law: AffinePolicy, first: int, step: int, state: Array) -> tuple[AffinePolicy, int]:
         """The law from now on, and the step that it begins at."""
         left = self.problem.steps - step
         if left < 1:
@@ -157,9 +154,9 @@ class Replanning(Controller):
 
     @property
     def digest(self) -> str:
-        text = f"{Feedback(self.solution.policy).digest} {self.problem.digest} {self._periods}"
+        text = f"{self.solution.policy.digest} {self.problem.digest} {self._periods}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
     def spaces(self) -> tuple[Coordinates, Coordinates]:
-        return Feedback(self.solution.policy).spaces
+        return self.solution.policy.state_coordinates, self.solution.policy.control_coordinates

@@ -1,5 +1,11 @@
-"""The feedback law, and how it is run on a robot. NumPy only."""
+"""The feedback law, and how it is run on a robot. NumPy only.
 
+The same law is written once more, in `kernels/policy_evaluation.py`, for simulations of many trials: compiled, it gives
+each trial the bits that it gets alone, which NumPy's products of matrices do not. Here it is for a robot, where there
+need be no compiler. `tests/test_policy.py` holds one against the other.
+"""
+
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,6 +63,14 @@ class AffinePolicy:
     def steps(self) -> int:
         """T, the number of laws."""
         return len(self.gain)
+
+    @property
+    def digest(self) -> str:
+        """Hash of the laws and their times, 16 hexadecimal digits; `Rollout.policy_digest` of a run of this policy."""
+        hasher = hashlib.sha256()
+        for array in (self.gain, self.offset, self.nominal, np.float64(self.dt)):
+            hasher.update(np.ascontiguousarray(array).tobytes())
+        return hasher.hexdigest()[:16]
 
     def control(self, state: npt.ArrayLike, step: int) -> Array:
         """The law of one step before saturation, (..., m), at states (..., n) given in the nominal's representative.
