@@ -81,9 +81,9 @@ from .simulation.outcomes import outcomes as outcomes
 from .simulation.plant import Plant as Plant
 from .simulation.plant_check import PlantCheck as PlantCheck
 from .simulation.plant_check import check_plant as check_plant
-from .solvers.continuous import ContinuousSolution as ContinuousSolution
 from .solvers.continuous import smooth_continuous as smooth_continuous
 from .solvers.continuous import smooth_lq_continuous as smooth_lq_continuous
+from .solvers.continuous_solution import ContinuousSolution as ContinuousSolution
 from .solvers.ilqr import ilqr as ilqr
 from .solvers.ilqr import ilqr_many as ilqr_many
 from .solvers.initial_guess import InitialPrior as InitialPrior
