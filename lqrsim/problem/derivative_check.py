@@ -205,7 +205,7 @@ class _Derivative(NamedTuple):
     u: Array
 
 
-def _derivatives(subject: Problem | Dynamics, points: list[tuple[Array, Array]]) -> Iterator[_Derivative]:
+def _derivatives(subject: Problem | Dynamics, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
     """All derivatives of dynamics, costs and constraints at the points, each one after the other."""
     if isinstance(subject, Dynamics):
         yield from _of_dynamics(subject, points)
@@ -215,7 +215,7 @@ def _derivatives(subject: Problem | Dynamics, points: list[tuple[Array, Array]])
     yield from _of_constraints(subject, points)
 
 
-def _of_dynamics(dynamics: Dynamics, points: list[tuple[Array, Array]]) -> Iterator[_Derivative]:
+def _of_dynamics(dynamics: Dynamics, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
     states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     n = len(states)
     for x, u in points:
@@ -225,7 +225,7 @@ def _of_dynamics(dynamics: Dynamics, points: list[tuple[Array, Array]]) -> Itera
         yield _Derivative(f"df/du of {dynamics.name}", states, controls, fu, (joint[:, n:], noise[:, n:]), x, u)
 
 
-def _of_costs(problem: Problem, points: list[tuple[Array, Array]]) -> Iterator[_Derivative]:
+def _of_costs(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
     dynamics = problem.dynamics
     names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
     n = len(dynamics.state_coordinates)
@@ -245,7 +245,7 @@ def _of_costs(problem: Problem, points: list[tuple[Array, Array]]) -> Iterator[_
             yield _Derivative(f"Hessian of {cost}", names, names, hessian, curvature, x, u)
 
 
-def _of_constraints(problem: Problem, points: list[tuple[Array, Array]]) -> Iterator[_Derivative]:
+def _of_constraints(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
     dynamics = problem.dynamics
     names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
     n = len(dynamics.state_coordinates)

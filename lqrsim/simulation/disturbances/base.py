@@ -90,8 +90,8 @@ class Disturbance(abc.ABC):
 
 
 @dataclass(frozen=True)
-class Spread(Disturbance):
-    """Base class of what is drawn with a standard deviation.
+class GaussianDisturbance(Disturbance):
+    """Base class of what is drawn from normal distributions of mean zero.
 
     Args:
       std: one number, or one for each of what it is drawn for.

@@ -13,7 +13,7 @@ from lqrsim.results.records import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
     Effect,
-    Spread,
+    GaussianDisturbance,
     check_strength,
     fit,
     normal,
@@ -24,7 +24,7 @@ from lqrsim.simulation.disturbances.base import (
 from lqrsim.simulation.plant import Plant
 
 
-class MeasurementBias(Spread):
+class MeasurementBias(GaussianDisturbance):
     """A constant error of each state that the policy is shown, drawn for each trial from a normal distribution.
 
     Args:

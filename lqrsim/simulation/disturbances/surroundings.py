@@ -6,11 +6,11 @@ import numpy as np
 
 from lqrsim.errors import InputError
 from lqrsim.results.records import Trajectory
-from lqrsim.simulation.disturbances.base import Effect, Spread, fit, normal, with_units, words
+from lqrsim.simulation.disturbances.base import Effect, GaussianDisturbance, fit, normal, with_units, words
 from lqrsim.simulation.plant import Plant
 
 
-class InitialStateError(Spread):
+class InitialStateError(GaussianDisturbance):
     """The robot does not begin where the plan does.
 
     Args:
@@ -26,7 +26,7 @@ class InitialStateError(Spread):
         return Effect(initial_states=lambda states: states + error)
 
 
-class DisplacedObstacles(Spread):
+class DisplacedObstacles(GaussianDisturbance):
     """Obstacles are not where the plan has them. Planes stay, and for a robot that is seen from above, heights.
 
     Args:
