@@ -41,6 +41,10 @@ class Controller(abc.ABC):
     def spaces(self) -> tuple[Coordinates, Coordinates]:
         """Of the states that it wants to be shown, and of its controls."""
 
+    def summary(self) -> str:
+        """What there is to say of the last run, in a line; empty if nothing."""
+        return ""
+
 
 class Feedback(Controller):
     """A policy, or an open-loop plan, whose gains are zero."""
