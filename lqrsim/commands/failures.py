@@ -72,7 +72,7 @@ class Search:
         words = [one.describe(trials.plant) for one in disturbances]
         console.say(f"{self.policy} on {self.scenario}, {self.sweep} at strength {self.strength:g}: {'; '.join(words)}")
         console.say(f"a trial draws {trials.size:,} numbers; failure: {self.failure}")
-        reach = scenario.reach(self.goal_radius, self.goal_tolerance)
+        reach = scenario.target_radius(self.goal_radius, self.goal_tolerance)
         for line in solution.target.of_plan(reach):
             console.say(line)
         asked = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "out"}

@@ -131,7 +131,7 @@ def _rehearse(campaign: Campaign, scenario: Scenario) -> None:
     start = np.zeros(n) if problem.start is None else problem.start
     standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
     plant.substeps(problem.dt)
-    scenario.reach(campaign.goal_radius, campaign.goal_tolerance)
+    scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance)
     for cell in campaign.cells:
         for disturbance in campaign.disturbances(cell):
             try:

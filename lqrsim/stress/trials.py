@@ -59,7 +59,7 @@ def solve(policies: tuple[str, ...], scenario: Scenario) -> dict[str, Solution]:
     for policy in policies:
         if not np.isfinite(found[policy].trajectory.states).all():
             raise InputError(f"policies: got {policy}, whose plan is not finite ({found[policy].status.name})")
-        found[policy] = replace(found[policy], goal_radius=scenario.reach())
+        found[policy] = replace(found[policy], goal_radius=scenario.target_radius())
         if not found[policy].success:
             _log.warning("%s did not converge (%s); its plan is run as it is", policy, found[policy].status.name)
     return {policy: found[policy] for policy in policies}
