@@ -95,7 +95,7 @@ _STATUS_TEXT = {
         "solve again, from start=solution",
     ),
     Status.INFEASIBLE: (
-        "the constraints can not be met, at least not near the plan that misses them least",
+        "the constraints cannot be met, at least not near the plan that misses them least",
         "relax the constraint that is named, give more time, or try another start",
     ),
     Status.DIVERGED: (

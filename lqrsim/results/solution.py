@@ -35,7 +35,7 @@ class Solution:
       detail: where and why, if it is not; and where the safeguard had to step in.
       policy: the feedback law, from the last backward pass that was completed.
       inverse_policy: the law that traces the optimum backwards from a state of arrival; None from `ilqr`, and where
-        states of arrival can not be chosen freely, as after a fixed start.
+        states of arrival cannot be chosen freely, as after a fixed start.
       cost_to_go, cost_to_come: the value functions of the last passes; None where a pass failed, the latter also from
         `ilqr`. The cost-to-come is a `Quadratic` in the primal form and `Moments` in the dual.
       trajectory: the plan: the rollout of the policy under the true dynamics from its first state.

@@ -51,7 +51,7 @@ def tolerances_of(rtol: float, atol: float) -> Tolerances:
 
 
 class IntegrationFailure(Exception):
-    """Why an integration can not go on: ends as the status of the solve, never reaches a caller."""
+    """Why an integration cannot go on: ends as the status of the solve, never reaches a caller."""
 
     def __init__(self, status: Status, why: str, t: float) -> None:
         super().__init__(why)
@@ -128,7 +128,7 @@ def riccati_pass(
     """Integrate the Riccati equation of `model(t, V)` from V = `end`: back from the horizon, or forward from 0.
 
     Raises:
-      IntegrationFailure: it can not be done.
+      IntegrationFailure: it cannot be done.
     """
     n = len(end) - 1
     sign = 1.0 if backward else -1.0
@@ -169,7 +169,7 @@ def integrate(
 ) -> Any:
     """What `solve_ivp` returns, with dense output, for `rate(t, y)` from y = `start` over `span`.
 
-    Where the rate can not be had, a shorter step is tried, for the step may only have been too bold.
+    Where the rate cannot be had, a shorter step is tried, for the step may only have been too bold.
 
     Raises:
       IntegrationFailure: that did not help.

@@ -3,7 +3,7 @@
 To add one, subclass `Disturbance` and give it a `start`. It is called once a run, and returns what the closed loop then
 calls in every control period, on all trials at once: functions, so that they may look at the state (wind that depends
 on where the robot is) or remember the past (a delay). `scaled` says what a multiple of it is, for sweeps; `check`
-refuses a plant that can not have it.
+refuses a plant that cannot have it.
 """
 
 import abc
@@ -78,7 +78,7 @@ class Disturbance(abc.ABC):
         )
 
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
-        """Raise InputError if the plant can not have this disturbance."""
+        """Raise InputError if the plant cannot have this disturbance."""
 
     @abc.abstractmethod
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
