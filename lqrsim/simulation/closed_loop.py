@@ -123,7 +123,7 @@ class Loop:
                 settings.progress(step + 1, steps)
         else:
             self.measure(steps)
-        self.touch_at_end()
+        self.detect_contacts_at_end()
 
     def measure(self, step: int) -> Array:
         """The states (K, n) that the controller is shown."""
@@ -184,11 +184,11 @@ class Loop:
             if watch is not None:
                 watch(time, frame, physics.unstable)
 
-    def touch_at_end(self) -> None:
+    def detect_contacts_at_end(self) -> None:
         """Contacts at the last knot, which no period comes after."""
-        if not self.physics.feels:
+        if not self.physics.senses_contacts:
             return
-        plan, touching = self.settings.plan, self.physics.felt()
+        plan, touching = self.settings.plan, self.physics.touching_now()
         never_lost = self.records.lost_since > plan.steps
         for row in np.flatnonzero(touching.any(axis=1) & np.isinf(self.collisions.at) & never_lost):
             self.collisions.touch(int(row), plan.horizon, touching[row])

@@ -47,11 +47,11 @@ class Collisions:
           step: its number. ignored: (K,) trials that are over already.
         """
         begun, parts = self.at.copy(), len(period.states)
-        for part, (states, felt) in enumerate(zip(period.states, period.felt, strict=True)):
+        for part, (states, touching) in enumerate(zip(period.states, period.touching, strict=True)):
             open_ = np.isinf(self.at) & ~ignored & (part < period.stable)
             start = (step + part / parts) * self.dt
-            for row in np.flatnonzero(open_ & felt.any(axis=1)) if len(felt) else ():
-                self.touch(int(row), start, felt[row])
+            for row in np.flatnonzero(open_ & touching.any(axis=1)) if len(touching) else ():
+                self.touch(int(row), start, touching[row])
             if len(self.plant.world):
                 self._search_line(step, part, parts, states[:, self._place], open_)
         found = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
@@ -59,10 +59,10 @@ class Collisions:
         self.at[found] = np.minimum(self.at[found], (step + 1) * self.dt)
         return found
 
-    def touch(self, row: int, time: float, felt: npt.NDArray[np.bool_]) -> None:
+    def touch(self, row: int, time: float, touching: npt.NDArray[np.bool_]) -> None:
         """A contact that MuJoCo saw, with which obstacles (obstacles,)."""
         self.at[row] = time
-        self.obstacles[row] = self.plant.obstacles[int(np.argmax(felt))]
+        self.obstacles[row] = self.plant.obstacles[int(np.argmax(touching))]
 
     def relocate(self, states: Array) -> None:
         """The trials are elsewhere, as obstacles have stopped some of them."""
