@@ -88,7 +88,7 @@ def compute(queries: int, trials: int) -> dict[str, list[Any]]:
     }
     lines: dict[str, list[Any]] = {name: [_line(one) for one in solutions] for name, solutions in solved.items()}
     for name in ("differential_drive", "quadrotor"):
-        sweeps = {kind: ls.preset(kind, ls.scenarios.get(name).plant()) for kind in ("light", "severe")}
+        sweeps = {kind: tuple(ls.preset(kind, ls.scenarios.get(name).plant())) for kind in ("light", "severe")}
         with tempfile.TemporaryDirectory() as folder:
             results = ls.run_campaign(
                 ls.Campaign(scenario=name, sweeps=sweeps, strengths=(0.5, 1.0), trials=trials), folder, workers=0

@@ -537,6 +537,17 @@ def test_stress_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert main(["stress", "quadrotor", "--resume", "--workers", "0", "--out", str(folder)]) == 0
 
 
+def test_a_replay_says_how_often_it_planned_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every 2 of 5 s: after 2 and after 4."""
+    run_campaign(replace(CAMPAIGN, policies=("smooth", "replan"), replan_every=2.0, trials=1), tmp_path, workers=0)
+    for cell, said in (("0", False), ("1", True)):
+        out = str(tmp_path / f"{cell}.npz")
+        assert main(["replay", str(tmp_path), "--cell", cell, "--trial", "0", "--out", out]) == 0
+        printed = capsys.readouterr().out
+        assert ("solved again 2 times\n" in printed) == said
+        assert ("solved again" in printed) == said
+
+
 def test_a_trial_again_is_the_same_until_it_collides(reference: Results) -> None:
     for cell in reference.cells:
         for trial in (0, 17, 59):

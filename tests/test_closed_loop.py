@@ -14,7 +14,8 @@ from tracking import hover, track, weave
 from lqrsim.errors import InputError
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results import files
-from lqrsim.results.solution import Solution, Status, Trajectory
+from lqrsim.results.records import Status, Trajectory
+from lqrsim.results.solution import Solution
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor

@@ -10,10 +10,11 @@ from scipy.optimize import minimize
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.problem.linear_quadratic import Stage
-from lqrsim.results.solution import Status
+from lqrsim.results.records import Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import riccati_ode
-from lqrsim.solvers.continuous import ContinuousSolution, smooth_continuous, smooth_lq_continuous
+from lqrsim.solvers.continuous import smooth_continuous, smooth_lq_continuous
+from lqrsim.solvers.continuous_solution import ContinuousSolution
 
 
 def measured_orders(errors: list[Any]) -> Array:

@@ -40,7 +40,7 @@ class Shift(ls.Disturbance):
     def start(self, plant, plan, generators):
         offset = np.zeros((len(generators), plan.states.shape[1]))
         offset[:, 1] = [-min(self.std * generator.standard_normal(), self.most) for generator in generators]
-        return Effect(begin=lambda states: states + offset)
+        return Effect(initial_states=lambda states: states + offset)
 
 
 def shifted(std: float = 0.1, most: float = 9.0, steps: int = 3) -> ls.Scenario:

@@ -1,10 +1,14 @@
 """Running a policy: time, angles, limits."""
 
+import dataclasses
+import hashlib
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
+from lqrsim.control import law
 from lqrsim.solvers import compiled
 
 
@@ -78,6 +82,45 @@ def test_many_states_at_once(quadrotor_solution: ls.Solution) -> None:
     together = policy(states, 1.0)
     for state, control in zip(states, together, strict=True):
         np.testing.assert_allclose(policy(state, 1.0), control, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("fixture", ["drive_solution", "quadrotor_solution"])
+def test_the_compiled_law_is_the_one_in_numpy(request: pytest.FixtureRequest, fixture: str) -> None:
+    """For states beside the plan, in any representative, within the limits and beyond them."""
+    solution: ls.Solution = request.getfixturevalue(fixture)
+    policy, rng = solution.policy, np.random.default_rng(0)
+    space, limits = policy.state_coordinates, policy.control_coordinates
+    evaluate = law.evaluator(space, limits)
+    at_limits = []
+    for step in (0, 40, policy.steps - 1):
+        states = policy.nominal[step] + rng.normal(size=(50, len(space))) * rng.choice([0.01, 3.0], size=(50, 1))
+        for i in space.angles:
+            states[:, i] += 2 * np.pi * rng.integers(-2, 3, size=50)
+        for i in space.rotation_vectors:
+            angle = np.linalg.norm(states[:, i : i + 3], axis=1, keepdims=True)
+            states[:, i : i + 3] *= 1 + 2 * np.pi * rng.integers(-2, 3, size=(50, 1)) / angle
+        compiled_controls = evaluate(states, policy.gain[step], policy.offset[step], policy.nominal[step])
+        controls = policy(states, step * policy.dt)
+        # Gains of up to 3 on a dozen states of up to 20: rounding, not more.
+        np.testing.assert_allclose(compiled_controls, controls, rtol=0, atol=1e-12)
+        at_limits.append((controls == limits.low) | (controls == limits.high))
+        near = states[None].copy()
+        law.turn_to_nearest(space, near, policy.nominal[step : step + 1])
+        np.testing.assert_allclose(near[0], space.nearest(states, policy.nominal[step]), rtol=0, atol=1e-12)
+    assert 0.1 < np.mean(at_limits) < 0.9
+
+
+def test_digest_tells_laws_apart(drive_solution: ls.Solution) -> None:
+    policy = drive_solution.policy
+    parts = policy.gain, policy.offset, policy.nominal, np.array(policy.dt)
+    assert policy.digest == hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()[:16]
+    assert ls.Feedback(policy).digest == policy.digest
+    others = [
+        dataclasses.replace(policy, **{name: getattr(policy, name) * (1 + 1e-15)})
+        for name in ("gain", "offset", "nominal", "dt")
+    ]
+    assert len({policy.digest, *(other.digest for other in others)}) == 5
+    assert dataclasses.replace(policy, gain=np.asfortranarray(policy.gain)).digest == policy.digest
 
 
 @pytest.mark.parametrize(

@@ -276,7 +276,8 @@ class TestDataThatUsersBuild:
         plant = differential_drive.plant()
         for hook, answer in (
             ("measure", [1.0]), ("measure", "text"), ("actuate", np.zeros((2, 2))), ("force", None),
-            ("torque", np.zeros(3)), ("begin", np.zeros((1, 4))), ("displaced", np.zeros((1, 2, 3))), ("measure", 1j),
+            ("torque", np.zeros(3)), ("initial_states", np.zeros((1, 4))), ("displaced", np.zeros((1, 2, 3))),
+            ("measure", 1j),
         ):  # fmt: skip
             effect = {hook: answer if hook == "displaced" else (lambda *_, answer=answer: answer)}
             line = refusal(lambda e=effect: of_runs.simulate_effect(plant, drive_solution, **e))

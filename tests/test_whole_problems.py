@@ -11,7 +11,7 @@ from whole_problems import draws, planar_quadrotor
 from whole_problems.claims import contradictions
 
 import lqrsim as ls
-from lqrsim.results.solution import Status
+from lqrsim.results.records import Status
 
 # Each kind is compiled where nothing is cached, some 5 seconds. Most of these are so by other tests, too; those that
 # are left out have nothing that these have not, and benchmark_claims.py draws them by the hundred.

@@ -96,8 +96,8 @@ def fits(disturbance: ls.Disturbance, place: Place) -> bool:
 
 def running(place: Place) -> dict[str, tuple[Any, ...]]:
     plant, solution, rollout = place.plant, place.solution, place.rollout
-    effect = {"begin": lambda states: states, "alter": print_nothing, "measure": hook, "actuate": hook,
-              "force": nothing_of_three, "torque": nothing_of_three,
+    effect = {"initial_states": lambda states: states, "alter": print_nothing, "measure": hook,
+              "actuate": hook, "force": nothing_of_three, "torque": nothing_of_three,
               "displaced": np.zeros((1, len(plant.world), 3))}  # fmt: skip
     disturbances = {name: getattr(ls, name)(**arguments) for name, arguments in DISTURBANCES.items()}
     for name, one in disturbances.items():  # those whose arguments are all optional

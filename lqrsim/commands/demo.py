@@ -48,7 +48,7 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
     for reference, scenario in scenarios.items():
         folder = out / folder_name(scenario)
         console.say(f"\n== {reference}: {scenario.summary}")
-        solved = console.solve(scenario.problem, "smooth", reach=scenario.reach())
+        solved = console.solve(scenario.problem, "smooth", reach=scenario.target_radius())
         solution = replace(solved, scenario=from_anywhere(reference))
         console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
         if solution.cost_to_go is not None:

@@ -97,7 +97,7 @@ class Solve:
             if scenario.paper_start is None:
                 raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario that the paper has")
             options["start"] = scenario.paper_start
-        solved = console.solve(problem, self.solver, reach=scenario.reach(), **options)
+        solved = console.solve(problem, self.solver, reach=scenario.target_radius(), **options)
         solution = replace(solved, scenario=from_anywhere(self.scenario))
         console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
         if self.figure is not None:

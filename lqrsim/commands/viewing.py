@@ -149,7 +149,7 @@ class View:
         else:
             scenario = resolve(self.what)
             plant = scenario.plant()
-            solution = console.solve(scenario.problem, "smooth", reach=scenario.reach())
+            solution = console.solve(scenario.problem, "smooth", reach=scenario.target_radius())
             shown = viewer.of_plant(plant, solution)
             wrong = [one.scaled(self.disturbances) for one in scenario.disturbances if self.disturbances]
 

@@ -13,7 +13,8 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution import Solution, Trajectory
+from lqrsim.results.records import Trajectory
+from lqrsim.results.solution import Solution
 from lqrsim.solvers import compiled
 from lqrsim.solvers.smoother import smooth
 
@@ -40,6 +41,10 @@ class Controller(abc.ABC):
     def spaces(self) -> tuple[Coordinates, Coordinates]:
         """Of the states that it wants to be shown, and of its controls."""
 
+    def summary(self) -> str:
+        """What there is to say of the last run, in a line; empty if nothing."""
+        return ""
+
 
 class Feedback(Controller):
     """A policy, or an open-loop plan, whose gains are zero."""
@@ -59,7 +64,7 @@ class Feedback(Controller):
 
     @property
     def digest(self) -> str:
-        return sha256(self.policy.gain, self.policy.offset, self.policy.nominal, np.float64(self.policy.dt))[:16]
+        return self.policy.digest
 
     @property
     def spaces(self) -> tuple[Coordinates, Coordinates]:
@@ -109,7 +114,7 @@ class Replanning(Controller):
         def control(step: int, shown: Array) -> Array:
             if step > 0 and step % self._periods == 0:
                 for trial, state in enumerate(shown):
-                    laws[trial] = self._again(*laws[trial], step, state)
+                    laws[trial] = self._replan(*laws[trial], step, state)
             commands = np.empty((trials, len(policy.control_coordinates)))
             for trial, (law, first) in enumerate(laws):
                 t = min(step - first, law.steps - 1)
@@ -119,7 +124,7 @@ class Replanning(Controller):
 
         return control
 
-    def _again(self, law: AffinePolicy, first: int, step: int, state: Array) -> tuple[AffinePolicy, int]:
+    def _replan(self, law: AffinePolicy, first: int, step: int, state: Array) -> tuple[AffinePolicy, int]:
         """The law from now on, and the step that it begins at."""
         left = self.problem.steps - step
         if left < 1:
@@ -153,8 +158,8 @@ class Replanning(Controller):
 
     @property
     def digest(self) -> str:
-        return sha256(f"{Feedback(self.solution.policy).digest} {self.problem.digest} {self._periods}")[:16]
+        return sha256(f"{self.solution.policy.digest} {self.problem.digest} {self._periods}")[:16]
 
     @property
     def spaces(self) -> tuple[Coordinates, Coordinates]:
-        return Feedback(self.solution.policy).spaces
+        return self.solution.policy.state_coordinates, self.solution.policy.control_coordinates

@@ -1,4 +1,7 @@
-"""Affine laws for many trials at once, compiled: each trial gets what it gets alone, to the last bit."""
+"""Affine laws for many trials at once, compiled: each trial gets what it gets alone, to the last bit.
+
+`AffinePolicy` has the same law in NumPy, for a robot; its module's docstring says why there are two.
+"""
 
 from collections.abc import Callable
 from functools import cache

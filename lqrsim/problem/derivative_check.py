@@ -1,8 +1,8 @@
 """Looks at what a user's functions return: before the first iteration, and where derivatives are in doubt."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -178,48 +178,98 @@ def check_derivatives(
         x0, u0 = x0 if subject.start is None else subject.start, subject.nominal_control
     rng = np.random.default_rng(check_seed("seed", seed))
     points = [(x0 + spread * rng.normal(size=n), u0 + spread * rng.normal(size=m)) for _ in range(samples)]
-    states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     found: dict[str, list[DerivativeCheck]] = {}
-
-    def compare(
-        what: str, stated: Array, differences: tuple[Array, Array], rows: Any, columns: Any, x: Array, u: Array
-    ) -> None:
-        difference, noise = differences
-        size = np.maximum(np.abs(stated), np.abs(difference)) + noise / tolerance
-        apart = np.abs(stated - difference) / np.maximum(size, np.finfo(float).tiny)
-        worst = int(np.argmax(np.where(np.isnan(apart), np.inf, apart)))
-        i, j = (int(k) for k in np.unravel_index(worst, apart.shape))
-        check = DerivativeCheck(
-            what, float(apart[i, j]), rows[i], columns[j], float(stated[i, j]), float(difference[i, j]), x, u, tolerance
-        )
-        found.setdefault(what, []).append(check)
-
     with np.errstate(all="ignore"):
-        for x, u in points:
-            fx, fu = dynamics.rate_jacobian(x, u)
-            joint = _differences(lambda z: dynamics.rate(z[:n], z[n:]), np.concatenate([x, u]), 6e-6)
-            left, right = (joint[0][:, :n], joint[1][:, :n]), (joint[0][:, n:], joint[1][:, n:])
-            compare(f"df/dx of {dynamics.name}", fx, left, states, states, x, u)
-            compare(f"df/du of {dynamics.name}", fu, right, states, controls, x, u)
-        for cost, term in _terms(subject) if isinstance(subject, Problem) else ():
-            names = (*states, *controls)
-            for x, u in points if len(term.functions) != 1 else ():
-                _, gradient, hessian = evaluate(term, dynamics, x, u)
-                z = np.concatenate([x, u])
-                slope = _differences(lambda z, t=term: np.array([evaluate(t, dynamics, z[:n], z[n:])[0]]), z, 6e-6)
-                curve = _differences(lambda z, t=term: evaluate(t, dynamics, z[:n], z[n:])[1], z, 6e-6)
-                compare(f"gradient of {cost}", gradient[None], slope, ("cost",), names, x, u)
-                compare(f"Hessian of {cost}", hessian, curve, names, names, x, u)
-        for name, value, slope in _constraints(subject) if isinstance(subject, Problem) else ():
-            for x, u in points:
-                differences = _differences(lambda z, f=value: np.array([f(z[:n], z[n:])]), np.concatenate([x, u]), 6e-6)
-                compare(f"slope of {name}", slope(x, u)[None], differences, ("value",), (*states, *controls), x, u)
+        for matrix in _derivatives(subject, points):
+            found.setdefault(matrix.what, []).append(_worst_entry(matrix, tolerance))
     return [
         max(checks, key=lambda check: np.inf if np.isnan(check.error) else check.error) for checks in found.values()
     ]
 
 
-def _differences(function: Any, z: Array, step: float) -> tuple[Array, Array]:
+class _Derivative(NamedTuple):
+    """A matrix of derivatives at a point.
+
+    Attributes:
+      what: as messages call it. rows, columns: names.
+      stated: by the function that is checked. differences: what `_differences` returns.
+      x, u: the point.
+    """
+
+    what: str
+    rows: Sequence[str]
+    columns: Sequence[str]
+    stated: Array
+    differences: tuple[Array, Array]
+    x: Array
+    u: Array
+
+
+def _derivatives(subject: Problem | Dynamics, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
+    """All derivatives of dynamics, costs and constraints at the points, each one after the other."""
+    if isinstance(subject, Dynamics):
+        yield from _of_dynamics(subject, points)
+        return
+    yield from _of_dynamics(subject.dynamics, points)
+    yield from _of_costs(subject, points)
+    yield from _of_constraints(subject, points)
+
+
+def _of_dynamics(dynamics: Dynamics, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
+    states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
+    n = len(states)
+    for x, u in points:
+        fx, fu = dynamics.rate_jacobian(x, u)
+        joint, noise = _differences(lambda z: dynamics.rate(z[:n], z[n:]), np.concatenate([x, u]))
+        yield _Derivative(f"df/dx of {dynamics.name}", states, states, fx, (joint[:, :n], noise[:, :n]), x, u)
+        yield _Derivative(f"df/du of {dynamics.name}", states, controls, fu, (joint[:, n:], noise[:, n:]), x, u)
+
+
+def _of_costs(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
+    dynamics = problem.dynamics
+    names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
+    n = len(dynamics.state_coordinates)
+    for cost, term in _terms(problem):
+        if len(term.functions) == 1:
+            continue  # without derivatives: what is stated are central differences
+
+        def at(z: Array, term: Term = term) -> tuple[float, Array, Array]:
+            return evaluate(term, dynamics, z[:n], z[n:])
+
+        for x, u in points:
+            z = np.concatenate([x, u])
+            _, gradient, hessian = at(z)
+            slope = _differences(lambda z, at=at: np.array([at(z)[0]]), z)
+            yield _Derivative(f"gradient of {cost}", ("cost",), names, gradient[None], slope, x, u)
+            curvature = _differences(lambda z, at=at: at(z)[1], z)
+            yield _Derivative(f"Hessian of {cost}", names, names, hessian, curvature, x, u)
+
+
+def _of_constraints(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
+    dynamics = problem.dynamics
+    names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
+    n = len(dynamics.state_coordinates)
+    for name, value, slope in _constraints(problem):
+        for x, u in points:
+            differences = _differences(lambda z, f=value: np.array([f(z[:n], z[n:])]), np.concatenate([x, u]))
+            yield _Derivative(f"slope of {name}", ("value",), names, slope(x, u)[None], differences, x, u)
+
+
+def _worst_entry(matrix: _Derivative, tolerance: float) -> DerivativeCheck:
+    """The entry of a matrix that is furthest from its difference, relative to the larger of the two."""
+    stated, (difference, noise) = matrix.stated, matrix.differences
+    size = np.maximum(np.abs(stated), np.abs(difference)) + noise / tolerance
+    error = np.abs(stated - difference) / np.maximum(size, np.finfo(float).tiny)
+    worst = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
+    i, j = (int(k) for k in np.unravel_index(worst, error.shape))
+    return DerivativeCheck(
+        what=matrix.what, error=float(error[i, j]), row=matrix.rows[i], column=matrix.columns[j],
+        stated=float(stated[i, j]), difference=float(difference[i, j]), state=matrix.x, control=matrix.u,
+        tolerance=tolerance,
+    )  # fmt: skip
+
+
+def _differences(function: Any, z: Array, step: float = 6e-6) -> tuple[Array, Array]:
     """The Jacobian of a function of a vector by central differences, and what rounding may have done to each entry."""
     columns, noise = [], []
     for i in range(len(z)):

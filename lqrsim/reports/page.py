@@ -147,7 +147,7 @@ def _reach(results: Results, scenario: Scenario) -> str:
     """Within which distance of what a trial has reached its goal."""
     target = next(iter(results.trials.solutions.values())).target
     asked = results.campaign
-    return f"{scenario.reach(asked.goal_radius, asked.goal_tolerance):g} {target.unit} of the {target.name}"
+    return f"{scenario.target_radius(asked.goal_radius, asked.goal_tolerance):g} {target.unit} of the {target.name}"
 
 
 def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[str, list[str]]:

@@ -118,7 +118,7 @@ class Target:
             )
         return check_number("goal_tolerance", TOLERANCE if goal_tolerance is None else goal_tolerance, above=0.0)
 
-    def told(self, distance: float) -> str:
+    def describe(self, distance: float) -> str:
         """A distance with its unit and what it is from."""
         return f"{distance:.3g} {self.unit} from the {self.name}"
 
@@ -131,7 +131,7 @@ class Target:
         if self.goal is None:
             return ["the final cost names no goal; the plan's end stands in for it"]
         away = float(self.distance(self.plan[-1]))
-        lines = [f"the plan ends {self.told(away)}"]
+        lines = [f"the plan ends {self.describe(away)}"]
         if radius is not None and self.misses(radius):
             lines.append(f"the plan MISSES the goal: it ends {away - radius:.3g} {self.unit} outside {radius:g}")
         return lines

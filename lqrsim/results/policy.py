@@ -1,4 +1,9 @@
-"""The feedback law, and how it is run on a robot. NumPy only."""
+"""The feedback law, and how it is run on a robot. NumPy only.
+
+The same law is written once more, in `kernels/policy_evaluation.py`, for simulations of many trials: compiled, it gives
+each trial the bits that it gets alone, which NumPy's products of matrices do not. Here it is for a robot, where there
+need be no compiler. `tests/test_policy.py` holds one against the other.
+"""
 
 from dataclasses import dataclass
 
@@ -17,6 +22,7 @@ from lqrsim.errors import (
     vectors_of,
 )
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.hashing import sha256
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +63,11 @@ class AffinePolicy:
     def steps(self) -> int:
         """T, the number of laws."""
         return len(self.gain)
+
+    @property
+    def digest(self) -> str:
+        """Hash of the laws and their times, 16 hexadecimal digits; `Rollout.policy_digest` of a run of this policy."""
+        return sha256(self.gain, self.offset, self.nominal, np.float64(self.dt))[:16]
 
     def control(self, state: npt.ArrayLike, step: int) -> Array:
         """The law of one step before saturation, (..., m), at states (..., n) given in the nominal's representative.

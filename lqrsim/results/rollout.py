@@ -22,7 +22,7 @@ from lqrsim.errors import (
 )
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.goal import Target, endings, tracking_error, tracking_unit
-from lqrsim.results.solution import Trajectory
+from lqrsim.results.records import Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,7 +270,7 @@ class Rollout:
             what = f" with {self.obstacles[k]}" if outcome == "collided" else ""
             how, final = f"{outcome}{what} {when}", ""
         else:
-            how = f"{outcome}, {self.target.told(float(self.goal_distance[k]))}"
+            how = f"{outcome}, {self.target.describe(float(self.goal_distance[k]))}"
             final = f", final {self.tracking_error[k, -1]:.3g}"
         error, unit = self.tracking_error[k, counts], self.tracking_unit
         rms = float(np.sqrt(np.mean(error**2)))

@@ -1,12 +1,11 @@
-"""What comes out of a solve: the plan, the log, how it ended. NumPy only.
+"""What comes out of a solve. NumPy only.
 
-`policy.py` has the feedback law, `value_functions.py` the value functions. `files.py` writes a `Solution` to disk and
-reads it back; `rollout.py` has what comes out of running it.
+`records.py` has the plan, the log and how it ended, `policy.py` the feedback law, `value_functions.py` the value
+functions. `files.py` writes a `Solution` to disk and reads it back; `rollout.py` has what comes out of running it.
 """
 
-import enum
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,262 +17,13 @@ from lqrsim.errors import (
     check_kind,
     check_number,
     check_shape,
-    check_text,
     excerpt,
     real,
-    shaped,
 )
 from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.records import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """States (T+1, n) and the controls (T, m) held between them, `dt` seconds apart.
-
-    Raises:
-      InputError: they do not fit together, there is no step, or dt is not above 0. NaN is what a failed solve has.
-    """
-
-    states: Array
-    controls: Array
-    dt: float
-
-    def __post_init__(self) -> None:
-        controls = shaped("Trajectory: controls", self.controls, (None, None))
-        if not controls.size:
-            raise InputError(f"Trajectory: controls: got shape {controls.shape}, want (T, m), at least one of each")
-        states = shaped("Trajectory: states", self.states, (len(controls) + 1, None))
-        if not states.size:
-            raise InputError(f"Trajectory: states: got shape {states.shape}, want ({len(states)}, n), at least one n")
-        object.__setattr__(self, "states", states)
-        object.__setattr__(self, "controls", controls)
-        object.__setattr__(self, "dt", check_number("Trajectory: dt", self.dt, above=0.0))
-
-    @property
-    def steps(self) -> int:
-        """T, the number of control periods."""
-        return len(self.controls)
-
-    @property
-    def horizon(self) -> float:
-        """Duration in seconds; the paper's l."""
-        return self.steps * self.dt
-
-    @property
-    def times(self) -> Array:
-        """Times of the states in seconds, (T+1,)."""
-        return self.dt * np.arange(self.steps + 1)
-
-
-class Status(enum.StrEnum):
-    """How a solve ended. `meaning` says it in words, `remedy` what to try."""
-
-    CONVERGED = "converged"
-    COST_CONVERGED = "cost converged"
-    MAX_ITERATIONS = "max iterations"
-    TIME_LIMIT = "time limit"
-    INTERRUPTED = "interrupted"
-    INFEASIBLE = "infeasible"
-    DIVERGED = "diverged"
-    NOT_FINITE = "not finite"
-    NOT_POSITIVE_DEFINITE = "not positive definite"
-    NOT_CERTIFIED = "not certified"
-
-    @property
-    def success(self) -> bool:
-        """True for CONVERGED, and for COST_CONVERGED, where only the cost was asked for."""
-        return self in (Status.CONVERGED, Status.COST_CONVERGED)
-
-    @property
-    def meaning(self) -> str:
-        return _STATUS_TEXT[self][0]
-
-    @property
-    def remedy(self) -> str:
-        """What to try; empty where nothing needs to be."""
-        return _STATUS_TEXT[self][1]
-
-
-_STATUS_TEXT = {
-    Status.CONVERGED: ("cost change, gap and first-order optimality are all within tolerance", ""),
-    Status.COST_CONVERGED: (
-        "the change of cost is within tolerance; gap and optimality were not asked for",
-        'look at the gap, or solve with stop="optimal"',
-    ),
-    Status.MAX_ITERATIONS: (
-        "the iteration limit came first, or no step lowered the cost any more",
-        "raise max_iterations if the improvements still shrink; if they do not, try another start",
-    ),
-    Status.TIME_LIMIT: (
-        "the time limit came first; the plan is the best so far",
-        "raise time_limit, or begin nearer: start=solution of a similar problem",
-    ),
-    Status.INTERRUPTED: (
-        "the callback raised, or Ctrl-C; the plan is the best so far",
-        "solve again, from start=solution",
-    ),
-    Status.INFEASIBLE: (
-        "the constraints can not be met, at least not near the plan that misses them least",
-        "relax the constraint that is named, give more time, or try another start",
-    ),
-    Status.DIVERGED: (
-        "the cost of the policy grew beyond all bounds",
-        "try a start nearer to a solution or an InitialPrior, shorten dt, or try the other solver",
-    ),
-    Status.NOT_FINITE: (
-        "a NaN or an infinity appeared",
-        "check the dynamics and the cost at the step that is named; try another start; shorten dt",
-    ),
-    Status.NOT_POSITIVE_DEFINITE: (
-        "a matrix that must be inverted was not positive definite",
-        "raise the control weight, start with an InitialPrior, shorten dt, or try the other solver",
-    ),
-    Status.NOT_CERTIFIED: (
-        "the method converged, but its plan, checked against the problem, is not what it claims",
-        "try another start or form; and please report it, for it is a fault of lqrsim",
-    ),
-}
-
-
-ITERATION_NUMBERS = ("cost", "improvement", "gap", "optimality", "dynamics_residual", "violation", "seconds")
-
-
-@dataclass(frozen=True)
-class Iteration:
-    """One line of the log.
-
-    Attributes:
-      cost: true cost of rolling the policy out under the true dynamics; NaN where it was only to keep the constraints.
-      improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration. Of damped iterations with
-        constraints it is of the cost with the augmented Lagrangian, and so is the optimality.
-      gap: largest difference between the minimal-total-cost states and that rollout, each state relative to its
-        range along the rollout (at least 1 unit). Where the safeguard went part of the way, they are taken there; 0 for
-        steps of iLQR, which has none.
-      optimality: the decrease that a linear-quadratic model about the rollout still predicts, relative to the cost; NaN
-        where it was not evaluated (it is once the other tests pass, and after the last iteration).
-      dynamics_residual: how far one step of the true dynamics takes a minimal-total-cost state from the next one, at
-        most; relative as the gap is, and evaluated where the optimality is. The plan itself is a rollout, and has none.
-      violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all are kept, NaN where
-        it was not looked at.
-      seconds: time this iteration took.
-      method: "smooth", the paper's; of the safeguard's: "damped", "ilqr" where its step is that of iLQR, or "rejected"
-        (it would have cost more, or a pass failed; cost is that of the plan that was kept).
-    """
-
-    cost: float
-    improvement: float
-    gap: float
-    optimality: float
-    dynamics_residual: float
-    violation: float
-    seconds: float
-    method: str
-
-    def __post_init__(self) -> None:
-        for name in ITERATION_NUMBERS:
-            if type(value := getattr(self, name)) is not float:
-                object.__setattr__(self, name, float(shaped(f"Iteration: {name}", value, ())))
-        check_kind("Iteration: method", self.method, str, "text")
-
-    HEADER = (
-        f"{'iteration':>9} {'cost':>14} {'improvement':>12} {'gap':>10} {'optimality':>11} {'violation':>10} {'ms':>8}"
-        "  method"
-    )
-
-    def row(self, number: int) -> str:
-        """This iteration as a line under `HEADER`."""
-        number = check_count("number", number, at_least=0)
-        optimality = "-" if np.isnan(self.optimality) else f"{self.optimality:.1e}"
-        improvement = "-" if np.isinf(self.improvement) else f"{self.improvement:.2e}"
-        gap = "-" if np.isnan(self.gap) else f"{self.gap:.1e}"
-        violation = "-" if np.isnan(self.violation) else f"{self.violation:.1e}"
-        return (
-            f"{number:>9} {self.cost:>14.9g} {improvement:>12} {gap:>10} {optimality:>11} {violation:>10}"
-            f" {1e3 * self.seconds:>8.2f}  {self.method}"
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Certificate:
-    """What the plan is, recomputed from the problem after the solve, on a path that the solvers do not use.
-
-    A solution that says CONVERGED has passed: each of these is within rounding, and the optimality within tolerance.
-
-    Attributes:
-      cost: of the plan.
-      start: largest difference of its first state from a `FixedState`; 0 where the start is not fixed.
-      motion: largest difference of a state from a step of the dynamics out of the state before it; each state relative
-        to its largest size along the plan, at least 1 unit.
-      law: largest difference of a control from the policy's at that state, relative to the terms of `L x + l`.
-      limits: by how much a control is beyond its limits, in its unit.
-      violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all are kept.
-      optimality: the decrease of cost that the slopes of the cost in the policy's offsets (and in a start that is not
-        fixed) still promise, relative to the cost; infinite where there is no cost-to-go to weigh them with.
-    """
-
-    cost: float
-    start: float
-    motion: float
-    law: float
-    limits: float
-    violation: float
-    optimality: float
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = float(shaped(f"Certificate: {field.name}", getattr(self, field.name), ()))
-            object.__setattr__(self, field.name, value)
-
-
-@dataclass(frozen=True)
-class Multipliers:
-    """What a constraint presses with, at each step: zero where it is kept with room to spare.
-
-    Attributes:
-      values: (T+1, rows), not negative: what a unit more of the constraint would cost.
-      penalty: mu of the augmented Lagrangian, which holds the policy to the constraint.
-    """
-
-    values: Array
-    penalty: float
-
-    def __post_init__(self) -> None:
-        values = shaped("Multipliers: values", self.values, (None, None))
-        if not len(values):
-            raise InputError(f"Multipliers: values: got shape {values.shape}, want (T+1, rows)")
-        object.__setattr__(self, "values", values)
-        object.__setattr__(self, "penalty", check_number("Multipliers: penalty", self.penalty, at_least=0.0))
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """One of several starts that a search tried.
-
-    Attributes:
-      start: what it was.
-      cost: true cost of the last plan that it led to; infinite if a pass failed, or the plan is only to keep the
-        constraints.
-      iterations: how many it took until then.
-      status: how it ended; None where it was dropped after a few iterations.
-      trajectory: that plan.
-    """
-
-    start: str
-    cost: float
-    iterations: int
-    status: Status | None
-    trajectory: Trajectory
-
-    def __post_init__(self) -> None:
-        check_text("Candidate: start", self.start, "what it was", at_most=1000, empty=True)
-        if np.isnan(cost := float(shaped("Candidate: cost", self.cost, ()))):
-            raise InputError("Candidate: cost: got nan, want a number, infinite where there is none")
-        object.__setattr__(self, "cost", cost)
-        check_count("Candidate: iterations", self.iterations, at_least=0)
-        check_kind("Candidate: status", self.status, (Status, type(None)), "a Status or None")
-        check_kind("Candidate: trajectory", self.trajectory, Trajectory, "a Trajectory")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,7 +35,7 @@ class Solution:
       detail: where and why, if it is not; and where the safeguard had to step in.
       policy: the feedback law, from the last backward pass that was completed.
       inverse_policy: the law that traces the optimum backwards from a state of arrival; None from `ilqr`, and where
-        states of arrival can not be chosen freely, as after a fixed start.
+        states of arrival cannot be chosen freely, as after a fixed start.
       cost_to_go, cost_to_come: the value functions of the last passes; None where a pass failed, the latter also from
         `ilqr`. The cost-to-come is a `Quadratic` in the primal form and `Moments` in the dual.
       trajectory: the plan: the rollout of the policy under the true dynamics from its first state.

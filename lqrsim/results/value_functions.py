@@ -78,7 +78,7 @@ class Quadratic:
 class Moments:
     """Quadratic functions of the state by moments, one a knot: `1/2 (x - mean)' covariance^-1 (x - mean) + const`.
 
-    What the dual form has for the cost-to-come: a state that can not be reached at all has no covariance in that
+    What the dual form has for the cost-to-come: a state that cannot be reached at all has no covariance in that
     direction, and costs infinitely much. For the terms see Kalman smoothing, to which LQR smoothing is dual.
 
     Attributes:

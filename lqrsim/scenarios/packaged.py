@@ -52,7 +52,7 @@ class Scenario:
             goal_radius, goal_tolerance = self.goal_radius, self.goal_tolerance
         return {"goal_radius": goal_radius, "goal_tolerance": goal_tolerance}
 
-    def reach(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> float:
+    def target_radius(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> float:
         """Within which distance the goal counts as reached, in `Target.unit`. Raises InputError as `simulate` does."""
         dynamics, goal = self.problem.dynamics, self.problem.weighed_goal
         target = Target(dynamics.state_coordinates, goal, np.zeros((1, len(dynamics.state_coordinates))))

@@ -40,36 +40,36 @@ class Collisions:
         for row in np.flatnonzero(self.clearance < 0):
             self._hit(int(row), 0.0, self._last[row])
 
-    def look(self, step: int, period: Period, *, ignored: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+    def detect(self, step: int, period: Period, *, ignored: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
         """The trials that collide for the first time in a period, by their rows.
 
         Args:
           step: its number. ignored: (K,) trials that are over already.
         """
         begun, parts = self.at.copy(), len(period.states)
-        for part, (states, felt) in enumerate(zip(period.states, period.felt, strict=True)):
+        for part, (states, touching) in enumerate(zip(period.states, period.touching, strict=True)):
             open_ = np.isinf(self.at) & ~ignored & (part < period.stable)
             start = (step + part / parts) * self.dt
-            for row in np.flatnonzero(open_ & felt.any(axis=1)) if len(felt) else ():
-                self.feel(int(row), start, felt[row])
+            for row in np.flatnonzero(open_ & touching.any(axis=1)) if len(touching) else ():
+                self.touch(int(row), start, touching[row])
             if len(self.plant.world):
-                self._along(step, part, parts, states[:, self._place], open_)
+                self._search_line(step, part, parts, states[:, self._place], open_)
         found = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
         # What is computed of a time in the period may be rounded to beyond its end.
         self.at[found] = np.minimum(self.at[found], (step + 1) * self.dt)
         return found
 
-    def feel(self, row: int, time: float, felt: npt.NDArray[np.bool_]) -> None:
+    def touch(self, row: int, time: float, touching: npt.NDArray[np.bool_]) -> None:
         """A contact that MuJoCo saw, with which obstacles (obstacles,)."""
         self.at[row] = time
-        self.obstacles[row] = self.plant.obstacles[int(np.argmax(felt))]
+        self.obstacles[row] = self.plant.obstacles[int(np.argmax(touching))]
 
-    def now(self, states: Array) -> None:
+    def relocate(self, states: Array) -> None:
         """The trials are elsewhere, as obstacles have stopped some of them."""
         self._last = states[:, self._place]
         self.clearance = self._clear(self._last)
 
-    def _along(self, step: int, part: int, parts: int, there: Array, open_: npt.NDArray[np.bool_]) -> None:
+    def _search_line(self, step: int, part: int, parts: int, there: Array, open_: npt.NDArray[np.bool_]) -> None:
         """Look along the lines from the last places to these (K, 2 or 3)."""
         last, before = self._last, self.clearance
         self._last, self.clearance = there, self._clear(there)

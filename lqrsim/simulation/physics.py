@@ -13,7 +13,7 @@ from lqrsim.machine import processors
 from lqrsim.simulation.plant import Indices, Plant
 
 FRAME_PERIOD = 1 / 30  # s; positions are looked at and recorded at least this often, if the physics step is not longer
-AWAY = 2.0**20  # m; how deep a robot must be within an obstacle that is only felt, before it is pushed
+AWAY = 2.0**20  # m; how deep a robot must be within an obstacle that is only sensed, before it is pushed
 
 _WARNINGS = mujoco.mjtWarning
 # What MuJoCo does not go on with: it resets the state, or the controls, and only warns.
@@ -32,13 +32,13 @@ class Period:
     Attributes:
       states: S arrays (K, n), at the end of each part; angles in any representative.
       frames: S arrays (K, nq), MuJoCo's qpos then.
-      felt: S arrays (K, obstacles), whether MuJoCo saw a contact; S empty ones where nothing could be felt.
+      touching: S arrays (K, obstacles), whether MuJoCo saw a contact; S empty ones where none could be sensed.
       stable: (K,) in how many of the parts, from the first on, the simulation was stable.
     """
 
     states: list[Array]
     frames: list[Array]
-    felt: list[npt.NDArray[np.bool_]]
+    touching: list[npt.NDArray[np.bool_]]
     stable: npt.NDArray[np.int64]
 
 
@@ -46,7 +46,7 @@ class Physics:
     """K simulations of a plant, in which the robot goes through the obstacles until it is told to run into them.
 
     Until then each is the same to the bit whether it will be told or not. Of a robot that can touch something at a
-    clearance above 0 the contacts are felt, without a force. `begin` must follow `place`.
+    clearance above 0 the contacts are sensed, without a force. `prepare` must follow `place`.
 
     Args:
       substeps: physics steps of a control period.
@@ -54,19 +54,19 @@ class Physics:
       threads: by default as many as there are processors.
 
     Attributes:
-      simulations: MuJoCo's. feels: whether contacts are felt without a force.
+      simulations: MuJoCo's. senses_contacts: whether contacts are sensed without a force.
       parts: S, parts of a control period. drawn_parts: how many of them end with a frame to draw.
       unstable: (K,) who blew up. solid: (K,) who runs into obstacles.
     """
 
     def __init__(self, plant: Plant, trials: int, substeps: int, *, contacts: bool, threads: int | None) -> None:
-        self.plant, self.feels = plant, not plant.enclosed
-        sensing = contacts or self.feels
+        self.plant, self.senses_contacts = plant, not plant.enclosed
+        sensing = contacts or self.senses_contacts
         model = plant.model if sensing else plant.without_contacts
         self.simulations = batch.Batch(model, trials, min(trials, threads or processors()))
         self._sensors = self.simulations.bind("sensordata") if sensing and plant.obstacles else None
         short = part_of(plant, substeps)
-        self._part = 1 if self.feels else short  # what is felt, is felt at each step
+        self._part = 1 if self.senses_contacts else short  # what is sensed, is sensed at each step
         self.parts = substeps // self._part
         self._every = short // self._part
         self.drawn_parts = self.parts // self._every
@@ -83,14 +83,14 @@ class Physics:
         qpos, qvel = self.plant.robot.configuration(states)
         self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel] = qpos, qvel
 
-    def begin(self, *, altered: bool) -> None:
+    def prepare(self, *, altered: bool) -> None:
         """Have obstacles without effect; and what follows from fields that were `altered` worked out."""
         model = self.simulations.model
         if altered:
             # While obstacles are still such: MuJoCo works out here, too, which bodies can collide at all.
             self.simulations.set_const()
         geoms = np.array([model.geom(name).id for name in self.plant.obstacles], dtype=np.intp)
-        if self.feels:
+        if self.senses_contacts:
             # MuJoCo detects a contact below margin + gap, and pushes below the margin.
             pairs = np.flatnonzero(np.isin(model.pair_geom1, geoms) | np.isin(model.pair_geom2, geoms))
             for field, ids, sign in (
@@ -116,7 +116,7 @@ class Physics:
         """The analytic states (K, n), angles in any representative."""
         return self.plant.robot.state(self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel])
 
-    def felt(self) -> npt.NDArray[np.bool_]:
+    def touching_now(self) -> npt.NDArray[np.bool_]:
         """Who touches which obstacle now, (K, obstacles); of no use to simulations that go on."""
         assert self._sensors is not None
         self.simulations.forward()
@@ -130,28 +130,28 @@ class Physics:
             self._before, self._was_unstable = self.simulations.state.copy(), self.unstable.copy()
         return self._run(None)
 
-    def collide(self, rows: npt.NDArray[np.intp], period: Period) -> None:
+    def rerun_with_contacts(self, rows: npt.NDArray[np.intp], period: Period) -> None:
         """From the period's start on, let these simulations run into the obstacles; replaces what it came to."""
         self.simulations.state[rows] = self._before[rows]
         self.simulations.warning[rows] = 0
         self.unstable[rows] = self._was_unstable[rows]
         for values, ids, solid in self._inactive:
             values[np.ix_(rows, ids)] = solid[rows]
-        if self.feels:
+        if self.senses_contacts:
             self.simulations.set_const(rows)
         self.solid[rows] = True
         again = self._run(rows)
         for part in range(self.parts):
             period.states[part][rows] = again.states[part][rows]
             period.frames[part][rows] = again.frames[part][rows]
-            period.felt[part] = again.felt[part]
+            period.touching[part] = again.touching[part]
         period.stable[rows] = again.stable[rows]
 
     def touched(self, period: Period) -> npt.NDArray[np.bool_]:
         """Who of those that run into obstacles touched one, (K,)."""
         if not self.solid.any():
             return np.zeros(len(self.solid), dtype=bool)
-        return self.solid & np.any([felt.any(axis=1) for felt in period.felt], axis=0)
+        return self.solid & np.any([touching.any(axis=1) for touching in period.touching], axis=0)
 
     def drawn(self, period: Period) -> list[Array]:
         """Those of the frames that are needed for drawing."""
@@ -173,10 +173,10 @@ class Physics:
                 period.stable[self.unstable] = np.minimum(period.stable[self.unstable], part)
             period.states.append(self.state())
             period.frames.append(self.frame())
-            if self._sensors is not None and (self.feels or self.solid.any()):
-                period.felt.append(self._sensors[:, self.plant.contact] > 0)
+            if self._sensors is not None and (self.senses_contacts or self.solid.any()):
+                period.touching.append(self._sensors[:, self.plant.contact] > 0)
             else:
-                period.felt.append(np.zeros((0, 0), dtype=bool))
+                period.touching.append(np.zeros((0, 0), dtype=bool))
         return period
 
 

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -145,24 +146,12 @@ def check_plant(
     plant = Plant(robot, scene)
     period = max(1, round(0.02 / plant.timestep)) * plant.timestep if period is None else period
     substeps = plant.substeps(period)
-    dynamics = robot.dynamics
-    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+    n = len(robot.dynamics.state_coordinates)
     middle = check_array("around", np.zeros(n) if around is None else around, (n,))
-    space = dynamics.control_coordinates
-    if controls is not None and (not isinstance(controls, tuple | list) or len(controls) != 2):
-        raise InputError(f"controls: got {excerpt(controls)}, want (lowest, highest), each ({m},)")
-    low, high = (space.low, space.high) if controls is None else controls
-    low, high = (
-        check_array("controls: lowest", low, (m,), infinite=True),
-        check_array("controls: highest", high, (m,), infinite=True),
-    )
-    if not (low <= high).all():
-        raise InputError(f"controls: got {low.tolist()} to {high.tolist()}, want the lowest first")
-    if not np.isfinite([low, high]).all():
-        raise InputError(f"controls: got {robot.name}'s limits, which are infinite, want controls=(lowest, highest)")
+    low, high = _control_range(robot, controls)
     taken_away = [plant.model.geom(name).id for name in plant.obstacles]
     plant.model.geom_contype[taken_away] = plant.model.geom_conaffinity[taken_away] = 0
-    rng, data = np.random.default_rng(check_seed("seed", seed)), mujoco.MjData(plant.model)
+    rng = np.random.default_rng(check_seed("seed", seed))
     spread = check_number("spread", spread, at_least=0.0)
     if settle is None:
         settle = 0.5 if 2 * len(plant.qvel) > n else 0.0
@@ -173,43 +162,85 @@ def check_plant(
             f"samples: got {samples}, which are {samples * (waiting + substeps):.3g} physics steps in all, want at most"
             f" {MOST_STEPS}: fewer samples, or a shorter period and time to settle"
         )
-    waiting, tolerance = round(waiting), check_number("tolerance", tolerance, above=0.0)
-    found, touching = [], Counter[tuple[str, str]]()
+    tolerance = check_number("tolerance", tolerance, above=0.0)
+    found, touching, data = [], Counter[tuple[str, str]](), mujoco.MjData(plant.model)
     with unlogged():
         for _ in range(samples):
             state, control = middle + spread * rng.normal(size=n), rng.uniform(low, high)
-            mujoco.mj_resetData(plant.model, data)
-            data.qpos[plant.qpos], data.qvel[plant.qvel] = robot.configuration(state)
-            data.ctrl[plant.ctrl] = robot.actuation(control)
-            for _ in range(waiting):
-                mujoco.mj_step(plant.model, data)
-            before = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=state)
-            touched: set[tuple[str, str]] = set()
-            for _ in range(substeps):
-                mujoco.mj_step(plant.model, data)
-                touched |= _touching(plant, data)
-            touching.update(touched)
-            if any(data.warning[kind].number for kind in UNSTABLE):
-                raise InputError(
-                    f"scene {scene.name}: got a simulation that becomes unstable from"
-                    f" x = {np.array2string(state, precision=3)}, u = {np.array2string(control, precision=3)},"
-                    " want a smaller timestep, other states (around, spread) or other controls"
-                )
-            predicted = dynamics.step(before, control, period)
-            simulated = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=predicted)
-            found.append((before, control, simulated, predicted))
-    errors = np.array([np.abs(simulated - predicted) for _, _, simulated, predicted in found])
-    changes = np.array([np.abs(predicted - before) for before, _, _, predicted in found])
-    state, control, simulated, predicted = found[0]
+            sample, touched = _sample(plant, data, state, control, round(waiting), period)
+            found.append(sample)
+            touching.update(sorted(touched))
+    return _worst_of(found, robot, period, tolerance, touching)
+
+
+class _Sample(NamedTuple):
+    """One control period, from the state (n,) before it, under a control (m,): what comes of it, (n,)."""
+
+    before: Array
+    control: Array
+    simulated: Array
+    predicted: Array
+
+
+def _control_range(robot: Robot, controls: tuple[npt.ArrayLike, npt.ArrayLike] | None) -> tuple[Array, Array]:
+    """The lowest and the highest control (m,); by default the dynamics' limits. Raises InputError."""
+    space = robot.dynamics.control_coordinates
+    m = len(space)
+    if controls is not None and (not isinstance(controls, tuple | list) or len(controls) != 2):
+        raise InputError(f"controls: got {excerpt(controls)}, want (lowest, highest), each ({m},)")
+    low, high = (space.low, space.high) if controls is None else controls
+    low = check_array("controls: lowest", low, (m,), infinite=True)
+    high = check_array("controls: highest", high, (m,), infinite=True)
+    if not (low <= high).all():
+        raise InputError(f"controls: got {low.tolist()} to {high.tolist()}, want the lowest first")
+    if not np.isfinite([low, high]).all():
+        raise InputError(f"controls: got {robot.name}'s limits, which are infinite, want controls=(lowest, highest)")
+    return low, high
+
+
+def _sample(
+    plant: Plant, data: mujoco.MjData, state: Array, control: Array, waiting: int, period: float
+) -> tuple[_Sample, set[tuple[str, str]]]:
+    """One control period after so many physics steps of waiting, and which geoms touched in it. Raises InputError."""
+    robot = plant.robot
+    mujoco.mj_resetData(plant.model, data)
+    data.qpos[plant.qpos], data.qvel[plant.qvel] = robot.configuration(state)
+    data.ctrl[plant.ctrl] = robot.actuation(control)
+    for _ in range(waiting):
+        mujoco.mj_step(plant.model, data)
+    before = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=state)
+    touched: set[tuple[str, str]] = set()
+    for _ in range(plant.substeps(period)):
+        mujoco.mj_step(plant.model, data)
+        touched |= _touching(plant, data)
+    if any(data.warning[kind].number for kind in UNSTABLE):
+        raise InputError(
+            f"scene {plant.scene.name}: got a simulation that becomes unstable from"
+            f" x = {np.array2string(state, precision=3)}, u = {np.array2string(control, precision=3)},"
+            " want a smaller timestep, other states (around, spread) or other controls"
+        )
+    predicted = robot.dynamics.step(before, control, period)
+    simulated = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=predicted)
+    return _Sample(before, control, simulated, predicted), touched
+
+
+def _worst_of(
+    found: list[_Sample], robot: Robot, period: float, tolerance: float, touching: Counter[tuple[str, str]]
+) -> PlantCheck:
+    """The check of all samples, with the one in which the worst state was furthest off."""
+    errors = np.array([np.abs(sample.simulated - sample.predicted) for sample in found])
+    changes = np.array([np.abs(sample.predicted - sample.before) for sample in found])
+    space, first = robot.dynamics.state_coordinates, found[0]
     check = PlantCheck(
-        names=dynamics.state_coordinates.names, units=dynamics.state_coordinates.units, errors=errors.max(axis=0),
-        changes=changes.max(axis=0), period=period, state=state, control=control, simulated=simulated,
-        predicted=predicted, tolerance=tolerance,
-        samples=len(found), contacts=tuple((*pair, count) for pair, count in touching.most_common()),
+        names=space.names, units=space.units, errors=errors.max(axis=0), changes=changes.max(axis=0), period=period,
+        state=first.before, control=first.control, simulated=first.simulated, predicted=first.predicted,
+        tolerance=tolerance, samples=len(found),
+        contacts=tuple((*pair, count) for pair, count in touching.most_common()),
     )  # fmt: skip
-    at = int(errors[:, check.names.index(check.worst)].argmax())
-    state, control, simulated, predicted = found[at]
-    return replace(check, state=state, control=control, simulated=simulated, predicted=predicted)
+    worst = found[int(errors[:, check.names.index(check.worst)].argmax())]
+    return replace(
+        check, state=worst.before, control=worst.control, simulated=worst.simulated, predicted=worst.predicted
+    )
 
 
 def _touching(plant: Plant, data: mujoco.MjData) -> set[tuple[str, str]]:

@@ -9,7 +9,7 @@ from lqrsim.errors import Array
 from lqrsim.kernels import interface
 from lqrsim.kernels.records import LOG, Plan, Policy, Rows, Settings
 from lqrsim.problem.problem import Problem
-from lqrsim.results.solution import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
+from lqrsim.results.records import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers.certify import certified
 from lqrsim.solvers.common import Callback, Ending, SmootherSettings, Stop, check_outcome, iterate
 from lqrsim.solvers.initial_guess import Start

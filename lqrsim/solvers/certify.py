@@ -12,7 +12,7 @@ from lqrsim.errors import Array
 from lqrsim.kernels import interface
 from lqrsim.kernels.records import CERTIFICATE, Rows
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.solution import Certificate
+from lqrsim.results.records import Certificate
 
 # What rounding may do. A policy's control is a sum of a few terms, and a step of the dynamics some hundred operations,
 # of which one amplifies what another has rounded.

@@ -30,7 +30,8 @@ from lqrsim.problem.constraints import Clearance
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution import Candidate, Certificate, Iteration, Multipliers, Solution, Status, Trajectory
+from lqrsim.results.records import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
+from lqrsim.results.solution import Solution
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.initial_guess import Start, StartLike, resolve

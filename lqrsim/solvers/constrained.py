@@ -16,7 +16,7 @@ from lqrsim.kernels import interface
 from lqrsim.kernels.records import LOG
 from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.problem.problem import Problem
-from lqrsim.results.solution import Iteration, Multipliers, Status
+from lqrsim.results.records import Iteration, Multipliers, Status
 from lqrsim.results.value_functions import Moments
 from lqrsim.solvers.attempt import Attempt, Found
 from lqrsim.solvers.common import Callback

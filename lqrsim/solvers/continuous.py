@@ -1,12 +1,12 @@
 """LQR smoothing and its iteration in continuous time: Secs. IV and V as the paper writes them.
 
-`riccati_ode.py` has the equations and integrates them.
+`riccati_ode.py` has the equations and integrates them; `continuous_solution.py` has what comes out.
 """
 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,143 +19,30 @@ from lqrsim.errors import (
     check_array,
     check_count,
     check_function,
-    check_items,
     check_kind,
     check_number,
     excerpt,
-    real,
 )
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.linear_quadratic import Stage, check_end
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.solution import Iteration, Status
+from lqrsim.results.records import Iteration, Status
 from lqrsim.results.value_functions import Quadratic
+from lqrsim.solvers.continuous_solution import ContinuousSolution
 from lqrsim.solvers.initial_guess import InitialPrior
 from lqrsim.solvers.riccati_ode import (
     NO_MINIMUM,
+    IntegrationFailure,
     Model,
     Pass,
     System,
     Tolerances,
-    Trouble,
     bordered,
     homogeneous,
     minimizer,
     riccati_pass,
     tolerances_of,
 )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ContinuousSolution:
-    """A policy and the value functions as functions of time, in seconds from 0 to the horizon.
-
-    Wherever a time is asked for, an array of times does as well: what comes back has their axes in front.
-
-    Attributes:
-      status: how the solve ended; only CONVERGED is success.
-      detail: in which pass, at what time and why, if it is not.
-      horizon: the paper's l, in seconds.
-      iterations: the log of the iterations; empty for a linear-quadratic problem, which takes none.
-    """
-
-    status: Status
-    detail: str
-    horizon: float
-    iterations: tuple[Iteration, ...] = ()
-    _backward: "Pass | None" = field(repr=False)
-    _forward: "Pass | None" = field(repr=False)
-
-    def __post_init__(self) -> None:
-        check_kind("ContinuousSolution: status", self.status, Status, "a Status")
-        check_kind("ContinuousSolution: detail", self.detail, str, "text")
-        check_number("ContinuousSolution: horizon", self.horizon, above=0.0)
-        log = check_items("ContinuousSolution: iterations", self.iterations, Iteration, "a tuple of Iteration")
-        object.__setattr__(self, "iterations", log)
-        for name in ("_backward", "_forward"):
-            check_kind(f"ContinuousSolution: {name}", getattr(self, name), (Pass, type(None)), "a Pass or None")
-
-    @property
-    def success(self) -> bool:
-        """True for CONVERGED."""
-        return self.status is Status.CONVERGED
-
-    @property
-    def cost(self) -> float:
-        """True cost of the rollout from x_hat(0), or the least cost of a linear-quadratic problem; NaN if not found."""
-        if self.iterations or not self.success:
-            return self.iterations[-1].cost if self.iterations else float("nan")
-        return float(self.total_cost(0.0).minimum())
-
-    def policy(self, x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
-        """The control (..., m) to apply in the states (..., n) at time t, without saturation. Paper: Eq. (13)."""
-        return self._law("policy", self._backward, x, t)
-
-    def inverse_policy(self, x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
-        """The control (..., m) that led to the states (..., n) at time t at least cost. Paper: Eq. (19)."""
-        return self._law("inverse_policy", self._forward, x, t)
-
-    def cost_to_go(self, t: npt.ArrayLike) -> Quadratic:
-        """v: the least cost from time t on, of the state then. Paper: Eqs. (8)-(11)."""
-        return self._value("cost_to_go", self._backward, t)
-
-    def cost_to_come(self, t: npt.ArrayLike) -> Quadratic:
-        """vbar: the least cost up to time t, of the state then. Paper: Eqs. (14)-(17)."""
-        return self._value("cost_to_come", self._forward, t)
-
-    def total_cost(self, t: npt.ArrayLike) -> Quadratic:
-        """vhat: the least cost of visiting a state at time t. Paper: Eq. (20)."""
-        return self.cost_to_go(t) + self.cost_to_come(t)
-
-    def x_hat(self, t: npt.ArrayLike) -> Array:
-        """The state (..., n) of least total cost at time t. Paper: Eq. (21)."""
-        return self.total_cost(t).minimizer()
-
-    def u_hat(self, t: npt.ArrayLike) -> Array:
-        """The control (..., m) of the policy there; once converged also that of the inverse policy. Paper: Eq. (22)."""
-        return self.policy(self.x_hat(t), t)
-
-    def summary(self) -> str:
-        """The status with its remedy, and what came out, in a few lines."""
-        lines = [f"{self.status.name} after {len(self.iterations)} iterations: {self.status.meaning}"]
-        if not self.iterations and self.success:
-            lines = [f"{self.status.name}: a linear-quadratic problem is solved by one pass each way"]
-        if self.detail:
-            lines.append(f"  where:     {self.detail}")
-        if self.status.remedy:
-            lines.append(f"  remedy:    {self.status.remedy}")
-        line = f"  cost:      {self.cost:.9g}"
-        if self.iterations:
-            line += f"   gap: {self.iterations[-1].gap:.1e}   optimality: {self.iterations[-1].optimality:.1e}"
-        return "\n".join([*lines, line])
-
-    def __str__(self) -> str:
-        rows = [iteration.row(number) for number, iteration in enumerate(self.iterations, start=1)]
-        return "\n".join([*([Iteration.HEADER, *rows] if rows else []), self.summary()])
-
-    def _at(self, what: str, found: "Pass | None", t: npt.ArrayLike) -> tuple["Pass", Array]:
-        if found is None:
-            raise InputError(f"{what}: got a solution that is {self.status.value} before a pass ended, want a success")
-        times, slack = real("t", t), 1e-9 * self.horizon  # a time may be out by rounding
-        outside = ~((times >= -slack) & (times <= self.horizon + slack))
-        if outside.any():
-            raise InputError(f"t: got {times[outside].flat[0]:g}, want seconds from 0 to {self.horizon:g}")
-        return found, np.clip(times, 0.0, self.horizon)
-
-    def _value(self, what: str, found: "Pass | None", t: npt.ArrayLike) -> Quadratic:
-        found, times = self._at(what, found, t)
-        value, _ = found.at(times)
-        return Quadratic(value[..., :-1, :-1], value[..., :-1, -1], 0.5 * value[..., -1, -1])
-
-    def _law(self, what: str, found: "Pass | None", x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
-        found, times = self._at(what, found, t)
-        states, want = real("x", x), f"(..., {found.states}), one state or one for each of the times"
-        if states.shape[-1:] != (found.states,) or (times.ndim and states.shape[:-1] not in ((), times.shape)):
-            raise InputError(f"x: got shape {states.shape}, want {want}")
-        if not np.isfinite(states).all():
-            raise InputError(f"x: got {excerpt(states)}, want finite numbers")
-        _, law = found.at(times)
-        return np.einsum("...ij,...j->...i", law[..., :-1], states) + law[..., -1]
 
 
 def smooth_lq_continuous(
@@ -213,8 +100,8 @@ def smooth_lq_continuous(
         forward = riccati_pass(model, c_0, horizon, backward=False, tolerances=tolerances)
         where = "total cost"
         _check_minimum(backward, forward)
-    except Trouble as trouble:
-        status, detail = trouble.status, _place(where, trouble)
+    except IntegrationFailure as failure:
+        status, detail = failure.status, _at(where, failure)
     return ContinuousSolution(status=status, detail=detail, horizon=horizon, _backward=backward, _forward=forward)
 
 
@@ -232,13 +119,13 @@ def _end(field: str, cost: Quadratic, n: int) -> Array:
 
 
 def _check_minimum(backward: Pass, forward: Pass) -> None:
-    """Look at the total cost wherever a pass stopped. Raises Trouble where it has no single minimum."""
+    """Look at the total cost wherever a pass stopped. Raises IntegrationFailure where it has no single minimum."""
     times = np.union1d(backward.times, forward.times)
     total = backward.at(times)[0] + forward.at(times)[0]
     spectrum = np.linalg.eigvalsh(total[:, :-1, :-1])
     flat = spectrum[:, 0] <= spectrum.shape[1] * np.finfo(float).eps * spectrum[:, -1]
     if flat.any():
-        raise Trouble(Status.NOT_POSITIVE_DEFINITE, NO_MINIMUM, float(times[flat][0]))
+        raise IntegrationFailure(Status.NOT_POSITIVE_DEFINITE, NO_MINIMUM, float(times[flat][0]))
 
 
 def smooth_continuous(
@@ -286,16 +173,13 @@ def smooth_continuous(
         )
     if problem.constraints:
         raise InputError("constraints: got some, want none in continuous time; smooth keeps them")
-    tolerance = check_number("tolerance", tolerance, above=0.0)
-    gap_tolerance = check_number("gap_tolerance", gap_tolerance, above=0.0)
-    check_count("max_iterations", max_iterations, at_most=1_000_000)
+    limits = _Limits(
+        check_number("tolerance", tolerance, above=0.0),
+        check_number("gap_tolerance", gap_tolerance, above=0.0),
+        check_count("max_iterations", max_iterations, at_most=1_000_000),
+    )
     tolerances = tolerances_of(rtol, atol)
-    m = len(problem.dynamics.control_coordinates)
-    prior = start.fitting(problem) if isinstance(start, InitialPrior) else None
-    if prior is not None and prior.obstacles:
-        raise InputError(f"start: got a prior with shares of the obstacles {prior.obstacles}, want one without, here")
-    wanted = start.controls if isinstance(start, InitialPrior) else start
-    control = problem.nominal_control if wanted is None else check_array("start", wanted, (m,))
+    control, prior = _initial_guess(problem, start)
     state = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
     check_functions(problem, state, control)
     check_start(problem, state, control)
@@ -304,35 +188,8 @@ def smooth_continuous(
     for function in functions:
         function.forget()
     solver = _Smoother(problem, state, control, prior, tolerances)
-    iterations: list[Iteration] = []
-    status, detail = Status.MAX_ITERATIONS, ""
-    for number in range(1, max_iterations + 1):
-        clock = time.perf_counter()
-        try:
-            solver.passes()
-        except Trouble as trouble:
-            status, detail = trouble.status, _place(f"{solver.where} of iteration {number}", trouble)
-            break
-        escape = solver.rollout()
-        old, cost = iterations[-1].cost if iterations else math.inf, solver.cost
-        improvement = (old - cost) / max(abs(cost), atol)  # what is less is the integrator's noise
-        settled = abs(improvement) < tolerance and solver.gap < gap_tolerance
-        left = solver.optimality() if settled or number == max_iterations else math.nan
-        row = Iteration(
-            cost=cost, improvement=improvement, gap=solver.gap, optimality=left, dynamics_residual=math.nan,
-            violation=0.0,
-            seconds=time.perf_counter() - clock, method="smooth",
-        )  # fmt: skip
-        iterations.append(row)
-        if callback is not None:
-            callback(row)
-        _heed_interrupts(functions)
-        if settled and left < tolerance:
-            status = Status.CONVERGED
-            break
-        if number == max_iterations and escape is not None:
-            status, detail = Status.DIVERGED, _place(f"rollout of iteration {number}", escape)
-    _heed_interrupts(functions)
+    iterations, status, detail = _iterate(solver, limits, functions, callback)
+    _raise_interrupts(functions)
     raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
     return ContinuousSolution(
         status=status, detail="; ".join([detail, *raised]) if detail else "", horizon=solver.system.horizon,
@@ -340,12 +197,61 @@ def smooth_continuous(
     )  # fmt: skip
 
 
+class _Limits(NamedTuple):
+    """When to stop; see `smooth_continuous`."""
+
+    tolerance: float
+    gap_tolerance: float
+    max_iterations: int
+
+
+def _initial_guess(problem: Problem, start: npt.ArrayLike | InitialPrior | None) -> tuple[Array, InitialPrior | None]:
+    """The control (m,) that the first pass applies, and the prior. Raises InputError for what is neither."""
+    prior = start.fitting(problem) if isinstance(start, InitialPrior) else None
+    if prior is not None and prior.obstacles:
+        raise InputError(f"start: got a prior with shares of the obstacles {prior.obstacles}, want one without, here")
+    wanted = start.controls if isinstance(start, InitialPrior) else start
+    if wanted is None:
+        return problem.nominal_control, prior
+    return check_array("start", wanted, (len(problem.dynamics.control_coordinates),)), prior
+
+
+def _iterate(
+    solver: "_Smoother", limits: _Limits, functions: list[External], callback: Callable[[Iteration], object] | None
+) -> tuple[list[Iteration], Status, str]:
+    """Iterate until a limit is met: the log, how it ended, and where, if it is not converged."""
+    iterations: list[Iteration] = []
+    for number in range(1, limits.max_iterations + 1):
+        clock, last = time.perf_counter(), number == limits.max_iterations
+        try:
+            solver.passes()
+        except IntegrationFailure as failure:
+            return iterations, failure.status, _at(f"{solver.where} of iteration {number}", failure)
+        escape = solver.rollout()
+        improvement = solver.improvement(iterations[-1].cost if iterations else math.inf)
+        settled = abs(improvement) < limits.tolerance and solver.gap < limits.gap_tolerance
+        row = Iteration(
+            cost=solver.cost, improvement=improvement, gap=solver.gap,
+            optimality=solver.optimality() if settled or last else math.nan, dynamics_residual=math.nan, violation=0.0,
+            seconds=time.perf_counter() - clock, method="smooth",
+        )  # fmt: skip
+        iterations.append(row)
+        if callback is not None:
+            callback(row)
+        _raise_interrupts(functions)
+        if settled and row.optimality < limits.tolerance:
+            return iterations, Status.CONVERGED, ""
+        if last and escape is not None:
+            return iterations, Status.DIVERGED, _at(f"rollout of iteration {number}", escape)
+    return iterations, Status.MAX_ITERATIONS, ""
+
+
 class _Smoother:
     """The passes of one iteration after another, and what each leaves to the next.
 
     Attributes:
       forward, backward: the passes of the last iteration of which both were completed; None before.
-      where: what was under way when there was trouble.
+      where: what was under way when there was failure.
       cost, gap: of the last rollout; see `Iteration`.
     """
 
@@ -365,7 +271,7 @@ class _Smoother:
         self._states: PPoly | None = None
 
     def passes(self) -> None:
-        """One pass forward and one backward. Paper: Secs. V-A and V-B. Raises Trouble."""
+        """One pass forward and one backward. Paper: Secs. V-A and V-B. Raises IntegrationFailure."""
         system, horizon, tolerances = self.system, self.system.horizon, self._tolerances
         prior, self._prior_left = self._prior if self._prior_left > 0 else None, self._prior_left - 1
         self.where = "forward pass"
@@ -384,7 +290,7 @@ class _Smoother:
         self._x_hat = minimizer(ahead + system.end_model("initial", x_hat), 0.0)
         self._to_go, self.forward, self.backward = go, come, go
 
-    def rollout(self) -> Trouble | None:
+    def rollout(self) -> IntegrationFailure | None:
         """Run the new policy and set `cost` and `gap`, which are infinite if it escapes; returns how it did."""
         assert self.forward is not None
         try:
@@ -392,12 +298,16 @@ class _Smoother:
             times = self.system.knots
             total = self.forward.at(times)[0] + self._to_go.at(times)[0]
             x_hats = np.array([minimizer(V, t) for V, t in zip(total, times.tolist(), strict=True)])
-        except Trouble as trouble:
+        except IntegrationFailure as failure:
             self.cost, self.gap, self._states = math.inf, math.inf, None
-            return trouble
+            return failure
         states = self._states(times)
         self.gap = float((np.abs(x_hats - states).max(axis=0) / np.maximum(np.ptp(states, axis=0), 1.0)).max())
         return None
+
+    def improvement(self, before: float) -> float:
+        """See `Iteration.improvement`, of the cost before; a cost below the tolerance is the integrator's noise."""
+        return (before - self.cost) / max(abs(self.cost), self._tolerances.atol)
 
     def optimality(self) -> float:
         """See `Iteration.optimality`; infinite where a model about the rollout has no minimum."""
@@ -405,16 +315,16 @@ class _Smoother:
             return math.inf
         try:
             decrease = self.system.decrease(self._states, self._to_go, self._tolerances)
-        except Trouble:
+        except IntegrationFailure:
             return math.inf
         return decrease / max(abs(self.cost), self._tolerances.atol)
 
 
-def _place(where: str, trouble: Trouble) -> str:
-    return f"{where}, at {trouble.time:.4g} s: {trouble}"
+def _at(where: str, failure: IntegrationFailure) -> str:
+    return f"{where}, at {failure.time:.4g} s: {failure}"
 
 
-def _heed_interrupts(functions: list[External]) -> None:
+def _raise_interrupts(functions: list[External]) -> None:
     """Raise what is not an error, such as Ctrl-C, that compiled code met in a function of Python's."""
     for function in functions:
         if function.raised is not None and not isinstance(function.raised, Exception):

@@ -10,7 +10,8 @@ from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Plan, Po
 from lqrsim.kernels.records import Settings as KernelSettings
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.problem import Problem
-from lqrsim.results.solution import Solution, Status
+from lqrsim.results.records import Status
+from lqrsim.results.solution import Solution
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.certify import certified

@@ -1,6 +1,7 @@
 """LQR smoothing of linear-quadratic problems: Sec. IV of the paper."""
 
 import time
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +13,8 @@ from lqrsim.problem.problem import FixedState
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution import Certificate, Iteration, Solution, Status, Trajectory
+from lqrsim.results.records import Certificate, Iteration, Status, Trajectory
+from lqrsim.results.solution import Solution
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.versions import versions
@@ -45,82 +47,36 @@ def smooth_lq(
     clock = time.perf_counter()
     check_name("form", form, tuple(compiled.FORMS))
     dt = check_number("dt", dt, above=0.0)
-    check_kind("stage", stage, Stage, "a Stage")
-    if np.ndim(stage.B) != 3:
-        raise InputError("stage: got one stage, want one a step: B of shape (T, n, m)")
     parts = _parts(stage)
-    A, B, c, Q, P, R, q, r, constant = parts
-    steps, n, m = B.shape
-    check_memory("stage: steps", steps, 8 * (6 * n * n + 5 * m * n + 3 * m * m))
-    jacobian = np.ascontiguousarray(np.concatenate([A, B], axis=2))
-    inverse, c_inverse = (jacobian, c.copy()) if form == "dual" else _inverse(A, B, c)
-    cost = np.ascontiguousarray(np.block([[Q, np.swapaxes(P, 1, 2)], [P, R]]))
-    slope = np.ascontiguousarray(np.concatenate([q, r], axis=1))
-    go = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
-    come = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
-    go[0][-1], go[1][-1], go[2][-1] = check_end("final", final, n)
-    come[0][0], come[1][0], come[2][0] = _begin(initial, n, form)
-    law = np.zeros((steps, m, n)), np.zeros((steps, m))
-    back = np.zeros((steps, n, n)), np.zeros((steps, n)), np.zeros((steps, m, n)), np.zeros((steps, m))
-    x_hat = np.zeros((steps + 1, n))
-    failed, which = compiled.linear_quadratic(n, m, form).lq_passes(
-        steps, Step(jacobian, c.copy()), Step(inverse, c_inverse), QuadraticStage(cost, slope), constant.copy(),
-        Passes(Policy(*law), CostToGo(*go), CostToCome(*come), Smoothing(*back), x_hat),
-    )  # fmt: skip
-    detail = f"{_WHICH[which]}, step {failed} of {steps}" if failed >= 0 else ""
-    if failed >= 0 and form == "dual" and which > 0:
-        detail += '; form="primal" may do'
-    to_go, to_come = Quadratic(*go), (Moments(*come) if form == "dual" else Quadratic(*come))
-    start = x_hat[0]
-    if isinstance(initial, Quadratic) and failed < 0:
-        # With every step of the cost-to-go definite, this alone says that there is one minimum.
-        curve = initial.hessian + go[0][0]
-        if not np.linalg.eigvalsh(curve)[0] > 0:
-            detail = "minimum of the total cost, step 0"
-        else:
-            start = -np.linalg.solve(curve, initial.gradient + go[1][0])
-    states, controls, value = _rollout(parts, law, start)
-    value += float(final(states[-1])) + (float(initial(states[0])) if isinstance(initial, Quadratic) else 0.0)
-    iterations, gap, residual, optimality = (), np.inf, np.inf, np.inf
+    passes = _passes(parts, initial, final, form)
+    start, detail = _start(passes, initial)
+    states, controls, value = _rollout(parts, passes.law, start)
+    value += float(final(states[-1])) + _cost_at(initial, states[0])
+    gap, residual, optimality = np.inf, np.inf, np.inf
     if not detail:
-        promised = float(Quadratic(go[0][0], go[1][0], go[2][0])(start))
-        promised += float(initial(start)) if isinstance(initial, Quadratic) else 0.0
+        promised = float(Quadratic(*(part[0] for part in passes.cost_to_go))(start)) + _cost_at(initial, start)
         with np.errstate(all="ignore"):
             optimality = abs(value - promised) / max(abs(value), 1e-28 * _size(parts, initial, final), 1e-300)
-            scale = np.maximum(np.ptp(states, axis=0), 1.0)
-            gap = float((np.abs(x_hat - states) / scale).max())
-            u_hat = np.einsum("tij,tj->ti", law[0], x_hat[:-1]) + law[1]
-            ahead = np.einsum("tij,tj->ti", A, x_hat[:-1]) + np.einsum("tij,tj->ti", B, u_hat) + c
-            residual = float((np.abs(x_hat[1:] - ahead) / scale).max())
+            gap, residual = _off_plan(parts, passes, states)
         if not optimality < ACCURACY:
             detail = f"too ill-conditioned: the plan costs {value:.9g}, the cost-to-go promised {promised:.9g}"
-        else:
-            iterations = (
-                Iteration(
-                    cost=value, improvement=np.inf, gap=gap, optimality=optimality, dynamics_residual=residual,
-                    violation=0.0, seconds=time.perf_counter() - clock, method="smooth",
-                ),
-            )  # fmt: skip
     solved = not detail
     whole = solved and max(gap, residual) < ACCURACY
     if solved and not whole:
         detail = f"the states of least total cost are {gap:.1g} off the plan, so the cost-to-come is left out"
-
-    def policy(gain: Array, offset: Array, nominal: Array) -> AffinePolicy:
-        return AffinePolicy(
-            gain=gain, offset=offset, nominal=nominal, dt=dt,
-            state_coordinates=_coordinates("x", n), control_coordinates=_coordinates("u", m),
-        )  # fmt: skip
-
+    iteration = Iteration(
+        cost=value, improvement=np.inf, gap=gap, optimality=optimality, dynamics_residual=residual, violation=0.0,
+        seconds=time.perf_counter() - clock, method="smooth",
+    )  # fmt: skip
     return Solution(
         status=Status.CONVERGED if solved else Status.NOT_POSITIVE_DEFINITE,
         detail=detail,
-        policy=policy(*law, states[:-1]),
-        inverse_policy=policy(*back[2:], states[1:]) if whole and form == "primal" else None,
-        cost_to_go=to_go if solved else None,
-        cost_to_come=to_come if whole else None,
+        policy=_policy(*passes.law, states[:-1], dt),
+        inverse_policy=_policy(*passes.inverse_law, states[1:], dt) if whole and form == "primal" else None,
+        cost_to_go=Quadratic(*passes.cost_to_go) if solved else None,
+        cost_to_come=(Moments if form == "dual" else Quadratic)(*passes.cost_to_come) if whole else None,
         trajectory=Trajectory(states, controls, dt),
-        iterations=iterations,
+        iterations=(iteration,) if solved else (),
         clearance=None,
         # The plan is the rollout just made.
         certificate=Certificate(
@@ -141,7 +97,91 @@ ACCURACY = 1e-6
 _WHICH = ("backward pass", "forward pass", "minimum of the total cost")
 
 
+class _Passes(NamedTuple):
+    """What the passes leave.
+
+    Attributes:
+      law, inverse_law: gain (T, m, n) and offset (T, m).
+      cost_to_go, cost_to_come: the fields of a `Quadratic`; of `Moments` for the latter in the dual form.
+      x_hat: (T+1, n), the states of least total cost.
+      failure: which pass failed, and where; empty if none did.
+    """
+
+    law: tuple[Array, Array]
+    inverse_law: tuple[Array, Array]
+    cost_to_go: tuple[Array, Array, Array]
+    cost_to_come: tuple[Array, Array, Array]
+    x_hat: Array
+    failure: str
+
+
+def _passes(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Quadratic, form: str) -> _Passes:
+    """One pass backward and one forward. Raises InputError for an end, or an A, that the form does not take."""
+    A, B, c, Q, P, R, q, r, constant = parts
+    steps, n, m = B.shape
+    check_memory("stage: steps", steps, 8 * (6 * n * n + 5 * m * n + 3 * m * m))
+    jacobian = np.ascontiguousarray(np.concatenate([A, B], axis=2))
+    inverse, c_inverse = (jacobian, c.copy()) if form == "dual" else _inverse(A, B, c)
+    cost = np.ascontiguousarray(np.block([[Q, np.swapaxes(P, 1, 2)], [P, R]]))
+    slope = np.ascontiguousarray(np.concatenate([q, r], axis=1))
+    go = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
+    come = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
+    go[0][-1], go[1][-1], go[2][-1] = check_end("final", final, n)
+    come[0][0], come[1][0], come[2][0] = _initial_cost_to_come(initial, n, form)
+    law = np.zeros((steps, m, n)), np.zeros((steps, m))
+    back = np.zeros((steps, n, n)), np.zeros((steps, n)), np.zeros((steps, m, n)), np.zeros((steps, m))
+    x_hat = np.zeros((steps + 1, n))
+    failed, which = compiled.linear_quadratic(n, m, form).lq_passes(
+        steps, Step(jacobian, c.copy()), Step(inverse, c_inverse), QuadraticStage(cost, slope), constant.copy(),
+        Passes(Policy(*law), CostToGo(*go), CostToCome(*come), Smoothing(*back), x_hat),
+    )  # fmt: skip
+    failure = f"{_WHICH[which]}, step {failed} of {steps}" if failed >= 0 else ""
+    if failed >= 0 and form == "dual" and which > 0:
+        failure += '; form="primal" may do'
+    return _Passes(law, back[2:], go, come, x_hat, failure)
+
+
+def _start(passes: _Passes, initial: Quadratic | FixedState) -> tuple[Array, str]:
+    """The state of least total cost at 0, and why there is none; empty if there is one."""
+    if passes.failure or isinstance(initial, FixedState):
+        return passes.x_hat[0], passes.failure
+    # With every step of the cost-to-go definite, this alone says that there is one minimum.
+    hessian, gradient = passes.cost_to_go[0][0], passes.cost_to_go[1][0]
+    curve = initial.hessian + hessian
+    if not np.linalg.eigvalsh(curve)[0] > 0:
+        return passes.x_hat[0], "minimum of the total cost, step 0"
+    return -np.linalg.solve(curve, initial.gradient + gradient), ""
+
+
+def _off_plan(parts: tuple[Array, ...], passes: _Passes, states: Array) -> tuple[float, float]:
+    """How far x_hat is from the plan's states, and from steps of the dynamics: see `Iteration`, gap and residual."""
+    A, B, c = parts[:3]
+    x_hat, (gain, offset) = passes.x_hat, passes.law
+    scale = np.maximum(np.ptp(states, axis=0), 1.0)
+    gap = float((np.abs(x_hat - states) / scale).max())
+    u_hat = np.einsum("tij,tj->ti", gain, x_hat[:-1]) + offset
+    ahead = np.einsum("tij,tj->ti", A, x_hat[:-1]) + np.einsum("tij,tj->ti", B, u_hat) + c
+    return gap, float((np.abs(x_hat[1:] - ahead) / scale).max())
+
+
+def _cost_at(initial: Quadratic | FixedState, state: Array) -> float:
+    """The initial cost of a state; 0 where the start is fixed."""
+    return float(initial(state)) if isinstance(initial, Quadratic) else 0.0
+
+
+def _policy(gain: Array, offset: Array, nominal: Array, dt: float) -> AffinePolicy:
+    _, m, n = gain.shape
+    return AffinePolicy(
+        gain=gain, offset=offset, nominal=nominal, dt=dt,
+        state_coordinates=_coordinates("x", n), control_coordinates=_coordinates("u", m),
+    )  # fmt: skip
+
+
 def _parts(stage: Stage) -> tuple[Array, ...]:
+    """The stage's arrays. Raises InputError unless there is one a step."""
+    check_kind("stage", stage, Stage, "a Stage")
+    if np.ndim(stage.B) != 3:
+        raise InputError("stage: got one stage, want one a step: B of shape (T, n, m)")
     return tuple(np.asarray(getattr(stage, name)) for name in ("A", "B", "c", *"QPRqr", "constant"))
 
 
@@ -164,7 +204,7 @@ def _digest(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Qu
     return sha256(*parts, *ends)[:16]
 
 
-def _begin(initial: Quadratic | FixedState, n: int, form: str) -> tuple[Array, Array, float]:
+def _initial_cost_to_come(initial: Quadratic | FixedState, n: int, form: str) -> tuple[Array, Array, float]:
     """The cost-to-come at 0, as the form has it."""
     if isinstance(initial, FixedState):
         if form == "primal":

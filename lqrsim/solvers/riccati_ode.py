@@ -23,7 +23,7 @@ from scipy.linalg.lapack import dposv  # pyright: ignore[reportAttributeAccessIs
 
 from lqrsim.errors import Array, check_number
 from lqrsim.problem.problem import Problem
-from lqrsim.results.solution import Status
+from lqrsim.results.records import Status
 from lqrsim.solvers import compiled
 from lqrsim.solvers.initial_guess import InitialPrior
 
@@ -50,8 +50,8 @@ def tolerances_of(rtol: float, atol: float) -> Tolerances:
     return Tolerances(check_number("rtol", rtol, at_least=1e-13), check_number("atol", atol, above=0.0))
 
 
-class Trouble(Exception):
-    """Why an integration can not go on: ends as the status of the solve, never reaches a caller."""
+class IntegrationFailure(Exception):
+    """Why an integration cannot go on: ends as the status of the solve, never reaches a caller."""
 
     def __init__(self, status: Status, why: str, t: float) -> None:
         super().__init__(why)
@@ -88,10 +88,12 @@ def bordered(hessian: Array, gradient: Array, constant: float) -> Array:
 
 
 def minimizer(V: Array, t: float) -> Array:
-    """The state (n,) of least value at time t. Paper: Eqs. (21), (28). Raises Trouble if there is none."""
+    """The state (n,) of least value at time t. Paper: Eqs. (21), (28). Raises IntegrationFailure if there is none."""
     _, x, info = dposv(V[:-1, :-1], V[:-1, -1])
     if info != 0:
-        raise Trouble(Status.NOT_POSITIVE_DEFINITE if np.isfinite(V).all() else Status.NOT_FINITE, NO_MINIMUM, t)
+        raise IntegrationFailure(
+            Status.NOT_POSITIVE_DEFINITE if np.isfinite(V).all() else Status.NOT_FINITE, NO_MINIMUM, t
+        )
     return -x
 
 
@@ -126,7 +128,7 @@ def riccati_pass(
     """Integrate the Riccati equation of `model(t, V)` from V = `end`: back from the horizon, or forward from 0.
 
     Raises:
-      Trouble: it can not be done.
+      IntegrationFailure: it cannot be done.
     """
     n = len(end) - 1
     sign = 1.0 if backward else -1.0
@@ -143,7 +145,9 @@ def riccati_pass(
         _, law, info = dposv(R, push)
         if info != 0:
             good = np.isfinite(R).all() and np.isfinite(push).all()
-            raise Trouble(Status.NOT_POSITIVE_DEFINITE if good else Status.NOT_FINITE, "R is not positive definite", t)
+            raise IntegrationFailure(
+                Status.NOT_POSITIVE_DEFINITE if good else Status.NOT_FINITE, "R is not positive definite", t
+            )
         drift = sign * (F.T @ V)
         return V, H + drift + drift.T - push.T @ law, -law
 
@@ -165,12 +169,12 @@ def integrate(
 ) -> Any:
     """What `solve_ivp` returns, with dense output, for `rate(t, y)` from y = `start` over `span`.
 
-    Where the rate can not be had, a shorter step is tried, for the step may only have been too bold.
+    Where the rate cannot be had, a shorter step is tried, for the step may only have been too bold.
 
     Raises:
-      Trouble: that did not help.
+      IntegrationFailure: that did not help.
     """
-    last: list[Trouble] = []
+    last: list[IntegrationFailure] = []
     count = 0
 
     def guarded(t: float, y: Array) -> Array:
@@ -178,14 +182,14 @@ def integrate(
         count += 1
         if count > _EVALUATIONS:
             why = f"the integration is not done after {_EVALUATIONS} evaluations"
-            raise Trouble(Status.MAX_ITERATIONS, why, t)
+            raise IntegrationFailure(Status.MAX_ITERATIONS, why, t)
         try:
             out = rate(t, y)
             if not math.isfinite(out.sum()):
-                raise Trouble(Status.NOT_FINITE, "a rate is not finite", t)
+                raise IntegrationFailure(Status.NOT_FINITE, "a rate is not finite", t)
             return out
-        except Trouble as trouble:
-            last[:] = [trouble]
+        except IntegrationFailure as failure:
+            last[:] = [failure]
             return np.full_like(y, math.nan)  # which SciPy takes for an error that is too large
 
     with np.errstate(all="ignore"):
@@ -197,7 +201,7 @@ def integrate(
         t = float(found.t[-1])
         if last and abs(last[0].time - t) < 1e-6 * abs(span[1] - span[0]):
             raise last[0]
-        raise Trouble(Status.NOT_FINITE, "the solution grows beyond what steps of any length can follow", t)
+        raise IntegrationFailure(Status.NOT_FINITE, "the solution grows beyond what steps of any length can follow", t)
     return found
 
 
@@ -233,8 +237,8 @@ class System:
             for name in ("initial", "stage", "final")
         }
 
-    def _look(self, t: float, x: Array, u: Array) -> float:
-        """Take the derivatives of dynamics and stage cost at (x, u); returns the cost a second. All are per second."""
+    def _expand(self, t: float, x: Array, u: Array) -> float:
+        """Expand dynamics and stage cost about (x, u), in place; returns the cost a second. All are per second."""
         self._linearize(x, u, self._data.parameters, self._f, self._fx, self._fu)
         step = min(max(int(t / self.dt), 1), self._last)
         value = self._quadratize["stage"](x, u, step, self._data.stage, self._hessian, self._gradient)
@@ -263,7 +267,7 @@ class System:
             theirs, law = other.at(t)
             x = minimizer(V + theirs, t)
             u = law[:, :-1] @ x + law[:, -1]
-            value = self._look(t, x, u)
+            value = self._expand(t, x, u)
             if prior is not None:
                 weight, error = prior.weight / self.dt, x - prior.at(t / self.dt)
                 self._hessian[range(self.n), range(self.n)] += weight
@@ -277,13 +281,13 @@ class System:
         """Run a policy under the true dynamics: its true cost, and the states (n,) as a function of time.
 
         Raises:
-          Trouble: it escapes, or leaves where the dynamics and the cost are finite.
+          IntegrationFailure: it escapes, or leaves where the dynamics and the cost are finite.
         """
 
         def rate(t: float, y: Array) -> Array:
             x = y[: self.n]
             law = policy.at(t)[1]
-            cost = self._look(t, x, law[:, :-1] @ x + law[:, -1])
+            cost = self._expand(t, x, law[:, :-1] @ x + law[:, -1])
             return np.append(self._f, cost)
 
         found = integrate(rate, np.append(start, self.end_value("initial", start)), (0.0, self.horizon), tolerances)
@@ -294,14 +298,14 @@ class System:
         """How much less a linear-quadratic model about a rollout of the policy promises to cost.
 
         Raises:
-          Trouble: the model has no minimum.
+          IntegrationFailure: the model has no minimum.
         """
         still, no_control = np.zeros(self.n), np.zeros(self.m)
 
         def deviation(t: float, _: Array) -> Model:
             """The model in x less the rollout's, and of cost less its own: no constants to cancel."""
             x, law = states(t), policy.at(t)[1]
-            self._look(t, x, law[:, :-1] @ x + law[:, -1])
+            self._expand(t, x, law[:, :-1] @ x + law[:, -1])
             return homogeneous(self._fx, self._fu, still, self._hessian, self._gradient, 0.0, still, no_control)
 
         def end(which: str, x: Array) -> Array:

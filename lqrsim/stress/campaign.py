@@ -22,7 +22,7 @@ from lqrsim.errors import InputError, check_count, check_function, check_kind, c
 from lqrsim.machine import description, processors
 from lqrsim.results import files
 from lqrsim.results.hashing import sha256
-from lqrsim.results.solution import Trajectory
+from lqrsim.results.records import Trajectory
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.stress import cluster, executors
@@ -132,7 +132,7 @@ def _check_runnable(campaign: Campaign, scenario: Scenario) -> None:
     start = np.zeros(n) if problem.start is None else problem.start
     standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
     plant.substeps(problem.dt)
-    scenario.reach(campaign.goal_radius, campaign.goal_tolerance)
+    scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance)
     for cell in campaign.cells:
         for disturbance in campaign.disturbances(cell):
             try:

@@ -124,7 +124,7 @@ class ReliabilityProblem:
             f"{self.policy} on {self.scenario}, {self.sweep} at strength {self.strength:g}: {words}",
             f"a trial draws {score.size:,} numbers; failure: {self.failure}",
         ]
-        radius = self.resolved.reach(self.goal_radius, self.goal_tolerance)
+        radius = self.resolved.target_radius(self.goal_radius, self.goal_tolerance)
         return "\n".join(lines + score.solution.target.of_plan(radius))
 
     def rare_failures(

@@ -59,7 +59,7 @@ def solve(policies: tuple[str, ...], scenario: Scenario) -> dict[str, Solution]:
     for policy in policies:
         if not np.isfinite(solutions[policy].trajectory.states).all():
             raise InputError(f"policies: got {policy}, whose plan is not finite ({solutions[policy].status.name})")
-        solutions[policy] = replace(solutions[policy], goal_radius=scenario.reach())
+        solutions[policy] = replace(solutions[policy], goal_radius=scenario.target_radius())
         if not solutions[policy].success:
             _log.warning("%s did not converge (%s); its plan is run as it is", policy, solutions[policy].status.name)
     return {policy: solutions[policy] for policy in policies}
@@ -86,18 +86,24 @@ def controller(policy: str, scenario: Scenario, solution: Solution, replan_every
 
 
 class Trials:
-    """Runs trials of a campaign's cells."""
+    """Runs trials of a campaign's cells.
+
+    Attributes:
+      controller: of the last run; None before.
+    """
 
     def __init__(self, campaign: Campaign, scenario: Scenario, solutions: Mapping[str, Solution]) -> None:
         self.campaign, self.scenario, self.solutions = campaign, scenario, solutions
         self.plant = scenario.plant()
+        self.controller: Controller | None = None
 
     def run(self, cell: Cell, first: int, count: int = 1, *, frames: bool, contacts: bool) -> Rollout:
         """So many trials of a cell, from the first on."""
+        self.controller = self._controller(cell.policy)
         return simulate(
             self.plant,
             self.solutions[cell.policy],
-            controller=self._controller(cell.policy),
+            controller=self.controller,
             disturbances=self.campaign.disturbances(cell),
             **self.scenario.near_enough(self.campaign.goal_radius, self.campaign.goal_tolerance),
             seed=self.campaign.seed,

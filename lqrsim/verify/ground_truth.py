@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.control.controllers import Feedback
 from lqrsim.errors import Array, InputError, check_function, check_kind
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -92,4 +91,4 @@ def plan(rollout: Rollout, solution: Solution | None) -> Test:
 
 def follows(rollout: Rollout, solution: Solution) -> bool:
     """Whether the solution's policy was run, with its gains or without."""
-    return rollout.policy_digest in [Feedback(one.policy).digest for one in (solution, solution.open_loop())]
+    return rollout.policy_digest in [one.policy.digest for one in (solution, solution.open_loop())]

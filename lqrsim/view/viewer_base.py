@@ -12,7 +12,7 @@ from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.solution import Trajectory
+from lqrsim.results.records import Trajectory
 from lqrsim.view.decor import PLAN, decorate
 from lqrsim.view.recorded import floor_below
 

@@ -3,7 +3,7 @@
 To add one, subclass `Disturbance` and give it a `start`. It is called once a run, and returns what the closed loop then
 calls in every control period, on all trials at once: functions, so that they may look at the state (wind that depends
 on where the robot is) or remember the past (a delay). `scaled` says what a multiple of it is, for sweeps; `check`
-refuses a plant that can not have it.
+refuses a plant that cannot have it.
 """
 
 import abc
@@ -17,7 +17,7 @@ from mujoco import batch
 
 from lqrsim.errors import Array, InputError, check_array, check_function, check_number, excerpt, real, shaped
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.solution import Trajectory
+from lqrsim.results.records import Trajectory
 from lqrsim.simulation.plant import Plant
 
 Hook = Callable[[int, Array], Array]
@@ -31,7 +31,7 @@ class Effect:
     What is called with all trials gives each the numbers that it gets alone, to the last bit: no sums over trials.
 
     Attributes:
-      begin: (states (K, n) at which the plan begins) -> the states at which the trials do, (K, n).
+      initial_states: (states (K, n) at which the plan begins) -> the states at which the trials do, (K, n).
       alter: called once, before the first step, with the simulations; gives each trial its own values of fields of
         the model with `simulations.expand(field)`, whose first axis is the trial.
       measure: (step, states (K, n)) -> the states that the policy is shown, (K, n); step runs to T inclusive.
@@ -41,7 +41,7 @@ class Effect:
       displaced: (K, obstacles, 3), by how much each of the plant's obstacles is away from where the scene has it, in m.
     """
 
-    begin: Callable[[Array], Array] | None = None
+    initial_states: Callable[[Array], Array] | None = None
     alter: Callable[[batch.Batch], None] | None = None
     measure: Hook | None = None
     actuate: Hook | None = None
@@ -50,9 +50,11 @@ class Effect:
     displaced: Array | None = None
 
     def __post_init__(self) -> None:
-        for name, count in (("begin", 1), ("alter", 1), ("measure", 2), ("actuate", 2), ("force", 2), ("torque", 2)):
-            given = "the step and an array" if count == 2 else "one thing"
-            check_function(f"Effect: {name}", getattr(self, name), f"a function of {given}, or None", arguments=count)
+        for name in ("initial_states", "alter"):
+            check_function(f"Effect: {name}", getattr(self, name), "a function of one thing, or None", arguments=1)
+        for name in ("measure", "actuate", "force", "torque"):
+            wanted = "a function of the step and an array, or None"
+            check_function(f"Effect: {name}", getattr(self, name), wanted, arguments=2)
         if self.displaced is not None:
             displaced = shaped("Effect: displaced", self.displaced, (None, None, 3))
             object.__setattr__(self, "displaced", displaced)
@@ -76,7 +78,7 @@ class Disturbance(abc.ABC):
         )
 
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
-        """Raise InputError if the plant can not have this disturbance."""
+        """Raise InputError if the plant cannot have this disturbance."""
 
     @abc.abstractmethod
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
@@ -88,8 +90,8 @@ class Disturbance(abc.ABC):
 
 
 @dataclass(frozen=True)
-class Spread(Disturbance):
-    """Base class of what is drawn with a standard deviation.
+class GaussianDisturbance(Disturbance):
+    """Base class of what is drawn from normal distributions of mean zero.
 
     Args:
       std: one number, or one for each of what it is drawn for.

@@ -6,12 +6,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lqrsim.errors import InputError, check_array, check_number
-from lqrsim.results.solution import Trajectory
-from lqrsim.simulation.disturbances.base import Disturbance, Effect, Spread, fit, normal, times, with_units, words
+from lqrsim.results.records import Trajectory
+from lqrsim.simulation.disturbances.base import (
+    Disturbance,
+    Effect,
+    GaussianDisturbance,
+    fit,
+    normal,
+    times,
+    with_units,
+    words,
+)
 from lqrsim.simulation.plant import Plant
 
 
-class ControlNoise(Spread):
+class ControlNoise(GaussianDisturbance):
     """White noise on each control, redrawn each control period.
 
     Args:
@@ -27,7 +36,7 @@ class ControlNoise(Spread):
         return Effect(actuate=lambda step, controls: controls + noise[:, step])
 
 
-class MeasurementNoise(Spread):
+class MeasurementNoise(GaussianDisturbance):
     """White noise on each state that the policy is shown.
 
     Args:
@@ -43,7 +52,7 @@ class MeasurementNoise(Spread):
         return Effect(measure=lambda step, states: states + noise[:, step])
 
 
-class ForceNoise(Spread):
+class ForceNoise(GaussianDisturbance):
     """A random force at the robot's centre of mass, redrawn each control period and held over it.
 
     Args:
@@ -60,7 +69,7 @@ class ForceNoise(Spread):
         return Effect(force=lambda step, states: forces[:, step])
 
 
-class TorqueNoise(Spread):
+class TorqueNoise(GaussianDisturbance):
     """A random torque on the robot, redrawn each control period and held over it.
 
     Args:

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lqrsim.errors import Array, check_count, check_number
-from lqrsim.results.solution import Trajectory
+from lqrsim.results.records import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
     Effect,
-    Spread,
+    GaussianDisturbance,
     check_strength,
     fit,
     normal,
@@ -24,7 +24,7 @@ from lqrsim.simulation.disturbances.base import (
 from lqrsim.simulation.plant import Plant
 
 
-class MeasurementBias(Spread):
+class MeasurementBias(GaussianDisturbance):
     """A constant error of each state that the policy is shown, drawn for each trial from a normal distribution.
 
     Args:

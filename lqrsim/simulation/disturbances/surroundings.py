@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from lqrsim.errors import InputError
-from lqrsim.results.solution import Trajectory
-from lqrsim.simulation.disturbances.base import Effect, Spread, fit, normal, with_units, words
+from lqrsim.results.records import Trajectory
+from lqrsim.simulation.disturbances.base import Effect, GaussianDisturbance, fit, normal, with_units, words
 from lqrsim.simulation.plant import Plant
 
 
-class InitialStateError(Spread):
+class InitialStateError(GaussianDisturbance):
     """The robot does not begin where the plan does.
 
     Args:
@@ -23,10 +23,10 @@ class InitialStateError(Spread):
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
         error = std * normal(generators, 1, len(std))[:, 0]
-        return Effect(begin=lambda states: states + error)
+        return Effect(initial_states=lambda states: states + error)
 
 
-class DisplacedObstacles(Spread):
+class DisplacedObstacles(GaussianDisturbance):
     """Obstacles are not where the plan has them. Planes stay, and for a robot that is seen from above, heights.
 
     Args:

@@ -1,0 +1,134 @@
+"""What the disturbances of a run do to it, one after the other; what they return is checked."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from mujoco import batch
+
+from lqrsim.errors import Array, InputError, check_kind, excerpt, shaped
+from lqrsim.results.records import Trajectory
+from lqrsim.simulation.disturbances import Disturbance, Effect
+from lqrsim.simulation.disturbances.base import Hook
+from lqrsim.simulation.plant import Plant
+
+MakeGenerator = Callable[[int, int], np.random.Generator]
+
+
+class Effects:
+    """The effects of disturbances on K trials, started.
+
+    Args:
+      plan: of the run. trials: their numbers.
+      generators: (trial, number of the disturbance) -> where its numbers come from.
+
+    Attributes:
+      displaced: (K, obstacles, 3), by how much each obstacle is elsewhere, in metres, along the world's axes.
+
+    Raises:
+      InputError: a disturbance does not fit the plant or the plan, or starts with what is no `Effect`.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        plan: Trajectory,
+        disturbances: Sequence[Disturbance],
+        trials: range,
+        generators: MakeGenerator,
+    ) -> None:
+        self._effects: list[tuple[str, Effect]] = []
+        for stream, disturbance in enumerate(disturbances):
+            name = type(disturbance).__name__
+            effect = disturbance.start(plant, plan, _Streams(generators, trials, stream))
+            self._effects.append((name, check_kind(f"{name}.start", effect, Effect, "an Effect")))
+        self.displaced = np.zeros((len(trials), len(plant.world), 3))
+        for name, effect in self._effects:
+            if effect.displaced is not None:
+                self.displaced += shaped(f"{name}: displaced", effect.displaced, self.displaced.shape)
+        if not np.isfinite(self.displaced).all():
+            raise InputError("disturbances: got obstacles that are displaced infinitely far, want finite numbers")
+        self._measures, self._actuations = self._hooks("measure"), self._hooks("actuate")
+        self._pushes = [(slice(0, 3), *hook) for hook in self._hooks("force")]
+        self._pushes += [(slice(3, 6), *hook) for hook in self._hooks("torque")]
+
+    def _hooks(self, kind: str) -> list[tuple[str, Hook]]:
+        """What is called in each period, and what messages call it."""
+        given = [(name, getattr(effect, kind)) for name, effect in self._effects]
+        return [(f"{name}: {kind}: returned", hook) for name, hook in given if hook is not None]
+
+    @property
+    def alters_models(self) -> bool:
+        """Whether any trial has a model of its own."""
+        return bool(self.displaced.any()) or any(effect.alter for _, effect in self._effects)
+
+    def initial_states(self, states: Array) -> Array:
+        """Where the trials start (K, n), of where the plan does. Raises InputError for what is not finite."""
+        shape = states.shape
+        for name, effect in self._effects:
+            if effect.initial_states is not None:
+                states = shaped(f"{name}: initial_states: returned", effect.initial_states(states), shape)
+        if not np.isfinite(states).all():
+            raise InputError("disturbances: got a start that is infinitely far away, want finite numbers")
+        return states
+
+    def alter_models(self, plant: Plant, simulations: batch.Batch) -> None:
+        """Give the trials models of their own; `Physics.prepare` must follow."""
+        for _, effect in self._effects:
+            if effect.alter is not None:
+                effect.alter(simulations)
+        if self.displaced.any():
+            plant.displace(simulations, self.displaced)
+
+    def measure(self, step: int, states: Array) -> Array:
+        """The states (K, n) that the controller is shown, of the true ones."""
+        shown = states.copy()
+        for name, measure in self._measures:
+            shown = shaped(name, measure(step, shown), shown.shape)
+        return shown
+
+    def actuate(self, step: int, controls: Array) -> Array:
+        """What of the controls (K, m) comes to the actuators, which then saturate."""
+        for name, actuate in self._actuations:
+            controls = shaped(name, actuate(step, controls), controls.shape)
+        return controls
+
+    def push(self, step: int, states: Array) -> Array:
+        """Forces in N and torques in N m on the robots, (K, 6), along the world's axes, in the true states (K, n)."""
+        wrench = np.zeros((len(states), 6))
+        for which, name, push in self._pushes:
+            wrench[:, which] += shaped(name, push(step, states), (len(states), 3))
+        return wrench
+
+
+class _Streams(Sequence[np.random.Generator]):
+    """The generator of each trial, made when it is asked for: some disturbances draw nothing."""
+
+    def __init__(self, make: MakeGenerator, trials: range, stream: int) -> None:
+        self._make, self._trials, self._stream = make, trials, stream
+        self._made: dict[int, np.random.Generator] = {}
+
+    def __len__(self) -> int:
+        return len(self._trials)
+
+    def __getitem__(self, place: Any) -> Any:
+        if isinstance(place, slice):
+            return [self[number] for number in range(*place.indices(len(self)))]
+        trial = self._trials[place]
+        if trial not in self._made:
+            made = self._make(trial, self._stream)
+            for draw in ("standard_normal", "random"):  # splitting gives objects that only draw, no Generators
+                if not callable(getattr(made, draw, None)):
+                    raise InputError(f"generators: got {excerpt(made)}, want a numpy.random.Generator of each trial")
+            self._made[trial] = made
+        return self._made[trial]
+
+
+def seeded(seed: int) -> MakeGenerator:
+    """The generators of a seed: (trial, number of the disturbance) -> a stream that is theirs alone."""
+
+    def make(trial: int, stream: int) -> np.random.Generator:
+        # Of NumPy's generators the quickest to make and to draw from, which shows in the time of the loop.
+        return np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(trial, stream))))
+
+    return make

@@ -1,0 +1,164 @@
+"""What `simulate` is asked for, checked: the options, and whether controller, plan and plant belong together."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.control.controllers import Controller, Feedback
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_count,
+    check_flag,
+    check_function,
+    check_items,
+    check_kind,
+    check_memory,
+    check_seed,
+    check_text,
+)
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.goal import Target
+from lqrsim.results.records import Trajectory
+from lqrsim.results.solution import Solution
+from lqrsim.simulation.disturbances import Disturbance
+from lqrsim.simulation.effects import MakeGenerator, seeded
+from lqrsim.simulation.physics import part_of
+from lqrsim.simulation.plant import MOST_STEPS, Plant
+from lqrsim.solvers.common import check_threads
+
+Progress = Callable[[int, int], object]
+Watch = Callable[[float, Array, npt.NDArray[np.bool_]], object]
+
+
+@dataclass(kw_only=True)
+class RunSettings:
+    """The arguments of `simulate`, and what follows from them.
+
+    Attributes:
+      law: the controller, by default the solution's policy.
+      states, controls: what the law's are; the controls within the robot's limits too.
+      radius: within which the goal counts as reached, in `Target.unit`.
+      substeps: physics steps of a control period.
+
+    Raises:
+      InputError: as `simulate` does.
+    """
+
+    plant: Plant
+    solution: Solution
+    disturbances: Sequence[Disturbance]
+    controller: Controller | None
+    seed: int
+    trials: int
+    first_trial: int
+    goal_radius: float | None
+    goal_tolerance: float | None
+    frames: bool
+    contacts: bool
+    threads: int | None
+    generators: MakeGenerator | None
+    progress: Progress | None
+    watch: Watch | None
+    law: Controller = field(init=False)
+    states: Coordinates = field(init=False)
+    controls: Coordinates = field(init=False)
+    radius: float = field(init=False)
+    substeps: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        check_kind("plant", self.plant, Plant, "a Plant, such as scenario.plant()")
+        check_kind("solution", self.solution, Solution, "a Solution, such as smooth(problem)")
+        kinds = (Controller, type(None))
+        check_kind("controller", self.controller, kinds, "a Controller, such as Feedback(solution.policy), or None")
+        wanted = "disturbances, such as ControlNoise(0.05)"
+        self.disturbances = check_items("disturbances", self.disturbances, Disturbance, wanted)
+        self.seed, self.first_trial = check_seed("seed", self.seed), check_seed("first_trial", self.first_trial)
+        self.trials, self.threads = check_count("trials", self.trials), check_threads(self.threads)
+        self.frames, self.contacts = check_flag("frames", self.frames), check_flag("contacts", self.contacts)
+        wanted = "a function of the trial and the disturbance's number that returns a numpy.random.Generator"
+        check_function("generators", self.generators, wanted, arguments=2)
+        check_function("progress", self.progress, "a function of how many periods are done, of how many", arguments=2)
+        check_function("watch", self.watch, "a function of the time, MuJoCo's qpos and who is unstable", arguments=3)
+        self.law = Feedback(self.solution.policy) if self.controller is None else self.controller
+        self.states, self.controls = _check_spaces(self.law, self.plant)
+        _check_plan(self.solution, self.plant)
+        target = Target(self.states, self.solution.goal, self.plan.states)
+        self.radius = target.radius(self.plant.robot.radius, self.goal_radius, self.goal_tolerance)
+        self.substeps = self.plant.substeps(self.plan.dt)
+        _check_size(self.plant, self.plan, self.substeps, self.trials, frames=self.frames)
+
+    @property
+    def plan(self) -> Trajectory:
+        """What is to be followed."""
+        return self.solution.trajectory
+
+    @property
+    def numbers(self) -> range:
+        """The trials' numbers."""
+        return range(self.first_trial, self.first_trial + self.trials)
+
+    @property
+    def random_streams(self) -> MakeGenerator:
+        """(trial, number of the disturbance) -> where its numbers come from."""
+        return self.generators or seeded(self.seed)
+
+
+def _check_spaces(controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:
+    """What the controller's states and controls are. Raises InputError unless they are the plant's."""
+    dynamics = plant.robot.dynamics
+    wanted = dynamics.state_coordinates.names, dynamics.control_coordinates.names
+    kind = type(controller).__name__
+    check_text(f"{kind}.digest", controller.digest, "a hash as text")
+    spaces = check_items(f"{kind}.spaces", controller.spaces, Coordinates, "Coordinates of states and of controls")
+    if len(spaces) != 2:
+        raise InputError(f"{kind}.spaces: got {len(spaces)}, want two: of the states, of the controls")
+    for what, space, want in zip(("states", "controls"), spaces, wanted, strict=True):
+        if space.names != want:
+            raise InputError(
+                f"solution: got a policy with {what} {', '.join(space.names)}, want those of robot"
+                f" {plant.robot.name}: {', '.join(want)}"
+            )
+    meant, moves = spaces[0], dynamics.state_coordinates
+    if (meant.position, meant.plane, meant.offset) != (moves.position, moves.plane, moves.offset):
+        raise InputError(
+            f"solution: got a policy for a position {_place(meant)}, want that of robot {plant.robot.name}:"
+            f" {_place(moves)}"
+        )
+    # A command that the robot cuts off is at a limit, whatever the policy took the limits to be.
+    own = dynamics.control_coordinates
+    low, high = np.maximum(spaces[1].low, own.low), np.minimum(spaces[1].high, own.high)
+    return spaces[0], spaces[1].limited(low, high)
+
+
+def _check_plan(solution: Solution, plant: Plant) -> None:
+    """Raises InputError unless the plan is finite, of the plant's states and controls."""
+    plan, dynamics = solution.trajectory, plant.robot.dynamics
+    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+    if plan.states.shape[1] != n or plan.controls.shape[1] != m:
+        shapes = f"{plan.states.shape[1]} states and {plan.controls.shape[1]} controls"
+        raise InputError(f"solution: got a plan of {shapes}, want {n} and {m}")
+    if not (np.isfinite(plan.states).all() and np.isfinite(plan.controls).all()):
+        raise InputError(f"solution: got a plan that is not finite ({solution.status.name}), want one that can be run")
+
+
+def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, frames: bool) -> None:
+    """Raises InputError for a run that would not end, or does not fit into memory."""
+    if plan.steps * substeps > MOST_STEPS:
+        raise InputError(
+            f"solution: got a plan of {plan.steps} control periods of {plan.dt:g} s, which are {plan.steps * substeps}"
+            f" physics steps, want at most {MOST_STEPS}"
+        )
+    n, m = plan.states.shape[1], plan.controls.shape[1]
+    pictures = plan.steps * (substeps // part_of(plant, substeps)) + 1 if frames else 1
+    numbers = (plan.steps + 1) * 3 * (2 * n + 2 * m + 6 + 1) + 2 * pictures * plant.model.nq + 3 * len(plant.world)
+    check_memory("trials", trials, 8 * numbers + 2000, "whose records")
+
+
+def _place(space: Coordinates) -> str:
+    """What the position is, for a message."""
+    names = ", ".join(space.names[index] for index in space.position) or "of no states"
+    plane = f" in the plane {space.plane!r}" if len(space.plane) == 2 else ""
+    return f"({names}){plane}" + ("" if space.offset is None else f" at {space.offset:g} m")
