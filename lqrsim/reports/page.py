@@ -92,7 +92,7 @@ def report(
             page["videos"].append(film)
             tell(3 + number, parts)
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    template = environment.from_string(packaged("lqrsim.view").joinpath("report.html.j2").read_text(encoding="utf-8"))
+    template = environment.from_string(packaged("lqrsim.reports").joinpath("page.html.j2").read_text(encoding="utf-8"))
     with replacing(path) as unfinished:
         unfinished.write_text(template.render(page), encoding="utf-8")
     tell(parts, parts)
