@@ -105,10 +105,10 @@ def draw(config: Config, result: Result) -> None:
         for row, (name, robot) in zip(drawn.subplots(2, 2, width_ratios=(3, 2)), result["robots"].items(), strict=True):
             over_time, success = row
             draw_errors(over_time, robot)
-            over_time.set_title(f"{NAMES[name]}, disturbances as in the demo: median, 5 to 95 %")
+            over_time.set_title(f"{NAMES[name]} at strength {FULL:g}: median, 5 to 95 %")
             draw_success(success, robot)
             success.set_title(f"{NAMES[name]}: goal reached")
-        drawn.tight_layout(w_pad=3)
+        drawn.set_layout_engine("tight", w_pad=3)
 
 
 def draw_errors(axes: Axes, robot: dict[str, Any]) -> None:

@@ -96,6 +96,7 @@ def draw(config: Config, result: Result, scenario: ls.Scenario, solution: ls.Sol
         assert isinstance(space, Axes3D)
         low, high = scenery.bounds(plan.states[:, :3], world)
         scenery.draw_in_space(space, world, low, high)
+        space.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2), zticks=(-2, 0, 2))  # those of the corners would touch
         space.plot(*plan.states[:, :3].T, color=PLAN)
         for step in range(0, plan.steps + 1, round(EVERY / plan.dt)):
             for outline in craft(plan.states[step], arm):

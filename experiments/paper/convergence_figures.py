@@ -49,7 +49,7 @@ def draw_iterations(
         ],
         loc="upper right",
     )
-    drawn.tight_layout()
+    drawn.set_layout_engine("tight")
 
 
 def _lines(axes: Axes, logs: Sequence[Log], what: str, colour: str) -> None:
@@ -124,7 +124,7 @@ def draw_order(
         xlabel="factor of a Gauss-Newton step, by what is\nthrown away alone", ylabel="factor of an iteration, measured"
     )
     axes.legend(loc="upper left")
-    drawn.tight_layout()
+    drawn.set_layout_engine("tight")
 
 
 def draw_ellipsoids(drawn: Figure, scenario: ls.Scenario, solutions: Mapping[str, ls.Solution]) -> None:
@@ -136,7 +136,7 @@ def draw_ellipsoids(drawn: Figure, scenario: ls.Scenario, solutions: Mapping[str
     panels[0].label_outer()
     panels[1].set_ylabel("")
     drawn.legend(*panels[0].get_legend_handles_labels(), loc="lower center", ncols=4)
-    drawn.tight_layout(rect=(0, 0.05, 1, 1))
+    drawn.set_layout_engine("tight", rect=(0, 0.05, 1, 1))
 
 
 def _level_sets(axes: Axes, scenario: ls.Scenario, solution: ls.Solution) -> None:
