@@ -13,7 +13,7 @@ from lqrsim.errors import Array, InputError, check_count, check_kind, check_text
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution, Trajectory
 from lqrsim.scenes.world import World
-from lqrsim.view import scenery, style
+from lqrsim.view import obstacle_plots, style
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 
 
@@ -86,7 +86,9 @@ def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
     places = np.vstack([points for *_, points in paths])
     space = solution.policy.state_coordinates
     flat = world.seen_by(space.plane, space.offset)
-    scenery.draw_in_plane(axes, flat, *scenery.bounds(places, flat, 1.5 * radius), radius, plane=space.plane)
+    obstacle_plots.draw_in_plane(
+        axes, flat, *obstacle_plots.bounds(places, flat, 1.5 * radius), radius, plane=space.plane
+    )
     for name, color, line, points in paths:
         axes.plot(*points.T, line, color=color, label=name)
     plan = paths[-1][-1]
@@ -97,7 +99,9 @@ def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
 
 def _path_in_space(axes: Axes3D, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
     paths = _paths(solution, rollouts, trial)
-    scenery.draw_in_space(axes, world, *scenery.bounds(np.vstack([points for *_, points in paths]), world))
+    obstacle_plots.draw_in_space(
+        axes, world, *obstacle_plots.bounds(np.vstack([points for *_, points in paths]), world)
+    )
     for name, color, line, points in paths:
         axes.plot(*points.T, line, color=color, label=name)
     plan = paths[-1][-1]
