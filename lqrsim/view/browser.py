@@ -205,6 +205,16 @@ class Browser(Viewer):
 def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
     """While it lasts, MuJoCo's server is made to listen on loopback only, to take no files, and to admit its own pages.
 
+    Three functions of MuJoCo are replaced. None has an option in 4.0; what happens without each was tried with 4.0.0:
+
+    - `web_server.bind_public_socket`: the viewer passes `::` to it. The server then answers at 127.0.0.2, ::1 and the
+      machine's addresses in the network.
+    - `web_server.serve`, whose handlers it wraps: a page of another site then opens the WebSockets /state and /drop,
+      which takes models; a request that calls the server by another name gets the model; and an answer may be read by
+      any page (Access-Control-Allow-Origin).
+    - `web_viewer._print_url_banner`: it then prints an address in the network, where nothing answers, and warns that
+      others can connect.
+
     Args:
       sockets: gets what it listens on.
     """
