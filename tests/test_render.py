@@ -208,6 +208,19 @@ def test_video_says_what_it_shows(flight: ls.Rollout, tmp_path: Path) -> None:
 
 
 @draws
+def test_captions_of_narrow_parts_are_not_cut_off(flight: ls.Rollout) -> None:
+    """No ink in the last columns of a caption's strip: what is too long for one line goes on in the next."""
+    with open_picture([flight] * 3, PictureOptions(size=(720, 360))) as drawn:
+        for time in (0.0, drawn.end):
+            image = drawn.draw(time)
+            for part in drawn.parts:
+                strip, right = part.views[0][0].top, part.box.left + part.box.width
+                assert strip > 0
+                assert image[:strip, part.box.left + 1 : right].min() < 100  # there is ink
+                assert image[:strip, right - 3 : right].min() > 200
+
+
+@draws
 @pytest.mark.parametrize("camera", ["top", "side"])
 def test_marker_is_where_the_calibration_says(camera: str, rollout: ls.Rollout, tmp_path: Path) -> None:
     """Green pixels of a pane, against where the camera's own formula sees the marker on the simulator's body."""

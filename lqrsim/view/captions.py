@@ -1,6 +1,7 @@
 """What the captions of pictures say: of each run what disturbs it and how it is doing, and of all what colours mean."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -32,13 +33,14 @@ class Caption:
         title = title or f"{run.robot} in {run.scene}{which}".replace("_", " ")
         self.width = box.width // 4 if over else box.width
         self.header = self._header_tile(title, list(run.disturbances) or ["undisturbed"], box)
-        # Where they are, numbers stay: beside the title in a strip that is wide enough, else in a line of their own.
-        last = text_tiles.text_tile((self._readings_in_a_line(recorded.end),), self.letter_height, width=0, bold=False)
-        longest = last.shape[1] + 3 * self.letter_height
+        # Where they are, readings stay: beside the title in a strip that is wide enough, else in lines of their own.
+        longest = self._readings_width(1)
         bare_title = text_tiles.text_tile((title,), self.letter_height, width=0)
         beside = not over and bare_title.shape[1] + longest < self.width
+        most = len(self._readings(recorded.end))
+        self.lines = next((count for count in range(1, most) if self._readings_width(count) <= self.width), most)
         self.place = (self.width - longest, 0) if beside else (0, self.header.shape[0])
-        self.height = self.header.shape[0] + (0 if beside else self._readings_tile(0.0).shape[0])
+        self.height = self.header.shape[0] + (0 if beside else self._readings_tile(recorded.end).shape[0])
 
     def _header_tile(self, title: str, what: list[str], box: Box) -> Pixels:
         """The title and as much of what disturbs as leaves most of the picture free, and how many more there are."""
@@ -65,12 +67,22 @@ class Caption:
         text_tiles.blend(area, readings, left=margin + self.place[0], top=margin + self.place[1])
 
     def _readings_tile(self, time: float) -> Pixels:
-        lines = tuple(self._readings(time)) if self.over else (self._readings_in_a_line(time),)
+        lines = tuple(self._readings(time)) if self.over else self._in_lines(time, self.lines)
         width = self.header.shape[1] if self.over else 0
         return text_tiles.text_tile(lines, self.letter_height, width=width, bold=False)
 
-    def _readings_in_a_line(self, time: float) -> str:
-        return "   ".join(self._readings(time))
+    def _readings_width(self, lines: int) -> int:
+        """The width in pixels that readings in so many lines take, with some room for numbers that are longer."""
+        ends = (self._in_lines(time, lines) for time in (0.0, self.recorded.end))
+        tiles = [text_tiles.text_tile(readings, self.letter_height, width=0, bold=False) for readings in ends]
+        return max(tile.shape[1] for tile in tiles) + 3 * self.letter_height
+
+    def _in_lines(self, time: float, most: int) -> tuple[str, ...]:
+        """The readings in so many lines, or one a line if they are fewer."""
+        readings = self._readings(time)
+        count = min(most, len(readings))
+        cuts = [len(readings) * number // count for number in range(count + 1)]
+        return tuple("   ".join(readings[first:last]) for first, last in pairwise(cuts))
 
     def _readings(self, time: float) -> list[str]:
         recorded, clearance = self.recorded, self.recorded.interpolate(self.recorded.clearance, time)
