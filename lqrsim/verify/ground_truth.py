@@ -17,7 +17,7 @@ Progress = Callable[[int, int], object]
 
 
 def check_arguments(solution: Solution | None, progress: Progress | None) -> None:
-    """Raises InputError for what is no solution, or can not be called."""
+    """Raises InputError for what is no solution, or cannot be called."""
     check_kind("solution", solution, (Solution, type(None)), "the Solution of the run, or None")
     check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)
 

@@ -22,7 +22,7 @@ from lqrsim.view.text_tiles import Pixels
 from lqrsim.view.video_metadata import Pane
 
 LARGEST = 8192  # pixels of a side: what OpenGL can surely draw
-MOST_RUNS = 6  # more can not be told apart side by side
+MOST_RUNS = 6  # more cannot be told apart side by side
 MOST_INSETS = 3
 READABLE = 300  # height of a picture in pixels from which on captions take a small part of it
 LEAST_HEIGHT = 16  # pixels, of what is shown below a caption

@@ -28,7 +28,7 @@ def plot_run(
       trial: row of each rollout.
 
     Raises:
-      InputError: the rollouts are of other systems, or the file can not be written.
+      InputError: the rollouts are of other systems, or the file cannot be written.
     """
     _check(solution, rollouts, trial, world)
     with style.figure(path, size=(11, 7.5)) as figure:

@@ -32,7 +32,7 @@ def plot_policy(solution: Solution, path: str | os.PathLike[str], *, world: Worl
       world: the obstacles, as the scene has them. radius: of the robot, in metres.
 
     Raises:
-      InputError: the solution has no policy or no position, or the file can not be written.
+      InputError: the solution has no policy or no position, or the file cannot be written.
     """
     check_kind("solution", solution, Solution, "a Solution")
     check_kind("world", world, World, "a World, such as scene.world")

@@ -67,7 +67,7 @@ def render(
       progress: called after each frame with the number of frames done and of all frames.
 
     Raises:
-      InputError: an argument is wrong, the file can not be written, or there is no OpenGL.
+      InputError: an argument is wrong, the file cannot be written, or there is no OpenGL.
     """
     path = _checked_path(path, ".mp4", ".gif")
     check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)

@@ -18,7 +18,7 @@ from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.text_tiles import Pixels
 
 FADED_OPACITY = 0.10  # what is left of the opacity of something that hides the robot
-MOST_ROBOTS = 50  # more of them in one picture can not be told apart
+MOST_ROBOTS = 50  # more of them in one picture cannot be told apart
 DRAWN_GROUPS = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # the geom groups that MuJoCo shows by default
 
 

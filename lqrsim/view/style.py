@@ -43,7 +43,7 @@ def figure(*paths: str | os.PathLike[str], size: tuple[float, float]) -> Iterato
     file is written: `tight_layout` would make room for the tick labels that logarithmic axes have before.
 
     Raises:
-      InputError: a name ends otherwise, or a file can not be written.
+      InputError: a name ends otherwise, or a file cannot be written.
     """
     places = [check_path("path", path) for path in paths]
     for place in places:
