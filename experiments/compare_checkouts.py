@@ -76,7 +76,8 @@ def compute(queries: int, trials: int) -> dict[str, list[Any]]:
     scenario, drive = ls.scenarios.quadrotor, ls.scenarios.differential_drive()
     soft = [scenario(query=query).problem for query in range(queries)]
     free = [replace(problem, control_limits=(-np.inf, np.inf)) for problem in soft]
-    fixed = [replace(problem, initial=ls.FixedState(problem.start)) for problem in soft]
+    starts = [(problem, problem.start) for problem in soft]
+    fixed = [replace(problem, initial=ls.FixedState(start)) for problem, start in starts if start is not None]
     paper = scenario().paper_start
     solved = {
         "paper": ls.smooth_many(free, start=paper, stop="cost"),

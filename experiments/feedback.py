@@ -30,7 +30,7 @@ from solver_benchmark.common import progress
 
 import lqrsim as ls
 from lqrsim.stress.statistics import compare, rate
-from lqrsim.view import scenery
+from lqrsim.view import obstacle_plots
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 
 FEEDBACK, OPEN_LOOP = "with feedback", "open loop"
@@ -105,10 +105,10 @@ def draw(config: Config, result: Result) -> None:
         for row, (name, robot) in zip(drawn.subplots(2, 2, width_ratios=(3, 2)), result["robots"].items(), strict=True):
             over_time, success = row
             draw_errors(over_time, robot)
-            over_time.set_title(f"{NAMES[name]}, disturbances as in the demo: median, 5 to 95 %")
+            over_time.set_title(f"{NAMES[name]} at strength {FULL:g}: median, 5 to 95 %")
             draw_success(success, robot)
             success.set_title(f"{NAMES[name]}: goal reached")
-        drawn.tight_layout(w_pad=3)
+        drawn.set_layout_engine("tight", w_pad=3)
 
 
 def draw_errors(axes: Axes, robot: dict[str, Any]) -> None:
@@ -146,15 +146,15 @@ def draw_paths(
         for number, scenario in enumerate(scenarios):
             place = list(scenario.robot.dynamics.state_coordinates.position)
             plan = rollouts[scenario.name][FEEDBACK].plan.states[:, place]
-            low, high = scenery.bounds(plan, scenario.scene.world, 0.5 if len(place) == 3 else 0.0)
+            low, high = obstacle_plots.bounds(plan, scenario.scene.world, 0.5 if len(place) == 3 else 0.0)
             if len(place) == 3:
                 axes = drawn.add_subplot(grid[number], projection="3d")
                 assert isinstance(axes, Axes3D)
-                scenery.draw_in_space(axes, scenario.scene.world, low, high)
+                obstacle_plots.draw_in_space(axes, scenario.scene.world, low, high)
                 axes.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2), zticks=(-2, 0, 2))
             else:
                 axes = drawn.add_subplot(grid[number])
-                scenery.draw_in_plane(axes, scenario.scene.world.seen_by("xy"), low, high, scenario.robot.radius)
+                obstacle_plots.draw_in_plane(axes, scenario.scene.world.seen_by("xy"), low, high, scenario.robot.radius)
             for name in (OPEN_LOOP, FEEDBACK):
                 draw_runs(axes, rollouts[scenario.name][name], config.paths, name)
             axes.plot(*plan.T, color=PLAN, label="plan")

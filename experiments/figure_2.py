@@ -161,16 +161,16 @@ def draw(
             arena.draw_plan(axes, scenario, plans[name].trajectory, colour)
             found = result["plans"][name]
             axes.set_title(f"from {name}:\n{found['iterations']} iterations, cost {shown(found['cost'], '.2f')}")
-        drawn.tight_layout()
+        drawn.set_layout_engine("tight")
     with figure(config, result, "figure_2_sensitivity", (9, 4.6)) as drawn:
         for axes, (name, cells) in zip(drawn.subplots(1, 2), result["grids"].items(), strict=True):
             arena.draw_map(axes, result["factors"], cells, list(paths))
             axes.set_title(f"from {name}")
-        drawn.tight_layout(w_pad=2)
+        drawn.set_layout_engine("tight", w_pad=2)
     down = -(-len(paths) // ACROSS)
     with figure(config, result, "figure_2_ways", (9, 1.6 * down + 0.2)) as drawn:
         arena.draw_ways(list(drawn.subplots(down, ACROSS, squeeze=False).flat), scenario, paths)
-        drawn.tight_layout(pad=0.8, h_pad=0.8)
+        drawn.set_layout_engine("tight", pad=0.8, h_pad=0.8)
 
 
 def report(result: Result) -> str:

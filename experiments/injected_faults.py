@@ -16,7 +16,7 @@ import numpy.typing as npt
 from lqrsim.view import video_metadata
 from lqrsim.view.cameras import Camera
 from lqrsim.view.video import encoder
-from lqrsim.view.video_metadata import Footage, Pane
+from lqrsim.view.video_metadata import Pane, VideoMetadata
 
 Pixels = npt.NDArray[np.uint8]
 Fault = Callable[[Path, Path], None]
@@ -31,21 +31,26 @@ def decoded(path: Path) -> Iterator[Pixels]:
 
 
 def write(
-    path: Path, frames: Iterable[Pixels], told: Footage, *, rate: Fraction | None = None, preset: str = "veryfast"
+    path: Path,
+    frames: Iterable[Pixels],
+    metadata: VideoMetadata,
+    *,
+    rate: Fraction | None = None,
+    preset: str = "veryfast",
 ) -> None:
-    """Encodes frames as `render` does; `told` is what the file says of itself, whether or not it is true."""
+    """Encodes frames as `render` does; `metadata` is what the file says of itself, whether or not it is true."""
     frames = iter(frames)
     first = next(frames)
     height, width, _ = first.shape
-    with encoder(path, (width, height), rate or told.rate, crf=18, preset=preset, footage=told) as encode:
+    with encoder(path, (width, height), rate or metadata.rate, crf=18, preset=preset, metadata=metadata) as encode:
         for frame in chain([first], frames):
             encode(frame)
 
 
-def retold(source: Path, path: Path, told: Footage) -> None:
+def with_metadata(source: Path, path: Path, metadata: VideoMetadata) -> None:
     """The same frames, to the last bit, in a file that says something else of itself."""
     with av.open(str(source)) as given, av.open(str(path), "w", format="mp4") as container:
-        told.embed(container)
+        metadata.embed(container)
         stream = container.add_stream_from_template(given.streams.video[0])
         for packet in given.demux(video=0):
             if packet.dts is not None:  # the last one only says that there are no more
@@ -70,32 +75,32 @@ def late(source: Path, path: Path) -> None:
 
 def dropped(source: Path, path: Path) -> None:
     """The middle one is missing, and the file gives the number of those that are left."""
-    told = video_metadata.read(source)
-    frames = (frame for number, frame in enumerate(decoded(source)) if number != told.frames // 2)
-    write(path, frames, dataclasses.replace(told, frames=told.frames - 1))
+    metadata = video_metadata.read(source)
+    frames = (frame for number, frame in enumerate(decoded(source)) if number != metadata.frames // 2)
+    write(path, frames, dataclasses.replace(metadata, frames=metadata.frames - 1))
 
 
 def swapped(source: Path, path: Path) -> None:
     """The middle one comes after the next."""
-    told = video_metadata.read(source)
+    metadata = video_metadata.read(source)
 
     def frames() -> Iterator[Pixels]:
         held = []
         for number, frame in enumerate(decoded(source)):
-            if number == told.frames // 2:
+            if number == metadata.frames // 2:
                 held = [frame]
             else:
                 yield frame
                 yield from held
                 held = []
 
-    write(path, frames(), told)
+    write(path, frames(), metadata)
 
 
 def mirrored(source: Path, path: Path) -> None:
     """The first calibrated pane, from left to right."""
-    told = video_metadata.read(source)
-    pane, _ = calibrated(told)[0]
+    metadata = video_metadata.read(source)
+    pane, _ = calibrated(metadata)[0]
     rows, columns = slice(pane.top, pane.top + pane.height), slice(pane.left, pane.left + pane.width)
 
     def frames() -> Iterator[Pixels]:
@@ -103,7 +108,7 @@ def mirrored(source: Path, path: Path) -> None:
             frame[rows, columns] = frame[rows, columns][:, ::-1].copy()
             yield frame
 
-    write(path, frames(), told)
+    write(path, frames(), metadata)
 
 
 # -- In what the file says of itself
@@ -119,8 +124,8 @@ def off(view: str, axis: int) -> Fault:
         return dataclasses.replace(pane, camera=dataclasses.replace(pane.camera, position=tuple(position.tolist())))
 
     def fault(source: Path, path: Path) -> None:
-        told = video_metadata.read(source)
-        retold(source, path, dataclasses.replace(told, panes=tuple(moved(pane) for pane in told.panes)))
+        metadata = video_metadata.read(source)
+        with_metadata(source, path, dataclasses.replace(metadata, panes=tuple(moved(pane) for pane in metadata.panes)))
 
     return fault
 
@@ -129,11 +134,11 @@ def forged(digest: str) -> Fault:
     """The file says that it shows the run of that digest."""
 
     def fault(source: Path, path: Path) -> None:
-        retold(source, path, dataclasses.replace(video_metadata.read(source), runs=(digest,)))
+        with_metadata(source, path, dataclasses.replace(video_metadata.read(source), runs=(digest,)))
 
     return fault
 
 
-def calibrated(told: Footage) -> list[tuple[Pane, Camera]]:
+def calibrated(metadata: VideoMetadata) -> list[tuple[Pane, Camera]]:
     """The panes that can be measured, and what they are seen through."""
-    return [(pane, pane.camera) for pane in told.panes if pane.camera is not None]
+    return [(pane, pane.camera) for pane in metadata.panes if pane.camera is not None]

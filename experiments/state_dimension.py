@@ -161,7 +161,7 @@ def draw(config: Config, result: Result) -> None:
             Line2D([], [], color=LIMIT, linestyle=":", label="cubic"),
         ]
         axes.legend(handles=key, loc="center left", bbox_to_anchor=(1.02, 0.5))
-        drawn.tight_layout()
+        drawn.set_layout_engine("tight")
 
 
 def report(result: Result) -> str:

@@ -183,7 +183,7 @@ def draw(config: Config, result: Result) -> None:
         spread, means = drawn.subplots(1, 2, width_ratios=(3, 2))
         draw_excess(spread, {name: one["excess"] for name, one in found.items()}, SAME)
         draw_means(means, found)
-        drawn.tight_layout(w_pad=2)
+        drawn.set_layout_engine("tight", w_pad=2)
 
 
 def report(result: Result) -> str:

@@ -168,7 +168,7 @@ def draw(config: Config, result: Result) -> None:
         spread.legend(loc="lower right", title="dots: means")
         pairs(against, result, "iterations", colours)
         pairs(costs, result, "cost", colours)
-        drawn.tight_layout()
+        drawn.set_layout_engine("tight")
 
 
 def pairs(axes: Axes, result: Result, what: str, colours: Mapping[str, str]) -> None:

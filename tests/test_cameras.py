@@ -14,7 +14,7 @@ import lqrsim as ls
 from lqrsim.view import cameras, gl, marker
 from lqrsim.view.cameras import Camera
 from lqrsim.view.video import encoder
-from lqrsim.view.video_metadata import Footage, Pane, digest, read
+from lqrsim.view.video_metadata import Pane, VideoMetadata, digest, read
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
 TILTED = Camera("tilted", (3.0, -4.0, 5.0), (0.0, 0.6, -0.8), (0.0, 0.8, 0.6), 4.0)
@@ -90,17 +90,17 @@ def test_a_diverged_trial_does_not_hide_the_others(rollout: ls.Rollout) -> None:
     assert np.isfinite(cameras.top(dataclasses.replace(rollout, states=states)).position).all()
 
 
-def footage(rollout: ls.Rollout) -> Footage:
+def metadata(rollout: ls.Rollout) -> VideoMetadata:
     panes = (
         Pane(0, 0, 320, 240, camera=cameras.top(rollout)),
         Pane(320, 0, 320, 240, trial=1, camera=cameras.side(rollout)),
         Pane(0, 240, 640, 240),
     )
-    return Footage((digest(rollout),), (marker.radius(rollout),), Fraction(30000, 1001), 0.5, 3, panes)
+    return VideoMetadata((digest(rollout),), (marker.radius(rollout),), Fraction(30000, 1001), 0.5, 3, panes)
 
 
 def test_footage_survives_its_file(rollout: ls.Rollout, tmp_path: Path) -> None:
-    written = footage(rollout)
+    written = metadata(rollout)
     path = tmp_path / "run.mp4"
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         written.embed(container)
@@ -124,19 +124,19 @@ def test_other_files_are_refused(rollout: ls.Rollout, tmp_path: Path) -> None:
         encode(np.zeros((64, 64, 3), dtype=np.uint8))
     with pytest.raises(ls.InputError, match="want a video that `lqrsim render` wrote"):
         read(tmp_path / "other.mp4")
-    good = json.loads(footage(rollout).as_json())
+    good = json.loads(metadata(rollout).as_json())
     for change, message in [
         ({"version": 99}, "got version 99"),
-        ({"frames": 0}, "footage.frames: got 0"),
+        ({"frames": 0}, "metadata.frames: got 0"),
         ({"rate": "30/0"}, "damaged"),
         ({"markers": []}, "contradicts itself"),
         ({"panes": [{"left": 0}]}, "damaged"),
     ]:
         with pytest.raises(ls.InputError, match=message):
-            Footage.from_json(json.dumps(good | change))
+            VideoMetadata.from_json(json.dumps(good | change))
     good["panes"][0]["camera"]["up"] = [0, 0, 1]
     with pytest.raises(ls.InputError, match="want unit vectors at right angles"):
-        Footage.from_json(json.dumps(good))
+        VideoMetadata.from_json(json.dumps(good))
 
 
 def test_digest_tells_runs_apart(rollout: ls.Rollout) -> None:

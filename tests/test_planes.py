@@ -20,7 +20,7 @@ from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.scenes.world import KINDS, PLANES
 from lqrsim.simulation.disturbances import Effect
 from lqrsim.view import cameras, gl, policy_plot, viewer
-from lqrsim.view.viewer_base import Screen
+from lqrsim.view.viewer_base import Viewer
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
 SIDES = '<geom name="beside" type="plane" size="1 1 1" pos="0 0.9 0" zaxis="0 -1 0"/>'
@@ -266,7 +266,7 @@ def test_pixels_tell_where_a_planar_quadrotor_is(flown, tmp_path: Path) -> None:
         ls.verify_video(ls.render(rollout, tmp_path / "top.mp4", camera="top", fps=2), rollout)
 
 
-class Seen(Screen):
+class Seen(Viewer):
     """A viewer that remembers what it is told to draw."""
 
     def refresh(self) -> bool:
@@ -279,15 +279,15 @@ def test_viewers_draw_the_plan_where_the_robot_moves() -> None:
     hover = planar_quadrotor.MASS * planar_quadrotor.GRAVITY / 2
     solution = track(robot, (0.0, 1.0, 0.0, 0.5, 0.0, 0.0), np.full((20, 2), hover), 0.02)
     rollout = ls.simulate(plant, solution)
-    for options in (viewer.of_plant(plant, solution), viewer.of_rollout(rollout, 0)):
+    for options in (viewer.arguments_for_plant(plant, solution), viewer.arguments_for_rollout(rollout, 0)):
         screen = Seen(**options, speed=1000.0)
         for time, qpos in zip(rollout.frame_times, rollout.frames[0], strict=True):
             place = screen.show(float(time), qpos)
-            np.testing.assert_allclose(place, screen.wanted(), rtol=0, atol=1e-4)  # it keeps to its plan
+            np.testing.assert_allclose(place, screen.planned_position(), rtol=0, atol=1e-4)  # it keeps to its plan
             assert place[0] == -2.0
         assert screen.caption.endswith(" 0 mm from the plan")
         drawn: list[mujoco.MjvGeom] = []
-        screen.draw(lambda drawn=drawn: drawn.append(mujoco.MjvGeom()) or drawn[-1])
+        screen.draw_overlays(lambda drawn=drawn: drawn.append(mujoco.MjvGeom()) or drawn[-1])
         assert {round(float(geom.pos[0]), 6) for geom in drawn} == {-2.0}
         assert drawn[-1].type == mujoco.mjtGeom.mjGEOM_SPHERE
 

@@ -11,8 +11,8 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.view import style
+from lqrsim.view.obstacle_plots import surface
 from lqrsim.view.plots import plot_run
-from lqrsim.view.scenery import surface
 
 
 @pytest.fixture(scope="module")

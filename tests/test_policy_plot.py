@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 import lqrsim as ls
 from lqrsim.view.ellipsoids import outlines
+from lqrsim.view.obstacle_plots import draw_projected
 from lqrsim.view.policy_plot import draw, strength
-from lqrsim.view.scenery import draw_projected
 
 
 def drawn(solution: ls.Solution, scenario: ls.Scenario) -> Figure:

@@ -16,9 +16,9 @@ import lqrsim as ls
 from lqrsim.view import gl, video_metadata
 from lqrsim.view.options import OVERLAYS, Overlay
 from lqrsim.view.overlays import ELLIPSOIDS, Overlays, Scale
-from lqrsim.view.picture import picture
+from lqrsim.view.picture import PictureOptions, open_picture
+from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.render import render, still
-from lqrsim.view.track import Track
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
 SMALL = (320, 180)
@@ -89,9 +89,9 @@ def difference(first: np.ndarray, second: np.ndarray) -> float:
 @draws
 def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
     """Where its geoms are, painting it changes what the default camera sees, obstacles before it or not."""
-    with picture(rollout, size=(640, 360)) as drawn:
-        stage = drawn.parts[0].stage
-        model = stage.model
+    with open_picture(rollout, PictureOptions(size=(640, 360))) as drawn:
+        renderer = drawn.parts[0].renderer
+        model = renderer.model
         robot = np.isin(model.geom_group, (0, 1, 2)) & (model.body_weldid[model.geom_bodyid] != 0)
         painted, material = model.geom_rgba.copy(), model.geom_matid.copy()
 
@@ -101,7 +101,7 @@ def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
 
         for time in np.linspace(0, rollout.times[-1], 12):
             hide(~robot)
-            masked = segmented(model, stage.track, time)
+            masked = segmented(model, renderer.recorded, time)
             hide(np.zeros(0, dtype=int))
             seen = drawn.draw(time).astype(int)
             hide(robot)
@@ -111,10 +111,10 @@ def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
             assert changed.mean() > 0.4, f"at {time:.2f} s"
 
 
-def segmented(model: mujoco.MjModel, track: Track, time: float) -> np.ndarray:
+def segmented(model: mujoco.MjModel, recorded: RecordedTrial, time: float) -> np.ndarray:
     """Which pixels of the overview show a geom."""
     data = mujoco.MjData(model)
-    track.pose(data, time)
+    recorded.pose(data, time)
     with mujoco.Renderer(model, 360, 640) as renderer:
         renderer.enable_segmentation_rendering()
         renderer.update_scene(data, "overview")
@@ -208,15 +208,28 @@ def test_video_says_what_it_shows(flight: ls.Rollout, tmp_path: Path) -> None:
 
 
 @draws
+def test_captions_of_narrow_parts_are_not_cut_off(flight: ls.Rollout) -> None:
+    """No ink in the last columns of a caption's strip: what is too long for one line goes on in the next."""
+    with open_picture([flight] * 3, PictureOptions(size=(720, 360))) as drawn:
+        for time in (0.0, drawn.end):
+            image = drawn.draw(time)
+            for part in drawn.parts:
+                strip, right = part.views[0][0].top, part.box.left + part.box.width
+                assert strip > 0
+                assert image[:strip, part.box.left + 1 : right].min() < 100  # there is ink
+                assert image[:strip, right - 3 : right].min() > 200
+
+
+@draws
 @pytest.mark.parametrize("camera", ["top", "side"])
 def test_marker_is_where_the_calibration_says(camera: str, rollout: ls.Rollout, tmp_path: Path) -> None:
     """Green pixels of a pane, against where the camera's own formula sees the marker on the simulator's body."""
-    with picture(rollout, insets=(camera,), size=(640, 360)) as drawn:
-        pane, data = drawn.panes[1], mujoco.MjData(drawn.parts[0].track.model)
+    with open_picture(rollout, PictureOptions(insets=(camera,), size=(640, 360))) as drawn:
+        pane, data = drawn.panes[1], mujoco.MjData(drawn.parts[0].recorded.model)
         assert pane.camera is not None
         for time in (0.0, 2.0, 4.5):
-            drawn.parts[0].track.pose(data, time)
-            want = pane.camera.project(data.xpos[drawn.parts[0].track.robot], (pane.width, pane.height))
+            drawn.parts[0].recorded.pose(data, time)
+            want = pane.camera.project(data.xpos[drawn.parts[0].recorded.robot], (pane.width, pane.height))
             area = drawn.draw(time)[pane.top : pane.top + pane.height, pane.left : pane.left + pane.width].astype(int)
             green = area[..., 1] - area[..., [0, 2]].max(axis=2) > 70
             rows, columns = np.nonzero(green)
@@ -230,13 +243,13 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
     """Each changes the picture, and only where it is: a few percent of it."""
     noisy = dataclasses.replace(flight, measured=flight.states + 0.05 * np.sin(np.arange(12)))
 
-    def shot(*overlays: Overlay) -> np.ndarray:
+    def shown(*overlays: Overlay) -> np.ndarray:
         options: dict = {"time": 2.1, "size": (640, 360), "overlays": overlays, "solution": quadrotor_solution}
         return pixels(still(noisy, tmp_path / "still.png", **options))
 
-    bare = shot()
+    bare = shown()
     for overlay in OVERLAYS:
-        changed = (np.abs(shot(overlay) - bare).max(axis=2) > 10).mean()
+        changed = (np.abs(shown(overlay) - bare).max(axis=2) > 10).mean()
         assert 1e-4 < changed < (0.2 if overlay == "caption" else 0.05), overlay
     moved = dataclasses.replace(flight.plan, states=flight.plan.states + 0.1)
     with pytest.raises(ls.InputError, match="solution: got one with another plan"):
@@ -245,7 +258,7 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
 
 def test_tube_is_the_shadow_of_what_the_total_cost_allows(flight: ls.Rollout, quadrotor_solution: ls.Solution) -> None:
     """Against the cost: of all states with a position on the ellipsoid its least is 2 above the least of all."""
-    overlays = Overlays(Track(flight, 0), quadrotor_solution, ("tube",), Scale(1.0, 1.0))
+    overlays = Overlays(RecordedTrial(flight, 0), quadrotor_solution, ("tube",), Scale(1.0, 1.0))
     assert overlays.tube is not None
     go, come = quadrotor_solution.cost_to_go, quadrotor_solution.cost_to_come
     assert go is not None

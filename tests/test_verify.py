@@ -14,7 +14,7 @@ from lqrsim.cli import main
 from lqrsim.verify import pixels
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera
-from lqrsim.view.video_metadata import Footage
+from lqrsim.view.video_metadata import VideoMetadata
 
 faults: Any = importlib.import_module("injected_faults")  # of experiments/, whose benchmark makes them at full size
 
@@ -36,7 +36,7 @@ class Case:
     other: ls.Rollout
     video: Path
     frames: list[np.ndarray]
-    told: Footage
+    metadata: VideoMetadata
 
     def beginning(self, frames: np.ndarray | None = None) -> ls.Rollout:
         """The first half of the run, as if it had diverged then, which is as good for faults; or with other frames."""
@@ -205,19 +205,19 @@ def test_a_fault_in_a_videos_frames_is_told(fault: str, likely: str, case: Case,
 
 
 def test_a_frame_that_is_missing_from_the_file_is_counted(case: Case, tmp_path: Path) -> None:
-    faults.write(tmp_path / "short.mp4", case.frames[:-1], case.told)
+    faults.write(tmp_path / "short.mp4", case.frames[:-1], case.metadata)
     found = ls.verify_video(tmp_path / "short.mp4", case.run)
     assert failed(found) == {"frames"}
     assert "cut" in found.likely
 
 
 def test_a_video_that_plays_at_another_speed_is_told(case: Case, tmp_path: Path) -> None:
-    faults.write(tmp_path / "fast.mp4", case.frames, case.told, rate=case.told.rate * 2)
+    faults.write(tmp_path / "fast.mp4", case.frames, case.metadata, rate=case.metadata.rate * 2)
     assert failed(ls.verify_video(tmp_path / "fast.mp4", case.run)) == {"frames"}
 
 
 def test_calibration_that_is_off_by_2_cm_is_told(case: Case, tmp_path: Path) -> None:
-    _, camera = faults.calibrated(case.told)[-1]  # the side of the quadrotor's video, the top of the other's
+    _, camera = faults.calibrated(case.metadata)[-1]  # the side of the quadrotor's video, the top of the other's
     for axis in range(3):
         faults.off(camera.name, axis)(case.video, tmp_path / "changed.mp4")
         found = ls.verify_video(tmp_path / "changed.mp4", case.run)
@@ -243,28 +243,30 @@ def test_a_covered_robot_is_counted_not_guessed(case: Case, tmp_path: Path) -> N
     for hidden, verdict in [(2, set()), (len(frames) // 10, {"seen"})]:
         for frame in frames[30 : 30 + hidden]:
             frame[:] = 200
-        faults.write(path, frames, case.told, preset="ultrafast")  # as sharp as possible: encoded twice, it is small
+        faults.write(
+            path, frames, case.metadata, preset="ultrafast"
+        )  # as sharp as possible: encoded twice, it is small
         found = ls.verify_video(path, case.run)
         assert failed(found) == verdict
         assert f"in {len(frames) - hidden} of {len(frames)} frames" in found.summary()
         assert np.isnan(found.seen).all(axis=1).sum() == hidden
-    faults.write(path, [np.full_like(frame, 200) for frame in frames], case.told)
+    faults.write(path, [np.full_like(frame, 200) for frame in frames], case.metadata)
     found = ls.verify_video(path, case.run)
     assert "seen" in failed(found)
     assert "not in the pictures" in found.likely
 
 
 def test_what_can_not_be_verified_is_refused(case: Case, tmp_path: Path) -> None:
-    bare = dataclasses.replace(case.told, panes=(dataclasses.replace(case.told.panes[0], camera=None),))
+    bare = dataclasses.replace(case.metadata, panes=(dataclasses.replace(case.metadata.panes[0], camera=None),))
     path = tmp_path / "changed.mp4"
-    faults.retold(case.video, path, bare)
+    faults.with_metadata(case.video, path, bare)
     with pytest.raises(ls.InputError, match="views: got none, want"):
         ls.verify_video(path, case.run)
     if case.name == "quadrotor":
-        faults.retold(case.video, path, dataclasses.replace(case.told, panes=case.told.panes[:1]))
+        faults.with_metadata(case.video, path, dataclasses.replace(case.metadata, panes=case.metadata.panes[:1]))
         with pytest.raises(ls.InputError, match="views: got top, want top and side"):
             ls.verify_video(path, case.run)
-    faults.write(path, [np.ascontiguousarray(frame[::2, ::2]) for frame in case.frames[:3]], case.told)
+    faults.write(path, [np.ascontiguousarray(frame[::2, ::2]) for frame in case.frames[:3]], case.metadata)
     with pytest.raises(ls.InputError, match="want them as lqrsim wrote them"):
         ls.verify_video(path, case.run)
     with pytest.raises(ls.InputError, match="trial: got 1, want one of 0 to 0"):
@@ -303,11 +305,11 @@ def test_views_that_disagree_are_told_apart() -> None:
     side = Camera("side", (0.0, -10.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), 5.0)
     point = np.array([0.3, -0.2, 0.5])
     measured = np.array([[view.axes @ point for view in (top, side)]])
-    place, apart = pixels.place((top, side), measured, "xyz")
+    place, apart = pixels.triangulate((top, side), measured, "xyz")
     np.testing.assert_allclose(place, [point], rtol=0, atol=1e-12)
     np.testing.assert_allclose(apart, 0, rtol=0, atol=1e-12)
     measured[0, 0, 0] += 0.01
-    place, apart = pixels.place((top, side), measured, "xyz")
+    place, apart = pixels.triangulate((top, side), measured, "xyz")
     np.testing.assert_allclose(place, [point + np.array([0.005, 0, 0])], rtol=0, atol=1e-12)
     np.testing.assert_allclose(apart, 0.01, rtol=0, atol=1e-12)
 
@@ -324,13 +326,13 @@ def test_the_marks_middle_is_found_between_pixels(centre: tuple[float, float]) -
     image[90:92, 90] = (20, 220, 10)
     # Where a fifth of it is outside of the picture, its middle is not the ball's, by less than that.
     near = 0.03 if centre[0] > radius else 0.5
-    np.testing.assert_allclose(pixels.mark(image, radius), centre, rtol=0, atol=near)
+    np.testing.assert_allclose(pixels.marker_centre(image, radius), centre, rtol=0, atol=near)
     image[:, 50:] = 0
     image[:, :50] = 0
-    assert np.isnan(pixels.mark(image, radius)).all()
+    assert np.isnan(pixels.marker_centre(image, radius)).all()
 
 
 def test_cameras_of_a_robot_in_the_plane_see_it_from_above(case: Case) -> None:
     views = [cameras.side(case.run)]
     with pytest.raises(ls.InputError, match="views: got side, want"):
-        pixels.place(views, np.zeros((0, 1, 2)), case.run.state_coordinates.plane)
+        pixels.triangulate(views, np.zeros((0, 1, 2)), case.run.state_coordinates.plane)

@@ -28,7 +28,7 @@ from lqrsim.results import files
 from lqrsim.simulation.disturbances import ForceNoise
 from lqrsim.view import viewer
 from lqrsim.view.browser import Browser
-from lqrsim.view.viewer_base import PUSHES, Screen
+from lqrsim.view.viewer_base import PUSHES, Viewer
 
 PORT = 18650 + os.getpid() % 1000  # of our own, also where tests run side by side
 
@@ -38,11 +38,11 @@ def rollout(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> ls.Rollo
     return ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[ForceNoise(0.1)], seed=1)
 
 
-class Recorder(Screen):
+class Recorder(Viewer):
     """A viewer that no one looks at; it keeps what it showed, and closes after so many frames."""
 
     def __init__(self, frames: int, **options: object) -> None:
-        super().__init__(speed=100.0, **options)  # pyright: ignore[reportArgumentType] what `of_plant` returns
+        super().__init__(speed=100.0, **options)  # pyright: ignore[reportArgumentType] of `arguments_for_plant`
         self.count, self.shown, self.errors, self.act = frames, [], [], lambda time: None
         self.shown: list[Array]
         self.errors: list[float]
@@ -54,7 +54,7 @@ class Recorder(Screen):
     def show(self, time: float, qpos: Array) -> Array:
         place = super().show(time, qpos)
         self.shown.append(self.data.qpos.copy())
-        self.errors.append(float(np.linalg.norm(place - self.wanted())))
+        self.errors.append(float(np.linalg.norm(place - self.planned_position())))
         self.act(time)
         return place
 
@@ -227,7 +227,7 @@ def test_a_server_that_is_not_private_is_refused(rollout: ls.Rollout, before: st
 def test_a_server_that_is_not_known_is_refused(rollout: ls.Rollout, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mujoco, "__version__", "4.1.0")
     with pytest.raises(InputError, match=r"got MuJoCo 4\.1\.0, want 4\.0\.x"):
-        Browser(port=PORT, **viewer.of_rollout(rollout, 0))
+        Browser(port=PORT, **viewer.arguments_for_rollout(rollout, 0))
 
 
 def test_what_can_not_be_shown(rollout: ls.Rollout, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -264,14 +264,14 @@ def test_a_port_that_is_taken(rollout: ls.Rollout, tmp_path: Path) -> None:
 
 def test_a_run_is_shown_as_it_was(rollout: ls.Rollout) -> None:
     count = rollout.frames.shape[1]
-    screen = Recorder(2 * count + 5, **viewer.of_rollout(rollout, 0))
+    screen = Recorder(2 * count + 5, **viewer.arguments_for_rollout(rollout, 0))
     viewer.play(rollout, screen)
     np.testing.assert_array_equal(screen.shown, [*rollout.frames[0], *rollout.frames[0], *rollout.frames[0][:5]])
 
 
 def test_a_run_takes_its_time(rollout: ls.Rollout) -> None:
     """At 5 times the real speed, 5 seconds take one; a machine that is busy may be late, none may be early."""
-    screen = Recorder(rollout.frames.shape[1], **viewer.of_rollout(rollout, 0))
+    screen = Recorder(rollout.frames.shape[1], **viewer.arguments_for_rollout(rollout, 0))
     screen.speed = 5.0
     begun = time.perf_counter()
     viewer.play(rollout, screen)
@@ -288,7 +288,7 @@ def test_a_live_run_is_what_simulate_does(quadrotor: ls.Scenario, quadrotor_solu
     """Run k has the numbers of trial k, to the last bit."""
     noise = [ForceNoise(0.1)]
     wanted = ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=noise, seed=3, trials=2)
-    screen = Recorder(300, **viewer.of_plant(quadrotor.plant(), quadrotor_solution))
+    screen = Recorder(300, **viewer.arguments_for_plant(quadrotor.plant(), quadrotor_solution))
     lines = live(quadrotor, quadrotor_solution, screen, disturbances=noise, seed=3)
     np.testing.assert_array_equal(screen.shown, [*wanted.frames[0][1:], *wanted.frames[1][1:]])
     assert [line.split(",")[0] for line in lines] == ["run 0: reached", "run 1: reached"]
@@ -297,7 +297,7 @@ def test_a_live_run_is_what_simulate_does(quadrotor: ls.Scenario, quadrotor_solu
 @pytest.mark.parametrize("key", PUSHES)
 def test_a_push_is_felt_and_overcome(key: str, quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """0.3 m/s at 3 s: a decimetre off, in the direction of the key, and back within 3 cm at the end, at 5 s."""
-    screen = Recorder(150, push=0.3, **viewer.of_plant(quadrotor.plant(), quadrotor_solution))
+    screen = Recorder(150, push=0.3, **viewer.arguments_for_plant(quadrotor.plant(), quadrotor_solution))
     azimuth = 0.0
     screen.act = lambda time: screen.push(PUSHES[key], azimuth) if abs(time - 3.0) < 0.01 else None
     live(quadrotor, quadrotor_solution, screen)
@@ -314,10 +314,10 @@ def test_a_push_is_felt_and_overcome(key: str, quadrotor: ls.Scenario, quadrotor
 
 def test_a_hand_is_felt_and_overcome(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """Half a newton upwards for half a second, a tenth of the weight."""
-    screen = Recorder(150, **viewer.of_plant(quadrotor.plant(), quadrotor_solution))
+    screen = Recorder(150, **viewer.arguments_for_plant(quadrotor.plant(), quadrotor_solution))
     wrenches = np.zeros((screen.model.nbody, 6))
     wrenches[screen.robot, 2] = 0.5
-    screen.act = lambda time: screen.pull(wrenches * (2.5 < time < 3.0))
+    screen.act = lambda time: screen.drag(wrenches * (2.5 < time < 3.0))
     live(quadrotor, quadrotor_solution, screen)
     assert max(screen.errors[:75]) < 1e-6
     assert 0.1 < max(screen.errors) < 1.0
@@ -325,16 +325,16 @@ def test_a_hand_is_felt_and_overcome(quadrotor: ls.Scenario, quadrotor_solution:
 
 
 def test_a_hand_is_only_so_strong(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
-    screen = Recorder(1, **viewer.of_plant(quadrotor.plant(), quadrotor_solution))
-    screen.pull(np.full((screen.model.nbody, 6), 1e4))
+    screen = Recorder(1, **viewer.arguments_for_plant(quadrotor.plant(), quadrotor_solution))
+    screen.drag(np.full((screen.model.nbody, 6), 1e4))
     weight = 0.5 * 9.81
-    assert np.linalg.norm(screen.take(0.1)[:3]) == pytest.approx(2 * weight)
-    assert np.linalg.norm(screen.take(0.1)[3:]) == pytest.approx(2 * weight * quadrotor.robot.radius)
+    assert np.linalg.norm(screen.take_wrench(0.1)[:3]) == pytest.approx(2 * weight)
+    assert np.linalg.norm(screen.take_wrench(0.1)[3:]) == pytest.approx(2 * weight * quadrotor.robot.radius)
 
 
 def test_who_is_lost_starts_again(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """A push to 1 km/s."""
-    screen = Recorder(90, push=1000.0, **viewer.of_plant(quadrotor.plant(), quadrotor_solution))
+    screen = Recorder(90, push=1000.0, **viewer.arguments_for_plant(quadrotor.plant(), quadrotor_solution))
     screen.act = lambda time: screen.push((1.0, 0.0, 0.0), 0.0) if time < 0.05 else None
     lines = live(quadrotor, quadrotor_solution, screen)
     assert len(lines) > 3
@@ -342,8 +342,8 @@ def test_who_is_lost_starts_again(quadrotor: ls.Scenario, quadrotor_solution: ls
 
 
 def test_backspace_starts_again(rollout: ls.Rollout) -> None:
-    screen = Recorder(20, **viewer.of_rollout(rollout, 0))
-    screen.act = lambda time: screen.restart() if len(screen.shown) == 8 else None
+    screen = Recorder(20, **viewer.arguments_for_rollout(rollout, 0))
+    screen.act = lambda time: screen.request_restart() if len(screen.shown) == 8 else None
     viewer.play(rollout, screen)
     np.testing.assert_array_equal(screen.shown, [*rollout.frames[0][:8], *rollout.frames[0][:12]])
 
@@ -381,16 +381,16 @@ def test_a_browser_draws_the_run(served: int, rollout: ls.Rollout, tmp_path: Pat
 @needs_browser
 def test_keys_and_the_mouse_reach_the_robot(tmp_path: Path) -> None:
     """In the browser: an arrow key pushes the robot, and Ctrl with the right mouse button drags it."""
-    before = """import lqrsim.view.viewer as viewer, lqrsim.view.viewer_base as screen
-push, pull = screen.Screen.push, screen.Screen.pull
+    before = """import lqrsim.view.viewer as viewer, lqrsim.view.viewer_base as viewer_base
+push, drag = viewer_base.Viewer.push, viewer_base.Viewer.drag
 def pushed(self, direction, azimuth):
     push(self, direction, azimuth)
     print("pushed", *direction, flush=True)
 def pulled(self, wrenches):
-    pull(self, wrenches)
+    drag(self, wrenches)
     if self.wrench.any():
         print("pulled", *self.wrench, flush=True)
-screen.Screen.push, screen.Screen.pull = pushed, pulled"""
+viewer_base.Viewer.push, viewer_base.Viewer.drag = pushed, pulled"""
     with viewing(tmp_path, "quadrotor", "--port", str(PORT + 3), "--speed", "0.3", before=before) as process:
         said(process, "Ctrl-C ends it")
         with browsing.browser(f"http://127.0.0.1:{PORT + 3}/", tmp_path / "profile", size=(500, 400)) as page:

@@ -13,7 +13,7 @@ from matplotlib.patches import Ellipse
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.results.value_functions import Moments
-from lqrsim.view import scenery
+from lqrsim.view import obstacle_plots
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 from paper.rates import tail
 
@@ -49,7 +49,7 @@ def draw_iterations(
         ],
         loc="upper right",
     )
-    drawn.tight_layout()
+    drawn.set_layout_engine("tight")
 
 
 def _lines(axes: Axes, logs: Sequence[Log], what: str, colour: str) -> None:
@@ -124,7 +124,7 @@ def draw_order(
         xlabel="factor of a Gauss-Newton step, by what is\nthrown away alone", ylabel="factor of an iteration, measured"
     )
     axes.legend(loc="upper left")
-    drawn.tight_layout()
+    drawn.set_layout_engine("tight")
 
 
 def draw_ellipsoids(drawn: Figure, scenario: ls.Scenario, solutions: Mapping[str, ls.Solution]) -> None:
@@ -136,7 +136,7 @@ def draw_ellipsoids(drawn: Figure, scenario: ls.Scenario, solutions: Mapping[str
     panels[0].label_outer()
     panels[1].set_ylabel("")
     drawn.legend(*panels[0].get_legend_handles_labels(), loc="lower center", ncols=4)
-    drawn.tight_layout(rect=(0, 0.05, 1, 1))
+    drawn.set_layout_engine("tight", rect=(0, 0.05, 1, 1))
 
 
 def _level_sets(axes: Axes, scenario: ls.Scenario, solution: ls.Solution) -> None:
@@ -149,8 +149,8 @@ def _level_sets(axes: Axes, scenario: ls.Scenario, solution: ls.Solution) -> Non
     least_to_go = -np.einsum("tij,tj->ti", of_go, go.gradient)
     (cost,) = scenario.problem.obstacle_costs
     world, plan = cost.world.seen_by("xy"), solution.trajectory.states[:, :2]
-    low, high = scenery.bounds(plan, world, 0.2)
-    scenery.draw_in_plane(axes, world, low, high, cost.radius)
+    low, high = obstacle_plots.bounds(plan, world, 0.2)
+    obstacle_plots.draw_in_plane(axes, world, low, high, cost.radius)
     axes.plot(*plan.T, color=LIMIT, linewidth=1, label="rollout")
     for name, colour, marker, centres, shapes in (
         ("cost-to-go", RUNS[0], "s", least_to_go, of_go),

@@ -14,6 +14,7 @@ from lqrsim.view.style import LIMIT, PLAN, RUNS
 from paper.common import Result, Settings, figure
 
 NAMES = {"differential_drive": "differential drive", "quadrotor": "quadrotor"}
+ASIDE = {"moderate": -3, "severe": 3}  # points; the last three presets are so close that their names would touch
 WORDS = {"smooth": "smoothing", "ilqr": "iLQR", "open_loop": "open loop", "replan": "replanning"}
 
 
@@ -25,7 +26,7 @@ def draw_together(config: Settings, result: Result) -> None:
             axes.set_title(NAMES[name], pad=50)
         both[0].set_ylabel("trials that reached their goal (%)")
         drawn.legend(*both[0].get_legend_handles_labels(), loc="upper center", ncols=4, handlelength=3)
-        drawn.tight_layout(rect=(0, 0, 1, 0.93), w_pad=3)
+        drawn.set_layout_engine("tight", rect=(0, 0, 1, 0.93), w_pad=3)
 
 
 def draw_success(axes: Axes, cells: Sequence[dict[str, Any]]) -> None:
@@ -49,8 +50,8 @@ def draw_success(axes: Axes, cells: Sequence[dict[str, Any]]) -> None:
 def above(axes: Axes, strength: float, name: str) -> None:
     """The name of a preset above the axes."""
     axes.annotate(
-        name, (strength, 1), (0, 3), xycoords=("data", "axes fraction"), textcoords="offset points", color=LIMIT,
-        fontsize=8, rotation=90, ha="center", va="bottom",
+        name, (strength, 1), (ASIDE.get(name, 0), 3), xycoords=("data", "axes fraction"),
+        textcoords="offset points", color=LIMIT, fontsize=8, rotation=90, ha="center", va="bottom",
     )  # fmt: skip
 
 
@@ -59,7 +60,7 @@ def draw_alone(config: Settings, result: Result) -> None:
         for axes, (name, robot) in zip(drawn.subplots(1, 2, sharex=True), result["robots"].items(), strict=True):
             draw_halves(axes, robot["alone"])
             axes.set_title(NAMES[name], pad=50)
-        drawn.tight_layout(w_pad=3)
+        drawn.set_layout_engine("tight", w_pad=3)
 
 
 def draw_halves(axes: Axes, kinds: Sequence[dict[str, Any]]) -> None:

@@ -32,7 +32,7 @@ from lqrsim.simulation.disturbances import MeasurementNoise
 from lqrsim.stress.campaign import Campaign, run_campaign
 from lqrsim.stress.manifest import digest_of_rows
 from lqrsim.stress.results import Results
-from lqrsim.view.track import Track
+from lqrsim.view.recorded_trial import RecordedTrial
 from robustness import mutations
 from robustness.common import Config, Hang, limited
 from robustness.mutations import pick
@@ -196,10 +196,10 @@ class Spoiler:
 def use_rollout(rollout: ls.Rollout) -> None:
     """What people do with a rollout, but for drawing it."""
     print(rollout, rollout.outcome, rollout.saturated.mean(), file=_Nowhere())
-    track = Track(rollout, 0)
-    for look in (track.driven, track.planned, track.force_at, track.over):
-        look(track.end / 2)
-    track.number_at(track.error, track.end)
+    recorded = RecordedTrial(rollout, 0)
+    for look in (recorded.driven, recorded.planned, recorded.force_at, recorded.ending):
+        look(recorded.end / 2)
+    recorded.interpolate(recorded.error, recorded.end)
 
 
 def originals() -> dict[str, ls.Solution | ls.Rollout]:

@@ -34,7 +34,7 @@ class Verify:
         """Carry the command out; its exit code: 1 if a test failed."""
         from lqrsim.commands import console
         from lqrsim.results import files
-        from lqrsim.verify.ground_truth import follows
+        from lqrsim.verify.ground_truth import ran_policy_of
         from lqrsim.verify.rollout_check import verify_run
         from lqrsim.verify.video_check import run_beside, verify_video
 
@@ -45,7 +45,7 @@ class Verify:
         if self.solution or os.path.isfile(beside):
             solution = files.load_solution(self.solution or beside)
             # What lies beside a run may be another's; what is given is meant.
-            solution = solution if self.solution or follows(rollout, solution) else None
+            solution = solution if self.solution or ran_policy_of(solution, rollout) else None
         with console.progress("verifying", "frame") as progress:
             if is_run:
                 found = verify_run(rollout, self.trial or 0, solution=solution, progress=progress)

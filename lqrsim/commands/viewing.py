@@ -11,7 +11,7 @@ from lqrsim.commands.options import optional
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
-    from lqrsim.view.viewer_base import Screen
+    from lqrsim.view.viewer_base import Viewer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,23 +142,23 @@ class View:
         options = {"push": self.push, "speed": self.speed, "seconds": self.seconds}
         if self.what.endswith(".npz"):
             rollout = files.load_rollout(self.what)
-            shown = viewer.of_rollout(rollout, self.trial)
+            shown = viewer.arguments_for_rollout(rollout, self.trial)
 
-            def go(screen: "Screen") -> None:
+            def go(screen: "Viewer") -> None:
                 viewer.play(rollout, screen, trial=self.trial, loop=self.loop)
         else:
             scenario = resolve(self.what)
             plant = scenario.plant()
             solution = console.solve(scenario.problem, "smooth", reach=scenario.target_radius())
-            shown = viewer.of_plant(plant, solution)
+            shown = viewer.arguments_for_plant(plant, solution)
             wrong = [one.scaled(self.disturbances) for one in scenario.disturbances if self.disturbances]
 
-            def go(screen: "Screen") -> None:
+            def go(screen: "Viewer") -> None:
                 console.say(viewer.KEYS)
                 viewer.live(plant, solution, screen, disturbances=wrong, seed=self.seed, ended=console.say)
 
         with viewer.open_viewer(kind, self.port, title=f"lqrsim {self.what}", **shown, **options) as screen:
-            console.say(screen.where)
+            console.say(screen.instructions)
             with contextlib.suppress(KeyboardInterrupt):
                 go(screen)
         return 0

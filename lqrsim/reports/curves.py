@@ -76,4 +76,4 @@ def _finish(figure: Figure, axes: Axes, curves: Mapping[str, object]) -> None:
     axes.margins(x=0.02)
     figure.legend(*axes.get_legend_handles_labels(), loc="upper center", ncols=min(len(curves), 4), handlelength=3)
     rows = -(-len(curves) // 4)
-    figure.tight_layout(rect=(0, 0, 1, 0.98 - 0.055 * rows))
+    figure.set_layout_engine("tight", rect=(0, 0, 1, 0.98 - 0.055 * rows))

@@ -5,10 +5,10 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 
-FEW = 4  # frames that may be wrong one by one
+FEW_FRAMES = 4  # frames that may be wrong one by one
 
 
-def explain(
+def diagnose(
     numbers: npt.NDArray[np.intp], times: Array, seen: Array, actual: Array, bound: float, interval: float
 ) -> str:
     """The explanation after which nearly all positions fit within twice the bound, in a line.
@@ -19,9 +19,9 @@ def explain(
     """
     where, truth, velocity = seen[numbers], actual[numbers], np.gradient(actual, times, axis=0)[numbers]
     error = where - truth
-    wrong = np.flatnonzero(_length(error) > bound)
-    if 0 < len(wrong) <= FEW:
-        return _single(wrong, numbers, where, truth, 2 * bound)
+    wrong = np.flatnonzero(_lengths(error) > bound)
+    if 0 < len(wrong) <= FEW_FRAMES:
+        return _single_frames(wrong, numbers, where, truth, 2 * bound)
     for axis, name in zip(range(truth.shape[1]), "xyz", strict=False):
         # Mirrored in one of two views that see it, it seems to stand still.
         spread = truth[:, axis] - truth[:, axis].mean()
@@ -30,34 +30,36 @@ def explain(
             return f"{name} is mirrored"
     offset = error.mean(axis=0)
     late = _slope(error, velocity)
-    split, ahead = _break(error, velocity)
+    split, ahead = _change_point(error, velocity)
     candidates: list[tuple[Array, str]] = []
-    if _length(offset) > bound / 2:
+    if _lengths(offset) > bound / 2:
         moved = np.round(1e3 * offset).astype(int).tolist()
         candidates.append((error - offset, f"a camera is off: it moves the robot by {moved} mm"))
     if abs(late) > interval / 4:
-        shown = _at(times, actual, times[numbers] + late)
-        candidates.append((where - shown, f"pictures show the run {_frames(late, interval)}"))
-    if abs(ahead) > interval / 4 and split > FEW:  # before that, it is late or early as a whole
-        shown = _at(times, actual, times[numbers] + ahead * (np.arange(len(numbers)) >= split))
+        shown = _positions_at(times, actual, times[numbers] + late)
+        candidates.append((where - shown, f"pictures show the run {_in_frames(late, interval)}"))
+    if abs(ahead) > interval / 4 and split > FEW_FRAMES:  # before that, it is late or early as a whole
+        shown = _positions_at(times, actual, times[numbers] + ahead * (np.arange(len(numbers)) >= split))
         said = "left out" if ahead > 0 else "shown twice"
-        said = f"frames are {said} at frame {numbers[split]}: from there on, the run is {_frames(ahead, interval)}"
+        said = f"frames are {said} at frame {numbers[split]}: from there on, the run is {_in_frames(ahead, interval)}"
         candidates.append((where - shown, said))
     if candidates:
-        rest, said = min(candidates, key=lambda candidate: _most(candidate[0]))
-        if _most(rest) <= 2 * bound:
+        rest, said = min(candidates, key=lambda candidate: _quantile_95(candidate[0]))
+        if _quantile_95(rest) <= 2 * bound:
             return said
-    if _most(error) <= 2 * bound:
+    if _quantile_95(error) <= 2 * bound:
         return "the pictures are too small or too coarse"
     return "pictures of another run than the record's: another seed, trial or policy; or another robot's body"
 
 
-def _single(wrong: npt.NDArray[np.intp], numbers: npt.NDArray[np.intp], seen: Array, actual: Array, near: float) -> str:
+def _single_frames(
+    wrong: npt.NDArray[np.intp], numbers: npt.NDArray[np.intp], seen: Array, actual: Array, near: float
+) -> str:
     """Which frames do not show their moment, and whether two show each other's."""
     if len(wrong) == 2:
         first, second = wrong
         crossed = seen[[first, second]] - actual[[second, first]]
-        if _length(crossed).max() <= near:
+        if _lengths(crossed).max() <= near:
             return f"frames {numbers[first]} and {numbers[second]} are swapped"
     return f"frames that do not show their moment: {', '.join(str(numbers[one]) for one in wrong)}"
 
@@ -66,7 +68,7 @@ def _slope(error: Array, velocity: Array) -> float:
     return float((error * velocity).sum() / max((velocity**2).sum(), 1e-12))
 
 
-def _break(error: Array, velocity: Array) -> tuple[int, float]:
+def _change_point(error: Array, velocity: Array) -> tuple[int, float]:
     """The frame from which on errors are velocity times a number of seconds, and before which there are none."""
     products, squares = ((error * velocity).sum(axis=1), (velocity**2).sum(axis=1))
     tails = [np.cumsum(part[::-1])[::-1] for part in (products, squares)]
@@ -75,19 +77,19 @@ def _break(error: Array, velocity: Array) -> tuple[int, float]:
     return split, float(tails[0][split] / max(tails[1][split], 1e-12))
 
 
-def _at(times: Array, places: Array, when: Array) -> Array:
+def _positions_at(times: Array, places: Array, when: Array) -> Array:
     return np.stack([np.interp(when, times, column) for column in places.T], axis=1)
 
 
-def _frames(seconds: float, interval: float) -> str:
+def _in_frames(seconds: float, interval: float) -> str:
     return f"{abs(seconds) / interval:.1f} frames {'early' if seconds > 0 else 'late'}"
 
 
-def _length(vectors: Array) -> npt.NDArray[np.float64]:
+def _lengths(vectors: Array) -> npt.NDArray[np.float64]:
     """Of vectors (..., d)."""
     return np.linalg.norm(vectors, axis=-1)
 
 
-def _most(vectors: Array) -> float:
+def _quantile_95(vectors: Array) -> float:
     """The length that all but one in twenty stay below."""
-    return float(np.quantile(_length(vectors), 0.95))
+    return float(np.quantile(_lengths(vectors), 0.95))

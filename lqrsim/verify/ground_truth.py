@@ -10,31 +10,31 @@ from lqrsim.errors import Array, InputError, check_function, check_kind
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.verify.verdict import Test
-from lqrsim.view.recorded import model_of
+from lqrsim.view.recorded_model import model_of, robot_body
 
 Progress = Callable[[int, int], object]
 
 
-def check_asked(solution: Solution | None, progress: Progress | None) -> None:
-    """Raises InputError for what is no solution, or can not be called."""
+def check_arguments(solution: Solution | None, progress: Progress | None) -> None:
+    """Raises InputError for what is no solution, or cannot be called."""
     check_kind("solution", solution, (Solution, type(None)), "the Solution of the run, or None")
     check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)
 
 
-def model(rollout: Rollout, trial: int) -> mujoco.MjModel:
+def drawable_model(rollout: Rollout, trial: int) -> mujoco.MjModel:
     """The model that was run. Raises InputError unless there is such a trial of it, recorded for drawing."""
-    found = model_of(rollout, trial)
+    model = model_of(rollout, trial)
     if len(rollout.frame_times) < 2:
         raise InputError(f"rollout.frames: got shape {rollout.frames.shape}, want what simulate(frames=True) records")
-    return found
+    return model
 
 
-def subject(rollout: Rollout, trial: int) -> str:
+def describe(rollout: Rollout, trial: int) -> str:
     """What was run, for a reader."""
     return f"{rollout.robot} in {rollout.scene}, seed {rollout.seed}, trial {rollout.first_trial + trial}"
 
 
-def drawn(rollout: Rollout, trial: int) -> tuple[Array, npt.NDArray[np.intp]]:
+def frames_at_states(rollout: Rollout, trial: int) -> tuple[Array, npt.NDArray[np.intp]]:
     """The times of states that were recorded for drawing too, and the rows of those in `frames`."""
     rows = np.abs(rollout.frame_times - rollout.times[:, None]).argmin(axis=1)
     good = np.abs(rollout.frame_times[rows] - rollout.times) < 1e-6 * rollout.plan.dt
@@ -44,22 +44,22 @@ def drawn(rollout: Rollout, trial: int) -> tuple[Array, npt.NDArray[np.intp]]:
     return rollout.times[good], rows[good]
 
 
-def states(rollout: Rollout, trial: int, times: Array) -> Array:
+def state_positions(rollout: Rollout, trial: int, times: Array) -> Array:
     """Positions (N, d) of the states at times that are theirs."""
     rows = np.abs(rollout.times - times[:, None]).argmin(axis=1)
     return rollout.states[trial, rows][:, list(rollout.state_coordinates.position)]
 
 
-def planned(rollout: Rollout, times: Array) -> Array:
+def planned_positions(rollout: Rollout, times: Array) -> Array:
     """Positions (N, d) of the plan."""
     columns = [rollout.plan.states[:, column] for column in rollout.state_coordinates.position]
     return np.stack([np.interp(times, rollout.times, column) for column in columns], axis=1)
 
 
-def between(rollout: Rollout, trial: int, model: mujoco.MjModel, times: Array) -> Array:
+def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: Array) -> Array:
     """Positions (N, d) of the robot's body, as recorded for drawing: closer in time than the states are."""
     good = np.isfinite(rollout.frames[trial]).all(axis=1)
-    data, body, places = mujoco.MjData(model), int(model.body(rollout.body).id), []
+    data, body, places = mujoco.MjData(model), robot_body(model, rollout.body), []
     for frame in rollout.frames[trial, good]:
         data.qpos = frame
         mujoco.mj_kinematics(model, data)
@@ -68,27 +68,28 @@ def between(rollout: Rollout, trial: int, model: mujoco.MjModel, times: Array) -
     return np.stack([np.interp(times, rollout.frame_times[good], column) for column in columns], axis=1)
 
 
-def consistent(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: float) -> Test:
+def check_record(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: float) -> Test:
     """Whether states and what was recorded for drawing are one motion."""
-    times, _ = drawn(rollout, trial)
-    apart = np.linalg.norm(between(rollout, trial, model, times) - states(rollout, trial, times), axis=1).max()
+    times, _ = frames_at_states(rollout, trial)
+    found, wanted = frame_positions(rollout, trial, model, times), state_positions(rollout, trial, times)
+    apart = np.linalg.norm(found - wanted, axis=1).max()
     said = f"frames and states at most {1e3 * apart:.2f} mm apart, want {1e3 * bound:.2f} at most"
     return Test("record", bool(apart <= bound), said)
 
 
-def plan(rollout: Rollout, solution: Solution | None) -> Test:
+def check_plan(rollout: Rollout, solution: Solution | None) -> Test:
     """Whether the plan is the solution's, and it was the solution's policy that was run."""
     if solution is None:
         return Test("plan", None, "whether it is the one that was followed takes the solution")
     same = np.array_equal(rollout.plan.states, solution.trajectory.states)
     same = same and np.array_equal(rollout.plan.controls, solution.trajectory.controls)
-    followed = follows(rollout, solution)
+    followed = ran_policy_of(solution, rollout)
     said = (
         f"{'as' if same else 'not as'} the solution has it, {'whose' if followed else 'but not whose'} policy was run"
     )
     return Test("plan", same and followed, said)
 
 
-def follows(rollout: Rollout, solution: Solution) -> bool:
+def ran_policy_of(solution: Solution, rollout: Rollout) -> bool:
     """Whether the solution's policy was run, with its gains or without."""
     return rollout.policy_digest in [one.policy.digest for one in (solution, solution.open_loop())]

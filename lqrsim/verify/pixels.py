@@ -9,20 +9,20 @@ from lqrsim.errors import Array, InputError
 from lqrsim.view.cameras import Camera, measuring_of
 from lqrsim.view.marker import RIM
 
-FEWEST = 20  # pixels of what is tracked; the middle of fewer is not known well enough
-SHARE = 0.5  # of the mark that must be seen; the rest may be outside of the picture
+FEWEST_PIXELS = 20  # pixels of what is tracked; the middle of fewer is not known well enough
+LEAST_SHARE = 0.5  # of the mark that must be seen; the rest may be outside of the picture
 # A pixel's green minus its red or blue, whichever is more: from which fraction on it counts, and where it is all mark.
 # Video blurs the mark's edge, and leaves a tinge of other overlays in what is around it.
 EMPTY, FULL = 0.2, 0.9
 
 
-def middle(mask: npt.NDArray[np.bool_]) -> Array:
+def mask_centre(mask: npt.NDArray[np.bool_]) -> Array:
     """The mean pixel (2,) of a mask (height, width), column and row; NaN if it has too few."""
     rows, columns = np.nonzero(mask)
-    return np.array([columns.mean(), rows.mean()]) + 0.5 if len(rows) >= FEWEST else np.full(2, np.nan)
+    return np.array([columns.mean(), rows.mean()]) + 0.5 if len(rows) >= FEWEST_PIXELS else np.full(2, np.nan)
 
 
-def mark(image: npt.NDArray[np.uint8], radius: float) -> Array:
+def marker_centre(image: npt.NDArray[np.uint8], radius: float) -> Array:
     """The pixel (2,), column and row, in the middle of the green mark of that radius in pixels; NaN if it is hidden."""
     red, green, blue = np.moveaxis(image.astype(np.int16), 2, 0)
     share = ((green - np.maximum(red, blue)) / 255 - EMPTY) / (FULL - EMPTY)
@@ -38,13 +38,13 @@ def mark(image: npt.NDArray[np.uint8], radius: float) -> Array:
         x, y = np.arange(left, left + part.shape[1]) + 0.5, np.arange(up, up + part.shape[0]) + 0.5
         weights = part * ((x - centre[0]) ** 2 + (y[:, None] - centre[1]) ** 2 <= reach**2)
         area = weights.sum()
-        if area < SHARE * np.pi * radius**2:
+        if area < LEAST_SHARE * np.pi * radius**2:
             return np.full(2, np.nan)
         centre = np.array([weights.sum(axis=0) @ x, weights.sum(axis=1) @ y]) / area
     return centre
 
 
-def place(views: Sequence[Camera], measured: npt.ArrayLike, plane: str) -> tuple[Array, Array]:
+def triangulate(views: Sequence[Camera], measured: npt.ArrayLike, plane: str) -> tuple[Array, Array]:
     """Positions (N, d) that fit best what N frames' views measured (N, views, 2), and how far apart views are (N,).
 
     Args:

@@ -12,14 +12,20 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.verify import ground_truth, pixels
 from lqrsim.verify.ground_truth import Progress
-from lqrsim.verify.verdict import Verification, judge
+from lqrsim.verify.verdict import Positions, Verification, compare
 from lqrsim.view import cameras, gl
 from lqrsim.view.cameras import Camera
 
 SIZE = (640, 480)
-BOUND = 1 / 60  # the worst error that is allowed, in radii of the robot: 5 and 2.8 mm for the packaged ones
+POSITION_BOUND = 1 / 60  # the worst error that is allowed, in radii of the robot: 5 and 2.8 mm for the packaged ones
 # Their silhouettes, seen orthographically, are symmetric about their centre, however they are turned.
-SYMMETRIC = (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE, Geom.mjGEOM_ELLIPSOID, Geom.mjGEOM_CYLINDER, Geom.mjGEOM_BOX)
+SYMMETRIC_KINDS = (
+    Geom.mjGEOM_SPHERE,
+    Geom.mjGEOM_CAPSULE,
+    Geom.mjGEOM_ELLIPSOID,
+    Geom.mjGEOM_CYLINDER,
+    Geom.mjGEOM_BOX,
+)
 
 
 def verify_run(
@@ -39,41 +45,44 @@ def verify_run(
     Raises:
       InputError: there is no such trial, nothing to draw, or no OpenGL.
     """
-    ground_truth.check_asked(solution, progress)
-    model, space = ground_truth.model(rollout, trial), rollout.state_coordinates
+    ground_truth.check_arguments(solution, progress)
+    model, space = ground_truth.drawable_model(rollout, trial), rollout.state_coordinates
     body = int(model.body(rollout.body).id)
-    geom = _part(model, body)
+    geom = _tracked_geom(model, body)
     views = [{"top": cameras.top, "side": cameras.side}[name](rollout) for name in cameras.measuring(rollout)]
-    times, rows = ground_truth.drawn(rollout, trial)
-    seen: list[Array] = []
+    times, rows = ground_truth.frames_at_states(rollout, trial)
+    measured: list[Array] = []
     offsets: list[Array] = []
     for masks, offset in _silhouettes(model, geom, body, rollout.frames[trial, rows], views):
-        seen.append(
-            np.array([view.measure(pixels.middle(mask), SIZE) for view, mask in zip(views, masks, strict=True)])
+        measured.append(
+            np.array([view.measure(pixels.mask_centre(mask), SIZE) for view, mask in zip(views, masks, strict=True)])
         )
         offsets.append(offset)
         if progress:
-            progress(len(seen), len(rows))
-    places, apart = pixels.place(views, seen, space.plane)
+            progress(len(measured), len(rows))
+    places, apart = pixels.triangulate(views, measured, space.plane)
     name = model.geom(geom).name or model.geom(geom).id
-    return judge(
-        ground_truth.subject(rollout, trial),
+    positions = Positions(
+        times,
+        seen=places - space.of_world(offsets),
+        actual=ground_truth.state_positions(rollout, trial, times),
+        planned=ground_truth.planned_positions(rollout, times),
+        apart=apart,
+    )
+    return compare(
+        ground_truth.describe(rollout, trial),
         f"the silhouette of {name} in {SIZE[0]} x {SIZE[1]} pixels from {' and '.join(view.name for view in views)},"
         " all else left out (X-ray)",
-        times,
-        places - space.of_world(offsets),
-        ground_truth.states(rollout, trial, times),
-        ground_truth.planned(rollout, times),
-        apart,
-        bound=BOUND * rollout.radius,
+        positions,
+        bound=POSITION_BOUND * rollout.radius,
         interval=float(rollout.frame_times[1] - rollout.frame_times[0]),
-        others=(ground_truth.plan(rollout, solution),),
+        others=(ground_truth.check_plan(rollout, solution),),
     )
 
 
-def _part(model: mujoco.MjModel, body: int) -> int:
+def _tracked_geom(model: mujoco.MjModel, body: int) -> int:
     """The largest geom of the robot's body that can collide and whose silhouette's middle is its centre."""
-    kinds = [kind.value for kind in SYMMETRIC]
+    kinds = [kind.value for kind in SYMMETRIC_KINDS]
     fits = (model.geom_bodyid == body) & np.isin(model.geom_type, kinds)
     fits &= (model.geom_contype | model.geom_conaffinity) != 0
     if not fits.any():

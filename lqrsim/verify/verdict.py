@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt, shaped
-from lqrsim.verify.diagnosis import explain
+from lqrsim.verify.diagnosis import diagnose
 
 HIDDEN = 0.05  # of the frames that may not show what is tracked
 SCALE = 0.002
@@ -15,16 +14,20 @@ VERDICTS = {True: "passed", False: "FAILED", None: "untold"}
 
 @dataclass(frozen=True)
 class Test:
-    """One thing that must hold. `passed`: None if it can not be told. `said`: what was measured and what was wanted."""
+    """One thing that must hold.
+
+    Attributes:
+      passed: None if it cannot be told. detail: what was measured and what was wanted.
+    """
 
     __test__ = False  # it is no test of pytest's
 
     name: str
     passed: bool | None
-    said: str
+    detail: str
 
     def __post_init__(self) -> None:
-        for name in ("name", "said"):
+        for name in ("name", "detail"):
             check_kind(f"Test: {name}", getattr(self, name), str, "text")
         if self.passed not in (True, False, None):
             raise InputError(f"Test: passed: got {excerpt(self.passed)}, want True, False or None")
@@ -91,20 +94,33 @@ class Verification:
             f"  off the plan by {1e3 * _rms(error):.0f} mm rms, {1e3 * np.nanmax(error, initial=0):.0f} mm at worst;"
             f" the record says {1e3 * _rms(recorded):.0f} and {1e3 * recorded.max():.0f} mm",
         ]
-        lines += [f"  {VERDICTS[test.passed]}  {test.name}: {test.said}" for test in self.tests]
+        lines += [f"  {VERDICTS[test.passed]}  {test.name}: {test.detail}" for test in self.tests]
         return "\n".join(lines + ([f"  likely: {self.likely}"] if self.likely else []))
 
     __str__ = summary
 
 
-def judge(
+@dataclass(frozen=True)
+class Positions:
+    """Where the robot is in N frames, d coordinates each, in metres.
+
+    Attributes:
+      times: (N,) seconds after the run's start. seen: (N, d) from pixels; NaN where the robot is hidden.
+      actual: (N, d) the simulator's. planned: (N, d) the plan's.
+      apart: (N,) by which the views differ about the same place.
+    """
+
+    times: Array
+    seen: Array
+    actual: Array
+    planned: Array
+    apart: Array
+
+
+def compare(
     subject: str,
     method: str,
-    times: Array,
-    seen: Array,
-    actual: Array,
-    planned: Array,
-    apart: Array,
+    positions: Positions,
     *,
     bound: float,
     interval: float,
@@ -113,21 +129,21 @@ def judge(
     """Compares what was seen with what there was.
 
     Args:
-      apart: (N,) metres by which the views differ about the same place.
       bound: on the distance between seen and actual, in metres, in any frame.
       interval: seconds between two frames; the shift must be less than a quarter of it.
       others: tests made already.
     """
+    times, seen, actual = positions.times, positions.seen, positions.actual
     good = np.asarray(np.isfinite(seen).all(axis=1))
-    hidden = Test(
+    visible = Test(
         "seen",
         bool(good.mean() >= 1 - HIDDEN) and int(good.sum()) > 2,
         f"in {good.sum()} of {len(good)} frames, want {100 * (1 - HIDDEN):.0f} % of them",
     )
     if good.sum() < 3:
         return Verification(
-            subject, method, times, seen, actual, planned, np.nan, np.nan, np.nan, np.nan, (*others, hidden),
-            "the robot is not in the pictures, or is too small in them",
+            subject, method, times, seen, actual, positions.planned, np.nan, np.nan, np.nan, np.nan,
+            (*others, visible), "the robot is not in the pictures, or is too small in them",
         )  # fmt: skip
     error, velocity = (seen - actual)[good], np.gradient(actual, times, axis=0)[good]
     distance = np.linalg.norm(error, axis=1)
@@ -135,13 +151,13 @@ def judge(
     # What hardly moves, or hardly anywhere, tells neither; then the fit's own uncertainty is what it is held to.
     most, stretch = max(interval / 4, 4 * shift_error), max(SCALE, 4 * scale_error)
     number = int(np.flatnonzero(good)[distance.argmax()])
-    most_apart, agreement = float(apart[good].max()), ()
+    most_apart, agreement = float(positions.apart[good].max()), ()
     if most_apart > 0:  # only one view leaves nothing to disagree about
-        said = f"at worst {1e3 * most_apart:.1f} mm apart, want {1e3 * bound:.1f} at most"
-        agreement = (Test("views agree", most_apart <= bound, said),)
+        detail = f"at worst {1e3 * most_apart:.1f} mm apart, want {1e3 * bound:.1f} at most"
+        agreement = (Test("views agree", most_apart <= bound, detail),)
     tests = (
         *others,
-        hidden,
+        visible,
         Test(
             "position",
             bool(distance.max() <= bound),
@@ -151,39 +167,28 @@ def judge(
         Test("time", abs(shift) <= most, f"{1e3 * shift:+.1f} ms ahead, want {1e3 * most:.1f} at most either way"),
         Test("scale", abs(scale) <= stretch, f"{1 + scale:.4f}, want 1 within {stretch:.4f}"),
     )
-    likely = (
-        ""
-        if all(test.passed is not False for test in tests)
-        else _likely(tests, good, times, seen, actual, bound, interval)
-    )
     return Verification(
-        subject, method, times, seen, actual, planned, _rms(distance), float(distance.max()), shift, 1 + scale, tests,
-        likely,
+        subject, method, times, seen, actual, positions.planned, _rms(distance), float(distance.max()), shift,
+        1 + scale, tests, _likely_cause(tests, positions, bound, interval),
     )  # fmt: skip
 
 
-def _likely(
-    tests: tuple[Test, ...],
-    good: npt.NDArray[np.bool_],
-    times: Array,
-    seen: Array,
-    actual: Array,
-    bound: float,
-    interval: float,
-) -> str:
+def _likely_cause(tests: tuple[Test, ...], positions: Positions, bound: float, interval: float) -> str:
+    """What is wrong, in a line; empty if no test failed."""
     failed = {test.name for test in tests if test.passed is False}
     if "mark" in failed:
         return "the panes are too small: render the video larger, or with fewer of them"
     if failed & {"position", "time", "scale", "views agree"}:
-        return explain(np.flatnonzero(good), times, seen, actual, bound, interval)
-    reasons = {
+        visible = np.flatnonzero(np.isfinite(positions.seen).all(axis=1))
+        return diagnose(visible, positions.times, positions.seen, positions.actual, bound, interval)
+    causes = {
         "run": "the video is of another run, or this run's file is not what it was",
         "plan": "the plan in this file is not the one that the policy followed",
         "frames": "frames were cut from the video or added to it, or its speed was changed",
         "record": "the file's pictures and states are not of the same run",
         "seen": "something covers the robot, or it leaves the pictures",
     }
-    return "; ".join(reason for name, reason in reasons.items() if name in failed)
+    return "; ".join(cause for name, cause in causes.items() if name in failed)
 
 
 def _fit(error: Array, velocity: Array, actual: Array) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -16,21 +16,21 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.verify import ground_truth, pixels
 from lqrsim.verify.ground_truth import Progress
-from lqrsim.verify.verdict import Test, Verification, judge
+from lqrsim.verify.verdict import Positions, Test, Verification, compare
 from lqrsim.view import video_metadata
 from lqrsim.view.cameras import Camera
-from lqrsim.view.video_metadata import Pane
+from lqrsim.view.video_metadata import Pane, VideoMetadata
 
-BOUND = 1 / 35  # the worst error that is allowed, in radii of the robot: 8.6 and 4.9 mm for the packaged ones
-SAME = 1 / 350  # between what was recorded for drawing and the states
+POSITION_BOUND = 1 / 35  # the worst error that is allowed, in radii of the robot: 8.6 and 4.9 mm for the packaged ones
+RECORD_BOUND = 1 / 350  # between what was recorded for drawing and the states
 
 
 def run_beside(path: str | os.PathLike[str]) -> Path:
     """The rollout's file in the video's folder that the video says it shows. Raises InputError if there is none."""
-    told, folder = video_metadata.read(path), Path(path).parent
+    metadata, folder = video_metadata.read(path), Path(path).parent
     for found in sorted(folder.glob("*.npz")):
         with contextlib.suppress(InputError):  # a solution, or what is damaged
-            if video_metadata.digest(files.load_rollout(found)) in told.runs:
+            if video_metadata.digest(files.load_rollout(found)) in metadata.runs:
                 return found
     raise InputError(f"run: got none, and none in {folder} is what the video says it shows, want the run's file")
 
@@ -54,58 +54,74 @@ def verify_video(
     Raises:
       InputError: the file is not lqrsim's, or has not the panes that it takes.
     """
-    ground_truth.check_asked(solution, progress)
+    ground_truth.check_arguments(solution, progress)
     trial = None if trial is None else check_count("trial", trial, at_least=0)
-    told = video_metadata.read(path)
-    digest, plane = video_metadata.digest(rollout), rollout.state_coordinates.plane
-    run = told.runs.index(digest) if digest in told.runs else 0
-    panes = [pane for pane in told.panes if pane.run == run and pane.camera is not None]
+    metadata, plane = video_metadata.read(path), rollout.state_coordinates.plane
+    digest = video_metadata.digest(rollout)
+    run = metadata.runs.index(digest) if digest in metadata.runs else 0
+    panes = [pane for pane in metadata.panes if pane.run == run and pane.camera is not None]
     trial = (panes[0].trial if panes and panes[0].trial < rollout.trials else 0) if trial is None else trial
-    panes = [pane for pane in panes if pane.trial == trial] if digest in told.runs else panes
+    panes = [pane for pane in panes if pane.trial == trial] if digest in metadata.runs else panes
     views = [pane.camera for pane in panes if pane.camera is not None]
-    pixels.place(views, np.zeros((0, len(views), 2)), plane)  # says what is missing before it takes any time
-    model = ground_truth.model(rollout, trial)
-    seen: list[list[Array]] = []
-    amiss = 0.0  # seconds between when a frame is shown and when it should be, at most
+    pixels.triangulate(views, np.zeros((0, len(views), 2)), plane)  # says what is missing before it takes any time
+    model, radius = ground_truth.drawable_model(rollout, trial), metadata.markers[run]
+    measured: list[list[Array]] = []
+    off = 0.0  # seconds between when a frame is shown and when it should be, at most
     for time, image in _decoded(path):
-        amiss = max(amiss, abs(time - len(seen) / float(told.rate)))
-        seen.append([_mark(image, pane, view, told.markers[run]) for pane, view in zip(panes, views, strict=True)])
+        off = max(off, abs(time - len(measured) / float(metadata.rate)))
+        measured.append([_measure_marker(image, pane, view, radius) for pane, view in zip(panes, views, strict=True)])
         if progress:
-            progress(len(seen), told.frames)
-    count = min(len(seen), told.frames)
-    times = told.times()[:count]
-    places, apart = pixels.place(views, seen[:count], plane)
-    known, interval = digest in told.runs, 1 / float(told.rate)
-    size_of_mark = min(
-        np.pi * (told.markers[run] * pane.height / view.height) ** 2 for pane, view in zip(panes, views, strict=True)
+            progress(len(measured), metadata.frames)
+    count = min(len(measured), metadata.frames)
+    times = metadata.times()[:count]
+    seen, apart = pixels.triangulate(views, measured[:count], plane)
+    positions = Positions(
+        times,
+        seen=seen,
+        actual=ground_truth.frame_positions(rollout, trial, model, times),
+        planned=ground_truth.planned_positions(rollout, times),
+        apart=apart,
     )
+    areas = [np.pi * (radius * pane.height / view.height) ** 2 for pane, view in zip(panes, views, strict=True)]
     others = (
-        Test("run", known, f"the video says that it shows {', '.join(told.runs)}, this run is {digest}"),
+        *_check_file(metadata, digest, len(measured), off, min(areas)),
+        ground_truth.check_record(rollout, trial, model, RECORD_BOUND * rollout.radius),
+        ground_truth.check_plan(rollout, solution),
+    )
+    named = " and ".join(f"{view.name} ({pane.width} x {pane.height})" for pane, view in zip(panes, views, strict=True))
+    return compare(
+        f"{Path(path).name}, {ground_truth.describe(rollout, trial)}",
+        f"the green mark in its panes {named}",
+        positions,
+        bound=POSITION_BOUND * rollout.radius,
+        interval=metadata.speed * (1 / float(metadata.rate)),
+        others=others,
+    )
+
+
+def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, area: float) -> tuple[Test, ...]:
+    """Whether the file is of the run of that digest, with its frames at their times, and its marks large enough.
+
+    Args:
+      frames: that were decoded. off: seconds between when one is shown and when it should be, at most.
+      area: of the smallest mark, in pixels.
+    """
+    return (
+        Test(
+            "run",
+            digest in metadata.runs,
+            f"the video says that it shows {', '.join(metadata.runs)}, this run is {digest}",
+        ),
         Test(
             "frames",
-            len(seen) == told.frames and amiss < interval / 4,
-            f"got {len(seen)}, want the {told.frames} that were written; {1e3 * amiss:.1f} ms from their times at most",
+            frames == metadata.frames and off < 1 / float(metadata.rate) / 4,
+            f"got {frames}, want the {metadata.frames} that were written; {1e3 * off:.1f} ms from their times at most",
         ),
         Test(
             "mark",
-            size_of_mark >= pixels.FEWEST,
-            f"{size_of_mark:.0f} pixels in the pane where it is smallest, want {pixels.FEWEST} or more",
+            area >= pixels.FEWEST_PIXELS,
+            f"{area:.0f} pixels in the pane where it is smallest, want {pixels.FEWEST_PIXELS} or more",
         ),
-        ground_truth.consistent(rollout, trial, model, SAME * rollout.radius),
-        ground_truth.plan(rollout, solution),
-    )
-    spots = " and ".join(f"{view.name} ({pane.width} x {pane.height})" for pane, view in zip(panes, views, strict=True))
-    return judge(
-        f"{Path(path).name}, {ground_truth.subject(rollout, trial)}",
-        f"the green mark in its panes {spots}",
-        times,
-        places,
-        ground_truth.between(rollout, trial, model, times),
-        ground_truth.planned(rollout, times),
-        apart,
-        bound=BOUND * rollout.radius,
-        interval=told.speed * interval,
-        others=others,
     )
 
 
@@ -119,9 +135,9 @@ def _decoded(path: str | os.PathLike[str]) -> Iterator[tuple[float, npt.NDArray[
         raise InputError(f"video: got {path}, want one that can be read ({error})") from None
 
 
-def _mark(image: npt.NDArray[np.uint8], pane: Pane, view: Camera, radius: float) -> Array:
+def _measure_marker(image: npt.NDArray[np.uint8], pane: Pane, view: Camera, radius: float) -> Array:
     """What the view measures (2,) of the mark of that radius in metres."""
     part = image[pane.top : pane.top + pane.height, pane.left : pane.left + pane.width]
     if part.shape[:2] != (pane.height, pane.width):
         raise InputError(f"video: got frames of {image.shape[1]} x {image.shape[0]}, want them as lqrsim wrote them")
-    return view.measure(pixels.mark(part, radius * pane.height / view.height), (pane.width, pane.height))
+    return view.measure(pixels.marker_centre(part, radius * pane.height / view.height), (pane.width, pane.height))

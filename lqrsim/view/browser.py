@@ -32,39 +32,39 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.web import web_server
 
 from lqrsim.errors import InputError
-from lqrsim.view.viewer_base import PUSHES, Screen
+from lqrsim.view.viewer_base import PUSHES, Viewer
 
-TESTED = "4.0."  # MuJoCo's versions whose server is known
+TESTED_VERSION = "4.0."  # MuJoCo's versions whose server is known
 LOOPBACK = "127.0.0.1"
-NAMES = LOOPBACK, "localhost"  # that it may be called by
+HOST_NAMES = LOOPBACK, "localhost"  # that it may be called by
 # What it sends is for its own pages alone: no other page may read it, embed it, or show it in a frame.
-PRIVATE = {"Cross-Origin-Resource-Policy": "same-origin", "Content-Security-Policy": "frame-ancestors 'none'"}
-SHARED = "Access-Control-Allow-Origin"
-STARTING = 10.0  # s, that the server may take to start
-FORGOTTEN = 0.5  # s; a hand that is not heard of for so long has let go
+PRIVATE_HEADERS = {"Cross-Origin-Resource-Policy": "same-origin", "Content-Security-Policy": "frame-ancestors 'none'"}
+SHARING_HEADER = "Access-Control-Allow-Origin"
+START_TIMEOUT = 10.0  # s, that the server may take to start
+RELEASE_AFTER = 0.5  # s; a hand that is not heard of for so long has let go
 
 
-class _Situation(messages.Snapshot):
+class _SceneUpdate(messages.Snapshot):
     """From the simulation to the viewer: what to draw beside the model, and what to say."""
 
     def __init__(self, geoms: list[mujoco.MjvGeom], caption: str) -> None:
         self.geoms, self.caption = geoms, caption
 
 
-class _Push(messages.Event):
+class _KeyPress(messages.Event):
     """From the viewer to the simulation: a key was pressed."""
 
     def __init__(self, key: str, azimuth: float) -> None:
         self.key, self.azimuth = key, azimuth
 
 
-class _Drawing(plugin.ViewerPlugin):
+class _ViewerSide(plugin.ViewerPlugin):
     """The viewer's side."""
 
     studio: app.App
 
-    def __init__(self, screen: Screen, title: str) -> None:
-        self.screen, self.title, self.started = screen, title, threading.Event()
+    def __init__(self, owner: Viewer, title: str) -> None:
+        self.owner, self.title, self.started = owner, title, threading.Event()
 
     @messages.handler
     def on_app(self, event: app.InitEvent) -> None:
@@ -72,49 +72,49 @@ class _Drawing(plugin.ViewerPlugin):
         self.started.set()
 
     @messages.handler
-    def on_situation(self, event: _Situation) -> None:
+    def on_scene_update(self, event: _SceneUpdate) -> None:
         self.viewer.extra_geoms[:] = event.geoms
         self.studio.status = f"{self.title}: {event.caption}"
 
     @messages.handler(priority=0)  # after the viewer has set up its own
     def on_model(self, event: messages.PostModelEvent) -> None:
-        self.screen.aim(self.viewer.camera)
-        self.viewer.perturb.select = self.screen.robot
-        self.studio.step_control_state.set_speed(100 * self.screen.speed)
+        self.owner.aim_camera(self.viewer.camera)
+        self.viewer.perturb.select = self.owner.robot
+        self.studio.step_control_state.set_speed(100 * self.owner.speed)
 
     @messages.handler
     def on_update(self, event: messages.UpdateEvent) -> None:
         if not imgui.GetIO().WantCaptureKeyboard:
             for key in PUSHES:
                 if imgui.IsKeyChordPressed(getattr(imgui.Key, key)):
-                    self.viewer.send_to_sim(_Push(key, self.viewer.camera.azimuth))
+                    self.viewer.send_to_sim(_KeyPress(key, self.viewer.camera.azimuth))
 
 
-class _Hand(plugin.SimPlugin):
-    """The simulation's side: what the person does reaches the screen, and nothing reaches anything else."""
+class _SimulationSide(plugin.SimPlugin):
+    """The simulation's side: what the person does reaches the Browser, and nothing reaches anything else."""
 
-    def __init__(self, screen: Screen) -> None:
-        self.screen, self.heard = screen, 0.0
+    def __init__(self, owner: Viewer) -> None:
+        self.owner, self.last_drag = owner, 0.0
 
     @messages.handler(priority=messages.Priority.CRITICAL)
-    def on_push(self, event: _Push) -> None:
-        self.screen.push(PUSHES[event.key], event.azimuth)
+    def on_key_press(self, event: _KeyPress) -> None:
+        self.owner.push(PUSHES[event.key], event.azimuth)
 
     @messages.handler(priority=messages.Priority.CRITICAL)
     def on_perturb(self, event: messages.PerturbSnapshot) -> bool:
-        self.heard = time.monotonic()
-        self.screen.pull(event.state)
+        self.last_drag = time.monotonic()
+        self.owner.drag(event.state)
         return True
 
     @messages.handler(priority=messages.Priority.CRITICAL)
     def on_reset(self, event: messages.ResetEvent) -> bool:
-        self.screen.restart()
+        self.owner.request_restart()
         return True
 
     @messages.handler(priority=messages.Priority.CRITICAL)
     def on_control(self, event: messages.StepControlSnapshot) -> bool:
-        self.screen.paused = event.pause_state != sim.PauseState.UNPAUSED
-        self.screen.speed = max(event.speed / 100, 0.001)
+        self.owner.paused = event.pause_state != sim.PauseState.UNPAUSED
+        self.owner.speed = max(event.speed / 100, 0.001)
         return True
 
     @messages.handler(priority=messages.Priority.CRITICAL)
@@ -127,16 +127,16 @@ class _Hand(plugin.SimPlugin):
 
     @messages.handler
     def on_step(self, event: messages.StepEvent) -> None:
-        if time.monotonic() - self.heard > FORGOTTEN:
-            self.screen.pull(np.zeros(6))
+        if time.monotonic() - self.last_drag > RELEASE_AFTER:
+            self.owner.drag(np.zeros(6))
 
 
-class Browser(Screen):
+class Browser(Viewer):
     """A viewer in a browser. Use it with `with`: its server runs as long as the block. One in a process: MuJoCo's user
     interface is global, and a second one may crash.
 
     Args:
-      port: 0 takes the first free one from 8080 on. title: of the page. The others are those of a Screen.
+      port: 0 takes the first free one from 8080 on. title: of the page. The others are those of a Viewer.
 
     Attributes:
       port: that it listens on.
@@ -147,17 +147,17 @@ class Browser(Screen):
 
     def __init__(self, *arguments: Any, port: int = 0, title: str = "", **options: Any) -> None:
         super().__init__(*arguments, **options)
-        if not mujoco.__version__.startswith(TESTED):
-            known = f"{TESTED}x, whose server is known to keep to this machine"
+        if not mujoco.__version__.startswith(TESTED_VERSION):
+            known = f"{TESTED_VERSION}x, whose server is known to keep to this machine"
             raise InputError(f"browser: got MuJoCo {mujoco.__version__}, want {known}; or a display, for a window")
-        drawing = _Drawing(self, title)
+        viewer_side = _ViewerSide(self, title)
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
         layout = app.Config(show_inspector=False)
         sockets: list[socket.socket] = []
         with _on_loopback(sockets):
-            self._handle = launch_web.launch(config, plugins=[app.App(layout), drawing, _Hand(self)])
+            self._handle = launch_web.launch(config, plugins=[app.App(layout), viewer_side, _SimulationSide(self)])
             try:
-                while not drawing.started.wait(0.02):
+                while not viewer_side.started.wait(0.02):
                     self._handle.is_running()  # raises what the viewer's thread did
                 self.port = sockets[0].getsockname()[1] if sockets else port
                 _check_private(self.port)
@@ -175,7 +175,7 @@ class Browser(Screen):
         self._handle.close()
 
     @property
-    def where(self) -> str:
+    def instructions(self) -> str:
         """How to get there."""
         tunnel = f"ssh -L {self.port}:{LOOPBACK}:{self.port} THIS-MACHINE"
         return (
@@ -196,14 +196,24 @@ class Browser(Screen):
             geoms.append(mujoco.MjvGeom())
             return geoms[-1]
 
-        self.draw(new)
-        self._handle.send_to_viewer(_Situation(geoms, self.caption))
+        self.draw_overlays(new)
+        self._handle.send_to_viewer(_SceneUpdate(geoms, self.caption))
         return place
 
 
 @contextlib.contextmanager
 def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
     """While it lasts, MuJoCo's server is made to listen on loopback only, to take no files, and to admit its own pages.
+
+    Three functions of MuJoCo are replaced. None has an option in 4.0; what happens without each was tried with 4.0.0:
+
+    - `web_server.bind_public_socket`: the viewer passes `::` to it. The server then answers at 127.0.0.2, ::1 and the
+      machine's addresses in the network.
+    - `web_server.serve`, whose handlers it wraps: a page of another site then opens the WebSockets /state and /drop,
+      which takes models; a request that calls the server by another name gets the model; and an answer may be read by
+      any page (Access-Control-Allow-Origin).
+    - `web_viewer._print_url_banner`: it then prints an address in the network, where nothing answers, and warns that
+      others can connect.
 
     Args:
       sockets: gets what it listens on.
@@ -228,7 +238,7 @@ def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
             return process_request(connection, request)
 
         def answer(connection: Any, request: Any, response: Any) -> Any:
-            return _private(process_response(connection, request, response) or response)
+            return _with_private_headers(process_response(connection, request, response) or response)
 
         return serve(handler, process_request=admit, process_response=answer, **options)
 
@@ -244,7 +254,7 @@ def _on_loopback(sockets: list[socket.socket]) -> Iterator[None]:
 def _refusal(request: Any, port: int) -> str:
     """Why a request is refused; empty if it is not."""
     hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
-    ours = [f"{name}:{port}" for name in NAMES] + (list(NAMES) if port == 80 else [])
+    ours = [f"{name}:{port}" for name in HOST_NAMES] + (list(HOST_NAMES) if port == 80 else [])
     if len(hosts) != 1 or hosts[0] not in ours:
         return f"this server is called {' or '.join(ours)}"
     if origins and origins != [f"http://{hosts[0]}"]:
@@ -252,24 +262,24 @@ def _refusal(request: Any, port: int) -> str:
     return "no files are taken" if request.path.split("?")[0] == "/drop" else ""
 
 
-def _private(response: Any) -> Any:
+def _with_private_headers(response: Any) -> Any:
     """The response as no other page may use it."""
-    for name in (SHARED, *PRIVATE):
+    for name in (SHARING_HEADER, *PRIVATE_HEADERS):
         if name in response.headers:
             del response.headers[name]
-    response.headers.update(PRIVATE)
+    response.headers.update(PRIVATE_HEADERS)
     return response
 
 
 def _check_private(port: int) -> None:
     """Raises InputError unless the server answers on loopback, and at no other address of this machine."""
-    until = time.monotonic() + STARTING
-    while not _answers(LOOPBACK, port):  # it is started on a thread of its own
+    until = time.monotonic() + START_TIMEOUT
+    while not _listens(LOOPBACK, port):  # it is started on a thread of its own
         if time.monotonic() > until:
             raise InputError(f"browser: got a server that does not answer at {LOOPBACK}:{port}, want one that does")
         time.sleep(0.02)
     for address in _other_addresses():
-        if _answers(address, port):
+        if _listens(address, port):
             raise InputError(f"browser: got a server that others can reach at {address}, port {port}; it was closed")
     here = f"{LOOPBACK}:{port}"
     for path, host, origin in (
@@ -279,11 +289,11 @@ def _check_private(port: int) -> None:
         ("/", f"example.org:{port}", None),
         ("/model", f"example.org:{port}", None),
     ):
-        if _asked(path, host, origin, port)[0] != http.HTTPStatus.FORBIDDEN:
+        if _request(path, host, origin, port)[0] != http.HTTPStatus.FORBIDDEN:
             who = origin or f"http://{host}"
             raise InputError(f"browser: got a server that lets {who} in to {path}, port {port}; it was closed")
     for path in ("/", "/model"):
-        if _asked(path, here, None, port)[1]:
+        if _request(path, here, None, port)[1]:
             raise InputError(f"browser: got a server that lets any page read {path}, port {port}; it was closed")
 
 
@@ -299,9 +309,9 @@ def _other_addresses() -> list[str]:
     return sorted(found - {LOOPBACK})
 
 
-def _asked(path: str, host: str, origin: str | None, port: int) -> tuple[int, bool]:
+def _request(path: str, host: str, origin: str | None, port: int) -> tuple[int, bool]:
     """The status of an answer, and whether other pages may read it; with an origin, to the opening of a WebSocket."""
-    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=STARTING)
+    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=START_TIMEOUT)
     with contextlib.closing(connection):
         headers = {"Host": host}
         if origin is not None:
@@ -309,10 +319,10 @@ def _asked(path: str, host: str, origin: str | None, port: int) -> tuple[int, bo
             headers |= {"Connection": "Upgrade", "Upgrade": "websocket", "Origin": origin, **key}
         connection.request("GET", path, headers=headers)
         answer = connection.getresponse()
-        return answer.status, answer.getheader(SHARED) is not None
+        return answer.status, answer.getheader(SHARING_HEADER) is not None
 
 
-def _answers(address: str, port: int) -> bool:
+def _listens(address: str, port: int) -> bool:
     try:
         socket.create_connection((address, port), timeout=1.0).close()
     except OSError:

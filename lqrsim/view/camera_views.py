@@ -10,17 +10,19 @@ from lqrsim.errors import Array, check_name
 from lqrsim.view import cameras
 from lqrsim.view.cameras import Camera
 from lqrsim.view.options import CALIBRATED, VIEWS
-from lqrsim.view.track import Track
+from lqrsim.view.recorded_trial import RecordedTrial
 
-WIDE = 1.7  # models' overviews are made for pictures of 16 : 9; in narrower ones they would cut off both sides
+OVERVIEW_ASPECT = (
+    1.7  # models' overviews are made for pictures of 16 : 9; in narrower ones they would cut off both sides
+)
 OBLIQUE = np.array([0.30, 0.75, -0.60])  # where an overview looks, in a scene without one
-LENS = 40.0  # degrees, of cameras that are not the model's
+FIELD_OF_VIEW = 40.0  # degrees, of cameras that are not the model's
 DISTANCE, HEIGHT = 11.0, 4.5  # of the one that follows, in robots' radii
-EASE = 0.8  # seconds over which it turns
+TURN_SECONDS = 0.8  # seconds over which it turns
 
 
 @dataclass(frozen=True)
-class Shot:
+class CameraView:
     """A view of one trial.
 
     Attributes:
@@ -32,50 +34,52 @@ class Shot:
     camera: Camera | None = None
 
 
-def shot(name: str, track: Track, aspect: float) -> Shot:
+def camera_view(name: str, recorded: RecordedTrial, aspect: float) -> CameraView:
     """The view of that name in a pane of width / height `aspect`: one of VIEWS, or another camera of the model.
 
     Raises:
       InputError: there is none of that name.
     """
-    model, own = track.model, _own(track)
-    check_name("camera", name, [*VIEWS, *(other for other in own if other not in VIEWS)])
+    model, of_model = recorded.model, _model_cameras(recorded)
+    check_name("camera", name, [*VIEWS, *(other for other in of_model if other not in VIEWS)])
     if name in CALIBRATED:
-        camera = (cameras.top if name == "top" else cameras.side)(track.rollout, aspect)
-        return Shot(lambda scene, data, time: camera.place(scene, aspect), camera)
+        camera = (cameras.top if name == "top" else cameras.side)(recorded.rollout, aspect)
+        return CameraView(lambda scene, data, time: camera.place(scene, aspect), camera)
     if name == "chase":
-        return _chase(track)
-    if name == "overview" and (aspect < WIDE or name not in own):
-        return _overview(track, model.camera(name).id if name in own else None, aspect)
+        return _chase(recorded)
+    if name == "overview" and (aspect < OVERVIEW_ASPECT or name not in of_model):
+        return _overview(recorded, model.camera(name).id if name in of_model else None, aspect)
     view = mujoco.MjvCamera()
     view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED.value, model.camera(name).id
-    return Shot(lambda scene, data, time: mujoco.mjv_updateCamera(model, data, view, scene))
+    return CameraView(lambda scene, data, time: mujoco.mjv_updateCamera(model, data, view, scene))
 
 
-def leaves_room(name: str, track: Track, aspect: float) -> bool:
+def leaves_room_for_captions(name: str, recorded: RecordedTrial, aspect: float) -> bool:
     """Whether captions may lie over a view: it is wide, and not made to fit what it shows."""
-    return aspect >= WIDE and name not in CALIBRATED and (name == "chase" or name in _own(track))
+    return (
+        aspect >= OVERVIEW_ASPECT and name not in CALIBRATED and (name == "chase" or name in _model_cameras(recorded))
+    )
 
 
-def _own(track: Track) -> list[str]:
+def _model_cameras(recorded: RecordedTrial) -> list[str]:
     """The names of the model's cameras."""
-    names = (track.model.camera(number).name for number in range(track.model.ncam))
+    names = (recorded.model.camera(number).name for number in range(recorded.model.ncam))
     return [name for name in names if name]
 
 
-def _overview(track: Track, like: int | None, aspect: float) -> Shot:
+def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> CameraView:
     """All of the run and what is around it, looked at as a camera of the model does."""
-    model, data = track.model, mujoco.MjData(track.model)
-    track.pose(data, 0.0)
-    forward, lens = OBLIQUE / np.linalg.norm(OBLIQUE), LENS
+    model, data = recorded.model, mujoco.MjData(recorded.model)
+    recorded.pose(data, 0.0)
+    forward, field_of_view = OBLIQUE / np.linalg.norm(OBLIQUE), FIELD_OF_VIEW
     right = np.cross(forward, [0.0, 0.0, 1.0])
     if like is not None and model.cam_projection[like] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE.value:
-        axes, lens = data.cam_xmat[like].reshape(3, 3), float(model.cam_fovy[like])
+        axes, field_of_view = data.cam_xmat[like].reshape(3, 3), float(model.cam_fovy[like])
         right, forward = axes[:, 0], -axes[:, 2]
     right = right / np.linalg.norm(right)
-    up, points = np.cross(right, forward), _around(track, data)
+    up, points = np.cross(right, forward), _extent_points(recorded, data)
     # From where every point is within both angles: as far back as the worst of each side asks for.
-    rise = np.tan(np.radians(lens) / 2) * 0.96
+    rise = np.tan(np.radians(field_of_view) / 2) * 0.96
     middle = points.mean(axis=0)
     back = 0.0
     for _ in range(20):  # each centres what the one before saw
@@ -86,14 +90,14 @@ def _overview(track: Track, like: int | None, aspect: float) -> Shot:
         shift = 0.5 * back * np.array([x.max() + x.min(), y.max() + y.min()])
         middle = middle + shift[0] * right + shift[1] * up
     eye = middle - back * forward
-    return Shot(lambda scene, data, time: _look(scene, model, eye, forward, up, lens))
+    return CameraView(lambda scene, data, time: _set_perspective(scene, model, eye, forward, up, field_of_view))
 
 
-def _around(track: Track, data: mujoco.MjData) -> Array:
+def _extent_points(recorded: RecordedTrial, data: mujoco.MjData) -> Array:
     """Points (k, 3): corners of what is drawn and does not move, as far as it is near the run, and the run."""
-    model, run = track.model, np.vstack([track.driven(track.times), track.planned(track.rollout.times)])
+    model, run = recorded.model, np.vstack([recorded.driven(recorded.times), recorded.planned(recorded.rollout.times)])
     low, high = run.min(axis=0), run.max(axis=0)
-    margin = 0.4 * float(np.linalg.norm(high - low)) + 2 * track.rollout.radius
+    margin = 0.4 * float(np.linalg.norm(high - low)) + 2 * recorded.rollout.radius
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     corners = [run]
     for geom in np.flatnonzero((model.body_weldid[model.geom_bodyid] == 0) & (model.geom_group < 3)):
@@ -105,17 +109,17 @@ def _around(track: Track, data: mujoco.MjData) -> Array:
     return np.vstack(corners)
 
 
-def _chase(track: Track) -> Shot:
+def _chase(recorded: RecordedTrial) -> CameraView:
     """From behind and above; it turns smoothly, for it knows where the plan goes."""
-    times = np.linspace(0, track.end, max(int(20 * track.end), 2))
-    planned, driven = track.planned(times), track.driven(times)
+    times = np.linspace(0, recorded.end, max(int(20 * recorded.end), 2))
+    planned, driven = recorded.planned(times), recorded.driven(times)
     motion = np.gradient(planned, times, axis=0)[:, :2]
-    # Without a direction of its own, as at rest or straight up, it is that of the whole way.
+    # Without a direction of its of_model, as at rest or straight up, it is that of the whole way.
     motion += 1e-3 * (planned[-1] - planned[0])[:2] + [1e-9, 0.0]
-    direction = _smooth(motion, times, EASE)
+    direction = _smooth(motion, times, TURN_SECONDS)
     azimuth = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
-    middle = _smooth(driven, times, 0.25 * EASE)
-    radius = track.rollout.radius
+    middle = _smooth(driven, times, 0.25 * TURN_SECONDS)
+    radius = recorded.rollout.radius
 
     def place(scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
         angle = np.interp(time, times, azimuth)
@@ -125,9 +129,11 @@ def _chase(track: Track) -> Shot:
         forward = at + 2 * radius * behind - eye
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, [0.0, 0.0, 1.0])
-        _look(scene, track.model, eye, forward, np.cross(right / np.linalg.norm(right), forward), LENS)
+        _set_perspective(
+            scene, recorded.model, eye, forward, np.cross(right / np.linalg.norm(right), forward), FIELD_OF_VIEW
+        )
 
-    return Shot(place)
+    return CameraView(place)
 
 
 def _smooth(values: Array, times: Array, width: float) -> Array:
@@ -136,12 +142,14 @@ def _smooth(values: Array, times: Array, width: float) -> Array:
     return weights @ values / weights.sum(axis=1, keepdims=True)
 
 
-def _look(scene: mujoco.MjvScene, model: mujoco.MjModel, eye: Array, forward: Array, up: Array, lens: float) -> None:
-    """Makes a scene one that is seen from a point, through a lens of that many degrees from bottom to top."""
+def _set_perspective(
+    scene: mujoco.MjvScene, model: mujoco.MjModel, eye: Array, forward: Array, up: Array, field_of_view: float
+) -> None:
+    """Makes a scene one that is seen from a point; the field of view is in degrees from bottom to top."""
     near = model.vis.map.znear * model.stat.extent
     for camera in scene.camera:
         camera.pos, camera.forward, camera.up, camera.orthographic = eye, forward, up, 0
         camera.frustum_near, camera.frustum_far = near, model.vis.map.zfar * model.stat.extent
-        camera.frustum_top = near * np.tan(np.radians(lens) / 2)
+        camera.frustum_top = near * np.tan(np.radians(field_of_view) / 2)
         camera.frustum_bottom, camera.frustum_center = -camera.frustum_top, 0
         camera.frustum_width = 0  # as wide as the pane

@@ -2,7 +2,7 @@
 
 They are orthographic, as on an engineering drawing: a metre is as many pixels wherever it is seen. So the middle of a
 ball's pixels is its centre, exactly, at any distance and anywhere in the picture; and where a camera stands along its
-line of sight does not matter, so that it can not be wrong either.
+line of sight does not matter, so that it cannot be wrong either.
 """
 
 from collections.abc import Mapping

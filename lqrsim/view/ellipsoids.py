@@ -9,14 +9,14 @@ from lqrsim.errors import Array
 from lqrsim.results.solution import Solution
 
 SIGMAS = 2.0  # of the ellipsoids
-ABOVE = SIGMAS**2 / 2  # the total cost on them, above its least
+COST_ABOVE_LEAST = SIGMAS**2 / 2  # the total cost on them, above its least
 
 
 def ellipsoids(solution: Solution, states: Sequence[int], knots: npt.NDArray[np.int64]) -> tuple[Array, Array, Array]:
     """Centres (k, d), half axes (k, d) and rotations (k, d, d) of the ellipsoids of d of the states.
 
-    Of all states whose total cost is at most `ABOVE` its least, these are what those d can be: what is an ellipsoid of
-    the whole state casts one on them, with that block of the covariance.
+    Of all states whose total cost is at most its least plus `COST_ABOVE_LEAST`, these are what those d can be: what is
+    an ellipsoid of the whole state casts one on them, with that block of the covariance.
 
     Raises:
       InputError: the solution has no total cost.

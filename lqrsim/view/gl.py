@@ -1,7 +1,7 @@
 """An OpenGL context that needs no display, bound when the first picture is drawn.
 
 On Linux MuJoCo chooses its OpenGL while it is imported and takes the one that needs a display, unless MUJOCO_GL names
-another; with MUJOCO_GL=egl and no EGL library it can not even be imported. So nothing is chosen ahead of time: EGL, or
+another; with MUJOCO_GL=egl and no EGL library it cannot even be imported. So nothing is chosen ahead of time: EGL, or
 else OSMesa, is put in place once MuJoCo is there and a library is found. macOS and Windows bring their own OpenGL.
 """
 

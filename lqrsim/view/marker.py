@@ -6,7 +6,7 @@ import numpy as np
 from lqrsim.errors import Array
 from lqrsim.results.rollout import Rollout
 from lqrsim.view.cameras import Camera
-from lqrsim.view.decor import decorate
+from lqrsim.view.decorative_geoms import decorate
 
 # Pure green: the error map, the plan, forces, robots and scenes do not use it. All of its light is its own and its
 # channels are at their ends, so that it looks the same in the sun and in the shade.

@@ -11,13 +11,13 @@ from mujoco import mjtGeom as Geom
 from lqrsim.errors import Array, InputError
 from lqrsim.results.solution import Solution
 from lqrsim.view import text_tiles
-from lqrsim.view.decor import PLAN, decorate
-from lqrsim.view.ellipsoids import ABOVE, SIGMAS, ellipsoids
+from lqrsim.view.decorative_geoms import PLAN_RGB, decorate
+from lqrsim.view.ellipsoids import COST_ABOVE_LEAST, SIGMAS, ellipsoids
 from lqrsim.view.options import Overlay
+from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.text_tiles import Colour
-from lqrsim.view.track import Track
 
-# As PLAN, no colours of the error map, and none of the robots.
+# As PLAN_RGB, no colours of the error map, and none of the robots.
 FORCE = (0.0, 0.50, 0.36)
 MEASURED = (0.10, 0.10, 0.12)
 TUBE = (0.47, 0.30, 0.78)
@@ -40,10 +40,10 @@ class Scale:
     force: float
 
 
-def scale(tracks: Sequence[Track]) -> Scale:
+def common_scale(recordings: Sequence[RecordedTrial]) -> Scale:
     """One for all of them, and all of their time."""
-    error = max(float(track.error.max()) for track in tracks)
-    force = max(float(np.linalg.norm(track.force, axis=1).max()) for track in tracks)
+    error = max(float(recorded.error.max()) for recorded in recordings)
+    force = max(float(np.linalg.norm(recorded.force, axis=1).max()) for recorded in recordings)
     return Scale(_round_up(max(error, 0.01)), force)
 
 
@@ -58,60 +58,62 @@ class Overlays:
       InputError: the solution is not that of the run, or has no total cost.
     """
 
-    def __init__(self, track: Track, solution: Solution | None, show: Sequence[Overlay], scale: Scale) -> None:
-        self.track, self.show, self.scale = track, set(show), scale
-        self.width = 0.0035 * track.model.stat.extent
-        steps = track.rollout.plan.steps
+    def __init__(
+        self, recorded: RecordedTrial, solution: Solution | None, show: Sequence[Overlay], scale: Scale
+    ) -> None:
+        self.recorded, self.show, self.scale = recorded, set(show), scale
+        self.width = 0.0035 * recorded.model.stat.extent
+        steps = recorded.rollout.plan.steps
         knots = np.unique(np.linspace(0, steps, min(steps, SEGMENTS) + 1).astype(int))
-        self.knots = track.rollout.times[knots]
-        self.plan, self.trace = track.planned(self.knots), track.driven(self.knots)
-        self.errors = np.interp(self.knots, track.times, track.error)
-        self.measured = track.places(track.measured, track.times, track.times)
-        if np.array_equal(track.measured, track.states):
+        self.knots = recorded.rollout.times[knots]
+        self.plan, self.trace = recorded.planned(self.knots), recorded.driven(self.knots)
+        self.errors = np.interp(self.knots, recorded.times, recorded.error)
+        self.measured = recorded.positions(recorded.measured, recorded.times, recorded.times)
+        if np.array_equal(recorded.measured, recorded.states):
             self.show.discard("measured")
         if scale.force < 1e-6:
             self.show.discard("forces")
-        self.tube = _tube(track, solution) if "tube" in self.show and solution is not None else None
+        self.tube = _tube(recorded, solution) if "tube" in self.show and solution is not None else None
 
-    def legend(self) -> list[tuple[str, Colour]]:
+    def legend_entries(self) -> list[tuple[str, Colour]]:
         """What the colours mean, but for those of the trace."""
         entries = {
-            "plan": ("planned", PLAN),
+            "plan": ("planned", PLAN_RGB),
             "forces": (f"force, longest {self.scale.force:.2g} N", FORCE),
             "measured": ("measured", MEASURED),
         }
         found = [entry for overlay, entry in entries.items() if overlay in self.show]
         if self.tube is not None:
-            found.append((f"{SIGMAS:g} sigma: total cost ≤ least + {ABOVE:g}", TUBE))
+            found.append((f"{SIGMAS:g} sigma: total cost ≤ least + {COST_ABOVE_LEAST:g}", TUBE))
         return found
 
     def draw(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
         """Appends the geoms of a moment to the scene; `data` is posed as it was then."""
-        pen, track = _Pen(scene, flat=self.track.planar), self.track
-        lift = np.array([0.0, 0.0, LIFT if track.planar else 0.0])
+        pen, recorded = _Pen(scene, flat=self.recorded.planar), self.recorded
+        lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
         if self.tube is not None:
             for centre, sizes, rotation in zip(*self.tube, strict=True):
                 pen.add(Geom.mjGEOM_ELLIPSOID, centre + 0.5 * lift, sizes, (*TUBE, 0.14), rotation)
         if "trace" in self.show:
             done = int(np.searchsorted(self.knots, time, side="right"))
-            points = np.vstack([self.trace[:done], track.driven(time)])
-            errors = np.append(self.errors[:done], track.number_at(track.error, time))
+            points = np.vstack([self.trace[:done], recorded.driven(time)])
+            errors = np.append(self.errors[:done], recorded.interpolate(recorded.error, time))
             colours = text_tiles.error_colours(0.5 * (errors[1:] + errors[:-1]) / self.scale.error)
-            pen.ribbon(points + lift, (2.6 if track.planar else 1.1) * self.width, colours)
+            pen.ribbon(points + lift, (2.6 if recorded.planar else 1.1) * self.width, colours)
         if "plan" in self.show:
-            colours = np.tile((*PLAN, 1.0), (len(self.plan) - 1, 1))
+            colours = np.tile((*PLAN_RGB, 1.0), (len(self.plan) - 1, 1))
             pen.ribbon(self.plan + 2 * lift, 0.8 * self.width, colours)
         if "measured" in self.show:
-            seen = int(np.searchsorted(track.times, time, side="right"))
+            seen = int(np.searchsorted(recorded.times, time, side="right"))
             for place in self.measured[max(seen - DOTS, 0) : seen]:
-                height = 0.2 * LIFT if track.planar else self.width
+                height = 0.2 * LIFT if recorded.planar else self.width
                 pen.add(Geom.mjGEOM_BOX, place + 3 * lift, [self.width, self.width, height], (*MEASURED, 1.0))
         if "ghost" in self.show:
-            wanted, radius = track.planned(time), track.rollout.radius
-            if track.planar:
-                pen.add(Geom.mjGEOM_CYLINDER, wanted + 3 * lift, [radius, LIFT, 0], (*PLAN, 0.35))
+            wanted, radius = recorded.planned(time), recorded.rollout.radius
+            if recorded.planar:
+                pen.add(Geom.mjGEOM_CYLINDER, wanted + 3 * lift, [radius, LIFT, 0], (*PLAN_RGB, 0.35))
             else:
-                pen.add(Geom.mjGEOM_SPHERE, wanted, [radius] * 3, (*PLAN, 0.10))
+                pen.add(Geom.mjGEOM_SPHERE, wanted, [radius] * 3, (*PLAN_RGB, 0.10))
 
     def draw_force(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
         """Appends the arrow of what disturbs the robot, as one camera is to see it.
@@ -121,15 +123,15 @@ class Overlays:
         """
         if "forces" not in self.show:
             return
-        track, forward = self.track, np.array(scene.camera[0].forward, dtype=np.float64)
-        force, radius = track.force_at(time), track.rollout.radius
+        recorded, forward = self.recorded, np.array(scene.camera[0].forward, dtype=np.float64)
+        force, radius = recorded.force_at(time), recorded.rollout.radius
         strength, width = float(np.linalg.norm(force)), max(0.1 * radius, 1.5 * self.width)
         length = 4 * radius * strength / self.scale.force
         if length < 2 * width or abs(force @ forward) > END_ON * strength:
             return
         direction = force / strength
-        start = data.xpos[track.robot] + radius * direction
-        arrow = _Pen(scene, flat=track.planar).add(Geom.mjGEOM_ARROW, start, [1, 1, 1], (*FORCE, 1.0))
+        start = data.xpos[recorded.robot] + radius * direction
+        arrow = _Pen(scene, flat=recorded.planar).add(Geom.mjGEOM_ARROW, start, [1, 1, 1], (*FORCE, 1.0))
         mujoco.mjv_connector(arrow, Geom.mjGEOM_ARROW, width, start, start + length * direction)
 
 
@@ -161,12 +163,12 @@ class _Pen:
             self.add(Geom.mjGEOM_BOX, centres[number], size, colours[number], rotations[number])
 
 
-def _tube(track: Track, solution: Solution) -> tuple[Array, Array, Array]:
+def _tube(recorded: RecordedTrial, solution: Solution) -> tuple[Array, Array, Array]:
     """Centres (k, 3), half axes (k, 3) and rotations (k, 3, 3) of the ellipsoids along the plan."""
-    if not np.array_equal(solution.trajectory.states, track.rollout.plan.states):
+    if not np.array_equal(solution.trajectory.states, recorded.rollout.plan.states):
         raise InputError("solution: got one with another plan than that of the run, want the one that was executed")
-    knots = np.unique(np.linspace(0, track.rollout.plan.steps, ELLIPSOIDS).astype(np.int64))
-    space = track.rollout.state_coordinates
+    knots = np.unique(np.linspace(0, recorded.rollout.plan.steps, ELLIPSOIDS).astype(np.int64))
+    space = recorded.rollout.state_coordinates
     size, count = len(space.position), len(knots)
     places, lengths, turns = ellipsoids(solution, space.position, knots)
     half_axes, rotations = np.full((count, 3), 0.1 * LIFT), np.zeros((count, 3, 3))
@@ -174,7 +176,7 @@ def _tube(track: Track, solution: Solution) -> tuple[Array, Array, Array]:
     rotations[:, list(space.world_axes), :size] = turns
     if size == 2:  # what is flat is thin across
         rotations[:, :, 2] = np.cross(rotations[:, :, 0], rotations[:, :, 1])
-    return space.in_world(places, height=track.floor), half_axes, rotations
+    return space.in_world(places, height=recorded.floor), half_axes, rotations
 
 
 def _round_up(value: float) -> float:

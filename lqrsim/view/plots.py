@@ -14,7 +14,7 @@ from lqrsim.results.records import Trajectory
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenes.world import World
-from lqrsim.view import scenery, style
+from lqrsim.view import obstacle_plots, style
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 
 
@@ -29,7 +29,7 @@ def plot_run(
       trial: row of each rollout.
 
     Raises:
-      InputError: the rollouts are of other systems, or the file can not be written.
+      InputError: the rollouts are of other systems, or the file cannot be written.
     """
     _check(solution, rollouts, trial, world)
     with style.figure(path, size=(11, 7.5)) as figure:
@@ -87,7 +87,9 @@ def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
     places = np.vstack([points for *_, points in paths])
     space = solution.policy.state_coordinates
     flat = world.seen_by(space.plane, space.offset)
-    scenery.draw_in_plane(axes, flat, *scenery.bounds(places, flat, 1.5 * radius), radius, plane=space.plane)
+    obstacle_plots.draw_in_plane(
+        axes, flat, *obstacle_plots.bounds(places, flat, 1.5 * radius), radius, plane=space.plane
+    )
     for name, color, line, points in paths:
         axes.plot(*points.T, line, color=color, label=name)
     plan = paths[-1][-1]
@@ -98,7 +100,9 @@ def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
 
 def _path_in_space(axes: Axes3D, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
     paths = _paths(solution, rollouts, trial)
-    scenery.draw_in_space(axes, world, *scenery.bounds(np.vstack([points for *_, points in paths]), world))
+    obstacle_plots.draw_in_space(
+        axes, world, *obstacle_plots.bounds(np.vstack([points for *_, points in paths]), world)
+    )
     for name, color, line, points in paths:
         axes.plot(*points.T, line, color=color, label=name)
     plan = paths[-1][-1]

@@ -13,8 +13,8 @@ from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.scenes.world import World
-from lqrsim.view import scenery, style
-from lqrsim.view.ellipsoids import ABOVE, SIGMAS, outlines
+from lqrsim.view import obstacle_plots, style
+from lqrsim.view.ellipsoids import COST_ABOVE_LEAST, SIGMAS, outlines
 from lqrsim.view.style import PLAN, RUNS
 
 TUBE, OUTLINE = "#d5c8ec", "#7a4dc7"
@@ -32,7 +32,7 @@ def plot_policy(solution: Solution, path: str | os.PathLike[str], *, world: Worl
       world: the obstacles, as the scene has them. radius: of the robot, in metres.
 
     Raises:
-      InputError: the solution has no policy or no position, or the file can not be written.
+      InputError: the solution has no policy or no position, or the file cannot be written.
     """
     check_kind("solution", solution, Solution, "a Solution")
     check_kind("world", world, World, "a World, such as scene.world")
@@ -75,16 +75,18 @@ def _tube(axes: Axes, solution: Solution, world: World, radius: float, plane: tu
     if len(position) == 2:
         space = solution.policy.state_coordinates
         flat = world.seen_by(space.plane, space.offset)
-        scenery.draw_in_plane(axes, flat, *scenery.bounds(plan, flat, 1.5 * radius), radius, plane=space.plane)
+        obstacle_plots.draw_in_plane(
+            axes, flat, *obstacle_plots.bounds(plan, flat, 1.5 * radius), radius, plane=space.plane
+        )
         axes.set_title("tube (pale: closer than the robot's radius)")
     else:
-        scenery.draw_projected(axes, world, *scenery.bounds(plan, world, 1.5 * radius), *plane)
+        obstacle_plots.draw_projected(axes, world, *obstacle_plots.bounds(plan, world, 1.5 * radius), *plane)
         axes.set_title(f"tube, from {'above' if plane == (0, 1) else 'the side'}")
     if solution.cost_to_come is not None:
         steps = solution.trajectory.steps
         every = outlines(solution, states, np.arange(steps + 1))
         some = every[np.unique(np.linspace(0, steps, OUTLINES).astype(int))]
-        label = f"{SIGMAS:g} sigma: total cost at most {ABOVE:g} above its least"
+        label = f"{SIGMAS:g} sigma: total cost at most {COST_ABOVE_LEAST:g} above its least"
         axes.add_collection(PolyCollection(list(every), facecolors=TUBE, edgecolors="none", zorder=1.5, label=label))
         axes.add_collection(
             PolyCollection(list(some), facecolors="none", edgecolors=OUTLINE, linewidths=0.6, zorder=2.5)

@@ -14,14 +14,14 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.view import video_metadata
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
-from lqrsim.view.picture import QUALITIES, Picture, picture
-from lqrsim.view.scene_renderer import ROBOTS
+from lqrsim.view.picture import QUALITIES, Picture, PictureOptions, open_picture
+from lqrsim.view.scene_renderer import MOST_ROBOTS
 from lqrsim.view.video import encoder, gif
 
 FADE_SECONDS = 0.25
-MOST = 1_000_000  # frames of a video
-SMALLEST = 480, 270  # pixels of a GIF that nobody gave a size: what is written on it can be read
-SAMPLES = 12  # moments that the palette of a GIF is made of
+MOST_FRAMES = 1_000_000  # frames of a video
+SMALLEST_GIF = 480, 270  # pixels of a GIF that nobody gave a size: what is written on it can be read
+PALETTE_SAMPLES = 12  # moments that the palette of a GIF is made of
 
 
 def render(
@@ -67,29 +67,33 @@ def render(
       progress: called after each frame with the number of frames done and of all frames.
 
     Raises:
-      InputError: an argument is wrong, the file can not be written, or there is no OpenGL.
+      InputError: an argument is wrong, the file cannot be written, or there is no OpenGL.
     """
-    path = _named(path, ".mp4", ".gif")
+    path = _checked_path(path, ".mp4", ".gif")
     check_function("progress", progress, "a function of how many frames are done, of how many", arguments=2)
     animated = path.suffix.lower() == ".gif"
     fps = check_number("fps", (15 if animated else 30) if fps is None else fps, at_least=0.1, at_most=240)
     rate = Fraction(fps).limit_denominator(1001)
     speed = check_number("speed", speed, at_least=1e-3, at_most=1000)
-    size = size if size is not None or not animated else _half(quality)
-    options = (trial, camera, insets, titles, overlays, solution, quality, size, speed)
-    with replacing(path) as unfinished, picture(runs, *options) as drawn:
+    size = size if size is not None or not animated else _gif_size(quality)
+    options = PictureOptions(
+        trial=trial, camera=camera, insets=insets, titles=titles, overlays=overlays, solution=solution,
+        quality=quality, size=size, speed=speed,
+    )  # fmt: skip
+    with replacing(path) as unfinished, open_picture(runs, options) as drawn:
         count = int(drawn.end / speed * rate + 1e-9) + 1
-        if count > MOST:
-            raise InputError(f"speed, fps: got {speed:g} and {fps:g}, which are {count} frames, want at most {MOST}")
+        if count > MOST_FRAMES:
+            frames = f"{count} frames, want at most {MOST_FRAMES}"
+            raise InputError(f"speed, fps: got {speed:g} and {fps:g}, which are {frames}")
         if animated:
-            samples = [drawn.draw(time) for time in np.linspace(0, drawn.end, min(SAMPLES, count))]
+            samples = [drawn.draw(time) for time in np.linspace(0, drawn.end, min(PALETTE_SAMPLES, count))]
             writer = gif(unfinished, rate, samples)
         else:
-            looks = QUALITIES[quality]
-            about = video_metadata.Footage(
+            settings = options.settings
+            metadata = video_metadata.VideoMetadata(
                 tuple(video_metadata.digest(run) for run in drawn.runs), drawn.markers, rate, speed, count, drawn.panes
             )
-            writer = encoder(unfinished, drawn.size, rate, crf=looks.crf, preset=looks.preset, footage=about)
+            writer = encoder(unfinished, drawn.size, rate, crf=settings.crf, preset=settings.preset, metadata=metadata)
         with writer as encode:
             for number in range(count):
                 fade = 1.0 if number == 0 else float(1 / (FADE_SECONDS * rate))
@@ -119,9 +123,12 @@ def still(
     With `every`, the robot is drawn also where it was at each multiple of that many seconds, as in the paper's figures.
     The rest, and what is raised, is as in `render`.
     """
-    path = _named(path, ".png")
-    options = (trial, camera, insets, titles, overlays, solution, quality, size)
-    with replacing(path) as unfinished, picture(runs, *options) as drawn:
+    path = _checked_path(path, ".png")
+    options = PictureOptions(
+        trial=trial, camera=camera, insets=insets, titles=titles, overlays=overlays, solution=solution,
+        quality=quality, size=size,
+    )  # fmt: skip
+    with replacing(path) as unfinished, open_picture(runs, options) as drawn:
         time = drawn.end if time is None else check_number("time", time, at_least=0, at_most=drawn.end)
         earlier = [] if every is None else _multiples(every, time, drawn)
         Image.fromarray(drawn.draw(time, earlier=earlier)).save(unfinished)
@@ -129,15 +136,15 @@ def still(
 
 
 def _multiples(every: float, time: float, drawn: Picture) -> list[float]:
-    return np.arange(0, time, check_number("every", every, at_least=drawn.end / ROBOTS)).tolist()
+    return np.arange(0, time, check_number("every", every, at_least=drawn.end / MOST_ROBOTS)).tolist()
 
 
-def _half(quality: Quality) -> tuple[int, int]:
+def _gif_size(quality: Quality) -> tuple[int, int]:
     width, height = QUALITIES[check_name("quality", quality, QUALITIES)].size  # pyright: ignore[reportArgumentType]
-    return max(width // 2, SMALLEST[0]), max(height // 2, SMALLEST[1])
+    return max(width // 2, SMALLEST_GIF[0]), max(height // 2, SMALLEST_GIF[1])
 
 
-def _named(path: str | os.PathLike[str], *suffixes: str) -> Path:
+def _checked_path(path: str | os.PathLike[str], *suffixes: str) -> Path:
     path = check_path("path", path)
     if path.suffix.lower() not in suffixes:
         raise InputError(f"path: got {excerpt(path.name)}, want a name that ends in {' or '.join(suffixes)}")

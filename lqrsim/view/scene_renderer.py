@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -12,36 +11,23 @@ from mujoco.rendering.classic import gl_context
 
 from lqrsim.errors import Array
 from lqrsim.view import marker
-from lqrsim.view.camera_views import Shot
+from lqrsim.view.camera_views import CameraView
+from lqrsim.view.layout import Box
 from lqrsim.view.overlays import Overlays
+from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.text_tiles import Pixels
-from lqrsim.view.track import Track
 
-FADE = 0.10  # what is left of the opacity of something that hides the robot
-ROBOTS = 50  # more of them in one picture can not be told apart
-DRAWN = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # the geom groups that MuJoCo shows by default
-
-
-@dataclass(frozen=True)
-class Box:
-    """A part of the picture, in pixels from its upper left corner."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-    @property
-    def aspect(self) -> float:
-        return self.width / self.height
+FADED_OPACITY = 0.10  # what is left of the opacity of something that hides the robot
+MOST_ROBOTS = 50  # more of them in one picture cannot be told apart
+DRAWN_GROUPS = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # the geom groups that MuJoCo shows by default
 
 
 @contextlib.contextmanager
-def stage(
-    track: Track, overlays: Overlays, views: Sequence[tuple[Box, Shot]], size: tuple[int, int]
-) -> Iterator["Stage"]:
+def open_renderer(
+    recorded: RecordedTrial, overlays: Overlays, views: Sequence[tuple[Box, CameraView]], size: tuple[int, int]
+) -> Iterator["SceneRenderer"]:
     """A trial in a picture of `size`, with the boxes in it that show it; needs OpenGL to be bound."""
-    model = track.model
+    model = recorded.model
     # A larger buffer than the picture costs as much as a larger picture, a smaller one is refused.
     model.vis.global_.offwidth, model.vis.global_.offheight = size
     window = gl_context.GLContext(*size)
@@ -50,7 +36,7 @@ def stage(
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         try:
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
-            yield Stage(track, overlays, views, size, window, context)
+            yield SceneRenderer(recorded, overlays, views, size, window, context)
         finally:
             window.make_current()
             context.free()
@@ -58,30 +44,30 @@ def stage(
         window.free()
 
 
-class Stage:
-    """What `stage` gives; draws into its own OpenGL context.
+class SceneRenderer:
+    """What `open_renderer` gives; draws into its own OpenGL context.
 
     MuJoCo's `Renderer` does the same for one view of a scene, with a copy of the picture more.
     """
 
     def __init__(
         self,
-        track: Track,
+        recorded: RecordedTrial,
         overlays: Overlays,
-        views: Sequence[tuple[Box, Shot]],
+        views: Sequence[tuple[Box, CameraView]],
         size: tuple[int, int],
         window: Any,
         context: mujoco.MjrContext,
     ) -> None:
-        self.track, self.overlays, self.views = track, overlays, views
-        self.window, self.context, self.model = window, context, track.model
+        self.recorded, self.overlays, self.views = recorded, overlays, views
+        self.window, self.context, self.model = window, context, recorded.model
         self.data, self.ghost = mujoco.MjData(self.model), mujoco.MjData(self.model)
-        self.scene = mujoco.MjvScene(self.model, maxgeom=1000 + (ROBOTS + 1) * self.model.ngeom)
-        self.extras = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self.scene = mujoco.MjvScene(self.model, maxgeom=1000 + (MOST_ROBOTS + 1) * self.model.ngeom)
+        self.visual_options = mujoco.MjvOption(), mujoco.MjvPerturb()
         self.pixels = np.empty((size[1], size[0], 3), dtype=np.uint8)
         # A plane is seen through from behind as it is, and from the front it hides nothing.
         solid = self.model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE.value
-        self.can_hide = solid & (self.model.body_weldid[self.model.geom_bodyid] == 0)
+        self.can_occlude = solid & (self.model.body_weldid[self.model.geom_bodyid] == 0)
         self.faded = np.zeros((len(views), self.model.ngeom))
 
     def draw(self, time: float, *, fade: float = 1.0, earlier: Iterable[float] = ()) -> Pixels:
@@ -91,45 +77,45 @@ class Stage:
           fade: the most by which opacities may change since the picture before.
         """
         model, data, scene = self.model, self.data, self.scene
-        self.track.pose(data, time)
+        self.recorded.pose(data, time)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(model, data, self.extras[0], None, mujoco.MjvCamera(), everything, scene)
+        mujoco.mjv_updateScene(model, data, self.visual_options[0], None, mujoco.MjvCamera(), everything, scene)
         own = scene.ngeom
         for moment in earlier:
-            self.track.pose(self.ghost, moment)
-            mujoco.mjv_addGeoms(model, self.ghost, *self.extras, mujoco.mjtCatBit.mjCAT_DYNAMIC.value, scene)
+            self.recorded.pose(self.ghost, moment)
+            mujoco.mjv_addGeoms(model, self.ghost, *self.visual_options, mujoco.mjtCatBit.mjCAT_DYNAMIC.value, scene)
         self.overlays.draw(scene, data, time)
         self.window.make_current()
-        for (box, shot), faded in zip(self.views, self.faded, strict=True):
-            shot.place(scene, data, time)
-            self._light_from_camera()
-            faded += np.clip(self._in_the_way() - faded, -fade, fade)
-            with self._see_through(faded, own):
+        for (box, view), faded in zip(self.views, self.faded, strict=True):
+            view.place(scene, data, time)
+            self._move_headlight()
+            faded += np.clip(self._occluders() - faded, -fade, fade)
+            with self._fade(faded, own):
                 height = self.pixels.shape[0]
                 where = mujoco.MjrRect(box.left, height - box.top - box.height, box.width, box.height)
                 common = scene.ngeom
                 self.overlays.draw_force(scene, data, time)
-                if shot.camera is not None:
-                    robot, worn = data.xpos[self.track.robot], marker.radius(self.track.rollout)
-                    marker.draw(scene, shot.camera, robot, worn)
+                if view.camera is not None:
+                    radius = marker.radius(self.recorded.rollout)
+                    marker.draw(scene, view.camera, data.xpos[self.recorded.robot], radius)
                 mujoco.mjr_render(where, scene, self.context)
                 scene.ngeom = common
         whole = mujoco.MjrRect(0, 0, self.pixels.shape[1], self.pixels.shape[0])
         mujoco.mjr_readPixels(self.pixels, None, whole, self.context)
         return self.pixels[::-1]
 
-    def _light_from_camera(self) -> None:
+    def _move_headlight(self) -> None:
         """The headlight goes where the camera went."""
         for light in self.scene.lights[: self.scene.nlight]:
             if light.headlight:
                 light.pos, light.dir = self.scene.camera[0].pos, self.scene.camera[0].forward
 
-    def _in_the_way(self) -> npt.NDArray[np.bool_]:
+    def _occluders(self) -> npt.NDArray[np.bool_]:
         """Which geoms (ngeom,) stand between the camera and the robot's centre or outline."""
         view = self.scene.camera[0]
         up, forward = np.array(view.up, dtype=np.float64), np.array(view.forward, dtype=np.float64)
         right = np.cross(forward, up)
-        centre, radius = self.data.xpos[self.track.robot], 0.8 * self.track.rollout.radius
+        centre, radius = self.data.xpos[self.recorded.robot], 0.8 * self.recorded.rollout.radius
         found, geom = np.zeros(self.model.ngeom, dtype=bool), np.zeros(1, np.int32)
         eye = np.array(view.pos, dtype=np.float64)
         for offset in (0 * up, up, -up, right, -right):
@@ -138,15 +124,15 @@ class Stage:
             start = target + forward * (forward @ (eye - target)) if view.orthographic else eye
             for _ in range(100):  # surfaces between; more do not matter
                 ray = target - start
-                hit = mujoco.mj_ray(self.model, self.data, start, ray, DRAWN, True, -1, geom)
+                hit = mujoco.mj_ray(self.model, self.data, start, ray, DRAWN_GROUPS, True, -1, geom)
                 if not 0 <= hit < 1:
                     break
-                found[geom[0]] = self.can_hide[geom[0]]
+                found[geom[0]] = self.can_occlude[geom[0]]
                 start = start + (hit + 1e-4) * ray
         return found
 
     @contextlib.contextmanager
-    def _see_through(self, faded: Array, own: int) -> Iterator[None]:
+    def _fade(self, faded: Array, own: int) -> Iterator[None]:
         """The scene with what hides the robot faded by these shares (ngeom,)."""
         before: list[tuple[int, float, int]] = []
         for number in range(own if faded.any() else 0):
@@ -154,7 +140,7 @@ class Stage:
             if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and faded[geom.objid] > 0:
                 share, alpha = faded[geom.objid], float(geom.rgba[3])
                 before.append((number, alpha, geom.transparent))
-                geom.rgba[3], geom.transparent = (1 - share) * alpha + share * min(alpha, FADE), 1
+                geom.rgba[3], geom.transparent = (1 - share) * alpha + share * min(alpha, FADED_OPACITY), 1
         yield
         for number, alpha, transparent in before:
             geom = self.scene.geoms[number]

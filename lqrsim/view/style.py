@@ -39,10 +39,11 @@ STYLE = {
 def figure(*paths: str | os.PathLike[str], size: tuple[float, float]) -> Iterator[Figure]:
     """A figure, `size` inches wide and high, that is written to each path as the block ends: png, pdf or svg.
 
-    A block that fails writes nothing.
+    A block that fails writes nothing. Lay it out with `Figure.set_layout_engine("tight", ...)`, which works as the
+    file is written: `tight_layout` would make room for the tick labels that logarithmic axes have before.
 
     Raises:
-      InputError: a name ends otherwise, or a file can not be written.
+      InputError: a name ends otherwise, or a file cannot be written.
     """
     places = [check_path("path", path) for path in paths]
     for place in places:

@@ -15,21 +15,21 @@ INK, PAPER = (28, 32, 38, 255), (255, 255, 255, 200)
 
 
 @functools.lru_cache(maxsize=16)
-def text(lines: tuple[str, ...], height: int, *, width: int, bold: bool = True) -> Pixels:
+def text_tile(lines: tuple[str, ...], height: int, *, width: int, bold: bool = True) -> Pixels:
     """Lines of text on translucent paper, (h, w, 4), at least `width` pixels wide.
 
     The letters are `height` pixels high, and the first line is bold unless it is not to be.
     """
     fonts = [_font(height, bold=bold and number == 0) for number in range(len(lines))]
     needed = max(font.getlength(line) for font, line in zip(fonts, lines, strict=True))
-    tile, draw = _paper(max(needed + 1.4 * height, width), (1.5 * len(lines) + 0.7) * height)
+    tile, draw = _blank_tile(max(needed + 1.4 * height, width), (1.5 * len(lines) + 0.7) * height)
     for number, (font, line) in enumerate(zip(fonts, lines, strict=True)):
         draw.text((0.7 * height, (0.4 + 1.5 * number) * height), line, font=font, fill=INK)
     return np.asarray(tile)
 
 
 @functools.lru_cache(maxsize=16)
-def legend(entries: tuple[tuple[str, Colour | None], ...], height: int, width: int) -> Pixels:
+def legend_tile(entries: tuple[tuple[str, Colour | None], ...], height: int, width: int) -> Pixels:
     """What the colours mean, (h, w, 4), in rows of at most `width` pixels; None is the map of the tracking error."""
     font, swatch, space = _font(height), round(2.5 * height), 0.6 * height
     rows: list[list[tuple[float, str, Colour | None]]] = [[]]
@@ -42,7 +42,7 @@ def legend(entries: tuple[tuple[str, Colour | None], ...], height: int, width: i
         rows[-1].append((x, name, colour))
         x += needed
         widest = max(widest, x)
-    tile, draw = _paper(widest, (1.6 * len(rows) + 0.6) * height)
+    tile, draw = _blank_tile(widest, (1.6 * len(rows) + 0.6) * height)
     for number, row in enumerate(rows):
         top = (1.6 * number + 0.45) * height
         for left, name, colour in row:
@@ -59,7 +59,7 @@ def error_colours(fractions: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return np.asarray(matplotlib.colormaps["cividis"](np.asarray(fractions, dtype=np.float64)))
 
 
-def fit(words: str, height: int, width: int) -> list[str]:
+def wrap(words: str, height: int, width: int) -> list[str]:
     """The text in lines of at most `width` pixels, if no word is longer, in letters that are `height` pixels high."""
     font, lines = _font(height), [""]
     for word in words.split():
@@ -71,7 +71,7 @@ def fit(words: str, height: int, width: int) -> list[str]:
     return lines
 
 
-def paste(image: Pixels, tile: Pixels, *, left: int, top: int | None = None, bottom: int | None = None) -> None:
+def blend(image: Pixels, tile: Pixels, *, left: int, top: int | None = None, bottom: int | None = None) -> None:
     """Blends a tile into the image, in place, that many pixels from the left and the top or the bottom edge."""
     room = image.shape[0] - tile.shape[0]
     start = max(top if top is not None else room - (bottom or 0), 0)
@@ -87,6 +87,6 @@ def _font(height: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(folder / f"DejaVuSans{'-Bold' if bold else ''}.ttf", height)
 
 
-def _paper(width: float, height: float) -> tuple[Image.Image, ImageDraw.ImageDraw]:
+def _blank_tile(width: float, height: float) -> tuple[Image.Image, ImageDraw.ImageDraw]:
     tile = Image.new("RGBA", (round(width), round(height)), PAPER)
     return tile, ImageDraw.Draw(tile)

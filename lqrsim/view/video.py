@@ -13,25 +13,25 @@ from av.video.reformatter import Colorspace
 from PIL import Image
 
 from lqrsim.view.text_tiles import Pixels
-from lqrsim.view.video_metadata import Footage
+from lqrsim.view.video_metadata import VideoMetadata
 
-WAITING = 3  # frames that may wait to be encoded
+QUEUE_LENGTH = 3  # frames that may wait to be encoded
 COLOURS = 192  # of a GIF
 
 
 @contextlib.contextmanager
 def encoder(
-    path: Path, size: tuple[int, int], rate: Fraction, *, crf: int, preset: str, footage: Footage | None = None
+    path: Path, size: tuple[int, int], rate: Fraction, *, crf: int, preset: str, metadata: VideoMetadata | None = None
 ) -> Iterator[Callable[[Pixels], None]]:
     """A function that appends a frame (height, width, 3), and keeps it; `size` is width and height.
 
     Args:
       rate: frames a second. crf, preset: x264's, for how good and how small the video is.
-      footage: what the file says of itself.
+      metadata: what the file says of itself.
     """
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
-        if footage is not None:
-            footage.embed(container)
+        if metadata is not None:
+            metadata.embed(container)
         stream = container.add_stream("libx264", rate=rate, options={"preset": preset, "crf": str(crf)})
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         # Say which matrix makes RGB of the pixels; players guess differently when it is left open.
@@ -41,7 +41,7 @@ def encoder(
             frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
             container.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709)))
 
-        with _meanwhile(encode) as put:
+        with _on_another_thread(encode) as put:
             yield put
         container.mux(stream.encode())
 
@@ -56,7 +56,7 @@ def gif(path: Path, rate: Fraction, samples: Sequence[Pixels]) -> Iterator[Calla
     def encode(pixels: Pixels) -> None:
         frames.append(Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE))
 
-    with _meanwhile(encode) as put:
+    with _on_another_thread(encode) as put:
         yield put
     # A GIF counts in hundredths of a second: frames last as long as keeps the whole in time.
     ends = [round(100 * (number + 1) / rate) for number in range(len(frames))]
@@ -65,9 +65,9 @@ def gif(path: Path, rate: Fraction, samples: Sequence[Pixels]) -> Iterator[Calla
 
 
 @contextlib.contextmanager
-def _meanwhile(work: Callable[[Pixels], None]) -> Iterator[Callable[[Pixels], None]]:
+def _on_another_thread(work: Callable[[Pixels], None]) -> Iterator[Callable[[Pixels], None]]:
     """A function that has `work` done on another thread, in order, while its caller draws the next frame."""
-    waiting: queue.Queue[Pixels | None] = queue.Queue(maxsize=WAITING)
+    waiting: queue.Queue[Pixels | None] = queue.Queue(maxsize=QUEUE_LENGTH)
     failed: list[BaseException] = []
 
     def run() -> None:

@@ -27,7 +27,7 @@ class Pane:
     """A part of the picture, in pixels from the upper left corner, that shows one trial.
 
     Attributes:
-      run: number of the rollout among the footage's. trial: row of it.
+      run: number of the rollout among those of the metadata. trial: row of it.
       camera: which calibrated one it is seen through; None if it moves, or is of the scene.
     """
 
@@ -41,7 +41,7 @@ class Pane:
 
 
 @dataclass(frozen=True)
-class Footage:
+class VideoMetadata:
     """What identifies a video: frame `number` shows the moment `number / rate * speed` seconds after a run's start.
 
     Attributes:
@@ -58,40 +58,40 @@ class Footage:
     panes: tuple[Pane, ...]
 
     def as_json(self) -> str:
-        """What `from_json` makes the same footage of."""
+        """What `from_json` makes the same metadata of."""
         panes = [vars(pane) | {"camera": pane.camera and pane.camera.as_json()} for pane in self.panes]
         parts = {"format": FORMAT, "version": VERSION, "runs": self.runs, "rate": str(self.rate), "speed": self.speed}
         parts |= {"frames": self.frames, "markers": self.markers, "panes": panes}
         return json.dumps(parts)
 
     @classmethod
-    def from_json(cls, text: str) -> "Footage":
+    def from_json(cls, text: str) -> "VideoMetadata":
         """Raises InputError unless it is what `as_json` gives, of this version."""
         try:
             parts = json.loads(text)
         except ValueError:
             parts = None
         if not isinstance(parts, dict) or parts.get("format") != FORMAT:
-            raise InputError("footage: got none, want a video that `lqrsim render` wrote, with its metadata")
+            raise InputError("video metadata: got none, want a video that `lqrsim render` wrote, with its metadata")
         if parts.get("version") != VERSION:
             got = parts.get("version")
-            raise InputError(f"footage: got version {got}, want version {VERSION}: render the video again")
+            raise InputError(f"video metadata: got version {got}, want version {VERSION}: render the video again")
         try:
-            footage = cls(
+            metadata = cls(
                 runs=tuple(str(run) for run in parts["runs"]),
-                markers=tuple(check_number("footage.markers", one, above=0) for one in parts["markers"]),
+                markers=tuple(check_number("metadata.markers", one, above=0) for one in parts["markers"]),
                 rate=Fraction(parts["rate"]),
-                speed=check_number("footage.speed", parts["speed"], above=0),
-                frames=check_count("footage.frames", parts["frames"]),
+                speed=check_number("metadata.speed", parts["speed"], above=0),
+                frames=check_count("metadata.frames", parts["frames"]),
                 panes=tuple(_pane(one) for one in parts["panes"]),
             )
-            good = footage.rate > 0 and len(footage.markers) == len(footage.runs)
-            good = good and all(pane.run < len(footage.runs) for pane in footage.panes)
+            good = metadata.rate > 0 and len(metadata.markers) == len(metadata.runs)
+            good = good and all(pane.run < len(metadata.runs) for pane in metadata.panes)
         except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-            raise InputError(f"footage: got {text[:40]}..., which is damaged ({error})") from None
+            raise InputError(f"video metadata: got {text[:40]}..., which is damaged ({error})") from None
         if not good:
-            raise InputError(f"footage: got {text[:40]}..., which contradicts itself")
-        return footage
+            raise InputError(f"video metadata: got {text[:40]}..., which contradicts itself")
+        return metadata
 
     def times(self) -> np.ndarray:
         """Seconds after the run's start that the frames show, (frames,)."""
@@ -102,7 +102,7 @@ class Footage:
         container.metadata["comment"] = self.as_json()
 
 
-def read(path: str | os.PathLike[str]) -> Footage:
+def read(path: str | os.PathLike[str]) -> VideoMetadata:
     """What the video says of itself. Raises InputError if it is none that lqrsim wrote."""
     path = check_path("video", path)
     if not os.path.isfile(path):  # not the method, which raises where a folder cannot be read
@@ -112,7 +112,7 @@ def read(path: str | os.PathLike[str]) -> Footage:
             text = container.metadata.get("comment", "")
     except (FFmpegError, OSError) as error:
         raise InputError(f"video: got {path}, want one that can be read ({error})") from None
-    return Footage.from_json(text)
+    return VideoMetadata.from_json(text)
 
 
 def digest(rollout: Rollout) -> str:

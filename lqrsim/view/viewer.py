@@ -18,25 +18,25 @@ from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
 from lqrsim.view.browser import Browser
-from lqrsim.view.recorded import model_of
-from lqrsim.view.viewer_base import PUSHES, Again, Closed, Screen
+from lqrsim.view.recorded_model import model_of
+from lqrsim.view.viewer_base import PUSHES, RestartRequested, Viewer, ViewerClosed
 
 KEYS = """Arrow keys and Page Up/Down push the robot, seen from the camera. Ctrl and the right mouse button drag it.
 Space pauses, Backspace starts again."""
-PAUSE = 1.0  # s, between the end of a run and the next
-GLFW = {"RightArrow": 262, "LeftArrow": 263, "DownArrow": 264, "UpArrow": 265, "PageUp": 266, "PageDown": 267}
+PAUSE_SECONDS = 1.0  # s, between the end of a run and the next
+GLFW_KEYS = {"RightArrow": 262, "LeftArrow": 263, "DownArrow": 264, "UpArrow": 265, "PageUp": 266, "PageDown": 267}
 
 
-class Window(Screen):
-    """A viewer in a window. Use it with `with`: it is open as long as the block. The arguments are a Screen's."""
+class Window(Viewer):
+    """A viewer in a window. Use it with `with`: it is open as long as the block. The arguments are a Viewer's."""
 
-    where = "A window has opened; closing it, or Ctrl-C here, ends it."
+    instructions = "A window has opened; closing it, or Ctrl-C here, ends it."
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         from mujoco import viewer
 
-        keys = {GLFW[name]: direction for name, direction in PUSHES.items()}
+        keys = {GLFW_KEYS[name]: direction for name, direction in PUSHES.items()}
 
         def pressed(code: int) -> None:
             if code in keys:
@@ -44,9 +44,9 @@ class Window(Screen):
             elif code == 32:  # the space bar
                 self.paused = not self.paused
             elif code == 259:  # backspace
-                self.restart()
+                self.request_restart()
 
-        _check_window()
+        _check_window_opens()
         others = set(threading.enumerate())
         try:
             self._viewer = viewer.launch_passive(self.model, self.data, key_callback=pressed, show_right_ui=False)
@@ -54,7 +54,7 @@ class Window(Screen):
             raise InputError(f"window: {' '.join(str(error).split())}; or use --viewer browser") from None
         self._threads = set(threading.enumerate()) - others
         with self._viewer.lock():
-            self.aim(self._viewer.cam)
+            self.aim_camera(self._viewer.cam)
             self._viewer.perturb.select = self.robot
 
     def __enter__(self) -> "Window":
@@ -69,7 +69,7 @@ class Window(Screen):
         if not self._viewer.is_running():
             return False
         self._viewer.sync()
-        self.pull(self.data.xfrc_applied)
+        self.drag(self.data.xfrc_applied)
         return True
 
     def show(self, time: float, qpos: Array) -> Array:
@@ -81,18 +81,18 @@ class Window(Screen):
 
         with self._viewer.lock():
             scene.ngeom = 0
-            self.draw(new)
+            self.draw_overlays(new)
         self._viewer.set_texts((None, None, self.caption, None))
         return place
 
 
 def open_viewer(kind: str, port: int, *, title: str, **options: Any) -> Window | Browser:
-    """A viewer that is a `window` or a `browser`; the options are a Screen's. To be used with `with`."""
+    """A viewer that is a `window` or a `browser`; the options are a Viewer's. To be used with `with`."""
     return Window(**options) if kind == "window" else Browser(port=port, title=title, **options)
 
 
-def of_rollout(rollout: Rollout, trial: int) -> dict[str, Any]:
-    """What a Screen needs to show one trial."""
+def arguments_for_rollout(rollout: Rollout, trial: int) -> dict[str, Any]:
+    """What a Viewer needs to show one trial."""
     model = model_of(rollout, trial)
     if not np.isfinite(rollout.frames[trial]).all(axis=1).any():
         raise InputError(f"rollout: got trial {trial} without one finite state, want something to show")
@@ -100,45 +100,45 @@ def of_rollout(rollout: Rollout, trial: int) -> dict[str, Any]:
     return {"model": model, "plan": rollout.plan, **where}
 
 
-def of_plant(plant: Plant, solution: Solution) -> dict[str, Any]:
-    """What a Screen needs to show a live run."""
+def arguments_for_plant(plant: Plant, solution: Solution) -> dict[str, Any]:
+    """What a Viewer needs to show a live run."""
     robot = plant.robot
     where = {"space": robot.dynamics.state_coordinates, "body": robot.body, "radius": robot.radius}
     return {"model": plant.model, "plan": solution.trajectory, **where}
 
 
-class _Person(Disturbance):
-    """Whoever sits before a screen."""
+class _UserForces(Disturbance):
+    """What the person before a viewer does, as forces on the robot."""
 
-    def __init__(self, screen: Screen) -> None:
-        self.screen = screen
+    def __init__(self, viewer: Viewer) -> None:
+        self.viewer = viewer
 
     def start(self, plant: Plant, plan: Any, generators: Sequence[np.random.Generator]) -> Effect:
         wrench = np.zeros(6)
 
         def force(step: int, states: Array) -> Array:
-            wrench[:] = self.screen.take(plan.dt)
+            wrench[:] = self.viewer.take_wrench(plan.dt)
             return wrench[None, :3]
 
         return Effect(force=force, torque=lambda step, states: wrench[None, 3:])
 
 
-def play(rollout: Rollout, screen: Screen, *, trial: int = 0, loop: bool = True) -> None:
+def play(rollout: Rollout, viewer: Viewer, *, trial: int = 0, loop: bool = True) -> None:
     """Show the frames of one trial, each at its time, until the viewer is closed; once, or again and again."""
     whole = np.isfinite(rollout.frames[trial]).all(axis=1)
     frames = list(zip(rollout.frame_times[whole].tolist(), rollout.frames[trial][whole], strict=True))
-    with contextlib.suppress(Closed):
+    with contextlib.suppress(ViewerClosed):
         while True:
-            with contextlib.suppress(Again):
+            with contextlib.suppress(RestartRequested):
                 for time, qpos in frames:
-                    screen.show(time, qpos)
-                screen.hold(PAUSE if loop else np.inf)
+                    viewer.show(time, qpos)
+                viewer.wait(PAUSE_SECONDS if loop else np.inf)
 
 
 def live(
     plant: Plant,
     solution: Solution,
-    screen: Screen,
+    viewer: Viewer,
     *,
     disturbances: Sequence[Disturbance] = (),
     seed: int = 0,
@@ -155,18 +155,18 @@ def live(
     space = plant.robot.dynamics.state_coordinates
 
     def watch(time: float, qpos: Array, unstable: np.ndarray) -> None:
-        apart = np.linalg.norm(space.of_world(screen.show(time, qpos[0]) - screen.wanted()))
+        apart = np.linalg.norm(space.of_world(viewer.show(time, qpos[0]) - viewer.planned_position()))
         if unstable.any() or not apart < plant.model.stat.extent:
             ended(f"run {run}: lost after {time:.1f} s")
-            raise Again
+            raise RestartRequested
 
-    run, everything = 0, [*disturbances, _Person(screen)]
-    with contextlib.suppress(Closed):
+    run, everything = 0, [*disturbances, _UserForces(viewer)]
+    with contextlib.suppress(ViewerClosed):
         while True:
-            with contextlib.suppress(Again):
+            with contextlib.suppress(RestartRequested):
                 rollout = simulate(plant, solution, disturbances=everything, seed=seed, first_trial=run, watch=watch)
                 ended(rollout.summary().splitlines()[-1].strip().replace("trial", "run"))
-                screen.hold(PAUSE)
+                viewer.wait(PAUSE_SECONDS)
             run += 1
 
 
@@ -175,7 +175,7 @@ def has_display() -> bool:
     return sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
-def _check_window() -> None:
+def _check_window_opens() -> None:
     """Raises InputError if no window can be opened, for which MuJoCo's viewer would wait for ever."""
     import glfw
 

@@ -13,15 +13,15 @@ from mujoco import mjtGeom as Geom
 from lqrsim.errors import Array, InputError
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.records import Trajectory
-from lqrsim.view.decor import PLAN, decorate
-from lqrsim.view.recorded import floor_below
+from lqrsim.view.decorative_geoms import PLAN_RGB, decorate
+from lqrsim.view.recorded_model import floor_below, robot_body
 
-WANTED = (*PLAN, 0.25)
-TRACE = (0.05, 0.35, 0.62, 1.0)
+PLANNED_RGBA = (*PLAN_RGB, 0.25)
+TRACE_RGBA = (0.05, 0.35, 0.62, 1.0)
 SEGMENTS = 60  # of the plan; the trace has twice as many
 LIFT = 0.008  # metres between the floor and the lines on it
-HAND = 2.0  # times the robot's weight that someone drags it with at most
-TOO_LATE = 0.2  # s; what a slow machine is behind by more than that is not made up for
+STRONGEST_DRAG = 2.0  # times the robot's weight that someone drags it with at most
+MOST_DELAY = 0.2  # s; what a slow machine is behind by more than that is not made up for
 # What a key adds to the velocity of the robot, seen from the camera: right, away, up.
 PUSHES = {
     "LeftArrow": (-1.0, 0.0, 0.0),
@@ -33,16 +33,16 @@ PUSHES = {
 }
 
 
-class Closed(Exception):
+class ViewerClosed(Exception):
     """The viewer was closed, or has been open for as long as it should."""
 
 
-class Again(Exception):
+class RestartRequested(Exception):
     """Someone wants to see it from the start."""
 
 
-class Screen(abc.ABC):
-    """A viewer. Subclasses say how it draws, and call `push`, `pull` and so on when someone interferes.
+class Viewer(abc.ABC):
+    """A viewer. Subclasses say how it draws, and call `push`, `drag` and so on when someone interferes.
 
     Args:
       model: what moves. plan: what it should do. space: of the plan's states. body: the robot's in the model.
@@ -70,7 +70,7 @@ class Screen(abc.ABC):
         # A copy: a viewer has sliders for gravity and the like.
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
-        self.space, self.robot = space, int(model.body(body).id)
+        self.space, self.robot = space, robot_body(model, body)
         self.radius, self.speed, self.paused, self.caption = radius, speed, False, ""
         self.wrench = np.zeros(6)
         self._mass = float(model.body_subtreemass[self.robot])
@@ -89,7 +89,7 @@ class Screen(abc.ABC):
         """Wait until it is `time` and show the model at `qpos`; where it is then, (3,).
 
         Raises:
-          Closed, Again: the person wants that.
+          ViewerClosed, RestartRequested: the person wants that.
         """
         begins = time <= self._time or not self._trace
         self._wait(max(time - self._time, 0.0))
@@ -104,10 +104,10 @@ class Screen(abc.ABC):
         on_floor = self._on_floor(self.space.of_world(place))
         if not self._trace or np.linalg.norm(on_floor - self._trace[-1]) > apart:
             self._trace = [*self._trace, on_floor][-2 * SEGMENTS :]
-        self.caption = f"{time:.1f} s, {1e3 * np.linalg.norm(on_floor - self.wanted()):.0f} mm from the plan"
+        self.caption = f"{time:.1f} s, {1e3 * np.linalg.norm(on_floor - self.planned_position()):.0f} mm from the plan"
         return place
 
-    def hold(self, seconds: float) -> None:
+    def wait(self, seconds: float) -> None:
         """Stand still for a while. Raises what `show` does."""
         self._wait(seconds * self.speed)
 
@@ -118,40 +118,40 @@ class Screen(abc.ABC):
         y = away * np.sin(along) - right * np.cos(along)
         self._impulse += self._push * np.array([x, y, up])
 
-    def pull(self, wrenches: Array) -> None:
+    def drag(self, wrenches: Array) -> None:
         """Someone drags bodies with forces and torques (nbody, 6); a hand is only so strong."""
-        wrench, strength = np.asarray(wrenches).reshape(-1, 6).sum(axis=0), HAND * 9.81 * self._mass
+        wrench, strength = np.asarray(wrenches).reshape(-1, 6).sum(axis=0), STRONGEST_DRAG * 9.81 * self._mass
         for part, most in ((slice(0, 3), strength), (slice(3, 6), strength * self.radius)):
             wrench[part] *= most / max(float(np.linalg.norm(wrench[part])), most)
         self.wrench = wrench
 
-    def restart(self) -> None:
+    def request_restart(self) -> None:
         """Someone wants to see it from the start."""
         self._restart = True
 
-    def take(self, dt: float) -> Array:
+    def take_wrench(self, dt: float) -> Array:
         """Force and torque (6,) of the person over the next `dt` seconds."""
         push, self._impulse = np.append(self._impulse / dt, np.zeros(3)), np.zeros(3)
         return self.wrench + push
 
-    def wanted(self) -> Array:
+    def planned_position(self) -> Array:
         """Where the plan is now, (3,)."""
         return self._on_floor([np.interp(self._time, self._times, column) for column in self._places.T])
 
-    def draw(self, new: Callable[[], mujoco.MjvGeom]) -> None:
+    def draw_overlays(self, new: Callable[[], mujoco.MjvGeom]) -> None:
         """Draw the plan, the trace and where the robot should be; `new` gives what to draw each part with."""
         knots = np.unique(np.linspace(0, len(self._times) - 1, SEGMENTS + 1).astype(int))
         plan = [self._on_floor(self._places[knot]) for knot in knots]
         width = 0.002 * float(self.model.stat.extent)
-        for points, thick, colour in ((plan, 0.6 * width, (*PLAN, 1.0)), (self._trace, width, TRACE)):
+        for points, thick, colour in ((plan, 0.6 * width, (*PLAN_RGB, 1.0)), (self._trace, width, TRACE_RGBA)):
             for ends in itertools.pairwise(points):
                 geom = decorate(new(), Geom.mjGEOM_CAPSULE, [thick] * 3, ends[0], colour)
                 mujoco.mjv_connector(geom, Geom.mjGEOM_CAPSULE, thick, *ends)
         flat = self.space.from_above
         shape = (Geom.mjGEOM_CYLINDER, [self.radius, LIFT, 0.0]) if flat else (Geom.mjGEOM_SPHERE, [self.radius] * 3)
-        decorate(new(), *shape, self.wanted(), WANTED)
+        decorate(new(), *shape, self.planned_position(), PLANNED_RGBA)
 
-    def aim(self, camera: mujoco.MjvCamera) -> None:
+    def aim_camera(self, camera: mujoco.MjvCamera) -> None:
         """Let a camera that a person can turn see what the scene's own `overview` sees, if it has one."""
         mujoco.mjv_defaultFreeCamera(self.model, camera)
         number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, "overview")
@@ -167,14 +167,14 @@ class Screen(abc.ABC):
 
     def _wait(self, left: float) -> None:
         """Until `left` seconds of the time shown have gone by."""
-        left = max(left - self._ahead, -TOO_LATE)
+        left = max(left - self._ahead, -MOST_DELAY)
         before = clock.perf_counter()
         while True:
             if clock.monotonic() > self._until or not self.refresh():
-                raise Closed
+                raise ViewerClosed
             if self._restart:
                 self._restart = False
-                raise Again
+                raise RestartRequested
             now = clock.perf_counter()
             left -= 0.0 if self.paused else (now - before) * self.speed
             before = now

@@ -5,12 +5,14 @@ import numpy as np
 
 from lqrsim.errors import Array, InputError
 from lqrsim.results.rollout import Rollout
-from lqrsim.view.recorded import floor_below, model_of
+from lqrsim.view.recorded_model import floor_below, model_of, robot_body
 
-SEEN = 0.2  # seconds for which a push is shown: one control period would be gone before it is seen, and noise flickers
+FORCE_WINDOW = (
+    0.2  # seconds for which a push is shown: one control period would be gone before it is seen, and noise flickers
+)
 
 
-class Track:
+class RecordedTrial:
     """A trial; where it diverged, it ends with its last finite state and stands still.
 
     Attributes:
@@ -34,10 +36,10 @@ class Track:
         self.times, self.states = rollout.times[alive], rollout.states[trial, alive]
         self.measured = rollout.measured[trial, alive]
         self.error, self.clearance = rollout.tracking_error[trial, alive], rollout.clearance[trial, alive]
-        self.force = _recent(rollout.forces[trial], rollout.plan.dt)
+        self.force = _recent_mean(rollout.forces[trial], rollout.plan.dt)
         self.end = float(rollout.times[-1])
         self.planar = rollout.state_coordinates.from_above
-        self.robot = int(self.model.body(rollout.body).id)
+        self.robot = robot_body(self.model, rollout.body)
         data = mujoco.MjData(self.model)
         self.pose(data, 0.0)
         self.floor = floor_below(self.model, data, self.robot)
@@ -57,13 +59,13 @@ class Track:
 
     def driven(self, at: Array | float) -> Array:
         """Where the robot was at these times, (..., 3); on the floor, if it is seen from above."""
-        return self.places(self.states, self.times, at)
+        return self.positions(self.states, self.times, at)
 
     def planned(self, at: Array | float) -> Array:
         """Where it was meant to be, (..., 3)."""
-        return self.places(self.rollout.plan.states, self.rollout.times, at)
+        return self.positions(self.rollout.plan.states, self.rollout.times, at)
 
-    def places(self, states: Array, times: Array, at: Array | float) -> Array:
+    def positions(self, states: Array, times: Array, at: Array | float) -> Array:
         """The positions (..., 3) of states (k, n) at `times`, at other times."""
         space = self.rollout.state_coordinates
         columns = [np.interp(at, times, states[:, i]) for i in space.position]
@@ -73,11 +75,11 @@ class Track:
         """The force (3,) in N that has disturbed the robot lately."""
         return self.force[min(int(time / self.rollout.plan.dt + 1e-9), len(self.force) - 1)]
 
-    def number_at(self, values: Array, time: float) -> float:
+    def interpolate(self, values: Array, time: float) -> float:
         """One of `error` and `clearance` at a time."""
         return float(np.interp(time, self.times, values))
 
-    def over(self, time: float) -> str:
+    def ending(self, time: float) -> str:
         """What had ended the trial by then, in words; empty if nothing had."""
         run, k = self.rollout, self.trial
         if run.outcome[k] not in ("collided", "diverged", "error") or time < run.ended[k]:
@@ -85,8 +87,8 @@ class Track:
         return f"collided with {run.obstacles[k]}" if run.collided[k] else run.outcome[k]
 
 
-def _recent(forces: Array, dt: float) -> Array:
+def _recent_mean(forces: Array, dt: float) -> Array:
     """Mean forces (T, 3) over the moment before each period's end."""
-    window = max(round(SEEN / dt), 1)
+    window = max(round(FORCE_WINDOW / dt), 1)
     total = np.cumsum(np.vstack([np.zeros((window, 3)), np.nan_to_num(forces)]), axis=0)
     return (total[window:] - total[:-window]) / window

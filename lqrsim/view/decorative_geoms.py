@@ -6,7 +6,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array
 
-PLAN = (0.78, 0.08, 0.42)  # the plan's colour; none of the error map, and of no robot
+PLAN_RGB = (0.78, 0.08, 0.42)  # the plan's colour; none of the error map, and of no robot
 
 
 def decorate(

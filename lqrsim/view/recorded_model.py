@@ -16,11 +16,18 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
     if len(rollout.state_coordinates.position) not in (2, 3):
         raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
     model = model_from_xml(rollout.model, "rollout.model")
-    if not isinstance(rollout.body, str) or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, rollout.body) < 0:
-        raise InputError(f"rollout.body: got {rollout.body!r}, want a body of its model")
+    robot_body(model, rollout.body)
     if model.nq != rollout.frames.shape[-1]:
         raise InputError(f"rollout.frames: got {rollout.frames.shape[-1]} numbers each, want the model's {model.nq}")
     return model
+
+
+def robot_body(model: mujoco.MjModel, name: str) -> int:
+    """The number of the body that is the robot. Raises InputError unless the model has one of that name."""
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) if isinstance(name, str) else -1
+    if number < 0:
+        raise InputError(f"rollout.body: got {name!r}, want a body of its model")
+    return number
 
 
 def floor_below(model: mujoco.MjModel, data: mujoco.MjData, robot: int) -> float:

@@ -1,0 +1,43 @@
+"""Where things are in a picture: the parts of runs side by side, and the panes within a part, as boxes of pixels."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+INSETS_SHARE = 0.4  # of a run's part of the picture, for its insets
+
+
+@dataclass(frozen=True)
+class Box:
+    """A part of the picture, in pixels from its upper left corner."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    @property
+    def aspect(self) -> float:
+        return self.width / self.height
+
+
+def side_by_side(count: int, size: tuple[int, int]) -> list[Box]:
+    """Equal parts of a picture of `size` width and height, in rows of three at most; their edges are even."""
+    columns = count if count <= 3 else -(-count // 2)
+    rows = -(-count // columns)
+    x = [2 * round(size[0] * column / columns / 2) for column in range(columns + 1)]
+    y = [2 * round(size[1] * row / rows / 2) for row in range(rows + 1)]
+    places = [(number % columns, number // columns) for number in range(count)]
+    return [Box(x[i], y[j], x[i + 1] - x[i], y[j + 1] - y[j]) for i, j in places]
+
+
+def split_into_panes(box: Box, insets: int) -> list[Box]:
+    """The first pane and those of insets: in a column on its right, or in a row below it if the box is higher."""
+    wide = box.width >= box.height
+    length, across = (box.width, box.height) if wide else (box.height, box.width)
+    edge = 2 * round(length * (1 - INSETS_SHARE) / 2) if insets else length
+    cuts = [2 * round(across * number / max(insets, 1) / 2) for number in range(insets + 1)]
+    if wide:
+        first = Box(box.left, box.top, edge, box.height)
+        return [first, *(Box(edge, box.top + i, length - edge, j - i) for i, j in pairwise(cuts))]
+    first = Box(box.left, box.top, box.width, edge)
+    return [first, *(Box(i, box.top + edge, j - i, length - edge) for i, j in pairwise(cuts))]
