@@ -7,7 +7,6 @@ calls, and kept under a hash of that text and its own name, so nothing kept can 
 import ast
 import contextlib
 import gc
-import inspect
 import logging
 import platform
 import re
@@ -17,7 +16,6 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -155,14 +153,6 @@ def _vocabulary() -> dict[str, Any]:
     inlined = jit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
     names = {**vars(math), "__name__": __name__, "inner": inner, "inlined": inlined}
     return names | {name: getattr(pointers, name) for name in ("stack", "pointer", "invoke", "invoke_writing")}
-
-
-def source_of(module: ModuleType) -> str:
-    """The text of a module's functions that are in the numba subset: those below the line that says so, or all."""
-    source = inspect.getsource(module)
-    marks = [i for i, line in enumerate(source.splitlines(), start=1) if line.startswith("# The numba subset")]
-    nodes = [node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)]
-    return "\n\n".join(ast.unparse(node) for node in nodes if node.lineno > (marks[0] if marks else 0))
 
 
 def in_c_order(array: Array) -> Array:

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lqrsim.codegen.kernel_source import source_of
 from lqrsim.errors import Array, InputError, check_array, check_count, check_flag, check_function, check_number, excerpt
+from lqrsim.kernels import clearance
 from lqrsim.problem.costs import check_source
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.scenes.world import ROW, World
+from lqrsim.scenes.world import World
 
 
 @dataclass(frozen=True)
@@ -78,24 +80,9 @@ class Clearance(Constraint):
         if not position:
             raise InputError("Clearance: got dynamics without a position, want Dynamics(..., position=(names))")
         world = self.world.seen_by(space.plane, space.offset)
-        place = [f"x[{i}]" for i in position] + (["0.0"] if len(position) == 2 else [])
         return Inequalities(
-            source=_CLEARANCE.format(place=", ".join(place), axes=repr(position), size=len(position), row=ROW),
+            source=source_of(clearance, AXES=position),
             data=np.concatenate([[self.radius + self.margin], world.table.ravel()]),
             rows=len(world),
             says=lambda row: f"a clearance of {self.margin:g} m to obstacle {world.names[row]!r}",
         )
-
-
-_CLEARANCE = """\
-def value(x, u, t, row, data):
-    return signed_distance(data, 1 + {row} * row, {place}) - data[0]
-
-
-def slope(x, u, t, row, data, gradient):
-    axes = {axes}
-    normal, curve = stack(3), stack(3, 3)
-    signed_distance_derivatives(data, 1 + {row} * row, {place}, normal, curve)
-    for i in range({size}):
-        gradient[axes[i]] += normal[i]
-"""

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order, source_of
+from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order
+from lqrsim.codegen.kernel_source import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     augmented_lagrangian,
@@ -39,7 +40,7 @@ from lqrsim.problem.costs import Term
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import FixedState, Problem
 
-# The terms of a cost as far as they are structure: the source of each, and what it may bend in (see `Term`).
+# The terms of a cost as far as they are structure: the source of each, and what it is not convex in (see `Term`).
 Structure = tuple[tuple[str, tuple[int, ...] | None], ...]
 # The constraints: the source of each, and whether it uses the control.
 Constraints = tuple[tuple[str, bool], ...]
@@ -60,7 +61,7 @@ def core(problem: Problem, form: str = "dual") -> Core:
 def _structure(problem: Problem) -> tuple[Any, ...]:
     dynamics = problem.dynamics
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-    costs = [(name, tuple((t.source, t.bends) for t in problem.terms(field))) for name, field in _FIELDS.items()]
+    costs = [(name, tuple((t.source, t.nonconvex_in) for t in problem.terms(field))) for name, field in _FIELDS.items()]
     constraints = tuple((inequalities.source, inequalities.uses_control) for inequalities in problem.inequalities)
     return n, m, dynamics.source, tuple(costs), constraints, f"{dynamics.name} ({n} states, {m} controls)"
 
@@ -176,18 +177,18 @@ def _cost_source(name: str, terms: Structure, constraints: Constraints) -> str:
     """Source of `<name>_value`, the sum of the terms, of `<name>_added`, what the augmented Lagrangian adds, and of
     `<name>_quadratic`, which models both.
     """
-    parts, values, convex, bent = [], [], [], []
-    for i, (source, bends) in enumerate(terms):
+    parts, values, convex, nonconvex = [], [], [], []
+    for i, (source, nonconvex_in) in enumerate(terms):
         prefix = _prefix(source)
         parts.append(_own(source))
         values.append(f"    total += {prefix}_value(x, u, t, data[{i}])")
         call = f"    total += {prefix}_derivatives(x, u, t, data[{i}], hessian, gradient)"
-        (convex if bends is None else bent).append(call)
-    support = tuple(sorted({i for _, bends in terms for i in bends or ()}))
+        (convex if nonconvex_in is None else nonconvex).append(call)
+    support = tuple(sorted({i for _, entries in terms for i in entries or ()}))
     if support:
         # The sum of what may be indefinite is projected once; what is convex is added after.
-        parts.append(_rename(source_of(projection), {"project": f"{name}_project", "K": str(len(support))}))
-        bent.append(f"    {name}_project(hessian, {support})")
+        parts.append(_rename(source_of(projection, K=len(support)), {"project": f"{name}_project"}))
+        nonconvex.append(f"    {name}_project(hessian, {support})")
     added = []
     for k, (source, uses_control) in enumerate(constraints):
         if not (uses_control and name == "final"):
@@ -200,7 +201,7 @@ def _cost_source(name: str, terms: Structure, constraints: Constraints) -> str:
     parts.append(f"{summed}\n    return total")
     modelled = f"def {name}_quadratic(x, u, t, data, hessian, gradient):\n    clear(hessian, W, W)\n"
     modelled += "    for i in range(W):\n        gradient[i] = 0.0\n    total = 0.0\n"
-    parts.append("\n".join([modelled.rstrip(), *bent, *convex, "    return total"]))
+    parts.append("\n".join([modelled.rstrip(), *nonconvex, *convex, "    return total"]))
     return "\n\n".join(parts)
 
 
