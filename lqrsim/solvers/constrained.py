@@ -248,7 +248,7 @@ def _rounds(
         lagrangian.update()
         rough = rough and lagrangian.stuck == 0 and not lagrangian.nearly
     status, detail = Status.MAX_ITERATIONS, f"{why}; {lagrangian.worst()}".removeprefix("; ")
-    if not lagrangian.kept and (lagrangian.stuck == STUCK or lagrangian.grown > LARGEST):
+    if not lagrangian.kept and not lagrangian.nearly and (lagrangian.stuck == STUCK or lagrangian.grown > LARGEST):
         status, detail = Status.INFEASIBLE, lagrangian.worst()
     if attempt.stop.due:
         status = Status.TIME_LIMIT

@@ -42,7 +42,7 @@ class AugmentedLagrangian:
       kept: whether the plan that was evaluated last keeps the constraints.
       solved: whether it does so as well as is aimed at: inequalities with the tolerance to spare, and where more than
         that is left, with a multiplier that is not off by more: `|min(d, lambda / mu)|`; equalities `|d|`.
-      nearly: whether equalities are all that is not, and are off by less than inequalities may be.
+      nearly: whether it would if equalities could be missed by as much as inequalities have to spare.
       grown: by how much a penalty has grown. stuck: how often in a row that did not help.
     """
 
@@ -70,10 +70,13 @@ class AugmentedLagrangian:
         stated = self._work.constraint_values(states, controls)
         self.kept = self._work.keeps(stated)
         self._values = [values.ravel() - array[3] for values, array in zip(stated, self._work.multipliers, strict=True)]
-        missed = self._each(_missed)
-        pairs = zip(self._terms, missed, strict=True)
-        self.solved = all(off <= self._tolerance[term.equality] for term, off in pairs)
-        self.nearly = not self.solved and True in self._tolerance and max(missed) <= self._near
+        missed = zip(self._terms, self._each(_missed), strict=True)
+        self.solved = all(off <= self._tolerance[term.equality] for term, off in missed)
+        beyond = [
+            term.violation(values) - term.equality * self._near
+            for term, values in zip(self._terms, stated, strict=True)
+        ]
+        self.nearly = not self.kept and max(beyond) <= 0
 
     def start(self) -> None:
         """No multipliers, and a penalty for each constraint that fits what it costs to change it."""
