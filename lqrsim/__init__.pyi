@@ -9,7 +9,10 @@ from .control.controllers import Replanning as Replanning
 from .errors import InputError as InputError
 from .problem.constraints import Clearance as Clearance
 from .problem.constraints import Constraint as Constraint
-from .problem.constraints import Inequalities as Inequalities
+from .problem.constraints import ConstraintTerm as ConstraintTerm
+from .problem.constraints import GoalState as GoalState
+from .problem.constraints import StateBounds as StateBounds
+from .problem.constraints import SymbolicConstraint as SymbolicConstraint
 from .problem.costs import ControlCost as ControlCost
 from .problem.costs import Cost as Cost
 from .problem.costs import FunctionCost as FunctionCost

@@ -177,12 +177,12 @@ def test_check_derivatives_finds_a_wrong_slope(differential_drive: ls.Scenario) 
     """Of a speed limit whose slope has one sign wrong; those of a clearance are right."""
 
     class Slow(ls.Constraint):
-        def bind(self, dynamics: ls.Dynamics) -> ls.Inequalities:
+        def bind(self, dynamics: ls.Dynamics) -> ls.ConstraintTerm:
             source = (
                 "def value(x, u, t, row, data):\n    return data[0] - u[0] * u[1]\n\n\n"
                 "def slope(x, u, t, row, data, gradient):\n    gradient[3] -= u[1]\n    gradient[4] += u[0]\n"
             )
-            return ls.Inequalities(source, np.array([0.1]), 1, lambda row: "slowness", uses_control=True)
+            return ls.ConstraintTerm(source, np.array([0.1]), 1, lambda row: "slowness", uses_control=True)
 
     clear = ls.Clearance(differential_drive.scene.world, radius=differential_drive.robot.radius)
     stated = replace(differential_drive.problem, constraints=[Slow(), clear])

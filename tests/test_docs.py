@@ -67,6 +67,15 @@ def test_one_system_at_three_levels() -> None:
     # The compiled statement has central differences: eight digits of a derivative, twice that of a minimum.
     assert names["same"].cost == pytest.approx(names["solution"].cost, rel=1e-7)
     assert names["rough_solution"].cost > names["solution"].cost
+    carried = names["carried"]
+    states, force = carried.trajectory.states, carried.trajectory.controls[:, 0]
+    assert carried.status is ls.Status.CONVERGED
+    np.testing.assert_allclose(states[-1], [0.8, 0, 0, 0], rtol=0, atol=1e-6)
+    # All three act: to within the tolerance that is left to spare they are as large as they may be.
+    for largest, most in (
+        (np.abs(states[:, 1]).max(), 0.08), (states[:, 2].max(), 0.42), ((force * states[:-1, 2]).max(), 0.08)
+    ):  # fmt: skip
+        assert most - 2e-3 < largest <= most
     assert all(check.good for check in ls.check_derivatives(names["pendulum"]))
     assert all(found.status is ls.Status.CONVERGED for found in names["solutions"])
 

@@ -43,7 +43,12 @@ FLOORS_WITHIN = {
         ("solution",),
         ("rollout",),
     ),
-    "codegen": (("arguments", "disk_cache", "pointers"), ("fingerprint",), ("symbolic", "user_functions"), ("jit",)),
+    "codegen": (
+        ("arguments", "disk_cache", "kernel_source", "pointers"),
+        ("fingerprint",),
+        ("symbolic", "user_functions"),
+        ("jit",),
+    ),
     "problem": (("dynamics", "linear_quadratic"), ("costs",), ("constraints",), ("problem",)),
     "solvers": (("compiled", "initial_guess"), ("common", "certify"), ("workspace",), ("attempt",)),
     "simulation": (("fitting", "plant"), ("physics",), ("disturbances",)),

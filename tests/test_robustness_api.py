@@ -328,8 +328,8 @@ class TestFunctions:
     def test_functions_of_modules_are_named(self, said: str) -> None:
         value = f"def value(x, u, t, row, data):\n    return {said}\n\n\n"
         slope = "def slope(x, u, t, row, data, gradient):\n    gradient[0] += 1.0\n"
-        line = refusal(lambda: ls.Inequalities(value + slope, np.zeros(0), 1, str))
-        assert line == f"Inequalities: source: got {said[:-6]} in line 2, want cos: modules are not at hand"
+        line = refusal(lambda: ls.ConstraintTerm(value + slope, np.zeros(0), 1, str))
+        assert line == f"ConstraintTerm: source: got {said[:-6]} in line 2, want cos: modules are not at hand"
         term = value.replace("row, ", "") + slope.replace(
             "def slope(x, u, t, row, data, gradient)", "def derivatives(x, u, t, data, hessian, gradient)"
         )
@@ -344,7 +344,7 @@ class TestFunctions:
         ],
     )  # fmt: skip
     def test_sources_that_are_none(self, source: Any, wanted: str) -> None:
-        assert wanted in refusal(lambda: ls.Inequalities(source, np.zeros(0), 1, str))
+        assert wanted in refusal(lambda: ls.ConstraintTerm(source, np.zeros(0), 1, str))
 
     def test_what_a_function_of_ones_own_raises_is_its_own(self, differential_drive: ls.Scenario) -> None:
         class Mine(Exception):

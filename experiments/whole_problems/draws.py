@@ -208,6 +208,35 @@ def drive(rng: Generator) -> ls.Problem:
     return replace(problem, final_cost=ls.QuadraticCost(_weights(rng, 3, 10.0, 5000.0), about=goal))
 
 
+def _sideways(x: Any, u: Any, p: Any) -> list[Any]:
+    across = u[1] * x[3] ** 2  # m/s^2
+    return [p.grip - across, p.grip + across]
+
+
+def _aligned(x: Any, u: Any, p: Any) -> Any:
+    from sympy import cos, sin
+
+    return x[0] * sin(p.bearing) - x[1] * cos(p.bearing)
+
+
+def parking(rng: Generator) -> ls.Problem:
+    """The car onto a line, at a heading and at rest, within bounds on its speed and on its sideways acceleration."""
+    problem, bearing = car(rng), float(rng.uniform(-np.pi, np.pi))
+    goal = np.array([0.0, 0.0, bearing, 0.0])
+    return replace(
+        problem,
+        steps=int(rng.integers(30, 80)),
+        stage_cost=ls.ControlCost(_weights(rng, 2, 0.1, 20.0)),
+        final_cost=ls.QuadraticCost(_weights(rng, 4, 1.0, 100.0), about=goal),
+        constraints=[
+            ls.SymbolicConstraint(_aligned, parameters={"bearing": bearing}, equality=True, at="final"),
+            ls.GoalState([bearing, 0.0], states=("heading", "speed")),
+            ls.StateBounds(low={"speed": float(rng.choice([-1.0, 0.0]))}, high={"speed": float(rng.uniform(0.5, 3.0))}),
+            ls.SymbolicConstraint(_sideways, parameters={"grip": float(rng.uniform(0.5, 5.0))}),
+        ],
+    )
+
+
 KINDS: dict[str, Callable[[Generator], ls.Problem]] = {
     "linear": linear,
     "pendulum": classics.pendulum,
@@ -220,4 +249,5 @@ KINDS: dict[str, Callable[[Generator], ls.Problem]] = {
     "planar_free": planar_free,
     "drive": drive,
     "quadrotor": quadrotor,
+    "parking": parking,
 }

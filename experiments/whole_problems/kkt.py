@@ -229,7 +229,7 @@ def _differentiate(function: Function, z: Array) -> tuple[Array, Array]:
 
 
 @cache
-def _numeric(function: Any, n: int, m: int, parameters: tuple[str, ...], several: bool) -> Any:
+def numeric(function: Any, n: int, m: int, parameters: tuple[str, ...], several: bool) -> Any:
     """A user's formula `function(x, u, p)` as a function of arrays: its entries, or its only one."""
     import sympy
 
@@ -246,7 +246,7 @@ def rate_of(problem: ls.Problem, rate: Rate | None) -> Rate:
     if rate is not None:
         return rate
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-    return _numeric(dynamics.f, n, m, tuple(dynamics.parameters), True)
+    return numeric(dynamics.f, n, m, tuple(dynamics.parameters), True)
 
 
 def numbers_of(problem: ls.Problem) -> tuple[float, ...]:
@@ -258,7 +258,7 @@ def _quadratic(cost: ls.QuadraticCost | ls.ControlCost, z: Values) -> Values:
 
 
 def _formula_cost(cost: ls.SymbolicCost, n: int, size: int, m: int) -> Function:
-    formula = _numeric(cost.function, n, m, tuple(cost.parameters), False)
+    formula = numeric(cost.function, n, m, tuple(cost.parameters), False)
     numbers = tuple(cost.parameters.values())
 
     def function(z: Values) -> Values:

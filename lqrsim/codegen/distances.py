@@ -5,7 +5,8 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.jit import Core, compiling, source_of
+from lqrsim.codegen.jit import Core, compiling
+from lqrsim.codegen.kernel_source import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import interface
 from lqrsim.kernels import signed_distance as kernel

@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -156,14 +155,6 @@ def _vocabulary() -> dict[str, Any]:
     names = {**vars(math), "__name__": __name__, "inner": inner, "inlined": inlined}
     names |= {name: record for name, record in vars(records).items() if inspect.isclass(record)}
     return names | {name: getattr(pointers, name) for name in ("stack", "pointer", "invoke", "invoke_writing")}
-
-
-def source_of(module: ModuleType) -> str:
-    """The text of a module's functions that are in the numba subset: those below the line that says so, or all."""
-    source = inspect.getsource(module)
-    marks = [i for i, line in enumerate(source.splitlines(), start=1) if line.startswith("# The numba subset")]
-    nodes = [node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)]
-    return "\n\n".join(ast.unparse(node) for node in nodes if node.lineno > (marks[0] if marks else 0))
 
 
 def in_c_order(array: Array) -> Array:

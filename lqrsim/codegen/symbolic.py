@@ -67,7 +67,8 @@ def kept(function: Callable[..., Any], details: object, make: Callable[[], dict[
 def _writers() -> str:
     """The code that writes what is kept: with other code, something else may be right."""
     package = Path(__file__).parents[1]
-    files = (package / name for name in ("codegen/symbolic.py", "problem/dynamics.py", "problem/costs.py"))
+    files = [package / "codegen" / "symbolic.py"]
+    files += [package / "problem" / f"{name}.py" for name in ("dynamics", "costs", "constraints")]
     return "".join(file.read_text(encoding="utf-8") for file in files)
 
 

@@ -8,7 +8,8 @@ from functools import cache
 
 import numpy as np
 
-from lqrsim.codegen.jit import Core, compiling, in_c_order, source_of
+from lqrsim.codegen.jit import Core, compiling, in_c_order
+from lqrsim.codegen.kernel_source import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import policy_evaluation
 from lqrsim.results.coordinates import Coordinates

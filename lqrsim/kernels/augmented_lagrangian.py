@@ -4,18 +4,24 @@ For inequalities d >= 0, with multipliers lambda >= 0 and a penalty mu, it is
 
     sum (max(0, lambda - mu d)^2 - lambda^2) / (2 mu)
 
-At the optimum the multipliers are `max(0, lambda - mu d)`. Here d is what a constraint has to spare beyond the
-tolerance to which it is solved, so that what is within the tolerance keeps the constraint itself. Of the curvature only
-`mu n n'` is taken, n the slope of d: the rest can be negative. `solvers/compiled.py` makes these functions for each
-constraint.
+and for equalities d = 0, with multipliers of either sign, the same without the max, which is
 
-`multipliers` is one array a constraint: mu, how many inequalities there are at a step, the first step at which they
-act, the tolerance, and from HEADER on lambda, step by step. With mu of zero there is nothing.
+    sum -lambda d + mu/2 d^2
+
+At the optimum the multipliers are the forces `max(0, lambda - mu d)` and `lambda - mu d`. For inequalities d is what a
+constraint has to spare beyond the tolerance to which it is solved, so that what is within the tolerance keeps the
+constraint itself. Of the curvature only `mu n n'` is taken, n the slope of d: the rest can be negative.
+`solvers/compiled.py` makes these functions for each constraint.
+
+`multipliers` is one array a constraint: mu, how many numbers there are at a step, the first step at which they act, the
+tolerance that is to be left to spare, and from HEADER on lambda, step by step. With mu of zero there is nothing.
 """
 
 from math import inf
 
 from lqrsim.kernels.interface import HEADER, W, constraint_slope, constraint_value, stack
+
+EQUALITY = False  # whether the constraint's numbers are to be zero
 
 
 def augment(x, u, t, data, multipliers, hessian, gradient):
@@ -28,7 +34,7 @@ def augment(x, u, t, data, multipliers, hessian, gradient):
             multiplier = multipliers[HEADER + rows * t + row]
             force = multiplier - penalty * (constraint_value(x, u, t, row, data) - multipliers[3])
             total -= multiplier * multiplier
-            if force > 0:
+            if EQUALITY or force > 0:
                 total += force * force
                 for i in range(W):
                     slope[i] = 0.0
@@ -50,14 +56,18 @@ def augmentation(x, u, t, data, multipliers):
             multiplier = multipliers[HEADER + rows * t + row]
             force = multiplier - penalty * (constraint_value(x, u, t, row, data) - multipliers[3])
             total -= multiplier * multiplier
-            if force > 0:
+            if EQUALITY or force > 0:
                 total += force * force
         total /= 2 * penalty
     return total
 
 
-def look(x, u, t, acts, data, multipliers, values):
-    """Write the values at a step, step by step as the multipliers are; infinite where they do not act."""
+def constraint_values(x, u, t, acts, data, multipliers, values):
+    """Write a constraint's numbers at a step, step by step as the multipliers are.
+
+    Where they do not act they are kept: an inequality's is infinite, an equality's zero.
+    """
     rows = int(multipliers[1])
     for row in range(rows):
-        values[rows * t + row] = constraint_value(x, u, t, row, data) if acts and t >= multipliers[2] else inf
+        kept = 0.0 if EQUALITY else inf
+        values[rows * t + row] = constraint_value(x, u, t, row, data) if acts and t >= multipliers[2] else kept

@@ -42,6 +42,14 @@ def stack(*shape: int) -> np.ndarray:
     return np.empty(shape)
 
 
+def invoke(address, x, u, data, out) -> None:
+    """Call the user's function at an address: it writes what it returns."""
+
+
+def invoke_writing(address, x, u, data, first, second) -> None:
+    """Call the user's function at an address that writes to two arrays, which it gets as they are."""
+
+
 def rate(x, u, p, out) -> None:
     """Write xdot = f(x, u), (N,)."""
 

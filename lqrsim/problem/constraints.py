@@ -1,23 +1,44 @@
-"""What a plan must keep to, besides the limits of the controls: inequalities at the steps.
+"""What a plan must keep to, besides the limits of the controls: numbers that are not to be negative, or to be zero.
 
-To add a kind, subclass `Constraint` and write `bind`, as for a cost.
+To add a kind, state it as a formula with `SymbolicConstraint`, or subclass `Constraint` and write `bind`.
 """
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_array, check_count, check_flag, check_function, check_number, excerpt
+from lqrsim.codegen import symbolic
+from lqrsim.codegen.kernel_source import source_of
+from lqrsim.codegen.user_functions import check_signature, level_of, name_of
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_flag,
+    check_function,
+    check_items,
+    check_kind,
+    check_name,
+    check_number,
+    excerpt,
+)
+from lqrsim.kernels import clearance, state_bound
 from lqrsim.problem.costs import check_source
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.scenes.world import ROW, World
+from lqrsim.scenes.world import World
+
+EQUALITY_TOLERANCE = 1e-6  # how closely equalities are kept, where `constraint_tolerance` is no smaller
+STEPS = ("all", "final")  # at which a constraint can act
 
 
 @dataclass(frozen=True)
-class Inequalities:
-    """A constraint, made for one system: so many numbers at each step that are not to be negative.
+class ConstraintTerm:
+    """A constraint, made for one system: so many numbers at each step that are not to be negative, or are to be zero.
 
     Attributes:
       source: defines `value(x, u, t, row, data)`, which returns one of the numbers, and `slope(x, u, t, row, data,
@@ -25,29 +46,45 @@ class Inequalities:
         Functions go by their bare names: `cos`, not `math.cos` or `np.cos`, which are refused.
       data: (any,) float64.
       rows: how many numbers there are at a step.
-      says: what a message calls a row.
+      describe: what a message calls a row.
       uses_control: whether they depend on u; if so, they do not act at the last step, which has none.
+      equality: whether they are to be zero.
+      final_only: whether they act at the last step alone.
     """
 
     source: str
     data: Array
     rows: int
-    says: Callable[[int], str]
+    describe: Callable[[int], str]
     uses_control: bool = False
+    equality: bool = False
+    final_only: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "data", check_array("Inequalities: data", self.data, (None,), infinite=True))
-        object.__setattr__(self, "rows", check_count("Inequalities: rows", self.rows, at_least=0))
-        check_function("Inequalities: says", self.says, "a function of a row", optional=False)
-        object.__setattr__(self, "uses_control", check_flag("Inequalities: uses_control", self.uses_control))
-        check_source("Inequalities", self.source, {"value": 5, "slope": 6})
+        object.__setattr__(self, "data", check_array("ConstraintTerm: data", self.data, (None,), infinite=True))
+        object.__setattr__(self, "rows", check_count("ConstraintTerm: rows", self.rows, at_least=0))
+        check_function("ConstraintTerm: describe", self.describe, "a function of a row", optional=False)
+        for name in ("uses_control", "equality", "final_only"):
+            object.__setattr__(self, name, check_flag(f"ConstraintTerm: {name}", getattr(self, name)))
+        if self.uses_control and self.final_only:
+            raise InputError("ConstraintTerm: final_only: got True with uses_control, want one: the end has no control")
+        check_source("ConstraintTerm", self.source, {"value": 5, "slope": 6})
+
+    def violation(self, values: Array) -> float:
+        """By how much the worst of these values misses what is wanted; 0 where none does, infinite if one is NaN."""
+        missed = float((np.abs(values) if self.equality else -values).max(initial=0.0))
+        return missed if not np.isnan(missed) else np.inf
+
+    def allowed(self, tolerance: float) -> float:
+        """The violation that is none: constraints are solved for to `tolerance`, and inequalities have it to spare."""
+        return min(tolerance, EQUALITY_TOLERANCE) if self.equality else 0.0
 
 
 class Constraint(abc.ABC):
     """One constraint."""
 
     @abc.abstractmethod
-    def bind(self, dynamics: Dynamics) -> Inequalities:
+    def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         """This constraint for a system. Raises InputError if it does not fit."""
 
 
@@ -72,30 +109,229 @@ class Clearance(Constraint):
         self.radius = check_number("Clearance: radius", radius, at_least=0.0)
         self.margin = check_number("Clearance: margin", margin)
 
-    def bind(self, dynamics: Dynamics) -> Inequalities:
+    def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         space = dynamics.state_coordinates
         position = space.position
         if not position:
             raise InputError("Clearance: got dynamics without a position, want Dynamics(..., position=(names))")
         world = self.world.seen_by(space.plane, space.offset)
-        place = [f"x[{i}]" for i in position] + (["0.0"] if len(position) == 2 else [])
-        return Inequalities(
-            source=_CLEARANCE.format(place=", ".join(place), axes=repr(position), size=len(position), row=ROW),
+        return ConstraintTerm(
+            source=source_of(clearance, AXES=position),
             data=np.concatenate([[self.radius + self.margin], world.table.ravel()]),
             rows=len(world),
-            says=lambda row: f"a clearance of {self.margin:g} m to obstacle {world.names[row]!r}",
+            describe=lambda row: f"a clearance of {self.margin:g} m to obstacle {world.names[row]!r}",
         )
 
 
-_CLEARANCE = """\
-def value(x, u, t, row, data):
-    return signed_distance(data, 1 + {row} * row, {place}) - data[0]
+class SymbolicConstraint(Constraint):
+    """A constraint stated as a formula.
+
+    One that depends on the control acts at the steps that have one, so not at the last; one of the state alone acts at
+    the last, too, but not at a start that is given exactly, about which nothing can be done.
+
+    Args:
+      function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns one expression, or a list of them, that
+        are not to be negative. All of them depend on u, or none does. They are solved for to one tolerance, so their
+        units are best such that numbers about 1 matter.
+      parameters: name -> value, as in `Dynamics`.
+      equality: the expressions are to be zero, and are to 1e-6, or to `constraint_tolerance` where that is smaller.
+      at: "all" steps, or the "final" one alone, where it must not depend on u.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any, Any, Any], Any],
+        *,
+        parameters: Mapping[str, float] | None = None,
+        equality: bool = False,
+        at: str = "all",
+    ) -> None:
+        if level_of(function, None) == "compiled":
+            raise InputError(
+                f"SymbolicConstraint: got the numba function {name_of(function)}, want one of SymPy symbols"
+            )
+        self.function = function
+        check_signature(function, ("x", "u", "p"))
+        self.parameters = symbolic.check_parameters(parameters)
+        self.equality = check_flag("SymbolicConstraint: equality", equality)
+        self.at = check_name("SymbolicConstraint: at", at, STEPS)
+
+    @property
+    def name(self) -> str:
+        """The name of its function."""
+        return f"{name_of(self.function)}(x, u, p)"
+
+    def bind(self, dynamics: Dynamics) -> ConstraintTerm:
+        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        details = ("constraint", n, m, tuple(self.parameters))
+        made = symbolic.kept(self.function, details, lambda: self._trace(n, m))
+        with_control, rows = made["with_control"], made["rows"]
+        if self.at == "final" and with_control:
+            raise InputError(
+                f"{self.name}: got an entry that depends on u, want none at the final step, which has no u"
+            )
+        if 0 < len(with_control) < rows:
+            raise InputError(
+                f"{self.name}: got {rows} entries of which {len(with_control)} depend on u, want all of them or none:"
+                " state the others as another SymbolicConstraint"
+            )
+        kind = "zero" if self.equality else "not negative"
+        return ConstraintTerm(
+            source=made["source"],
+            data=np.array(list(self.parameters.values()), dtype=np.float64),
+            rows=rows,
+            describe=lambda row: f"that {self.name}{f'[{row}]' if rows > 1 else ''} is {kind}",
+            uses_control=bool(with_control),
+            equality=self.equality,
+            final_only=self.at == "final",
+        )
+
+    def _trace(self, n: int, m: int) -> dict[str, Any]:
+        traced, x, u = symbolic.trace(self.function, n, m, list(self.parameters))
+        if not traced:
+            raise InputError(f"{self.name}: got no entries, want at least one: what is not to be negative, or zero")
+        parts, choices = [], {"value": [], "slope": []}
+        for row, entry in enumerate(traced):
+            if not entry.free_symbols & {*x, *u}:
+                raise InputError(f"{self.name}: got {entry} as entry {row}, want it to depend on x or u")
+            slopes = {f"gradient[{i}]+": entry.diff(symbol) for i, symbol in enumerate([*x, *u])}
+            slopes = {target: slope for target, slope in slopes.items() if slope != 0}
+            value, slope = f"value_{row}(x, u, data)", f"slope_{row}(x, u, data, gradient)"
+            parts.append(_written(value, {"entry": entry}, self.name, returns="entry"))
+            parts.append(_written(slope, slopes, self.name))
+            choices["value"].append(f"    if row == {row}:\n        return {value}")
+            choices["slope"].append(f"    if row == {row}:\n        {slope}")
+        value = "\n".join(["def value(x, u, t, row, data):", *choices["value"], "    return 0.0"])
+        slope = "\n".join(["def slope(x, u, t, row, data, gradient):", *choices["slope"]])
+        return {
+            "source": "\n\n".join([*parts, value, slope]) + "\n",
+            "rows": len(traced),
+            "with_control": [row for row, entry in enumerate(traced) if entry.free_symbols & set(u)],
+        }
 
 
-def slope(x, u, t, row, data, gradient):
-    axes = {axes}
-    normal, curve = stack(3), stack(3, 3)
-    signed_distance_derivatives(data, 1 + {row} * row, {place}, normal, curve)
-    for i in range({size}):
-        gradient[axes[i]] += normal[i]
-"""
+class GoalState(Constraint):
+    """The final state equals a goal, exactly; where a cost only draws it there.
+
+    Args:
+      goal: (n,) the state, or with `states` as many numbers, in the states' units. Angles count whole turns, as for a
+        QuadraticCost.
+      states: names of the states that it is for; all by default.
+    """
+
+    def __init__(self, goal: npt.ArrayLike, *, states: Sequence[str] | None = None) -> None:
+        self.goal = check_array("GoalState: goal", goal, (None,))
+        self.states = None if states is None else _names("GoalState: states", states)
+        if self.states is not None and len(self.states) != len(self.goal):
+            raise InputError(f"GoalState: goal: got {len(self.goal)} numbers, want {len(self.states)}, one a name")
+
+    def numbers(self, dynamics: Dynamics) -> dict[int, float]:
+        """What is asked of which state, by its index. Raises InputError if it does not fit."""
+        names = dynamics.state_coordinates.names
+        wanted = names if self.states is None else self.states
+        if len(self.goal) != len(wanted):
+            each = f"one for each of {', '.join(names)}"
+            raise InputError(f"GoalState: goal: got {len(self.goal)} numbers, want {len(names)}, {each}")
+        indices = [names.index(check_name("GoalState: states", name, names)) for name in wanted]
+        return dict(zip(indices, self.goal.tolist(), strict=True))
+
+    def bind(self, dynamics: Dynamics) -> ConstraintTerm:
+        names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
+        rows = list(self.numbers(dynamics).items())
+        says = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
+        data = [(i, 1.0, number, np.inf) for i, number in rows]
+        return ConstraintTerm(
+            source_of(state_bound), np.ravel(data), len(rows), says.__getitem__, equality=True, final_only=True
+        )
+
+
+class StateBounds(Constraint):
+    """Bounds on states, kept at each step; only at a start that is given exactly they do not act.
+
+    Nor at the end on a state that a GoalState fixes there, which may be at its bound.
+
+    Args:
+      low, high: name of a state -> the least and the most it may be, in its unit.
+    """
+
+    def __init__(self, low: Mapping[str, float] | None = None, high: Mapping[str, float] | None = None) -> None:
+        self.low, self.high = (_bounds(f"StateBounds: {name}", side) for name, side in (("low", low), ("high", high)))
+        if not self.low and not self.high:
+            raise InputError("StateBounds: got no bounds, want a dictionary of name: number for low, high or both")
+        for name in self.low.keys() & self.high.keys():
+            if not self.low[name] < self.high[name]:
+                span = f"{self.low[name]:g} to {self.high[name]:g}"
+                raise InputError(f"StateBounds: got {span} for {excerpt(name)}, want low below high")
+
+    def bind(self, dynamics: Dynamics) -> ConstraintTerm:
+        return self.bind_to_goal(dynamics, {}, 0)
+
+    def bind_to_goal(self, dynamics: Dynamics, goals: Mapping[int, float], steps: int) -> ConstraintTerm:
+        """As `bind`, where some states, by their indices, must be at a goal after so many steps.
+
+        Raises:
+          InputError: a goal is outside the bounds.
+        """
+        names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
+        data, says = [], []
+        for sign, side, word in ((1.0, self.low, "at least"), (-1.0, self.high, "at most")):
+            for name, number in side.items():
+                i = names.index(check_name("StateBounds: states", name, names))
+                wanted = f"{name} of {word} {_quantity(number, units[i])}"
+                if sign * (goals.get(i, number) - number) < 0:
+                    goal = _quantity(goals[i], units[i])
+                    raise InputError(f"constraints: got a goal of {goal} for {name}, want {wanted}")
+                data.append((i, sign, number, steps - 1 if i in goals else np.inf))
+                says.append(wanted)
+        return ConstraintTerm(source_of(state_bound), np.ravel(data), len(data), says.__getitem__)
+
+
+def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
+    """What all GoalStates ask of which state, by its index. Raises InputError if two contradict each other."""
+    goals: dict[int, float] = {}
+    for constraint in constraints:
+        for i, number in constraint.numbers(dynamics).items() if isinstance(constraint, GoalState) else ():
+            if goals.setdefault(i, number) != number:
+                name = dynamics.state_coordinates.names[i]
+                raise InputError(f"constraints: got goals of {goals[i]:g} and {number:g} for {name}, want one")
+    return goals
+
+
+def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, steps: int) -> tuple[ConstraintTerm, ...]:
+    """The constraints for a system and so many steps. Raises InputError if they do not fit it, or each other."""
+    goals, terms = goals_of(constraints, dynamics), []
+    for constraint in constraints:
+        if isinstance(constraint, StateBounds):
+            term = constraint.bind_to_goal(dynamics, goals, steps)
+        else:
+            term = constraint.bind(dynamics)
+        terms.append(check_kind(f"{type(constraint).__name__}.bind", term, ConstraintTerm, "a ConstraintTerm"))
+    return tuple(terms)
+
+
+def _written(signature: str, assignments: Mapping[str, Any], of: str, returns: str | None = None) -> str:
+    name, arguments = signature.removesuffix(")").split("(")
+    return symbolic.write_function(name, arguments, "data", assignments, of=of, returns=returns)
+
+
+def _names(field: str, names: Sequence[str]) -> tuple[str, ...]:
+    """The names of states, each once."""
+    if isinstance(names, str):
+        raise InputError(f"{field}: got {excerpt(names)}, want a tuple of names: ({excerpt(names)},)")
+    listed = check_items(field, names, str, "a tuple of names of states, at least one")
+    if not listed or len(set(listed)) < len(listed):
+        raise InputError(f"{field}: got {excerpt(listed)}, want names of states, at least one, and each once")
+    return listed
+
+
+def _bounds(field: str, side: Mapping[str, float] | None) -> dict[str, float]:
+    if side is None:
+        return {}
+    wanted = "a dictionary of name: number"
+    check_kind(field, side, Mapping, wanted)
+    check_items(field, tuple(side), str, wanted)
+    return {name: check_number(f"{field}: {excerpt(name)}", number) for name, number in side.items()}
+
+
+def _quantity(number: float, unit: str) -> str:
+    return f"{number:g} {unit}".rstrip()

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
+from lqrsim.codegen.kernel_source import source_of
 from lqrsim.codegen.user_functions import External, check_signature, level_of, name_of
 from lqrsim.errors import (
     Array,
@@ -29,8 +30,9 @@ from lqrsim.errors import (
     check_weight,
     excerpt,
 )
+from lqrsim.kernels import control_cost, cost_differences, function_cost, obstacle_cost, quadratic_cost
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.scenes.world import ROW, World
+from lqrsim.scenes.world import World
 
 
 @dataclass(frozen=True)
@@ -43,8 +45,8 @@ class Term:
         numba subset; the names of `kernels/signed_distance.py` and `kernels/rotation_ratios.py`, and N, M, W, sqrt, exp
         and the like are at hand, by their bare names: `cos`, not `math.cos` or `np.cos`, which are refused.
       data: (any,) float64; the source can index it, but not ask for its length.
-      bends: indices of the entries of (x, u) in which the Hessian may be indefinite: None for a convex term. The sum of
-        all such terms is projected to the nearest positive-semidefinite matrix.
+      nonconvex_in: indices of the entries of (x, u) in which the Hessian may be indefinite: None for a convex term. The
+        sum of all such terms is projected to the nearest positive-semidefinite matrix.
       uses_control: whether it depends on u (only stage costs may).
       factor: index in `data` of a number that the whole term is proportional to, for what may be eased in the first
         iterations; see `InitialPrior`. None where there is none.
@@ -53,7 +55,7 @@ class Term:
 
     source: str
     data: Array
-    bends: tuple[int, ...] | None = None
+    nonconvex_in: tuple[int, ...] | None = None
     uses_control: bool = False
     factor: int | None = None
     functions: tuple[External, ...] = ()
@@ -61,9 +63,11 @@ class Term:
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", check_array("Term: data", self.data, (None,), infinite=True))
         check_source("Term", self.source, {"value": 4, "derivatives": 6})
-        if self.bends is not None:
-            bends = check_items("Term: bends", self.bends, (int, np.integer), "a tuple of indices, or None")
-            object.__setattr__(self, "bends", tuple(check_count("Term: bends", i, at_least=0) for i in bends))
+        if self.nonconvex_in is not None:
+            wanted = "a tuple of indices, or None"
+            given = check_items("Term: nonconvex_in", self.nonconvex_in, (int, np.integer), wanted)
+            entries = tuple(check_count("Term: nonconvex_in", i, at_least=0) for i in given)
+            object.__setattr__(self, "nonconvex_in", entries)
         object.__setattr__(self, "uses_control", check_flag("Term: uses_control", self.uses_control))
         if self.factor is not None:
             last = len(self.data) - 1
@@ -121,7 +125,7 @@ class QuadraticCost(Cost):
 
     def bind(self, dynamics: Dynamics) -> Term:
         _check_size("QuadraticCost: weight", self.weight, len(dynamics.state_coordinates), "states")
-        return Term(_QUADRATIC.format(first="0", size="N", z="x"), np.concatenate([self.about, self.weight.ravel()]))
+        return Term(source_of(quadratic_cost), np.concatenate([self.about, self.weight.ravel()]))
 
 
 class ControlCost(Cost):
@@ -140,8 +144,8 @@ class ControlCost(Cost):
 
     def bind(self, dynamics: Dynamics) -> Term:
         _check_size("ControlCost: weight", self.weight, len(dynamics.control_coordinates), "controls")
-        source = _QUADRATIC.format(first="N", size="M", z="u")
-        return Term(source, np.concatenate([self.about, self.weight.ravel()]), uses_control=True)
+        numbers = np.concatenate([self.about, self.weight.ravel()])
+        return Term(source_of(control_cost), numbers, uses_control=True)
 
 
 class ObstacleCost(Cost):
@@ -169,10 +173,8 @@ class ObstacleCost(Cost):
         if not position:
             raise InputError("ObstacleCost: got dynamics without a position, want Dynamics(..., position=(names))")
         world = self.world.seen_by(space.plane, space.offset)
-        place = [f"x[{i}]" for i in position] + (["0.0"] if len(position) == 2 else [])
-        source = _OBSTACLES.format(place=", ".join(place), axes=repr(position), size=len(position), row=ROW)
         data = np.concatenate([[self.radius, self.sharpness, self.weight, len(world)], world.table.ravel()])
-        return Term(source, data, bends=position, factor=2)
+        return Term(source_of(obstacle_cost, AXES=position), data, nonconvex_in=position, factor=2)
 
 
 class SymbolicCost(Cost):
@@ -211,7 +213,7 @@ class SymbolicCost(Cost):
         return Term(
             made["source"],
             np.array(list(self.parameters.values()), dtype=np.float64),
-            bends=None if self.convex or not made["bends"] else tuple(made["bends"]),
+            nonconvex_in=None if self.convex or not made["nonconvex_in"] else tuple(made["nonconvex_in"]),
             uses_control=made["uses_control"],
         )
 
@@ -231,7 +233,7 @@ class SymbolicCost(Cost):
         )
         return {
             "source": f"{value}\n\n{derivatives}",
-            "bends": sorted({i for (i, _), curve in curves.items() if curve != 0}),
+            "nonconvex_in": sorted({i for (i, _), curve in curves.items() if curve != 0}),
             "uses_control": bool(cost.free_symbols & set(u)),
         }
 
@@ -299,11 +301,13 @@ class FunctionCost(Cost):
         functions = (External(function=self.function, values=1, unused=unused, **rest),)
         if self.derivatives is not None:
             functions += (External(function=self.derivatives, writes=((n + m,), (n + m, n + m)), **rest),)
-        source = _FUNCTION + (_DIFFERENCES if self.derivatives is None else _DERIVATIVES)
+        source = source_of(function_cost)
+        if self.derivatives is None:
+            source = f"{source_of(function_cost, 'value')}\n\n{source_of(cost_differences, AXES=axes)}"
         return Term(
-            source.format(axes=f"({''.join(f'{axis}, ' for axis in axes)})", count=len(axes)),
+            source,
             np.array(list(self.parameters.values()), dtype=np.float64),
-            bends=None if self.convex else axes,
+            nonconvex_in=None if self.convex else axes,
             uses_control=any(axis >= n for axis in axes),
             functions=functions,
         )
@@ -346,127 +350,3 @@ def _wrong(source: str, functions: tuple[tuple[str, int], ...]) -> str:
 def _check_size(field: str, weight: Array, want: int, what: str) -> None:
     if len(weight) != want:
         raise InputError(f"{field}: got size {len(weight)}, want {want}, the number of {what}")
-
-
-_QUADRATIC = """\
-def value(x, u, t, data):
-    total = 0.0
-    for i in range({size}):
-        slope = 0.0
-        for j in range({size}):
-            slope += data[{size} + {size} * i + j] * ({z}[j] - data[j])
-        total += 0.5 * slope * ({z}[i] - data[i])
-    return total
-
-
-def derivatives(x, u, t, data, hessian, gradient):
-    total = 0.0
-    for i in range({size}):
-        slope = 0.0
-        for j in range({size}):
-            weight = data[{size} + {size} * i + j]
-            slope += weight * ({z}[j] - data[j])
-            hessian[{first} + i, {first} + j] += weight
-        gradient[{first} + i] += slope
-        total += 0.5 * slope * ({z}[i] - data[i])
-    return total
-"""
-
-_OBSTACLES = """\
-def value(x, u, t, data):
-    total = 0.0
-    if t > 0:
-        for i in range(int(data[3])):
-            distance = signed_distance(data, 4 + {row} * i, {place})
-            total += exp(-data[1] * (distance - data[0]))
-    return data[2] * total
-
-
-def derivatives(x, u, t, data, hessian, gradient):
-    total = 0.0
-    if t > 0:
-        axes = {axes}
-        slope, curve, slopes, curves = stack(3), stack(3, 3), stack(3), stack(3, 3)
-        clear(curves, 3, 3)
-        for j in range(3):
-            slopes[j] = 0.0
-        for i in range(int(data[3])):
-            distance = signed_distance_derivatives(data, 4 + {row} * i, {place}, slope, curve)
-            cost = data[2] * exp(-data[1] * (distance - data[0]))
-            total += cost
-            for j in range(3):
-                slopes[j] -= cost * slope[j]
-                for k in range(3):
-                    curves[j, k] += cost * (data[1] * slope[j] * slope[k] - curve[j, k])
-        for j in range({size}):
-            gradient[axes[j]] += data[1] * slopes[j]
-            for k in range({size}):
-                hessian[axes[j], axes[k]] += data[1] * curves[j, k]
-    return total
-"""
-
-_FUNCTION = """\
-def value(x, u, t, data):
-    out = stack(1)
-    out[0] = nan
-    invoke(data[0], x, u, data, out)
-    return out[0]
-
-
-"""
-
-_DERIVATIVES = """\
-def derivatives(x, u, t, data, hessian, gradient):
-    slope, curve = stack(W), stack(W, W)
-    clear(curve, W, W)
-    for i in range(W):
-        slope[i] = 0.0
-    invoke_writing(data[1], x, u, data, slope, curve)
-    for i in range(W):
-        gradient[i] += slope[i]
-        for j in range(W):
-            hessian[i, j] += 0.5 * (curve[i, j] + curve[j, i])
-    return value(x, u, t, data)
-"""
-
-# The step is the fourth root of the machine's precision, as a second derivative wants it.
-_DIFFERENCES = """\
-def derivatives(x, u, t, data, hessian, gradient):
-    axes = {axes}
-    z, h, ahead, behind = stack(W), stack(W), stack(W), stack(W)
-    for i in range(W):
-        z[i] = x[i] if i < N else u[i - N]
-        h[i] = 1.2e-4 * max(1.0, abs(z[i]))
-    middle = value(x, u, t, data)
-    for i in range({count}):
-        a = axes[i]
-        ahead[a] = shifted(z, a, h[a], a, 0.0, t, data)
-        behind[a] = shifted(z, a, -h[a], a, 0.0, t, data)
-        gradient[a] += (ahead[a] - behind[a]) / (2 * h[a])
-        hessian[a, a] += (ahead[a] - 2 * middle + behind[a]) / (h[a] * h[a])
-    for i in range({count}):
-        for j in range(i):
-            a, b = axes[i], axes[j]
-            both = shifted(z, a, h[a], b, h[b], t, data) + shifted(z, a, -h[a], b, -h[b], t, data)
-            bend = (both + 2 * middle - ahead[a] - behind[a] - ahead[b] - behind[b]) / (2 * h[a] * h[b])
-            hessian[a, b] += bend
-            hessian[b, a] += bend
-    return middle
-
-
-def shifted(z, i, a, j, b, t, data):
-    x, u = stack(N), stack(M)
-    for k in range(N):
-        x[k] = z[k]
-    for k in range(M):
-        u[k] = z[N + k]
-    if i < N:
-        x[i] += a
-    else:
-        u[i - N] += a
-    if j < N:
-        x[j] += b
-    else:
-        u[j - N] += b
-    return value(x, u, t, data)
-"""

@@ -85,20 +85,20 @@ def _constraints(
 ) -> Iterator[tuple[str, Callable[[Array, Array], float], Callable[[Array, Array], Array]]]:
     """The constraints' numbers in plain Python: what messages call each, its value and its slope (n+m,) at (x, u)."""
     n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
-    for inequalities in problem.inequalities:
+    for term in problem.constraint_terms:
         names = plain_names(n, m, (), {})
-        exec(compile(inequalities.source, "<constraint>", "exec"), names)
-        for row in range(inequalities.rows):
+        exec(compile(term.source, "<constraint>", "exec"), names)
+        for row in range(term.rows):
 
-            def value(x: Array, u: Array, row: int = row, names: Any = names, data: Array = inequalities.data) -> float:
+            def value(x: Array, u: Array, row: int = row, names: Any = names, data: Array = term.data) -> float:
                 return float(names["value"](x, u, 1, row, data))
 
-            def slope(x: Array, u: Array, row: int = row, names: Any = names, data: Array = inequalities.data) -> Array:
+            def slope(x: Array, u: Array, row: int = row, names: Any = names, data: Array = term.data) -> Array:
                 gradient = np.zeros(n + m)
                 names["slope"](x, u, 1, row, data, gradient)
                 return gradient
 
-            yield inequalities.says(row), value, slope
+            yield term.describe(row), value, slope
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """The dynamics of a system, stated as a function: of symbols, of arrays for numba, or of NumPy arrays."""
 
 import copy
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -10,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
+from lqrsim.codegen.kernel_source import source_of
 from lqrsim.codegen.user_functions import External, check_signature, level_of, name_of, plain_names
 from lqrsim.errors import (
     Array,
@@ -22,7 +22,7 @@ from lqrsim.errors import (
     excerpt,
     numbers_of,
 )
-from lqrsim.kernels import finite_differences, runge_kutta
+from lqrsim.kernels import finite_differences, function_dynamics, runge_kutta
 from lqrsim.results.coordinates import Coordinates
 
 Limits = tuple[npt.ArrayLike, npt.ArrayLike]
@@ -196,9 +196,9 @@ class Dynamics:
     def source(self) -> str:
         """Source of `rate` and `rate_jacobian` of `kernels/interface.py`; symbolic dynamics are traced for it, once."""
         if self.level != "symbolic":
-            return _CALL + (
-                inspect.getsource(finite_differences.rate_jacobian) if self.jacobian is None else _CALL_JACOBIAN
-            )
+            if self.jacobian is not None:
+                return source_of(function_dynamics)
+            return f"{source_of(function_dynamics, 'rate')}\n\n{source_of(finite_differences)}"
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
         details = ("dynamics", *names)
         return symbolic.kept(self.f, details, lambda: {"source": self._trace()})["source"]
@@ -267,30 +267,12 @@ class Dynamics:
         n, m = len(self.state_coordinates), len(self.control_coordinates)
         names = plain_names(n, m, self.functions, self.parameters)
         exec(compile(self.source, f"<{self.name}>", "exec"), names)
-        for function in (runge_kutta.advance, runge_kutta.step_jacobian):
-            exec(compile(inspect.getsource(function), "<runge_kutta>", "exec"), names)
+        for function in ("advance", "step_jacobian"):
+            exec(compile(source_of(runge_kutta, function), "<runge_kutta>", "exec"), names)
         if "chain" not in names:
-            exec(compile(inspect.getsource(runge_kutta.chain), "<runge_kutta>", "exec"), names)
+            exec(compile(source_of(runge_kutta, "chain"), "<runge_kutta>", "exec"), names)
         return names
 
     def _numbers(self) -> Array:
         """What `p` is in the compiled functions, with the places of the functions for their addresses."""
         return np.concatenate([np.arange(len(self.functions), dtype=np.float64), self.data])
-
-
-_CALL = """\
-def rate(x, u, p, out):
-    for i in range(N):
-        out[i] = nan
-    invoke(p[0], x, u, p, out)
-
-
-"""
-
-_CALL_JACOBIAN = """\
-def rate_jacobian(x, u, p, out, fx, fu):
-    rate(x, u, p, out)
-    clear(fx, N, N)
-    clear(fu, N, M)
-    invoke_writing(p[1], x, u, p, fx, fu)
-"""

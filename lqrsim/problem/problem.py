@@ -18,7 +18,7 @@ from lqrsim.errors import (
     check_number,
     excerpt,
 )
-from lqrsim.problem.constraints import Constraint, Inequalities
+from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, goals_of
 from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost, Term, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
@@ -50,7 +50,8 @@ class Problem:
       final_cost: c_T.
       control_limits: (lowest, highest) control, each a number or (m,); by default what the actuators can do. Infinite
         ones plan as if there were none. Plan and policy keep them exactly, and the policy keeps the actuators', too.
-      constraints: what the plan must keep to at the steps; see `Clearance`.
+      constraints: what the plan must keep to at the steps; see `SymbolicConstraint`, `GoalState`, `StateBounds` and
+        `Clearance`.
 
     Raises:
       InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
@@ -67,7 +68,7 @@ class Problem:
     control_limits: tuple[npt.ArrayLike, npt.ArrayLike] | None = None
     constraints: Sequence[Constraint] = ()
     _terms: dict[str, tuple[Term, ...]] = field(init=False, repr=False, compare=False)
-    _inequalities: tuple[Inequalities, ...] = field(init=False, repr=False, compare=False)
+    _constraint_terms: tuple[ConstraintTerm, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dt", check_number("dt", self.dt, above=0.0))
@@ -89,12 +90,8 @@ class Problem:
         object.__setattr__(self, "_terms", bound)
         wanted = "a list of constraints, such as [Clearance(...)]"
         object.__setattr__(self, "constraints", check_items("constraints", self.constraints, Constraint, wanted))
-        bound_constraints = tuple(constraint.bind(self.dynamics) for constraint in self.constraints)
-        for constraint, inequalities in zip(self.constraints, bound_constraints, strict=True):
-            if not isinstance(inequalities, Inequalities):
-                name = type(constraint).__name__
-                raise InputError(f"constraints: {name}.bind: got {excerpt(inequalities)}, want Inequalities(...)")
-        object.__setattr__(self, "_inequalities", bound_constraints)
+        terms = bind_all(self.constraints, self.dynamics, self.steps)
+        object.__setattr__(self, "_constraint_terms", terms)
         if self.control_limits is not None:
             try:
                 low, high = self.control_limits
@@ -123,17 +120,29 @@ class Problem:
 
     @property
     def goal(self) -> Array | None:
-        """The state (n,) that the final cost asks for; None where it names none."""
+        """The state (n,) that the final cost and GoalStates ask for; None where they name none."""
         abouts = [cost.about for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
-        return abouts[0] if len(abouts) == 1 else None
+        return self._with_goal_states(abouts[0] if len(abouts) == 1 else None)
 
     @property
     def weighed_goal(self) -> Array | None:
-        """The goal, NaN in the states to which the final cost gives no weight; None where it names no state."""
+        """The goal, NaN in states that have neither a weight nor a GoalState; None where it names no state."""
         abouts = [cost for cost in terms_of(self.final_cost) if isinstance(cost, QuadraticCost)]
-        if len(abouts) != 1 or not abouts[0].weight.any():
+        goal = np.full(len(self.dynamics.state_coordinates), np.nan)
+        if len(abouts) == 1:
+            goal = np.where(abouts[0].weight.any(axis=1), abouts[0].about, np.nan)
+        goal = self._with_goal_states(goal)
+        return None if goal is None or np.isnan(goal).all() else goal
+
+    def _with_goal_states(self, goal: Array | None) -> Array | None:
+        """The goal with what GoalStates ask for; None where some of it is still unknown."""
+        stated = goals_of(self.constraints, self.dynamics)
+        if goal is None and len(stated) < len(self.dynamics.state_coordinates):
             return None
-        return np.where(abouts[0].weight.any(axis=1), abouts[0].about, np.nan)
+        goal = np.zeros(len(stated)) if goal is None else goal.copy()
+        for i, number in stated.items():
+            goal[i] = number
+        return goal
 
     @property
     def control_coordinates(self) -> Coordinates:
@@ -157,9 +166,9 @@ class Problem:
         return self._terms[check_name("which", which, self._terms)]
 
     @property
-    def inequalities(self) -> tuple[Inequalities, ...]:
+    def constraint_terms(self) -> tuple[ConstraintTerm, ...]:
         """The bound constraints."""
-        return self._inequalities
+        return self._constraint_terms
 
     @property
     def digest(self) -> str:
@@ -173,8 +182,10 @@ class Problem:
             for term in self.terms(name):
                 parts += [term.source, term.data]
                 functions += term.functions
-        for inequalities in self.inequalities:
-            parts += [inequalities.source, inequalities.data]
+        for term in self.constraint_terms:
+            parts += [term.source, term.data]
+            if term.equality or term.final_only:
+                parts.append(repr((term.equality, term.final_only)))
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
 
     def _check_start_clear(self) -> None:

@@ -135,8 +135,8 @@ class Iteration:
         where it was not evaluated (it is once the other tests pass, and after the last iteration).
       dynamics_residual: how far one step of the true dynamics takes a minimal-total-cost state from the next one, at
         most; relative as the gap is, and evaluated where the optimality is. The plan itself is a rollout, and has none.
-      violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all are kept, NaN where
-        it was not looked at.
+      violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all inequalities are
+        kept and there are no equalities, which are off by rounding at least; NaN where it was not evaluated.
       seconds: time this iteration took.
       method: "smooth", the paper's; of the safeguard's: "damped", "ilqr" where its step is that of iLQR, or "rejected"
         (it would have cost more, or a pass failed; cost is that of the plan that was kept).
@@ -188,7 +188,8 @@ class Certificate:
         to its largest size along the plan, at least 1 unit.
       law: largest difference of a control from the policy's at that state, relative to the terms of `L x + l`.
       limits: by how much a control is beyond its limits, in its unit.
-      violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all are kept.
+      violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all inequalities are
+        kept and there are no equalities, which are kept to 1e-6.
       optimality: the decrease of cost that the slopes of the cost in the policy's offsets (and in a start that is not
         fixed) still promise, relative to the cost; infinite where there is no cost-to-go to weigh them with.
     """
@@ -209,10 +210,10 @@ class Certificate:
 
 @dataclass(frozen=True)
 class Multipliers:
-    """What a constraint presses with, at each step: zero where it is kept with room to spare.
+    """What a constraint presses with, at each step: zero where an inequality is kept with room to spare.
 
     Attributes:
-      values: (T+1, rows), not negative: what a unit more of the constraint would cost.
+      values: (T+1, rows): what a unit more of the constraint would cost; of an inequality not negative.
       penalty: mu of the augmented Lagrangian, which holds the policy to the constraint.
     """
 

@@ -227,11 +227,12 @@ class Attempt:
 
     def certified(self, found: Found) -> Found:
         """With its certificate; a success that fails it is none."""
-        violation = self._violation_of((found.states, found.controls))
+        values = self.work.constraint_values(found.states, found.controls)
+        violation = self.work.violation(values)
         value = found.values.get("cost_to_go")
         certificate, wrong = certified(
             self.problem, lambda task, hessians, out: self._loop(*self._check_arguments(task, found, hessians, out)),
-            found.states, None if value is None else value.hessian, violation=violation,
+            found.states, None if value is None else value.hessian, violation=violation, kept=self.work.keeps(values),
             claimed=found.iterations[-1].cost if found.success else None,
             tolerance=self.settings.tolerance if found.status is Status.CONVERGED else None,
         )  # fmt: skip

@@ -34,6 +34,7 @@ def certified(
     hessians: Array | None,
     *,
     violation: float,
+    kept: bool = True,
     claimed: float | None,
     tolerance: float | None,
 ) -> tuple[Certificate, str]:
@@ -42,7 +43,7 @@ def certified(
     Args:
       work: runs the compiled `certify`: of a task, Hessians (T+1, n, n) of the cost-to-go, and where to write (1,).
       states: (T+1, n) of the plan. hessians: None where there are none.
-      violation: by how much the worst constraint is missed.
+      violation: by how much the worst constraint is missed. kept: whether that is within the equalities' tolerance.
       claimed: the cost that the log ends with; None where success is not claimed, and nothing can contradict it.
       tolerance: of the optimality; None where only the cost was asked for.
     """
@@ -59,7 +60,7 @@ def certified(
         work(interface.EVALUATE, np.zeros_like(given), numbers)
         certificate = certificate_of(problem, numbers[0], states, violation=violation)
     rest = REST * float(numbers["scale"][0])
-    return certificate, faults(certificate, claimed=claimed, rest=rest, tolerance=tolerance)
+    return certificate, faults(certificate, claimed=claimed, rest=rest, tolerance=tolerance, kept=kept)
 
 
 def certificate_of(problem: Problem, found: np.void, states: Array, *, violation: float) -> Certificate:
@@ -77,12 +78,15 @@ def certificate_of(problem: Problem, found: np.void, states: Array, *, violation
     )  # fmt: skip
 
 
-def faults(certificate: Certificate, *, claimed: float, rest: float, tolerance: float | None) -> str:
+def faults(
+    certificate: Certificate, *, claimed: float, rest: float, tolerance: float | None, kept: bool = False
+) -> str:
     """What of it contradicts a solver that says it converged; empty where nothing does.
 
     Args:
       claimed: the cost that the log ends with. rest: what rounding may leave of a cost where all of it cancels.
       tolerance: of the optimality; None where only the cost was asked for.
+      kept: whether the violation is that of equalities within their tolerance.
     """
     found = []
     if certificate.start != 0:
@@ -93,7 +97,7 @@ def faults(certificate: Certificate, *, claimed: float, rest: float, tolerance: 
         found.append(f"its controls are {certificate.law:.2g} off the policy's")
     if certificate.limits > 0:
         found.append(f"a control is {certificate.limits:.2g} beyond its limit")
-    if certificate.violation > 0:
+    if certificate.violation > 0 and not kept:
         found.append(f"a constraint is missed by {certificate.violation:.2g}")
     if not abs(certificate.cost - claimed) <= COST * abs(certificate.cost) + rest:
         found.append(f"it costs {certificate.cost:.9g}, not {claimed:.9g}")

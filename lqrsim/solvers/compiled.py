@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order, source_of
+from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order
+from lqrsim.codegen.kernel_source import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     augmented_lagrangian,
@@ -35,15 +36,15 @@ from lqrsim.kernels import (
     signed_distance,
 )
 from lqrsim.kernels.records import Limits, Model, Plan, Policy
-from lqrsim.problem.constraints import Inequalities
+from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import Term
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import FixedState, Problem
 
-# The terms of a cost as far as they are structure: the source of each, and what it may bend in (see `Term`).
+# The terms of a cost as far as they are structure: the source of each, and what it is not convex in (see `Term`).
 Structure = tuple[tuple[str, tuple[int, ...] | None], ...]
-# The constraints: the source of each, and whether it uses the control.
-Constraints = tuple[tuple[str, bool], ...]
+# The constraints: the source of each, whether it uses the control, and whether it is an equality.
+Constraints = tuple[tuple[str, bool, bool], ...]
 
 _FIELDS = {"initial": "initial", "stage": "stage_cost", "final": "final_cost"}
 
@@ -61,8 +62,8 @@ def core(problem: Problem, form: str = "dual") -> Core:
 def _structure(problem: Problem) -> tuple[Any, ...]:
     dynamics = problem.dynamics
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-    costs = [(name, tuple((t.source, t.bends) for t in problem.terms(field))) for name, field in _FIELDS.items()]
-    constraints = tuple((inequalities.source, inequalities.uses_control) for inequalities in problem.inequalities)
+    costs = [(name, tuple((t.source, t.nonconvex_in) for t in problem.terms(field))) for name, field in _FIELDS.items()]
+    constraints = tuple((term.source, term.uses_control, term.equality) for term in problem.constraint_terms)
     return n, m, dynamics.source, tuple(costs), constraints, f"{dynamics.name} ({n} states, {m} controls)"
 
 
@@ -109,8 +110,8 @@ def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> Model:
         return np.array([*(address_of(function) for function in part.functions), *part.data], dtype=np.float64)
 
     data = {name: tuple(numbers(term) for term in problem.terms(field)) for name, field in _FIELDS.items()}
-    multipliers = multipliers or [no_multipliers(problem, inequalities) for inequalities in problem.inequalities]
-    pairs = [(part.data.copy(), own) for part, own in zip(problem.inequalities, multipliers, strict=True)]
+    multipliers = multipliers or [no_multipliers(problem, term) for term in problem.constraint_terms]
+    pairs = [(part.data.copy(), own) for part, own in zip(problem.constraint_terms, multipliers, strict=True)]
     data["stage"] += tuple(array for pair in pairs for array in pair)
     data["final"] += tuple(array for pair in pairs for array in pair)
     space = problem.control_coordinates
@@ -134,30 +135,35 @@ def rollout(problem: Problem, gain: Array, offset: Array, state: Array) -> tuple
     return states, controls
 
 
-def no_multipliers(problem: Problem, inequalities: Inequalities, tolerance: float = 0.0) -> Array:
+def no_multipliers(problem: Problem, term: ConstraintTerm, tolerance: float = 0.0) -> Array:
     """Those of a constraint that does not act yet; see `kernels/augmented_lagrangian.py`."""
-    rows = inequalities.rows
     # Nothing can be done about a start that is given; but about its control.
-    first = 1 if isinstance(problem.initial, FixedState) and not inequalities.uses_control else 0
-    return np.concatenate([[0.0, rows, first, tolerance], np.zeros((problem.steps + 1) * rows)])
+    first = 1 if isinstance(problem.initial, FixedState) and not term.uses_control else 0
+    first, spare = problem.steps if term.final_only else first, 0.0 if term.equality else tolerance
+    return np.concatenate([[0.0, term.rows, first, spare], np.zeros((problem.steps + 1) * term.rows)])
 
 
 def _constraint_source(constraints: Constraints, terms: int) -> str:
-    """Source of what the augmented Lagrangian needs of each constraint, and to look at them from outside."""
+    """Source of what the augmented Lagrangian needs of each constraint, and to evaluate them from outside."""
     parts = []
-    look = "def look_at_constraints(steps, states, controls, data, values):\n    for t in range(steps + 1):\n"
-    look += "        u = controls[min(t, steps - 1)]\n"
+    values = "def evaluate_constraints(steps, states, controls, data, values):\n    for t in range(steps + 1):\n"
+    values += "        u = controls[min(t, steps - 1)]\n"
     slope = "def slope_of_constraint(which, row, x, u, t, data, gradient):\n"
-    for k, (source, uses_control) in enumerate(constraints):
-        prefix = _prefix(source)
+    for k, (source, uses_control, equality) in enumerate(constraints):
+        prefix, own = _prefix(source), _constraint_prefix(source, equality)
         names = {"constraint_value": f"{prefix}_value", "constraint_slope": f"{prefix}_slope"}
-        names |= {name: f"{prefix}_{name}" for name in ("augment", "augmentation", "look")}
-        parts += [_own(source), _rename(source_of(augmented_lagrangian), names)]
+        names |= {name: f"{own}_{name}" for name in ("augment", "augmentation", "constraint_values")}
+        parts += [_own(source), _rename(source_of(augmented_lagrangian, EQUALITY=equality), names)]
         at = terms + 2 * k
         slope += f"    if which == {k}:\n        {prefix}_slope(x, u, t, row, data[{at}], gradient)\n"
         acts = "t < steps" if uses_control else "True"  # there is no last control
-        look += f"        {prefix}_look(states[t], u, t, {acts}, data[{at}], data[{at + 1}], values[{k}])\n"
-    return "\n\n".join([*parts, look, slope] if constraints else [])
+        pair = f"data[{at}], data[{at + 1}]"
+        values += f"        {own}_constraint_values(states[t], u, t, {acts}, {pair}, values[{k}])\n"
+    return "\n\n".join([*parts, values, slope] if constraints else [])
+
+
+def _constraint_prefix(source: str, equality: bool) -> str:
+    return f"{_prefix(source)}_{'equality' if equality else 'inequality'}"
 
 
 def _prefix(source: str) -> str:
@@ -175,31 +181,32 @@ def _cost_source(name: str, terms: Structure, constraints: Constraints) -> str:
     """Source of `<name>_value`, the sum of the terms, of `<name>_added`, what the augmented Lagrangian adds, and of
     `<name>_quadratic`, which models both.
     """
-    parts, values, convex, bent = [], [], [], []
-    for i, (source, bends) in enumerate(terms):
+    parts, values, convex, nonconvex = [], [], [], []
+    for i, (source, nonconvex_in) in enumerate(terms):
         prefix = _prefix(source)
         parts.append(_own(source))
         values.append(f"    total += {prefix}_value(x, u, t, data[{i}])")
         call = f"    total += {prefix}_derivatives(x, u, t, data[{i}], hessian, gradient)"
-        (convex if bends is None else bent).append(call)
-    support = tuple(sorted({i for _, bends in terms for i in bends or ()}))
+        (convex if nonconvex_in is None else nonconvex).append(call)
+    support = tuple(sorted({i for _, entries in terms for i in entries or ()}))
     if support:
         # The sum of what may be indefinite is projected once; what is convex is added after.
-        parts.append(_rename(source_of(projection), {"project": f"{name}_project", "K": str(len(support))}))
-        bent.append(f"    {name}_project(hessian, {support})")
+        parts.append(_rename(source_of(projection, K=len(support)), {"project": f"{name}_project"}))
+        nonconvex.append(f"    {name}_project(hessian, {support})")
     added = []
-    for k, (source, uses_control) in enumerate(constraints):
+    for k, (source, uses_control, equality) in enumerate(constraints):
         if not (uses_control and name == "final"):
+            own = _constraint_prefix(source, equality)
             pair = f"data[{len(terms) + 2 * k}], data[{len(terms) + 2 * k + 1}]"
-            convex.append(f"    total += {_prefix(source)}_augment(x, u, t, {pair}, hessian, gradient)")
-            added.append(f"    total += {_prefix(source)}_augmentation(x, u, t, {pair})")
+            convex.append(f"    total += {own}_augment(x, u, t, {pair}, hessian, gradient)")
+            added.append(f"    total += {own}_augmentation(x, u, t, {pair})")
     if name != "initial":
         parts.append("\n".join([f"def {name}_added(x, u, t, data):\n    total = 0.0", *added, "    return total"]))
     summed = f"def {name}_value(x, u, t, data):\n    total = 0.0\n" + "\n".join(values)
     parts.append(f"{summed}\n    return total")
     modelled = f"def {name}_quadratic(x, u, t, data, hessian, gradient):\n    clear(hessian, W, W)\n"
     modelled += "    for i in range(W):\n        gradient[i] = 0.0\n    total = 0.0\n"
-    parts.append("\n".join([modelled.rstrip(), *bent, *convex, "    return total"]))
+    parts.append("\n".join([modelled.rstrip(), *nonconvex, *convex, "    return total"]))
     return "\n\n".join(parts)
 
 

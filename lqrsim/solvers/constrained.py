@@ -1,32 +1,28 @@
 """Constraints: from the optimum without them to one that keeps them, by the method of multipliers.
 
-The smoother minimises the augmented Lagrangian (see `augmented_lagrangian.py`), roughly; then the multipliers are
-renewed, and where what is missed has not halved, the penalty grows; and again. Were they renewed after every iteration,
-plans that slide along an obstacle would swing to and fro, for the model leaves out how an obstacle curves. Where
-undamped iterations do not settle, the safeguard's minimise each augmented Lagrangian.
+The smoother minimises the augmented Lagrangian, roughly; then the multipliers are updated, and where what is missed has
+not halved, the penalty grows (see `multipliers.py`); and again. Were they updated after every iteration, plans that
+slide along an obstacle would swing to and fro, for the model leaves out how an obstacle curves. Where undamped
+iterations do not settle, the safeguard's minimise each augmented Lagrangian.
 """
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 
-from lqrsim.errors import Array
 from lqrsim.kernels import interface
 from lqrsim.kernels.records import LOG
 from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.problem.problem import Problem
-from lqrsim.results.records import Iteration, Multipliers, Status
-from lqrsim.results.value_functions import Moments
+from lqrsim.results.records import Iteration, Status
 from lqrsim.solvers.attempt import Attempt, Found
 from lqrsim.solvers.common import Callback
 from lqrsim.solvers.initial_guess import Start
+from lqrsim.solvers.multipliers import LARGEST, AugmentedLagrangian
 
-PENALTY = 8.0  # at first, relative to what it costs to change what is constrained
-GROWTH = 5.0  # of the penalty
-LARGEST, STUCK = 1e4, 3  # how far it grows before that is given up, and how often to no avail at all
+STUCK = 3  # how often the penalty grows to no avail at all before that is given up
 ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
-ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to renew the multipliers, and when anyway
+ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to update the multipliers, and when anyway
 ROUGHEST_GAP = 3e-2  # and of damped iterations, which come to their minimum slowly
 
 
@@ -57,7 +53,7 @@ def _with_constraints(
 ) -> tuple[Attempt, Found]:
     """Go on from what was found without the constraints; also which attempt has the answer in its memory."""
     if attempt.stop.due or not attempt.left(found.iterations):
-        if found.success and attempt.work.violation(attempt.work.constraint_values(found.states, found.controls)) > 0:
+        if found.success and not attempt.work.keeps(attempt.work.constraint_values(found.states, found.controls)):
             status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS
             found = dataclasses.replace(found, status=status, detail="before the constraints could be met")
         return attempt, found
@@ -68,15 +64,15 @@ def _with_constraints(
 
 def _satisfy(attempt: Attempt, found: Found | None, *, each: bool, callback: Callback | None = None) -> Found:
     """Go on from what was found without the constraints, or, without it, from the multipliers of another solution."""
-    lagrangian = _Lagrangian(attempt)
+    lagrangian = AugmentedLagrangian(attempt)
     if found is None:
         attempt.roll_out()
-        lagrangian.look(attempt.work.states, attempt.work.controls)
+        lagrangian.evaluate(attempt.work.states, attempt.work.controls)
     else:
-        lagrangian.look(found.states, found.controls)
-        if lagrangian.violation == 0:
+        lagrangian.evaluate(found.states, found.controls)
+        if lagrangian.kept:
             return found
-        lagrangian.begin()
+        lagrangian.start()
         # These will be overwritten.
         found = dataclasses.replace(found, states=found.states.copy(), controls=found.controls.copy())
     before = found.iterations if found is not None else ()
@@ -133,13 +129,13 @@ def _first_feasible(attempt: Attempt, found: Found, *, each: bool, callback: Cal
 
 def _undamped(
     attempt: Attempt,
-    lagrangian: "_Lagrangian",
+    lagrangian: AugmentedLagrangian,
     before: tuple[Iteration, ...],
     *,
     each: bool,
     callback: Callback | None,
 ) -> Found:
-    work, settings = attempt.work, attempt.settings
+    work = attempt.work
     work.memory["plan_cost"] = -np.inf  # of lower cost is not better now
     log = np.zeros(min(ITERATIONS, max(attempt.left(before), 1)), LOG)
     done: tuple[Iteration, ...] = ()
@@ -150,17 +146,17 @@ def _undamped(
         stopped = ending.pass_failed or ending.outcome in (interface.CYCLING, interface.TIMED_OUT)
         if stopped or not np.isfinite(done[-1].cost):
             break
-        lagrangian.look(work.states, work.controls)
+        lagrangian.evaluate(work.states, work.controls)
         settled = ending.outcome in (interface.CONVERGED, interface.COST_CONVERGED)
-        if len(done) == len(log) or (settled and lagrangian.missed <= settings.constraint_tolerance):
+        if len(done) == len(log) or (settled and lagrangian.solved):
             break
         rough = abs(done[-1].improvement) < ROUGH and done[-1].gap < ROUGH_GAP
         if settled or rough or since == PATIENCE:
             since = 0
-            lagrangian.renew()
+            lagrangian.update()
     found = attempt.found(dataclasses.replace(ending, iterations=before + done))
     detail = found.detail or ("" if found.success else f"with constraints, {lagrangian.worst()}")
-    if found.success and lagrangian.missed > settings.constraint_tolerance:
+    if found.success and not lagrangian.solved:
         found = dataclasses.replace(found, status=Status.MAX_ITERATIONS)
         detail = f"{len(done)} iterations with constraints: {lagrangian.worst()}"
     return dataclasses.replace(found, detail=detail, multipliers=lagrangian.multipliers())
@@ -168,7 +164,7 @@ def _undamped(
 
 def _damped(
     attempt: Attempt,
-    lagrangian: "_Lagrangian",
+    lagrangian: AugmentedLagrangian,
     found: Found | None,
     undamped: Found,
     *,
@@ -182,11 +178,11 @@ def _damped(
     plans = [plan for plan in plans if np.isfinite(plan[2])]
     if not plans:
         return undamped
-    lagrangian.look(*plans[-1][:2])
-    lagrangian.begin()
+    lagrangian.evaluate(*plans[-1][:2])
+    lagrangian.start()
     merits = []
     for *plan, cost in plans:
-        lagrangian.look(*plan)
+        lagrangian.evaluate(*plan)
         merits.append(cost + lagrangian.added())
     states, controls, cost = plans[int(np.argmin(merits))]
     work.plan[0][:], work.plan[1][:] = states, controls
@@ -210,26 +206,26 @@ def refine(attempt: Attempt, *, each: bool, callback: Callback | None = None) ->
         damped = attempt.damp(before=(), each=each, callback=callback)
         found = attempt.found_damped(damped, damped.status, damped.detail(attempt.problem.steps))
         return attempt.certified(found)
-    lagrangian = _Lagrangian(attempt)
-    lagrangian.look(*attempt.work.plan)
-    lagrangian.begin()
+    lagrangian = AugmentedLagrangian(attempt)
+    lagrangian.evaluate(*attempt.work.plan)
+    lagrangian.start()
     return attempt.certified(_rounds(attempt, lagrangian, (), "", each=each, callback=callback))
 
 
 def _rounds(
     attempt: Attempt,
-    lagrangian: "_Lagrangian",
+    lagrangian: AugmentedLagrangian,
     iterations: tuple[Iteration, ...],
     why: str,
     *,
     each: bool,
     callback: Callback | None,
 ) -> Found:
-    """Damped iterations from the plan in the memory, and renewed multipliers, until the constraints are met or can not
+    """Damped iterations from the plan in the memory, and updated multipliers, until the constraints are met or can not
     be.
     """
-    work, tolerance = attempt.work, attempt.settings.constraint_tolerance
-    lagrangian.look(*work.plan)
+    work = attempt.work
+    lagrangian.evaluate(*work.plan)
     rounds, rough = 0, True
     while True:
         rounds += 1
@@ -238,8 +234,8 @@ def _rounds(
         limits = (ROUGH, ROUGHEST_GAP) if rough else (0.0, 0.0)
         ending = attempt.damp(before=iterations, least=limits, each=each, callback=callback)
         iterations = ending.iterations
-        lagrangian.look(*work.plan)
-        if ending.success and lagrangian.missed <= tolerance:
+        lagrangian.evaluate(*work.plan)
+        if ending.success and lagrangian.solved:
             if not rough:
                 found = attempt.found_damped(ending, ending.status, why)
                 return dataclasses.replace(found, multipliers=lagrangian.multipliers())
@@ -250,128 +246,12 @@ def _rounds(
             break
         if attempt.stop.due or not attempt.left(iterations):
             break
-        lagrangian.renew()
-        rough = rough and lagrangian.stuck == 0
+        lagrangian.update()
+        rough = rough and lagrangian.stuck == 0 and not lagrangian.nearly
     status, detail = Status.MAX_ITERATIONS, f"{why}; {lagrangian.worst()}".removeprefix("; ")
-    if lagrangian.violation == 0:
-        detail = f"{why}; the plan keeps the constraints, but there are better ones".removeprefix("; ")
-    elif lagrangian.stuck == STUCK or lagrangian.grown > LARGEST:
+    if not lagrangian.kept and not lagrangian.nearly and (lagrangian.stuck == STUCK or lagrangian.grown > LARGEST):
         status, detail = Status.INFEASIBLE, lagrangian.worst()
     if attempt.stop.due:
         status = Status.TIME_LIMIT
     found = attempt.found_damped(ending, status, detail)
     return dataclasses.replace(found, multipliers=lagrangian.multipliers())
-
-
-def _press(array: Array, values: Array) -> Array:
-    """max(0, lambda - mu d): what the inequalities press with; 0 where they do not act."""
-    acting = np.where(np.isinf(values), 0.0, values)
-    return np.where(np.isinf(values), 0.0, np.maximum(array[interface.HEADER :] - array[0] * acting, 0.0))
-
-
-def _missed(array: Array, values: Array) -> float:
-    """By how much a constraint is missed, or its multipliers are off, at most."""
-    press = array[interface.HEADER :] / array[0] if array[0] > 0 else 0.0
-    return float(np.abs(np.minimum(values, press)).max(initial=0.0))
-
-
-class _Lagrangian:
-    """The multipliers of all constraints, in the memory that the compiled loops read.
-
-    Attributes:
-      violation: by how much the worst constraint is missed by the plan that was looked at last.
-      missed: by how much what is aimed at is, which is to keep them with the tolerance to spare; and where that is
-        kept, by how much its multiplier is still off: `|min(d, lambda / mu)|`.
-      grown: by how much the penalty has grown. stuck: how often in a row that did not help.
-    """
-
-    def __init__(self, attempt: Attempt) -> None:
-        self._problem, self._work = attempt.problem, attempt.work
-        self._tolerance = attempt.settings.constraint_tolerance
-        self.violation, self.missed, self.grown, self.stuck = 0.0, np.inf, 1.0, 0
-        self._last = np.inf
-        self._first = [array[0] for array in self._work.multipliers]  # zero, but for those of another solution
-
-    def look(self, states: Array, controls: Array) -> None:
-        """Evaluate the constraints of a plan."""
-        self._plan = states, controls
-        stated = self._work.constraint_values(states, controls)
-        self.violation = self._work.violation(stated)
-        self._values = [values.ravel() - self._tolerance for values in stated]
-        self.missed = max(self._each(_missed))
-
-    def begin(self) -> None:
-        """No multipliers, and a penalty for each constraint that fits what it costs to change it."""
-        self.grown, self.stuck, self._last = 1.0, 0, np.inf
-        for which, (array, values) in enumerate(zip(self._work.multipliers, self._values, strict=True)):
-            array[interface.HEADER :] = 0.0
-            if not self._first[which] > 0:
-                # Only now: once there is a penalty, it is what the passes say of curvature.
-                self._first[which] = PENALTY * self._curvature(which, int(values.argmin())) if len(values) else 1.0
-            array[0] = self._first[which]
-
-    def renew(self) -> None:
-        """Take what the constraints press with for the multipliers; let the penalty grow if that helps too little."""
-        for array, values in zip(self._work.multipliers, self._values, strict=True):
-            array[interface.HEADER :] = _press(array, values)
-        missed = max(-values.min(initial=np.inf) for values in self._values)
-        self.stuck = self.stuck + 1 if missed > 0.9 * self._last else 0
-        if missed > max(0.5 * self._last, self._tolerance):
-            self.grown *= GROWTH
-            for array in self._work.multipliers:
-                array[0] *= GROWTH
-        self._last = missed
-
-    def added(self) -> float:
-        """What the augmented Lagrangian adds to the cost of the plan."""
-
-        def one(array: Array, values: Array) -> float:
-            force = _press(array, values)
-            return float((force @ force - array[interface.HEADER :] @ array[interface.HEADER :]) / (2 * array[0]))
-
-        return sum(self._each(one))
-
-    def multipliers(self) -> tuple[Multipliers, ...]:
-        """As a solution has them: with the last look taken into account."""
-
-        def one(array: Array, values: Array) -> Multipliers:
-            return Multipliers(_press(array, values).reshape(self._problem.steps + 1, -1), float(array[0]))
-
-        return tuple(self._each(one))
-
-    def worst(self) -> str:
-        """Which constraint is missed most, by how much and when."""
-        least = [values.min(initial=np.inf) + self._tolerance for values in self._values]
-        which = int(np.argmin(least))
-        inequalities = self._problem.inequalities[which]
-        step, row = divmod(int(self._values[which].argmin()), inequalities.rows)
-        missed, time = -least[which], step * self._problem.dt
-        return f"{inequalities.says(row)} is missed by {missed:.2g} at {time:.2f} s (step {step})"
-
-    def _each(self, function: Callable[[Array, Array], "float | Multipliers"]) -> list:
-        return [function(*pair) for pair in zip(self._work.multipliers, self._values, strict=True)]
-
-    def _curvature(self, which: int, index: int) -> float:
-        """What it costs to change one of a constraint's numbers: twice the total cost of a change by 1 unit.
-
-        `1 / n' (S + Sbar)^-1 n` of its slope n: the curvature of the total cost, the rest of the trajectory giving way.
-        """
-        states, controls = self._plan
-        n, steps = states.shape[1], len(controls)
-        step, row = divmod(index, self._problem.inequalities[which].rows)
-        slope = self._work.constraint_slope(which, row, states[step], controls[min(step, steps - 1)], step)
-        values = self._work.value_functions()
-        go, come = values["cost_to_go"], values["cost_to_come"]
-        try:
-            if isinstance(come, Moments):
-                given = np.linalg.solve(np.eye(n) + come.covariance[step] @ go.hessian[step], come.covariance[step])
-            else:
-                given = np.linalg.inv(go.hessian[step] + come.hessian[step])
-        except np.linalg.LinAlgError:
-            return 1.0
-        spread = np.zeros((len(slope), len(slope)))
-        gain = self._work.arrays.policy.gain[min(step, steps - 1)]
-        spread[:n, :n], spread[n:, n:] = given, gain @ given @ gain.T
-        spread[:n, n:], spread[n:, :n] = given @ gain.T, gain @ given
-        bend = float(slope @ spread @ slope)
-        return 1 / bend if bend > 0 else 1.0

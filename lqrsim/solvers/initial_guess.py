@@ -143,7 +143,7 @@ def resolve(start: StartLike, problem: Problem) -> Start:
             value = Quadratic(hessian, check_array("start: cost_to_go.gradient", value.gradient, (steps + 1, n)),
                               check_array("start: cost_to_go.constant", value.constant, (steps + 1,)))  # fmt: skip
         multipliers = start.multipliers
-        if [one.values.shape for one in multipliers] != [(steps + 1, one.rows) for one in problem.inequalities]:
+        if [one.values.shape for one in multipliers] != [(steps + 1, one.rows) for one in problem.constraint_terms]:
             multipliers = ()  # of other constraints
         summary = _summary(start, policy.gain, policy.offset)
         return Start(policy.gain, policy.offset, value, None, summary, multipliers=multipliers)

@@ -73,7 +73,8 @@ def smooth(
       starts: how many starts to try, by default 7 where there is an ObstacleCost; 1 is the straight way to the goal.
         The candidates are in the solution.
       constraint_tolerance: how closely the problem's constraints are solved for, in their unit: for a clearance it is
-        metres. So much to spare is aimed at; a plan that has converged keeps the constraints themselves.
+        metres. So much to spare is aimed at; a plan that has converged keeps the constraints themselves, and equalities
+        to 1e-6, or to this where it is smaller.
       threads: how many starts to run at once; by default as many as there are processors.
       callback: called with each `Iteration` as it ends; of a search, those of the starts that are run to their end.
         What it raises ends the solve, as Ctrl-C does, and is raised again with the best plan so far as its `solution`.

@@ -59,12 +59,12 @@ class Workspace:
         self.memory_rows = zeros(1, MEMORY)
         self.memory = self.memory_rows[0]
         spare = settings.constraint_tolerance
-        self.multipliers = [compiled.no_multipliers(problem, one, spare) for one in problem.inequalities]
+        self.multipliers = [compiled.no_multipliers(problem, one, spare) for one in problem.constraint_terms]
         for array, known in zip(self.multipliers, begin.multipliers, strict=False):
             array[0], array[interface.HEADER :] = known.penalty, known.values.ravel()
         self.core = compiled.core(problem, settings.form)
         self.model = compiled.arguments(problem, multipliers=self.multipliers)
-        self._problem = problem
+        self._problem, self._tolerance = problem, settings.constraint_tolerance
         self.arrays = records.Workspace(
             start=start, x_hat=start.copy(), x_hats=zeros((steps + 1, n)),
             policy=Policy(begin.gain.copy(), begin.offset.copy()), to_go=CostToGo(*go), to_come=CostToCome(*come),
@@ -115,10 +115,10 @@ class Workspace:
         return tuple(stage)
 
     def constraint_values(self, states: Array, controls: Array) -> list[Array]:
-        """Of each constraint (T+1, rows): not to be negative; infinite where it does not act."""
+        """Of each constraint (T+1, rows): not to be negative, or zero; where it does not act, infinite or zero."""
         values = [np.empty(len(multipliers) - interface.HEADER) for multipliers in self.multipliers]
         if values:
-            self.core.look_at_constraints(self._problem.steps, states, controls, self.model.stage, tuple(values))
+            self.core.evaluate_constraints(self._problem.steps, states, controls, self.model.stage, tuple(values))
         return [one.reshape(self._problem.steps + 1, -1) for one in values]
 
     def constraint_slope(self, which: int, row: int, x: Array, u: Array, step: int) -> Array:
@@ -127,8 +127,12 @@ class Workspace:
         self.core.slope_of_constraint(which, row, x, u, step, self.model.stage, slope)
         return slope
 
-    @staticmethod
-    def violation(values: list[Array]) -> float:
+    def violation(self, values: list[Array]) -> float:
         """By how much the worst constraint is missed, given their values; 0 where none is, infinite if one is NaN."""
-        least = np.min([one.min(initial=np.inf) for one in values], initial=np.inf)
-        return max(0.0, float(-least)) if not np.isnan(least) else np.inf
+        terms = self._problem.constraint_terms
+        return max((term.violation(one) for term, one in zip(terms, values, strict=True)), default=0.0)
+
+    def keeps(self, values: list[Array]) -> bool:
+        """Whether values are those of a plan that keeps all constraints, the equalities within their tolerance."""
+        pairs = zip(self._problem.constraint_terms, values, strict=True)
+        return all(term.violation(one) <= term.allowed(self._tolerance) for term, one in pairs)

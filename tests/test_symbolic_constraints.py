@@ -1,0 +1,364 @@
+"""Constraints as formulas, equalities, goal states and bounds on states: against closed forms, dense KKT and SLSQP."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from whole_problems.claims import contradictions
+
+import lqrsim as ls
+from lqrsim.errors import Array, InputError
+from lqrsim.results.records import Status
+
+EXACT: dict[str, Any] = {"tolerance": 1e-10, "gap_tolerance": 1e-6, "constraint_tolerance": 1e-9}
+
+
+def mass(x, u, p):
+    return [x[1], u[0]]
+
+
+DYNAMICS = ls.Dynamics(mass, states={"x": "m", "v": "m/s"}, controls={"a": "m/s^2"})
+
+
+def problem(
+    *constraints: ls.Constraint, soft: bool = False, steps: int = 20, dt: float = 0.1, weight: float = 0.0, **rest: Any
+) -> ls.Problem:
+    """A mass on a rail, from rest at 0; nothing but constraints sends it anywhere, unless there is a weight."""
+    return ls.Problem(
+        dynamics=DYNAMICS, dt=dt, steps=steps,
+        initial=ls.QuadraticCost([100.0, 100.0], about=[0, 0]) if soft else ls.FixedState([0, 0]),
+        stage_cost=ls.ControlCost([1.0]), final_cost=ls.QuadraticCost([weight, weight], about=[1, 0]),
+        constraints=constraints, **rest,
+    )  # fmt: skip
+
+
+class Dense:
+    """The same in what is free: of a soft start the first state, and the controls. `1/2 z'Hz + g'z`, states `G z`."""
+
+    def __init__(self, case: ls.Problem) -> None:
+        steps, dt, self.free = case.steps, case.dt, 0 if isinstance(case.initial, ls.FixedState) else 2
+        A, B = np.array([[1, dt], [0, 1]]), np.array([dt**2 / 2, dt])
+        self.states = np.zeros((steps + 1, 2, self.free + steps))
+        self.states[0, :, : self.free] = np.eye(2)[:, : self.free]
+        for t in range(steps):
+            self.states[t + 1] = A @ self.states[t]
+            self.states[t + 1, :, self.free + t] += B
+        final: Any = case.final_cost
+        self.H = np.diag([100.0] * self.free + [1.0] * steps) + self.states[-1].T @ final.weight @ self.states[-1]
+        self.g = -self.states[-1].T @ final.weight @ final.about
+        self.constant = 0.5 * final.about @ final.weight @ final.about
+        self.controls = np.eye(self.free + steps)[self.free :]
+
+    def pack(self, plan: ls.Trajectory) -> Array:
+        return np.concatenate([plan.states[0][: self.free], plan.controls.ravel()])
+
+    def cost(self, z: Array) -> float:
+        return float(0.5 * z @ self.H @ z + self.g @ z + self.constant)
+
+    def optimum(self, C: Array, d: Array) -> tuple[Array, Array]:
+        """z and the multipliers of `C z = d`, from the KKT conditions `Hz + g = C'lambda`."""
+        system = np.block([[self.H, -C.T], [C, np.zeros((len(C), len(C)))]])
+        found = np.linalg.solve(system, np.concatenate([-self.g, d]))
+        return found[: len(self.g)], found[len(self.g) :]
+
+    def least(self, case: ls.Problem, values: Callable[[Array], Array], equal: Callable[[Array], Array]) -> float:
+        """What SLSQP finds from nothing, with numbers that are not to be negative and numbers that are to be zero."""
+        kept = [{"type": "ineq", "fun": values}, {"type": "eq", "fun": equal}]
+        options = {"maxiter": 500, "ftol": 1e-12}
+        found = minimize(self.cost, np.zeros(len(self.g)), method="SLSQP", constraints=kept, options=options)
+        assert found.success
+        return float(found.fun)
+
+
+class TestGoalState:
+    @pytest.mark.parametrize("soft", [False, True])
+    def test_is_the_dense_kkt_solution(self, soft: bool) -> None:
+        case = problem(ls.GoalState([1, -0.5]), soft=soft, weight=0.3)
+        solution, dense = ls.smooth(case, **EXACT), Dense(case)
+        z, multipliers = dense.optimum(dense.states[-1], np.array([1, -0.5]))
+        assert solution.status is Status.CONVERGED, solution.summary()
+        np.testing.assert_allclose(dense.pack(solution.trajectory), z, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(solution.multipliers[0].values[-1], multipliers, rtol=1e-6)
+        assert (multipliers < 0).any()
+        assert (multipliers > 0).any()
+        assert not solution.multipliers[0].values[:-1].any()
+        assert solution.violation <= 1e-9
+
+    def test_is_the_cubic_of_least_energy(self) -> None:
+        """From rest to rest x = 3 s^2 - 2 s^3; held controls approach it with the square of the step."""
+        steps = 100
+        solution = ls.smooth(problem(ls.GoalState([1, 0]), steps=steps, dt=2 / steps))
+        s = np.linspace(0, 1, steps + 1)
+        np.testing.assert_allclose(solution.trajectory.states[:, 0], 3 * s**2 - 2 * s**3, rtol=0, atol=1e-4)
+        middles = (s[1:] + s[:-1]) / 2
+        np.testing.assert_allclose(solution.trajectory.controls[:, 0], (6 - 12 * middles) / 2**2, rtol=0, atol=1e-3)
+        # 1/2 integral of u^2 is 6 / T^3, and a stage cost is per step.
+        assert solution.cost * 2 / steps == pytest.approx(6 / 2**3, rel=1e-3)
+
+    @pytest.mark.parametrize(("tolerance", "kept"), [(1e-3, 1e-6), (1e-5, 1e-6), (1e-8, 1e-8)])
+    def test_is_kept_to_a_millionth_or_closer(self, tolerance: float, kept: float) -> None:
+        solution = ls.smooth(problem(ls.GoalState([1, 0])), constraint_tolerance=tolerance)
+        assert solution.status is Status.CONVERGED
+        off = np.abs(solution.trajectory.states[-1] - [1, 0]).max()
+        assert off <= kept
+        assert solution.violation == pytest.approx(off, abs=1e-15)
+
+    def test_of_some_states_leaves_the_others(self) -> None:
+        case = problem(ls.GoalState([1.0], states=("x",)))
+        solution, dense = ls.smooth(case, **EXACT), Dense(case)
+        z, multiplier = dense.optimum(dense.states[-1, :1], np.array([1.0]))
+        np.testing.assert_allclose(dense.pack(solution.trajectory), z, rtol=0, atol=1e-6)
+        assert solution.trajectory.states[-1, 1] > 0.5
+        np.testing.assert_allclose(solution.multipliers[0].values[-1], multiplier, rtol=1e-6)
+        assert solution.goal is not None
+        np.testing.assert_array_equal(solution.goal, [1, np.nan])
+
+    def test_multipliers_are_what_a_unit_more_costs(self) -> None:
+        moved = [ls.smooth(problem(ls.GoalState([1 + e, 0]), weight=1.0), **EXACT).cost for e in (-1e-3, 1e-3)]
+        solution = ls.smooth(problem(ls.GoalState([1, 0]), weight=1.0), **EXACT)
+        slope = (moved[1] - moved[0]) / 2e-3
+        # The cost's own slope is at the goal: it wants to be at 1, and is.
+        assert solution.multipliers[0].values[-1, 0] == pytest.approx(slope, rel=1e-5)
+
+
+def steered(x, u, p):
+    return [u[0] - p.gain * (1 - x[0])]
+
+
+def line(x, u, p):
+    return x[0] + p.slope * x[1] - 1
+
+
+class TestEquality:
+    @pytest.mark.parametrize(("form", "soft"), [("dual", False), ("dual", True), ("primal", True)])
+    def test_at_the_end_is_the_dense_kkt_solution(self, form: str, soft: bool) -> None:
+        constraint = ls.SymbolicConstraint(line, parameters={"slope": -0.3}, equality=True, at="final")
+        case = problem(constraint, soft=soft, weight=20.0)
+        solution, dense = ls.smooth(case, form=form, **EXACT), Dense(case)
+        z, multipliers = dense.optimum((dense.states[-1, 0] - 0.3 * dense.states[-1, 1])[None], np.ones(1))
+        assert solution.status is Status.CONVERGED, solution.summary()
+        np.testing.assert_allclose(dense.pack(solution.trajectory), z, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(solution.multipliers[0].values[-1], multipliers, rtol=1e-4)
+        assert contradictions(case, solution) == []
+
+    @pytest.mark.parametrize("soft", [False, True])
+    def test_of_state_and_control_is_the_dense_kkt_solution(self, soft: bool) -> None:
+        """At all steps but the last, which has no control. From a given start it leaves nothing free."""
+        constraint = ls.SymbolicConstraint(steered, parameters={"gain": 0.4}, equality=True)
+        case = problem(constraint, soft=soft, weight=20.0)
+        solution, dense = ls.smooth(case, **EXACT), Dense(case)
+        C, d = dense.controls + 0.4 * dense.states[:-1, 0], np.full(case.steps, 0.4)
+        z, multipliers = dense.optimum(C, d)
+        assert solution.status is Status.CONVERGED, solution.summary()
+        np.testing.assert_allclose(dense.pack(solution.trajectory), z, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(solution.multipliers[0].values[:-1, 0], multipliers, rtol=0, atol=1e-4)
+        assert contradictions(case, solution) == []
+
+
+def effort(x, u, p):
+    return [p.most - u[0], p.most + u[0]]
+
+
+def power_left(x, u, p):
+    return p.room - x[1] * u[0]  # the power
+
+
+def past(x, u, p):
+    return x[0] - p.least
+
+
+class TestInequality:
+    @pytest.mark.parametrize(("soft", "most", "room"), [(False, 1.35, 0.35), (True, 1.1, 0.25)])
+    def test_of_state_and_control_with_a_goal(self, soft: bool, most: float, room: float) -> None:
+        kept = [
+            ls.GoalState([1, 0]),
+            ls.SymbolicConstraint(effort, parameters={"most": most}),
+            ls.SymbolicConstraint(power_left, parameters={"room": room}),
+        ]
+        case = problem(*kept, soft=soft)
+        solution, dense = ls.smooth(case, tolerance=1e-8, constraint_tolerance=1e-6), Dense(case)
+        z = dense.pack(solution.trajectory)
+
+        def values(z: Array) -> Array:
+            u, v = dense.controls @ z, dense.states[:-1, 1] @ z
+            return np.concatenate([most - u, most + u, room - u * v])
+
+        least = dense.least(case, values, lambda z: dense.states[-1] @ z - [1, 0])
+        assert solution.status is Status.CONVERGED, solution.summary()
+        assert solution.cost == pytest.approx(least, rel=1e-4)
+        assert values(z).min() >= 0
+        assert values(z).min() <= 2e-6  # it acts
+        assert all(one.values.any() for one in solution.multipliers)
+        assert all((one.values >= 0).all() for one in solution.multipliers[1:])
+        assert contradictions(case, solution) == []
+
+    def test_at_the_final_step_alone(self) -> None:
+        case = problem(ls.SymbolicConstraint(past, parameters={"least": 1.0}, at="final"))
+        solution, dense = ls.smooth(case, constraint_tolerance=1e-6), Dense(case)
+        z, multiplier = dense.optimum(dense.states[-1, :1], np.array([1.0]))
+        np.testing.assert_allclose(dense.pack(solution.trajectory), z, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(solution.multipliers[0].values[-1], multiplier, rtol=1e-3)
+        assert solution.trajectory.states[-1, 0] >= 1
+
+
+class TestStateBounds:
+    @pytest.mark.parametrize("soft", [False, True])
+    def test_are_kept_at_every_step(self, soft: bool) -> None:
+        case = problem(ls.GoalState([1, 0]), ls.StateBounds(low={"v": -0.1}, high={"v": 0.55}), soft=soft)
+        solution, dense = ls.smooth(case, tolerance=1e-8, constraint_tolerance=1e-6), Dense(case)
+        speeds = solution.trajectory.states[:, 1]
+
+        def values(z: Array) -> Array:
+            v = dense.states[:, 1] @ z
+            return np.concatenate([v[:-1] + 0.1, 0.55 - v[:-1]])
+
+        least = dense.least(case, values, lambda z: dense.states[-1] @ z - [1, 0])
+        assert solution.status is Status.CONVERGED, solution.summary()
+        assert speeds.min() >= -0.1
+        assert 0.55 - 2e-6 <= speeds.max() <= 0.55
+        assert solution.cost == pytest.approx(least, rel=1e-4)
+        assert contradictions(case, solution) == []
+
+    def test_may_be_where_the_goal_is(self) -> None:
+        """A bound wants some room, and the goal leaves none: at the end it does not act."""
+        solution = ls.smooth(problem(ls.GoalState([1, 0]), ls.StateBounds(low={"v": 0.0}, high={"x": 1.0})))
+        assert solution.status is Status.CONVERGED, solution.summary()
+        np.testing.assert_allclose(solution.trajectory.states[-1], [1, 0], rtol=0, atol=1e-6)
+        assert solution.trajectory.states[:-1, 1].min() >= 0
+
+
+def swing(x, u, p):
+    from sympy import sin
+
+    return [x[1], u[0] - p.gravity * sin(x[0])]
+
+
+def test_a_pendulum_up_within_its_power() -> None:
+    """Not linear, and far from the goal where it begins: SLSQP finds nothing better from there."""
+
+    def power(x, u, p):
+        return p.most - (x[1] * u[0]) ** 2 / p.most
+
+    pendulum = ls.Dynamics(
+        swing, states={"angle": "rad", "turn": "rad/s"}, controls={"push": "1/s^2"}, parameters={"gravity": 2.0}
+    )
+    case = ls.Problem(
+        dynamics=pendulum, dt=0.1, steps=30, initial=ls.FixedState([0, 0]), stage_cost=ls.ControlCost([0.1]),
+        final_cost=ls.QuadraticCost([1.0, 1.0], about=[np.pi, 0]),
+        constraints=[ls.GoalState([np.pi, 0]), ls.SymbolicConstraint(power, parameters={"most": 2.5})],
+    )  # fmt: skip
+    solution = ls.smooth(case, tolerance=1e-7, constraint_tolerance=1e-6)
+    assert solution.status is Status.CONVERGED, solution.summary()
+    assert contradictions(case, solution) == []
+
+    def states(u: Array) -> Array:
+        found = [np.zeros(2)]
+        for control in u:
+            found.append(pendulum.step(found[-1], [control], case.dt))
+        return np.array(found)
+
+    start = solution.trajectory.controls.ravel()
+    found = minimize(
+        lambda u: 0.05 * u @ u, start, method="SLSQP", options={"maxiter": 50, "ftol": 1e-10},
+        constraints=[
+            {"type": "eq", "fun": lambda u: states(u)[-1] - [np.pi, 0]},
+            {"type": "ineq", "fun": lambda u: 2.5 - (states(u)[:-1, 1] * u) ** 2 / 2.5},
+        ],
+    )  # fmt: skip
+    assert solution.cost <= found.fun * (1 + 1e-4)
+    assert solution.multipliers[1].values.any()  # the power acts
+
+
+class TestInfeasible:
+    @pytest.mark.parametrize(
+        ("constraints", "said"),
+        [
+            ([ls.GoalState([1, 0])], "the goal of 1 m for x is missed by"),
+            ([ls.SymbolicConstraint(line, parameters={"slope": 0.0}, equality=True, at="final")],
+             "that line(x, u, p) is zero is missed by"),
+            ([ls.GoalState([0.3], states=("x",)), ls.StateBounds(low={"v": 0.5})],
+             "v of at least 0.5 m/s is missed by 0.47 at 0.10 s (step 1)"),
+        ],
+    )  # fmt: skip
+    def test_what_cannot_be_kept_is_named(self, constraints: list[ls.Constraint], said: str) -> None:
+        solution = ls.smooth(problem(*constraints, control_limits=(-0.3, 0.3)))
+        assert solution.status is Status.INFEASIBLE, solution.summary()
+        assert said in solution.detail
+        assert solution.violation > 1e-3
+
+
+def test_a_file_and_a_warm_start_keep_multipliers_of_either_sign(tmp_path: Path) -> None:
+    case = problem(ls.GoalState([1, 0]), ls.StateBounds(high={"v": 0.6}))
+    solution = ls.smooth(case)
+    loaded = ls.load_solution(ls.save(solution, tmp_path / "solution.npz"))
+    assert loaded.multipliers[0].values.min() < 0
+    for one, other in zip(loaded.multipliers, solution.multipliers, strict=True):
+        np.testing.assert_array_equal(one.values, other.values)
+    assert loaded.violation == solution.violation
+    again = ls.smooth(case, start=loaded)
+    assert again.status is Status.CONVERGED
+    assert len(again.iterations) <= 3
+
+
+def test_derivatives_are_right() -> None:
+    kept = [
+        ls.GoalState([1, 0]), ls.SymbolicConstraint(power_left, parameters={"room": 0.3}), ls.StateBounds({"x": -1})
+    ]  # fmt: skip
+    checks = [check for check in ls.check_derivatives(problem(*kept)) if "slope of" in check.what]
+    assert len(checks) == 4
+    assert all(check.good for check in checks)
+
+
+def test_kinds_and_steps_are_part_of_the_digest() -> None:
+    kinds = [{}, {"equality": True}, {"at": "final"}, {"equality": True, "at": "final"}]
+    cases = [problem(ls.SymbolicConstraint(line, parameters={"slope": 0.1}, **kind)) for kind in kinds]
+    assert len({case.digest for case in cases}) == 4
+
+
+@pytest.mark.parametrize(
+    ("state", "line"),
+    [
+        (lambda: problem(ls.SymbolicConstraint(steered, parameters={"gain": 1.0}, at="final")),
+         "steered(x, u, p): got an entry that depends on u, want none at the final step, which has no u"),
+        (lambda: problem(ls.SymbolicConstraint(lambda x, u, p: [x[0], u[0]])),
+         "got 2 entries of which 1 depend on u, want all of them or none"),
+        (lambda: problem(ls.SymbolicConstraint(lambda x, u, p: [])), "got no entries, want at least one"),
+        (lambda: problem(ls.SymbolicConstraint(lambda x, u, p: p.a, parameters={"a": 1.0})),
+         "got p0 as entry 0, want it to depend on x or u"),
+        (lambda: ls.SymbolicConstraint(line, at="start"),
+         "SymbolicConstraint: at: got 'start', want one of: all, final"),
+        (lambda: ls.SymbolicConstraint(line, equality="yes"), "SymbolicConstraint: equality: got 'yes'"),
+        (lambda: problem(ls.GoalState([1, 2, 3])), "GoalState: goal: got 3 numbers, want 2, one for each of x, v"),
+        (lambda: ls.GoalState([1, 2], states=("x",)), "GoalState: goal: got 2 numbers, want 1, one a name"),
+        (lambda: ls.GoalState([1, 2], states=("x", "x")), "want names of states, at least one, and each once"),
+        (lambda: ls.GoalState([1], states="x"), "GoalState: states: got 'x', want a tuple of names: ('x',)"),
+        (lambda: problem(ls.GoalState([1], states=("y",))), "GoalState: states: got 'y', want one of: x, v"),
+        (lambda: problem(ls.GoalState([1, 0]), ls.GoalState([2], states=("x",))),
+         "constraints: got goals of 1 and 2 for x, want one"),
+        (lambda: ls.StateBounds(), "StateBounds: got no bounds"),
+        (lambda: ls.StateBounds(low={"x": 1}, high={"x": -1}), "StateBounds: got 1 to -1 for 'x', want low below high"),
+        (lambda: ls.StateBounds(low=[0, 0]), "StateBounds: low: got [0, 0], want a dictionary of name: number"),
+        (lambda: ls.StateBounds(low={"x": np.nan}), "StateBounds: low: 'x': got nan"),
+        (lambda: problem(ls.StateBounds(low={"y": 0})), "StateBounds: states: got 'y', want one of: x, v"),
+        (lambda: problem(ls.StateBounds(high={"x": 0.5}), ls.GoalState([1, 0])),
+         "constraints: got a goal of 1 m for x, want x of at most 0.5 m"),
+        (lambda: ls.ilqr(problem(ls.GoalState([1, 0]))), "constraints: got some, want none for ilqr"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_in_a_line(state: Callable[[], object], line: str) -> None:
+    with pytest.raises(InputError) as caught:
+        state()
+    assert line in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_constraint_that_is_kept_anyway_changes_nothing() -> None:
+    bare = problem(weight=10.0)
+    kept = dataclasses.replace(bare, constraints=[ls.SymbolicConstraint(past, parameters={"least": -5.0})])
+    one, other = ls.smooth(bare), ls.smooth(kept)
+    np.testing.assert_array_equal(one.trajectory.states, other.trajectory.states)
+    assert other.multipliers == ()
