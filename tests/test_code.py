@@ -13,57 +13,6 @@ LINES_OF_A_FUNCTION = 80
 POSITIONAL_ARGUMENTS = 8
 LINES_OF_A_FILE = 399
 
-# What is over a limit still. A place that has been mended must be taken off, so nothing is added unseen.
-LONG_FUNCTIONS = {
-    "kernels/certificate.py: certify",
-    "kernels/damped_iterations.py: damped_iterations",
-    "kernels/dual_form.py: riccati_forward",
-    "problem/dynamics.py: Dynamics.__init__",
-    "simulation/closed_loop.py: simulate",
-    "simulation/plant_check.py: check_plant",
-    "solvers/continuous.py: smooth_continuous",
-    "solvers/linear_quadratic.py: smooth_lq",
-}
-MANY_ARGUMENTS = {
-    "kernels/certificate.py: certify",
-    "kernels/control_limits.py: minimize_within",
-    "kernels/control_limits.py: riccati_backward_within",
-    "kernels/damped_iterations.py: damped_iterations",
-    "kernels/damped_iterations.py: relinearize",
-    "kernels/dual_form.py: depart",
-    "kernels/dual_form.py: linearize",
-    "kernels/dual_form.py: riccati_forward",
-    "kernels/entry_points.py: ilqr",
-    "kernels/entry_points.py: smoother",
-    "kernels/interface.py: depart",
-    "kernels/interface.py: linearize",
-    "kernels/interface.py: riccati_forward",
-    "kernels/iterations.py: ilqr_iterations",
-    "kernels/iterations.py: optimality",
-    "kernels/iterations.py: smoother_iterations",
-    "kernels/linear_algebra.py: riccati_backward",
-    "kernels/linear_quadratic_passes.py: lq_passes",
-    "kernels/passes.py: backward_pass",
-    "kernels/passes.py: forward_pass",
-    "kernels/passes.py: opening_pass",
-    "kernels/passes.py: stage_model",
-    "kernels/primal_form.py: depart",
-    "kernels/primal_form.py: linearize",
-    "kernels/primal_form.py: riccati_forward",
-    "kernels/rollouts.py: differential_pass",
-    "kernels/rollouts.py: line_search",
-    "kernels/rollouts.py: rollout",
-    "kernels/signed_distance.py: rim_derivatives",
-    "view/picture.py: picture",
-}
-LONG_FILES = {
-    "problem/costs.py",
-    "reports/page.py",
-    "results/solution.py",
-    "solvers/common.py",
-    "solvers/continuous.py",
-}
-
 
 def files() -> Iterator[tuple[str, str]]:
     """The name of each module, as in `solvers/ilqr.py`, and its text."""
@@ -102,15 +51,15 @@ def many_arguments(name: str, text: str) -> set[str]:
 
 
 def test_functions_are_short() -> None:
-    assert {found for name, text in files() for found in long_functions(name, text)} == LONG_FUNCTIONS
+    assert {found for name, text in files() for found in long_functions(name, text)} == set()
 
 
 def test_functions_take_few_arguments_by_place() -> None:
-    assert {found for name, text in files() for found in many_arguments(name, text)} == MANY_ARGUMENTS
+    assert {found for name, text in files() for found in many_arguments(name, text)} == set()
 
 
 def test_files_are_short() -> None:
-    assert {name for name, text in files() if len(text.splitlines()) > LINES_OF_A_FILE} == LONG_FILES
+    assert {name for name, text in files() if len(text.splitlines()) > LINES_OF_A_FILE} == set()
 
 
 def test_what_is_over_a_limit_is_noticed() -> None:

@@ -117,12 +117,7 @@ class Dynamics:
             if len(indices) != 3 or indices != list(range(indices[0], indices[0] + 3)):
                 raise InputError(f"rotation_vectors: got {excerpt(tuple(triple))}, want three neighbouring states")
             starts.append(indices[0])
-        limits = control_limits if control_limits is not None else (-np.inf, np.inf)
-        try:
-            low, high = (np.broadcast_to(numbers_of("control_limits", side), len(controls)).tolist() for side in limits)
-        except Exception:  # no pair, no numbers, another number of them
-            wanted = f"(lowest, highest), each a number or ({len(controls)},)"
-            raise InputError(f"control_limits: got {excerpt(control_limits)}, want {wanted}") from None
+        low, high = _limits_of(control_limits, len(controls))
         self.f, self.jacobian = f, jacobian
         self.level = level_of(f, level)
         if jacobian is not None and self.level == "symbolic":
@@ -276,3 +271,14 @@ class Dynamics:
     def _numbers(self) -> Array:
         """What `p` is in the compiled functions, with the places of the functions for their addresses."""
         return np.concatenate([np.arange(len(self.functions), dtype=np.float64), self.data])
+
+
+def _limits_of(control_limits: Limits | None, count: int) -> tuple[list[float], list[float]]:
+    """The lowest and the highest of each of so many controls. Raises InputError for what is no such pair."""
+    limits = control_limits if control_limits is not None else (-np.inf, np.inf)
+    try:
+        low, high = (np.broadcast_to(numbers_of("control_limits", side), count).tolist() for side in limits)
+    except Exception:  # no pair, no numbers, another number of them
+        wanted = f"(lowest, highest), each a number or ({count},)"
+        raise InputError(f"control_limits: got {excerpt(control_limits)}, want {wanted}") from None
+    return low, high

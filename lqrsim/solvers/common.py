@@ -1,4 +1,4 @@
-"""What the solvers share: settings, the iterations with a look after each, and putting the answer together."""
+"""What the solvers share: settings, when to stop, and the iterations with a look after each."""
 
 import contextlib
 import time
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen import distances
 from lqrsim.codegen.user_functions import External
 from lqrsim.errors import (
     Array,
@@ -26,16 +25,13 @@ from lqrsim.errors import (
 from lqrsim.kernels import interface
 from lqrsim.kernels.records import Rows
 from lqrsim.machine import processors
-from lqrsim.problem.constraints import Clearance
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.records import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
+from lqrsim.results.records import Iteration, Status
 from lqrsim.results.solution import Solution
-from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.initial_guess import Start, StartLike, resolve
-from lqrsim.versions import versions
 
 Callback = Callable[[Iteration], object]
 
@@ -340,77 +336,3 @@ def check_outcome(problem: Problem, ending: Ending, x: Array, u: Array, *, refus
                 raise
             return replace(ending, outcome=interface.NOT_FINITE, raised=str(error))
     return ending
-
-
-def assemble(
-    problem: Problem,
-    *,
-    solver: str,
-    options: dict[str, object],
-    status: Status,
-    detail: str,
-    iterations: tuple[Iteration, ...],
-    states: Array,
-    controls: Array,
-    law: tuple[Array, Array],
-    certificate: Certificate,
-    gap: float,
-    inverse_law: tuple[Array, Array] | None = None,
-    cost_to_go: Quadratic | None = None,
-    cost_to_come: Quadratic | Moments | None = None,
-    multipliers: tuple[Multipliers, ...] = (),
-    candidates: tuple[Candidate, ...] = (),
-) -> Solution:
-    """The Solution of what a solver found."""
-
-    def policy(gain: Array, offset: Array, nominal: Array) -> AffinePolicy:
-        return AffinePolicy(
-            gain=gain, offset=offset, nominal=nominal, dt=problem.dt,
-            state_coordinates=problem.dynamics.state_coordinates,
-            control_coordinates=problem.control_coordinates.within(problem.dynamics.control_coordinates),
-        )  # fmt: skip
-
-    return Solution(
-        status=status,
-        detail=detail,
-        policy=policy(*law, states[:-1]),
-        inverse_policy=policy(*inverse_law, states[1:]) if inverse_law is not None else None,
-        cost_to_go=cost_to_go,
-        cost_to_come=cost_to_come,
-        trajectory=Trajectory(states, controls, problem.dt),
-        iterations=iterations,
-        clearance=clearance_of(problem, states),
-        certificate=certificate,
-        gap=gap,
-        solver=solver,
-        options=options,
-        multipliers=multipliers,
-        candidates=candidates,
-        problem_digest=problem.digest,
-        versions=versions(),
-        goal=problem.weighed_goal,
-        goal_radius=_radius(problem),
-    )
-
-
-def _radius(problem: Problem) -> float | None:
-    """The robot's radius, where the goal has a position, and the problem obstacles that know it; None for a point."""
-    goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
-    if not position or (goal is not None and np.isnan(goal[position]).all()):
-        return None
-    constraints = [constraint for constraint in problem.constraints if isinstance(constraint, Clearance)]
-    return max((one.radius for one in (*problem.obstacle_costs, *constraints)), default=0.0) or None
-
-
-def clearance_of(problem: Problem, states: Array) -> Array | None:
-    """Signed distance to the nearest obstacle minus the robot's radius, (T+1,); None without obstacles."""
-    space = problem.dynamics.state_coordinates
-    constraints = [constraint for constraint in problem.constraints if isinstance(constraint, Clearance)]
-    worlds = {(id(one.world), one.radius): one.world for one in (*problem.obstacle_costs, *constraints)}
-    place = states[:, list(space.position)]
-    found = [
-        distances.signed_distance(world.seen_by(space.plane, space.offset), place) - radius
-        for (_, radius), world in worlds.items()
-        if len(world)
-    ]
-    return np.min(found, axis=0) if found else None

@@ -14,11 +14,11 @@ from lqrsim.results.records import Status
 from lqrsim.results.solution import Solution
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
+from lqrsim.solvers.assembly import assemble
 from lqrsim.solvers.certify import certified
 from lqrsim.solvers.common import (
     Callback,
     Settings,
-    assemble,
     check_callback,
     check_outcome,
     check_problem,

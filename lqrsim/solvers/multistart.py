@@ -16,8 +16,9 @@ from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, ter
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.records import Candidate
+from lqrsim.solvers.assembly import clearance_of
 from lqrsim.solvers.attempt import Attempt, Found
-from lqrsim.solvers.common import Callback, SmootherSettings, Stop, clearance_of, workers
+from lqrsim.solvers.common import Callback, SmootherSettings, Stop, workers
 from lqrsim.solvers.constrained import finish, refine
 from lqrsim.solvers.initial_guess import InitialPrior, Start, resolve
 

@@ -8,12 +8,12 @@ from lqrsim.errors import InputError
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
+from lqrsim.solvers.assembly import assemble
 from lqrsim.solvers.attempt import Attempt
 from lqrsim.solvers.common import (
     Callback,
     SmootherSettings,
     Stop,
-    assemble,
     check_attempts,
     check_callback,
     check_problem,
