@@ -7,11 +7,11 @@ that it can be read, linted and type-checked as it stands. `source_of` puts in w
 import ast
 import functools
 import inspect
+import sys
 from types import ModuleType
 from typing import Any
 
 
-@functools.lru_cache(maxsize=256)  # a problem that is stated again and again has the same sources
 def source_of(module: ModuleType, *functions: str, **constants: Any) -> str:
     """The text of a module's functions that are in the numba subset.
 
@@ -22,15 +22,18 @@ def source_of(module: ModuleType, *functions: str, **constants: Any) -> str:
     Raises:
       AttributeError: the module has no such function, or declares no such constant.
     """
-    for name in (*functions, *constants):
-        getattr(module, name)
-    source = inspect.getsource(module)
+    return _source_of(module.__name__, functions, tuple(constants.items()))
+
+
+@functools.lru_cache(maxsize=256)  # a problem that is stated again and again has the same sources
+def _source_of(module: str, functions: tuple[str, ...], constants: tuple[tuple[str, Any], ...]) -> str:
+    for name in (*functions, *dict(constants)):
+        getattr(sys.modules[module], name)
+    source = inspect.getsource(sys.modules[module])
     marks = [i for i, line in enumerate(source.splitlines(), start=1) if line.startswith("# The numba subset")]
     nodes = [node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)]
     nodes = [node for node in nodes if node.lineno > (marks[0] if marks else 0)]
-    nodes = [node for node in nodes if not functions or node.name in functions]
-    if constants:
-        nodes = [_Fill(constants).visit(node) for node in nodes]
+    nodes = [_Fill(dict(constants)).visit(node) for node in nodes if not functions or node.name in functions]
     return "\n\n".join(ast.unparse(node) for node in nodes)
 
 
@@ -49,15 +52,15 @@ class _Fill(ast.NodeTransformer):
     def visit_Call(self, node: ast.Call) -> ast.AST:
         self.generic_visit(node)
         match node:
-            case ast.Call(func=ast.Name("len"), args=[ast.Constant(value)]):
-                return ast.Constant(len(value))
+            case ast.Call(func=ast.Name("len"), args=[ast.Constant(value=tuple(entries))]):
+                return ast.Constant(len(entries))
         return node
 
     def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
         self.generic_visit(node)
         match node:
-            case ast.Subscript(value=ast.Constant(value), slice=ast.Constant(int(index))):
-                return ast.Constant(value[index])
+            case ast.Subscript(value=ast.Constant(value=tuple(entries)), slice=ast.Constant(value=int(index))):
+                return ast.Constant(entries[index])
         return node
 
     def visit_IfExp(self, node: ast.IfExp) -> ast.AST:

@@ -70,15 +70,6 @@ class ConstraintTerm:
             raise InputError("ConstraintTerm: final_only: got True with uses_control, want one: the end has no control")
         check_source("ConstraintTerm", self.source, {"value": 5, "slope": 6})
 
-    def violation(self, values: Array) -> float:
-        """By how much the worst of these values misses what is wanted; 0 where none does, infinite if one is NaN."""
-        missed = float((np.abs(values) if self.equality else -values).max(initial=0.0))
-        return missed if not np.isnan(missed) else np.inf
-
-    def allowed(self, tolerance: float) -> float:
-        """The violation that is none: constraints are solved for to `tolerance`, and inequalities have it to spare."""
-        return min(tolerance, EQUALITY_TOLERANCE) if self.equality else 0.0
-
 
 class Constraint(abc.ABC):
     """One constraint."""
@@ -225,7 +216,7 @@ class GoalState(Constraint):
         if self.states is not None and len(self.states) != len(self.goal):
             raise InputError(f"GoalState: goal: got {len(self.goal)} numbers, want {len(self.states)}, one a name")
 
-    def numbers(self, dynamics: Dynamics) -> dict[int, float]:
+    def _numbers(self, dynamics: Dynamics) -> dict[int, float]:
         """What is asked of which state, by its index. Raises InputError if it does not fit."""
         names = dynamics.state_coordinates.names
         wanted = names if self.states is None else self.states
@@ -237,7 +228,7 @@ class GoalState(Constraint):
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
-        rows = list(self.numbers(dynamics).items())
+        rows = list(self._numbers(dynamics).items())
         says = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
         data = [(i, 1.0, number, np.inf) for i, number in rows]
         return ConstraintTerm(
@@ -264,9 +255,9 @@ class StateBounds(Constraint):
                 raise InputError(f"StateBounds: got {span} for {excerpt(name)}, want low below high")
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        return self.bind_to_goal(dynamics, {}, 0)
+        return self._bind_to_goal(dynamics, {}, 0)
 
-    def bind_to_goal(self, dynamics: Dynamics, goals: Mapping[int, float], steps: int) -> ConstraintTerm:
+    def _bind_to_goal(self, dynamics: Dynamics, goals: Mapping[int, float], steps: int) -> ConstraintTerm:
         """As `bind`, where some states, by their indices, must be at a goal after so many steps.
 
         Raises:
@@ -290,7 +281,7 @@ def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int,
     """What all GoalStates ask of which state, by its index. Raises InputError if two contradict each other."""
     goals: dict[int, float] = {}
     for constraint in constraints:
-        for i, number in constraint.numbers(dynamics).items() if isinstance(constraint, GoalState) else ():
+        for i, number in constraint._numbers(dynamics).items() if isinstance(constraint, GoalState) else ():
             if goals.setdefault(i, number) != number:
                 name = dynamics.state_coordinates.names[i]
                 raise InputError(f"constraints: got goals of {goals[i]:g} and {number:g} for {name}, want one")
@@ -302,11 +293,22 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, steps: int) 
     goals, terms = goals_of(constraints, dynamics), []
     for constraint in constraints:
         if isinstance(constraint, StateBounds):
-            term = constraint.bind_to_goal(dynamics, goals, steps)
+            term = constraint._bind_to_goal(dynamics, goals, steps)
         else:
             term = constraint.bind(dynamics)
         terms.append(check_kind(f"{type(constraint).__name__}.bind", term, ConstraintTerm, "a ConstraintTerm"))
     return tuple(terms)
+
+
+def violation_of(term: ConstraintTerm, values: Array) -> float:
+    """By how much the worst of a constraint's values is missed; 0 where none is, infinite if one is NaN."""
+    missed = float((np.abs(values) if term.equality else -values).max(initial=0.0))
+    return missed if not np.isnan(missed) else np.inf
+
+
+def allowed_violation(term: ConstraintTerm, tolerance: float) -> float:
+    """The violation that is none: constraints are solved for to `tolerance`, which inequalities have to spare."""
+    return min(tolerance, EQUALITY_TOLERANCE) if term.equality else 0.0
 
 
 def _written(signature: str, assignments: Mapping[str, Any], of: str, returns: str | None = None) -> str:
