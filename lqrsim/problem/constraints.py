@@ -229,10 +229,10 @@ class GoalState(Constraint):
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
         rows = list(self._numbers(dynamics).items())
-        says = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
+        described = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
         data = [(i, 1.0, number, np.inf) for i, number in rows]
         return ConstraintTerm(
-            source_of(state_bound), np.ravel(data), len(rows), says.__getitem__, equality=True, final_only=True
+            source_of(state_bound), np.ravel(data), len(rows), described.__getitem__, equality=True, final_only=True
         )
 
 
@@ -264,7 +264,7 @@ class StateBounds(Constraint):
           InputError: a goal is outside the bounds.
         """
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
-        data, says = [], []
+        data, described = [], []
         for sign, side, word in ((1.0, self.low, "at least"), (-1.0, self.high, "at most")):
             for name, number in side.items():
                 i = names.index(check_name("StateBounds: states", name, names))
@@ -273,8 +273,8 @@ class StateBounds(Constraint):
                     goal = _quantity(goals[i], units[i])
                     raise InputError(f"constraints: got a goal of {goal} for {name}, want {wanted}")
                 data.append((i, sign, number, steps - 1 if i in goals else np.inf))
-                says.append(wanted)
-        return ConstraintTerm(source_of(state_bound), np.ravel(data), len(data), says.__getitem__)
+                described.append(wanted)
+        return ConstraintTerm(source_of(state_bound), np.ravel(data), len(data), described.__getitem__)
 
 
 def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
