@@ -13,7 +13,7 @@ from whole_problems.claims import contradictions
 import lqrsim as ls
 from lqrsim.results.solution import Status
 
-# Each kind of problem is compiled where nothing is cached, some 10 seconds each.
+# Ten kinds of problems are compiled where nothing is cached, some 10 seconds each.
 pytestmark = pytest.mark.timeout(900)
 
 

@@ -6,8 +6,8 @@ that it can be read, linted and type-checked as it stands. `source_of` puts in w
 
 import ast
 import functools
+import importlib
 import inspect
-import sys
 from types import ModuleType
 from typing import Any
 
@@ -22,18 +22,22 @@ def source_of(module: ModuleType, *functions: str, **constants: Any) -> str:
     Raises:
       AttributeError: the module has no such function, or declares no such constant.
     """
-    return _source_of(module.__name__, functions, tuple(constants.items()))
+    return _source(module.__name__, functions, tuple(constants.items()))
 
 
 @functools.lru_cache(maxsize=256)  # a problem that is stated again and again has the same sources
-def _source_of(module: str, functions: tuple[str, ...], constants: tuple[tuple[str, Any], ...]) -> str:
-    for name in (*functions, *dict(constants)):
-        getattr(sys.modules[module], name)
-    source = inspect.getsource(sys.modules[module])
+def _source(name: str, functions: tuple[str, ...], pairs: tuple[tuple[str, Any], ...]) -> str:
+    """See `source_of`; of the module of that name."""
+    module, constants = importlib.import_module(name), dict(pairs)
+    for wanted in (*functions, *constants):
+        getattr(module, wanted)
+    source = inspect.getsource(module)
     marks = [i for i, line in enumerate(source.splitlines(), start=1) if line.startswith("# The numba subset")]
     nodes = [node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)]
     nodes = [node for node in nodes if node.lineno > (marks[0] if marks else 0)]
-    nodes = [_Fill(dict(constants)).visit(node) for node in nodes if not functions or node.name in functions]
+    nodes = [node for node in nodes if not functions or node.name in functions]
+    if constants:
+        nodes = [_Fill(constants).visit(node) for node in nodes]
     return "\n\n".join(ast.unparse(node) for node in nodes)
 
 
@@ -52,15 +56,17 @@ class _Fill(ast.NodeTransformer):
     def visit_Call(self, node: ast.Call) -> ast.AST:
         self.generic_visit(node)
         match node:
-            case ast.Call(func=ast.Name("len"), args=[ast.Constant(value=tuple(entries))]):
-                return ast.Constant(len(entries))
+            case ast.Call(func=ast.Name("len"), args=[ast.Constant(value)]):
+                sized: Any = value  # a tuple's, which ast does not know of
+                return ast.Constant(len(sized))
         return node
 
     def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
         self.generic_visit(node)
         match node:
-            case ast.Subscript(value=ast.Constant(value=tuple(entries)), slice=ast.Constant(value=int(index))):
-                return ast.Constant(entries[index])
+            case ast.Subscript(value=ast.Constant(value), slice=ast.Constant(int(index))):
+                indexed: Any = value
+                return ast.Constant(indexed[index])
         return node
 
     def visit_IfExp(self, node: ast.IfExp) -> ast.AST:
