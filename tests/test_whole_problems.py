@@ -15,7 +15,7 @@ from lqrsim.results.records import Status
 
 # Each kind is compiled where nothing is cached, some 5 seconds. Most of these are so by other tests, too; those that
 # are left out have nothing that these have not, and benchmark_claims.py draws them by the hundred.
-KINDS = ("linear", "pendulum", "arm", "car", "planar", "planar_free", "drive", "quadrotor")
+KINDS = ("linear", "pendulum", "parking", "car", "planar", "planar_free", "drive", "quadrotor")
 pytestmark = pytest.mark.timeout(900)
 
 

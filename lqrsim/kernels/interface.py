@@ -79,7 +79,7 @@ def final_added(x, u, t, data) -> float:
 
 
 def constraint_value(x, u, t, row, data) -> float:
-    """One of a constraint's numbers that are not to be negative."""
+    """One of a constraint's numbers, which are not to be negative, or to be zero."""
     return 0.0
 
 

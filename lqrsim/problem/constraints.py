@@ -70,15 +70,6 @@ class ConstraintTerm:
             raise InputError("ConstraintTerm: final_only: got True with uses_control, want one: the end has no control")
         check_source("ConstraintTerm", self.source, {"value": 5, "slope": 6})
 
-    def violation(self, values: Array) -> float:
-        """By how much the worst of these values misses what is wanted; 0 where none does, infinite if one is NaN."""
-        missed = float((np.abs(values) if self.equality else -values).max(initial=0.0))
-        return missed if not np.isnan(missed) else np.inf
-
-    def allowed(self, tolerance: float) -> float:
-        """The violation that is none: constraints are solved for to `tolerance`, and inequalities have it to spare."""
-        return min(tolerance, EQUALITY_TOLERANCE) if self.equality else 0.0
-
 
 class Constraint(abc.ABC):
     """One constraint."""
@@ -225,7 +216,7 @@ class GoalState(Constraint):
         if self.states is not None and len(self.states) != len(self.goal):
             raise InputError(f"GoalState: goal: got {len(self.goal)} numbers, want {len(self.states)}, one a name")
 
-    def numbers(self, dynamics: Dynamics) -> dict[int, float]:
+    def _numbers(self, dynamics: Dynamics) -> dict[int, float]:
         """What is asked of which state, by its index. Raises InputError if it does not fit."""
         names = dynamics.state_coordinates.names
         wanted = names if self.states is None else self.states
@@ -237,11 +228,11 @@ class GoalState(Constraint):
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
-        rows = list(self.numbers(dynamics).items())
-        says = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
+        rows = list(self._numbers(dynamics).items())
+        described = [f"the goal of {_quantity(number, units[i])} for {names[i]}" for i, number in rows]
         data = [(i, 1.0, number, np.inf) for i, number in rows]
         return ConstraintTerm(
-            source_of(state_bound), np.ravel(data), len(rows), says.__getitem__, equality=True, final_only=True
+            source_of(state_bound), np.ravel(data), len(rows), described.__getitem__, equality=True, final_only=True
         )
 
 
@@ -264,16 +255,16 @@ class StateBounds(Constraint):
                 raise InputError(f"StateBounds: got {span} for {excerpt(name)}, want low below high")
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        return self.bind_to_goal(dynamics, {}, 0)
+        return self._bind_to_goal(dynamics, {}, 0)
 
-    def bind_to_goal(self, dynamics: Dynamics, goals: Mapping[int, float], steps: int) -> ConstraintTerm:
+    def _bind_to_goal(self, dynamics: Dynamics, goals: Mapping[int, float], steps: int) -> ConstraintTerm:
         """As `bind`, where some states, by their indices, must be at a goal after so many steps.
 
         Raises:
           InputError: a goal is outside the bounds.
         """
         names, units = dynamics.state_coordinates.names, dynamics.state_coordinates.units
-        data, says = [], []
+        data, described = [], []
         for sign, side, word in ((1.0, self.low, "at least"), (-1.0, self.high, "at most")):
             for name, number in side.items():
                 i = names.index(check_name("StateBounds: states", name, names))
@@ -282,15 +273,15 @@ class StateBounds(Constraint):
                     goal = _quantity(goals[i], units[i])
                     raise InputError(f"constraints: got a goal of {goal} for {name}, want {wanted}")
                 data.append((i, sign, number, steps - 1 if i in goals else np.inf))
-                says.append(wanted)
-        return ConstraintTerm(source_of(state_bound), np.ravel(data), len(data), says.__getitem__)
+                described.append(wanted)
+        return ConstraintTerm(source_of(state_bound), np.ravel(data), len(data), described.__getitem__)
 
 
 def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
     """What all GoalStates ask of which state, by its index. Raises InputError if two contradict each other."""
     goals: dict[int, float] = {}
     for constraint in constraints:
-        for i, number in constraint.numbers(dynamics).items() if isinstance(constraint, GoalState) else ():
+        for i, number in constraint._numbers(dynamics).items() if isinstance(constraint, GoalState) else ():
             if goals.setdefault(i, number) != number:
                 name = dynamics.state_coordinates.names[i]
                 raise InputError(f"constraints: got goals of {goals[i]:g} and {number:g} for {name}, want one")
@@ -302,11 +293,22 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, steps: int) 
     goals, terms = goals_of(constraints, dynamics), []
     for constraint in constraints:
         if isinstance(constraint, StateBounds):
-            term = constraint.bind_to_goal(dynamics, goals, steps)
+            term = constraint._bind_to_goal(dynamics, goals, steps)
         else:
             term = constraint.bind(dynamics)
         terms.append(check_kind(f"{type(constraint).__name__}.bind", term, ConstraintTerm, "a ConstraintTerm"))
     return tuple(terms)
+
+
+def violation_of(term: ConstraintTerm, values: Array) -> float:
+    """By how much the worst of a constraint's values is missed; 0 where none is, infinite if one is NaN."""
+    missed = float((np.abs(values) if term.equality else -values).max(initial=0.0))
+    return missed if not np.isnan(missed) else np.inf
+
+
+def allowed_violation(term: ConstraintTerm, tolerance: float) -> float:
+    """The violation that is none: constraints are solved for to `tolerance`, which inequalities have to spare."""
+    return min(tolerance, EQUALITY_TOLERANCE) if term.equality else 0.0
 
 
 def _written(signature: str, assignments: Mapping[str, Any], of: str, returns: str | None = None) -> str:

@@ -155,7 +155,7 @@ def _undamped(
             since = 0
             lagrangian.update()
     found = attempt.found(dataclasses.replace(ending, iterations=before + done))
-    detail = found.detail or ("" if found.success else f"with constraints, {lagrangian.worst()}")
+    detail = found.detail or ("" if found.success else f"with constraints; {lagrangian.worst()}")
     if found.success and not lagrangian.solved:
         found = dataclasses.replace(found, status=Status.MAX_ITERATIONS)
         detail = f"{len(done)} iterations with constraints: {lagrangian.worst()}"

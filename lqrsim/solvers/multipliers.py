@@ -9,7 +9,7 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels import interface
-from lqrsim.problem.constraints import ConstraintTerm
+from lqrsim.problem.constraints import ConstraintTerm, allowed_violation, violation_of
 from lqrsim.results.records import Multipliers
 from lqrsim.results.value_functions import Moments
 from lqrsim.solvers.attempt import Attempt
@@ -51,7 +51,7 @@ class AugmentedLagrangian:
         self._terms = attempt.problem.constraint_terms
         self._near = tolerance = attempt.settings.constraint_tolerance
         # Of inequalities and of equalities, if there are any.
-        self._tolerance = {term.equality: term.allowed(tolerance) or tolerance for term in self._terms}
+        self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in self._terms}
         self.kept = self.solved = self.nearly = False
         self._restart()
         self._first = [array[0] for array in self._work.multipliers]  # zero, but for those of another solution
@@ -72,11 +72,9 @@ class AugmentedLagrangian:
         self._values = [values.ravel() - array[3] for values, array in zip(stated, self._work.multipliers, strict=True)]
         missed = zip(self._terms, self._each(_missed), strict=True)
         self.solved = all(off <= self._tolerance[term.equality] for term, off in missed)
-        beyond = [
-            term.violation(values) - term.equality * self._near
-            for term, values in zip(self._terms, stated, strict=True)
-        ]
-        self.nearly = not self.kept and max(beyond) <= 0
+        pairs = zip(self._terms, stated, strict=True)
+        beyond = max(violation_of(term, values) - term.equality * self._near for term, values in pairs)
+        self.nearly = not self.kept and beyond <= 0
 
     def start(self) -> None:
         """No multipliers, and a penalty for each constraint that fits what it costs to change it."""
@@ -133,7 +131,7 @@ class AugmentedLagrangian:
             (np.abs(values) if term.equality else -(values + array[3])).max(initial=-np.inf)
             for term, array, values in self._constraints()
         ]
-        beyond = [one - term.allowed(self._near) for one, term in zip(missed, self._terms, strict=True)]
+        beyond = [one - allowed_violation(term, self._near) for one, term in zip(missed, self._terms, strict=True)]
         which = int(np.argmax(beyond))
         step, row = divmod(self._worst_of(which), self._terms[which].rows)
         time = step * self._problem.dt

@@ -17,6 +17,7 @@ from lqrsim.kernels.records import (
     Prior,
     Smoothing,
 )
+from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
@@ -130,9 +131,9 @@ class Workspace:
     def violation(self, values: list[Array]) -> float:
         """By how much the worst constraint is missed, given their values; 0 where none is, infinite if one is NaN."""
         terms = self._problem.constraint_terms
-        return max((term.violation(one) for term, one in zip(terms, values, strict=True)), default=0.0)
+        return max((violation_of(term, one) for term, one in zip(terms, values, strict=True)), default=0.0)
 
     def keeps(self, values: list[Array]) -> bool:
         """Whether values are those of a plan that keeps all constraints, the equalities within their tolerance."""
         pairs = zip(self._problem.constraint_terms, values, strict=True)
-        return all(term.violation(one) <= term.allowed(self._tolerance) for term, one in pairs)
+        return all(violation_of(term, one) <= allowed_violation(term, self._tolerance) for term, one in pairs)
