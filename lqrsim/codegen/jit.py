@@ -24,7 +24,7 @@ import numpy as np
 from lqrsim.codegen import disk_cache as disk
 from lqrsim.codegen.arguments import converted, kind_of, signature_of
 from lqrsim.codegen.fingerprint import fingerprint, note_helpers, stale
-from lqrsim.codegen.user_functions import External
+from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import records
 
@@ -164,7 +164,7 @@ def in_c_order(array: Array) -> Array:
     return np.require(array, np.float64, ["C", "W"])
 
 
-def address_of(function: External) -> float:
+def address_of(function: UserFunction) -> float:
     """Where compiled code finds a user's function."""
     with compiling:
         if not function.held:
@@ -172,7 +172,7 @@ def address_of(function: External) -> float:
     return float(function.held[0][1])
 
 
-def _compile(function: External) -> tuple[Any, int]:
+def _compile(function: UserFunction) -> tuple[Any, int]:
     """A numba function behind C's calling convention: what must be kept alive, and its address.
 
     Raises:

@@ -58,7 +58,7 @@ def parameters_class(names: tuple[str, ...]) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class External:
+class UserFunction:
     """One function, and how it is called.
 
     With `values`, `function(x, u, p)` returns that many numbers (one: the number itself); with `writes`,
@@ -90,7 +90,7 @@ class External:
     def __reduce__(self) -> tuple[Any, ...]:
         """Without its address, which another process has no use for."""
         stated = {field.name: getattr(self, field.name) for field in fields(self) if field.init}
-        return partial(External, **stated), ()
+        return partial(UserFunction, **stated), ()
 
     @property
     def name(self) -> str:
@@ -214,7 +214,7 @@ class External:
         return source, {"Parameters": parameters_class(self.parameters)}
 
 
-def plain_names(states: int, controls: int, functions: Sequence[External], parameters: Mapping[str, float]) -> dict:
+def plain_names(states: int, controls: int, functions: Sequence[UserFunction], parameters: Mapping[str, float]) -> dict:
     """The names that sources in the numba subset are run with as plain Python, instead of being compiled.
 
     An address stands for a function here, too: its place among `functions`.

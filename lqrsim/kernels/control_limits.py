@@ -8,7 +8,7 @@ without a penalty or a multiplier. iLQR's steps become those of control-limited 
 """
 
 from lqrsim.kernels.interface import M, N, W, stack
-from lqrsim.kernels.linear_algebra import ahead, minimize_control, within
+from lqrsim.kernels.linear_algebra import add_cost_to_go, minimize_control, within
 
 
 def fix_control(i, value, stage, step) -> float:
@@ -110,7 +110,7 @@ def slope_at(stage, x, u, i) -> float:
 
 def riccati_backward_within(t, step, stage, constant, x, limits, policy, to_go) -> bool:
     """As `riccati_backward`, within the limits at the state x."""
-    shifted = ahead(t, step, stage, constant, to_go)
+    shifted = add_cost_to_go(t, step, stage, constant, to_go)
     decrease, good = minimize_within(
         stage, x, limits, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]
     )

@@ -19,7 +19,7 @@ from lqrsim.kernels.interface import (
     N,
     stack,
 )
-from lqrsim.kernels.iterations import ending, relative_improvement, relative_optimality, write_row
+from lqrsim.kernels.iterations import outcome_of, relative_improvement, relative_optimality, write_row
 from lqrsim.kernels.passes import backward_pass, copy, forward_pass, minimizers
 from lqrsim.kernels.records import Linearization
 from lqrsim.kernels.rollouts import (
@@ -69,10 +69,10 @@ def damped_iterations(first, last, settings, model, work, memory, log):
             small = abs(improvement) < settings.tolerance and (gap < settings.gap_tolerance or not settings.optimal)
             memory.small_changes = memory.small_changes + 1 if small else 0.0
             settled, stalled = memory.small_changes > 1, False
-            be_bolder(memory, fraction)
+            relax_damping(memory, fraction)
             write_row(log[done], cost, improvement, gap, nan, nan, DAMPED if reach > 0 else ILQR)
         else:
-            be_more_careful(memory)
+            tighten_damping(memory)
             stalled = memory.weight > 1e12
             settled = stalled
             write_row(log[done], memory.plan_cost, 0.0, nan, nan, nan, REJECTED)
@@ -108,7 +108,7 @@ def damped_step(settings, model, work, memory):
     return merit, cost, fraction, nothing
 
 
-def be_bolder(memory, fraction):
+def relax_damping(memory, fraction):
     """What the next iteration ventures after one that lowered the cost, by that fraction of its step."""
     if memory.weight > 0:
         memory.weight = 0.1 * memory.weight if memory.weight > 1e-6 else 0.0
@@ -123,7 +123,7 @@ def be_bolder(memory, fraction):
         memory.reach = 0.25 if memory.ilqr_left <= 0 else 0.0
 
 
-def be_more_careful(memory):
+def tighten_damping(memory):
     """What the next iteration ventures after one that did not lower the cost."""
     if memory.reach > 0.25:
         memory.reach = 0.25
@@ -168,4 +168,4 @@ def relinearize(settings, settled, nothing, model, work, memory, row):
     row.optimality, row.residual = left, dynamics_residual(steps, work.x_hats, policy, model, plan.states)
     if isnan(row.gap):  # of an iteration that was rejected
         row.gap = 0.0
-    return ending(settled and left < settings.tolerance, settings, left, memory.plan_cost, False)
+    return outcome_of(settled and left < settings.tolerance, settings, left, memory.plan_cost, False)

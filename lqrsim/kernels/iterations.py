@@ -93,7 +93,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
             left = optimality(settings, work.rollout, model, cost, nothing)
             residual = dynamics_residual(steps, work.x_hats, work.policy, model, work.rollout.states)
         write_row(log[done], cost, improvement, gap, left, residual, SMOOTH)
-        outcome = ending(settled, settings, left, cost, full)
+        outcome = outcome_of(settled, settings, left, cost, full)
         if outcome == RUNNING and cycling(log, done):
             outcome = CYCLING
         if outcome == RUNNING and memory.watched > 0 and no_progress(log, done):
@@ -179,7 +179,7 @@ def relative_optimality(failed, decrease, cost, nothing):
     return decrease / max(abs(cost), nothing, 1e-300)
 
 
-def ending(settled, settings, left, cost, full):
+def outcome_of(settled, settings, left, cost, full):
     """The outcome after an iteration whose cost did or did not settle, with that optimality left."""
     if settled and not settings.optimal:
         return COST_CONVERGED
@@ -234,7 +234,7 @@ def ilqr_iterations(first, last, settings, model, work, log):
             failed, _, left = differential_pass(steps, plan, model, 0.0, 1, policy, to_go)
             left = relative_optimality(failed, left, cost, 0.0)
         write_row(log[done], cost, improvement, 0.0, left, 0.0, ILQR)
-        outcome = ending(settled, settings, left, cost, done + 1 == settings.max_iterations)
+        outcome = outcome_of(settled, settings, left, cost, done + 1 == settings.max_iterations)
         if outcome == RUNNING and fraction == 0:
             outcome = STALLED
         if outcome != RUNNING:

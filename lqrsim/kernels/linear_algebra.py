@@ -174,7 +174,7 @@ def riccati_backward(t, step, stage, constant, policy, to_go):
 
     The stage, with its constant, is about the origin, and is used up.
     """
-    shifted = ahead(t, step, stage, constant, to_go)
+    shifted = add_cost_to_go(t, step, stage, constant, to_go)
     decrease = minimize_control(
         stage.hessian, stage.gradient, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]
     )
@@ -182,7 +182,7 @@ def riccati_backward(t, step, stage, constant, policy, to_go):
     return decrease >= 0
 
 
-def ahead(t, step, stage, constant, to_go):
+def add_cost_to_go(t, step, stage, constant, to_go):
     """Add to a stage about the origin the cost-to-go at t + 1, where its step leads. Returns the sum's constant."""
     S1, s1, k1 = to_go.hessian[t + 1], to_go.gradient[t + 1], to_go.constant[t + 1]
     c = step.offset

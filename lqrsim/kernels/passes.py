@@ -123,7 +123,7 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
     for _ in range(2):
         final_model(x_hat, steps, model, to_go)
         if not guided:
-            lowest(to_go.hessian[steps], to_go.gradient[steps], x_hat)
+            minimizer_of_cost_to_go(to_go.hessian[steps], to_go.gradient[steps], x_hat)
     for t in range(steps - 1, -1, -1):
         copy(guess.controls[t], M, u)
         if guided:
@@ -135,7 +135,7 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
         if not riccati_backward_within(t, step, stage, constant, x, model.limits, policy, to_go):
             return t, finite(stage.hessian, W, W) and finite(step.jacobian, N, W)
         copy(x, N, x_hat)
-        lowest(to_go.hessian[t], to_go.gradient[t], x_hat)
+        minimizer_of_cost_to_go(to_go.hessian[t], to_go.gradient[t], x_hat)
     return -1, True
 
 
@@ -231,7 +231,7 @@ def minimizers(steps, to_go, to_come, x_hats):
     return good
 
 
-def lowest(S, s, x):
+def minimizer_of_cost_to_go(S, s, x):
     """Write the minimiser of a cost-to-go, if it has one; leave x as it is if not."""
     factor, least = stack(N, N), stack(N)
     for i in range(N):

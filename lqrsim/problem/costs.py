@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.kernel_source import source_of
-from lqrsim.codegen.user_functions import External, check_signature, level_of, name_of
+from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
 from lqrsim.errors import (
     Array,
     InputError,
@@ -58,7 +58,7 @@ class Term:
     nonconvex_in: tuple[int, ...] | None = None
     uses_control: bool = False
     factor: int | None = None
-    functions: tuple[External, ...] = ()
+    functions: tuple[UserFunction, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", check_array("Term: data", self.data, (None,), infinite=True))
@@ -72,8 +72,8 @@ class Term:
         if self.factor is not None:
             last = len(self.data) - 1
             object.__setattr__(self, "factor", check_count("Term: factor", self.factor, at_least=0, at_most=last))
-        wanted = "a tuple of External, as FunctionCost makes them"
-        object.__setattr__(self, "functions", check_items("Term: functions", self.functions, External, wanted))
+        wanted = "a tuple of UserFunction, as FunctionCost makes them"
+        object.__setattr__(self, "functions", check_items("Term: functions", self.functions, UserFunction, wanted))
 
 
 class Cost(abc.ABC):
@@ -298,9 +298,9 @@ class FunctionCost(Cost):
         rest: dict[str, Any] = {"level": self.level, "states": n, "controls": m, "parameters": tuple(self.parameters)}
         rest["offset"] = 1 if self.derivatives is None else 2
         unused = tuple((i, name) for i, name in enumerate(names) if i not in axes)
-        functions = (External(function=self.function, values=1, unused=unused, **rest),)
+        functions = (UserFunction(function=self.function, values=1, unused=unused, **rest),)
         if self.derivatives is not None:
-            functions += (External(function=self.derivatives, writes=((n + m,), (n + m, n + m)), **rest),)
+            functions += (UserFunction(function=self.derivatives, writes=((n + m,), (n + m, n + m)), **rest),)
         source = source_of(function_cost)
         if self.derivatives is None:
             source = f"{source_of(function_cost, 'value')}\n\n{source_of(cost_differences, AXES=axes)}"

@@ -6,14 +6,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lqrsim.codegen.user_functions import External, brief, plain_names
+from lqrsim.codegen.user_functions import UserFunction, brief, plain_names
 from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, check_text, excerpt, real, shaped
 from lqrsim.problem.costs import Term, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import FixedState, Problem
 
 
-def functions_of(problem: Problem) -> list[External]:
+def functions_of(problem: Problem) -> list[UserFunction]:
     """The numba and plain Python functions of a problem."""
     terms = [term for name in ("initial", "stage_cost", "final_cost") for term in problem.terms(name)]
     return [function for part in (problem.dynamics, *terms) for function in part.functions]

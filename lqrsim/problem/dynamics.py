@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
 from lqrsim.codegen.kernel_source import source_of
-from lqrsim.codegen.user_functions import External, check_signature, level_of, name_of, plain_names
+from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of, plain_names
 from lqrsim.errors import (
     Array,
     InputError,
@@ -175,17 +175,17 @@ class Dynamics:
         """The parameters' values, in order."""
         return np.array(list(self.parameters.values()), dtype=np.float64)
 
-    def _functions(self) -> tuple[External, ...]:
+    def _functions(self) -> tuple[UserFunction, ...]:
         """What compiled code calls: nothing if the dynamics are symbolic, else f and the Jacobian, if there is one."""
         if self.level == "symbolic":
             return ()
         n, m, names = len(self.state_coordinates), len(self.control_coordinates), tuple(self.parameters)
         rest: dict[str, Any] = {"level": self.level, "states": n, "controls": m, "parameters": names}
         rest["offset"] = 1 if self.jacobian is None else 2
-        rate = External(function=self.f, values=n, entries=self.state_coordinates.names, **rest)
+        rate = UserFunction(function=self.f, values=n, entries=self.state_coordinates.names, **rest)
         if self.jacobian is None:
             return (rate,)
-        return rate, External(function=self.jacobian, writes=((n, n), (n, m)), **rest)
+        return rate, UserFunction(function=self.jacobian, writes=((n, n), (n, m)), **rest)
 
     @cached_property
     def source(self) -> str:

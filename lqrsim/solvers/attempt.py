@@ -11,13 +11,13 @@ from lqrsim.kernels.records import LOG, Plan, Policy, Rows, Settings
 from lqrsim.problem.problem import Problem
 from lqrsim.results.records import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers.certify import certified
-from lqrsim.solvers.common import Callback, Ending, SmootherSettings, Stop, check_outcome, iterate
-from lqrsim.solvers.initial_guess import Start
+from lqrsim.solvers.common import Callback, SmootherSettings, Stop, Termination, check_outcome, iterate
+from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.workspace import Workspace
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
+class AttemptResult:
     """What there is to answer with; see `assemble`. With `final`, another start would not do better.
 
     `cost` is that of the plan, as the iterations that led to it say: infinite where there is none.
@@ -52,96 +52,102 @@ class Attempt:
     """Iterated LQR smoothing from one start.
 
     Attributes:
-      begin: where it starts from. work: its memory.
-      ending: how it stands; its outcome is RUNNING until it has ended.
+      initial_guess: where it starts from. work: its memory.
+      termination: how it stands; its outcome is RUNNING until it has ended.
     """
 
-    def __init__(self, problem: Problem, settings: SmootherSettings, begin: Start, start: Array, stop: Stop) -> None:
+    def __init__(
+        self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, stop: Stop
+    ) -> None:
         self.problem, self.settings, self.stop = problem, settings, stop
-        if settings.first_pass == "backward" and begin.gain.any():
-            begin = begin.rolled_out(problem, start)
-        self.begin = begin
-        self.work = Workspace(problem, settings, begin, start)
+        if settings.first_pass == "backward" and initial_guess.gain.any():
+            initial_guess = initial_guess.rolled_out(problem, start)
+        self.initial_guess = initial_guess
+        self.work = Workspace(problem, settings, initial_guess, start)
         self.work.memory["watched"] = float(settings.safeguard)
-        self.ending = Ending((), interface.RUNNING, False, -1, "")
+        self.termination = Termination((), interface.RUNNING, False, -1, "")
         self._log = np.zeros(settings.max_iterations, LOG)
-        self._shares = begin.prior.obstacles if begin.prior is not None else ()
+        self._shares = initial_guess.prior.obstacles if initial_guess.prior is not None else ()
         self._loop = self.work.core.entry("smoother", *self._arguments(0, 0, self._log))
 
     @property
     def cost(self) -> float:
         """True cost of the last rollout; infinite where there is none, or a pass failed."""
-        if self.ending.pass_failed or not self.ending.iterations:
+        if self.termination.pass_failed or not self.termination.iterations:
             return np.inf
-        cost = self.ending.iterations[-1].cost
+        cost = self.termination.iterations[-1].cost
         return cost if np.isfinite(cost) else np.inf
 
     def run(self, last: int, *, each: bool, callback: Callback | None = None) -> None:
         """Go on until there are `last` iterations, or it ends; with `each`, a look after each (see `iterate`)."""
-        if self.ending.outcome != interface.RUNNING:
+        if self.termination.outcome != interface.RUNNING:
             return
-        if not self.ending.iterations and not self.opened():
+        if not self.termination.iterations and not self.run_opening_pass():
             return
-        self.ending = iterate(
+        self.termination = iterate(
             self.problem, lambda first, last: self._loop(*self._arguments(first, last, self._log)), self._log,
-            min(last, self.settings.max_iterations), done=self.ending.iterations, look=self._violation,
-            each=self._looking(each), stop=self.stop, callback=callback,
+            min(last, self.settings.max_iterations), done=self.termination.iterations, look=self._violation,
+            each=self._returns_each(each), stop=self.stop, callback=callback,
         )  # fmt: skip
-        if self.ending.outcome == interface.TIMED_OUT and not self.ending.iterations:
+        if self.termination.outcome == interface.TIMED_OUT and not self.termination.iterations:
             self.roll_out()
 
     def run_on(
         self, log: Rows, last: int, *, done: tuple[Iteration, ...], each: bool, callback: Callback | None
-    ) -> Ending:
+    ) -> Termination:
         """More iterations of the same kind, with a log of their own; the prior has had its time."""
         self.work.memory["watched"] = 0.0  # with constraints the least cost is no measure
         return iterate(
             self.problem, lambda first, last: self._loop(*self._arguments(first, last, log, again=True)), log, last,
-            done=done, look=self._violation, each=self._looking(each), stop=self.stop, callback=callback,
+            done=done, look=self._violation, each=self._returns_each(each), stop=self.stop, callback=callback,
         )  # fmt: skip
 
     def roll_out(self) -> None:
         """See where the start leads, if nothing has been done yet; the states and controls are in `work`."""
         self._loop(*self._arguments(0, 0, self._log))
 
-    def finish(self, *, each: bool, callback: Callback | None = None) -> Found:
+    def finish(self, *, each: bool, callback: Callback | None = None) -> AttemptResult:
         """The method, and its safeguard where that fails."""
         settings = self.settings
         self.run(settings.max_iterations, each=each, callback=callback)
-        ending = check_outcome(self.problem, self.ending, self.work.start, self.begin.offset[0], refuse=each)
-        lost = ending is not self.ending  # a function that is not finite at the start: nothing can help
-        found = self.found(ending)
+        termination = check_outcome(
+            self.problem, self.termination, self.work.start, self.initial_guess.offset[0], refuse=each
+        )
+        lost = termination is not self.termination  # a function that is not finite at the start: nothing can help
+        found = self.result(termination)
         if lost or found.success:
             return found
-        if ending.outcome == interface.TIMED_OUT or (settings.safeguard and self.left(found.iterations) == 0):
+        if termination.outcome == interface.TIMED_OUT or (
+            settings.safeguard and self.iterations_left(found.iterations) == 0
+        ):
             return self.best(found)
         return self.rescue(found, each=each, callback=callback) if settings.safeguard else found
 
-    def left(self, iterations: tuple[Iteration, ...]) -> int:
+    def iterations_left(self, iterations: tuple[Iteration, ...]) -> int:
         """How many iterations may still follow these."""
         return max(self.settings.max_iterations - len(iterations), 0)
 
-    def found(self, ending: Ending) -> Found:
-        """What the bare method found; `ending` is its own, or one that knows more of why it failed."""
-        work, last = self.work, ending.iterations[-1] if ending.iterations else None
-        return Found(
-            status=ending.status, detail=ending.detail(self.problem.steps), iterations=ending.iterations,
+    def result(self, termination: Termination) -> AttemptResult:
+        """What the bare method found; `termination` is its own, or one that knows more of why it failed."""
+        work, last = self.work, termination.iterations[-1] if termination.iterations else None
+        return AttemptResult(
+            status=termination.status, detail=termination.detail(self.problem.steps), iterations=termination.iterations,
             states=work.states, controls=work.controls, law=work.arrays.kept, cost=_cost_of(last),
             violation=np.inf if last is None else last.violation, gap=np.nan if last is None else last.gap,
-            values={} if ending.pass_failed or last is None else work.value_functions(),
+            values={} if termination.pass_failed or last is None else work.value_functions(),
         )  # fmt: skip
 
-    def best(self, found: Found) -> Found:
+    def best(self, found: AttemptResult) -> AttemptResult:
         """The best plan so far in place of the last one, with a policy and value functions about it."""
         cost = float(self.work.memory["plan_cost"])
         if not np.isfinite(cost) or (not cost < found.cost and found.values):
             return found
-        optimality = self.look_back()
+        optimality = self.linearize_about_plan()
         detail = f"{found.detail}; the plan is the best so far" if found.detail else "the plan is the best so far"
         status = Status.MAX_ITERATIONS if found.status is Status.DIVERGED else found.status  # this plan has not
         return self._about_plan(found.iterations, optimality, status, detail)
 
-    def look_back(self) -> float:
+    def linearize_about_plan(self) -> float:
         """Make policy and value functions about the plan in the memory; its optimality, NaN if that fails."""
         work, log = self.work, np.full(1, np.nan, LOG)
         trial = Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
@@ -149,34 +155,34 @@ class Attempt:
         self._loop(*self._damped_arguments(0, 0, log, 1, trial))
         return float(log["optimality"][0])
 
-    def rescue(self, found: Found, *, each: bool, callback: Callback | None = None) -> Found:
+    def rescue(self, found: AttemptResult, *, each: bool, callback: Callback | None = None) -> AttemptResult:
         """The safeguard: iterations from the best plan so far."""
         work, detail = self.work, f"the undamped method failed ({found.detail or found.status.meaning})"
         work.memory["merit"] = work.memory["plan_cost"]
-        damped = self.damp(before=found.iterations, each=each, callback=callback)
+        damped = self.run_damped(before=found.iterations, each=each, callback=callback)
         if not np.isfinite(work.memory["plan_cost"]):
             # Nothing that was tried leads anywhere. What is left is how it failed.
             status = Status.DIVERGED if found.status is Status.MAX_ITERATIONS else found.status
             return replace(found, status=status, detail=detail, iterations=damped.iterations, values={})
         status = damped.status
         if damped.outcome == interface.STALLED:
-            status, detail = self.ending.status, f"{detail}; from the best plan, no step lowers the cost any more"
-        return self.found_damped(damped, status, detail)
+            status, detail = self.termination.status, f"{detail}; from the best plan, no step lowers the cost any more"
+        return self.damped_result(damped, status, detail)
 
-    def damp(
+    def run_damped(
         self,
         *,
         before: tuple[Iteration, ...],
         least: tuple[float, float] = (0.0, 0.0),
         each: bool,
         callback: Callback | None,
-    ) -> Ending:
+    ) -> Termination:
         """Damped iterations from the plan, whose cost and merit are in the memory; see `kernels/damped_iterations.py`.
 
         Args:
           before: the iterations that led there. least: what the tolerances of cost and gap are to be at least.
         """
-        work, last = self.work, self.left(before)
+        work, last = self.work, self.iterations_left(before)
         log = np.zeros(max(last, 1), LOG)
         memory = work.memory
         memory["reach"], memory["weight"], memory["small_changes"] = 1.0, 0.0, 0.0
@@ -188,22 +194,24 @@ class Attempt:
 
         return iterate(
             self.problem, run, log, last, before=before, look=lambda: self._violation_of(work.plan),
-            each=self._looking(each), stop=self.stop, callback=callback,
+            each=self._returns_each(each), stop=self.stop, callback=callback,
         )  # fmt: skip
 
-    def found_damped(self, damped: Ending, status: Status, detail: str) -> Found:
+    def damped_result(self, damped: Termination, status: Status, detail: str) -> AttemptResult:
         """What damped iterations found: the plan, and what was modelled about it."""
         optimality = damped.iterations[-1].optimality if damped.iterations else np.nan
         if damped.outcome in (interface.RUNNING, interface.TIMED_OUT):  # they were stopped, and did not look back
             return self.best(
-                Found(
+                AttemptResult(
                     status=status, detail=detail, iterations=damped.iterations, states=self.work.states,
                     controls=self.work.controls, law=self.work.arrays.kept, cost=np.inf, violation=np.inf, gap=np.nan,
                 )
             )  # fmt: skip
         return self._about_plan(damped.iterations, optimality, status, detail)
 
-    def _about_plan(self, iterations: tuple[Iteration, ...], optimality: float, status: Status, detail: str) -> Found:
+    def _about_plan(
+        self, iterations: tuple[Iteration, ...], optimality: float, status: Status, detail: str
+    ) -> AttemptResult:
         """The plan in the memory, with the policy and the value functions that were made about it last."""
         work = self.work
         states, controls = work.plan
@@ -219,13 +227,13 @@ class Attempt:
                 detail += (
                     f"; the states of least total cost are {off:.1g} off the plan, so the cost-to-come is left out"
                 )
-        return Found(
+        return AttemptResult(
             status=status, detail=detail.removeprefix("; "), iterations=iterations, states=states, controls=controls,
             law=law, cost=float(work.memory["plan_cost"]), violation=self._violation_of(work.plan), gap=gap,
             values=values,
         )  # fmt: skip
 
-    def certified(self, found: Found) -> Found:
+    def certified(self, found: AttemptResult) -> AttemptResult:
         """With its certificate; a success that fails it is none."""
         values = self.work.constraint_values(found.states, found.controls)
         violation = self.work.violation(values)
@@ -242,39 +250,39 @@ class Attempt:
             return found
         return replace(found, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
 
-    def candidate(self, name: str, found: Found | None) -> Candidate:
+    def candidate(self, name: str, found: AttemptResult | None) -> Candidate:
         """It, as one of several; `found` if it was run to its end."""
         if found is None:
             plan = Trajectory(self.work.states, self.work.controls, self.problem.dt)
-            return Candidate(name, self.cost, len(self.ending.iterations), None, plan)
+            return Candidate(name, self.cost, len(self.termination.iterations), None, plan)
         plan = Trajectory(found.states, found.controls, self.problem.dt)
         return Candidate(name, found.cost, len(found.iterations), found.status, plan)
 
-    def opened(self) -> bool:
+    def run_opening_pass(self) -> bool:
         """Do what comes before the first iteration; False if it fails."""
         if self.settings.first_pass == "forward":
             return True
         self.roll_out()  # before the start is forgotten
         work = self.work
-        arrays, eased = work.arrays, work.model._replace(stage=work.eased(self._share(0)))
+        arrays, eased = work.arrays, work.model._replace(stage=work.eased(self._obstacle_share(0)))
         failed, good = work.core.opening_pass(
-            self.problem.steps, self.begin.trajectory is not None, arrays.guess, work.prior, eased, arrays.policy,
-            arrays.to_go,
+            self.problem.steps, self.initial_guess.trajectory is not None, arrays.guess, work.prior, eased,
+            arrays.policy, arrays.to_go,
         )  # fmt: skip
         if failed >= 0:
             outcome = interface.NOT_POSITIVE_DEFINITE if good else interface.NOT_FINITE
-            self.ending = Ending((), outcome, True, failed, "")
+            self.termination = Termination((), outcome, True, failed, "")
         return failed < 0
 
     def _arguments(self, first: int, last: int, log: Rows, *, again: bool = False) -> tuple[Any, ...]:
         """What the loop takes, for the iterations from `first` up to `last`, or fewer: of a continuation, one."""
         settings, work = self.settings, self.work
-        share = 1.0 if again else self._share(first)
+        share = 1.0 if again else self._obstacle_share(first)
         tolerance = settings.tolerance
         if share != 1:
             last = min(last, first + 1)
             tolerance = 0.0  # what is not all of the cost does not settle
-        guided = self.begin.trajectory is not None and settings.first_pass == "forward" and not again
+        guided = self.initial_guess.trajectory is not None and settings.first_pass == "forward" and not again
         prior, count = (work.no_prior, 0) if again else (work.prior, work.prior_iterations)
         options = self._settings(len(log), tolerance, settings.gap_tolerance)._replace(
             guided=guided, prior_iterations=count
@@ -291,7 +299,7 @@ class Attempt:
         arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
         return interface.DAMP, first, last, options, work.model, arrays, work.memory_rows, log
 
-    def _check_arguments(self, task: int, found: Found, hessians: Array, certificate: Rows) -> tuple[Any, ...]:
+    def _check_arguments(self, task: int, found: AttemptResult, hessians: Array, certificate: Rows) -> tuple[Any, ...]:
         """What it takes to certify a plan and its policy, with these Hessians of a cost-to-go."""
         settings, work = self.settings, self.work
         arrays = work.arrays._replace(
@@ -309,11 +317,11 @@ class Attempt:
             guided=False, prior_iterations=0,
         )  # fmt: skip
 
-    def _share(self, iteration: int) -> float:
+    def _obstacle_share(self, iteration: int) -> float:
         """How much of the obstacle costs the passes of an iteration see."""
         return self._shares[iteration] if iteration < len(self._shares) else 1.0
 
-    def _looking(self, each: bool) -> bool:
+    def _returns_each(self, each: bool) -> bool:
         """Whether to come back after each iteration: constraints are looked at from outside of the loops."""
         return each or bool(self.problem.constraints)
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen.user_functions import External
+from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import (
     Array,
     InputError,
@@ -31,7 +31,7 @@ from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.records import Iteration, Status
 from lqrsim.results.solution import Solution
 from lqrsim.solvers import compiled
-from lqrsim.solvers.initial_guess import Start, StartLike, resolve
+from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
 
 Callback = Callable[[Iteration], object]
 
@@ -91,7 +91,7 @@ class Settings:
         """For a solve that begins now."""
         return Stop(np.inf if self.time_limit is None else time.perf_counter() + self.time_limit)
 
-    def options(self, start: Start) -> dict[str, object]:
+    def options(self, start: InitialGuess) -> dict[str, object]:
         """The settings as a solution keeps them."""
         return {field.name: getattr(self, field.name) for field in fields(self)} | {"start": start.summary}
 
@@ -140,7 +140,7 @@ class Stop:
     def due(self) -> bool:
         return self.error is not None or time.perf_counter() >= self.deadline
 
-    def settle(self, solution: Solution) -> Solution:
+    def finish(self, solution: Solution) -> Solution:
         """The solution; or, where something was raised, raises it again."""
         if self.error is None:
             return solution
@@ -151,7 +151,7 @@ class Stop:
 
 
 @dataclass(frozen=True)
-class Ending:
+class Termination:
     """How the iterations of `iterate` ended.
 
     `failed` is the step of the pass that failed, or -1; `raised` what a user's function raised, if one did.
@@ -205,7 +205,7 @@ def iterate(
     each: bool,
     stop: Stop,
     callback: Callback | None = None,
-) -> Ending:
+) -> Termination:
     """Run a loop of `kernels/iterations.py` until it ends, or there are so many iterations.
 
     Args:
@@ -214,7 +214,7 @@ def iterate(
       log: (any,) rows of `LOG`, where `run` writes.
       last: how many iterations there are to be.
       done: those that there are already.
-      before: the iterations of what ran before, which come first in the ending's.
+      before: the iterations of what ran before, which come first in the termination's.
       look: how far the constraints are missed by what `run` found last.
       each: come back after each iteration, to time it, to tell `callback` and to heed Ctrl-C; otherwise nothing but
         compiled code runs, and the seconds of an iteration are the average.
@@ -248,7 +248,7 @@ def iterate(
     except BaseException as error:  # the callback's, or Ctrl-C: raised again when there is a solution
         stop.error, outcome = error, interface.TIMED_OUT
     raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
-    return Ending((*before, *iterations), outcome, backward, failed, "; ".join(raised))
+    return Termination((*before, *iterations), outcome, backward, failed, "; ".join(raised))
 
 
 def solve_all(
@@ -282,7 +282,7 @@ def solve_all(
 
 
 @contextlib.contextmanager
-def workers(threads: int, functions: Iterable[External]) -> Iterator[ThreadPoolExecutor]:
+def workers(threads: int, functions: Iterable[UserFunction]) -> Iterator[ThreadPoolExecutor]:
     """Threads that solve. On an error, Ctrl-C too, what is compiled ends in a moment; plain functions are told to."""
     with ThreadPoolExecutor(threads, thread_name_prefix="lqrsim") as pool:
         try:
@@ -321,18 +321,18 @@ def check_problem(problem: Problem) -> None:
     check_kind("problem", problem, Problem, "a Problem, such as scenario.problem")
 
 
-def check_outcome(problem: Problem, ending: Ending, x: Array, u: Array, *, refuse: bool) -> Ending:
+def check_outcome(problem: Problem, termination: Termination, x: Array, u: Array, *, refuse: bool) -> Termination:
     """Look for the cause if the first iteration led nowhere: a function that is not finite at the start (n,), (m,).
 
     Raises:
-      InputError: that is so, and `refuse` is set; otherwise the returned ending says it.
+      InputError: that is so, and `refuse` is set; otherwise the returned termination says it.
     """
-    lost = not ending.iterations and ending.status is Status.NOT_FINITE
-    if lost or (ending.iterations and not np.isfinite(ending.iterations[0].cost)):
+    lost = not termination.iterations and termination.status is Status.NOT_FINITE
+    if lost or (termination.iterations and not np.isfinite(termination.iterations[0].cost)):
         try:
             check_start(problem, x, u)
         except InputError as error:
             if refuse:
                 raise
-            return replace(ending, outcome=interface.NOT_FINITE, raised=str(error))
-    return ending
+            return replace(termination, outcome=interface.NOT_FINITE, raised=str(error))
+    return termination

@@ -15,9 +15,9 @@ from lqrsim.kernels.records import LOG
 from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.records import Iteration, Status
-from lqrsim.solvers.attempt import Attempt, Found
+from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import Callback
-from lqrsim.solvers.initial_guess import Start
+from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.multipliers import LARGEST, AugmentedLagrangian
 
 STUCK = 3  # how often the penalty grows to no avail at all before that is given up
@@ -26,33 +26,33 @@ ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to up
 ROUGHEST_GAP = 3e-2  # and of damped iterations, which come to their minimum slowly
 
 
-def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> Found:
+def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
     """Run an attempt to its end, the method, its safeguard where that fails, and then the constraints; certified."""
     tried: tuple[Iteration, ...] = ()
-    if attempt.begin.multipliers and attempt.opened():
+    if attempt.initial_guess.multipliers and attempt.run_opening_pass():
         found = _satisfy(attempt, None, each=each, callback=callback)
-        if found.success or attempt.stop.due or not attempt.left(found.iterations):
+        if found.success or attempt.stop.due or not attempt.iterations_left(found.iterations):
             return attempt.certified(found)
         # What is known of another problem does not help here.
         tried = found.iterations
-        attempt = _again(attempt, attempt.problem, dataclasses.replace(attempt.begin, multipliers=()), tried)
+        attempt = _again(attempt, attempt.problem, dataclasses.replace(attempt.initial_guess, multipliers=()), tried)
     found = attempt.finish(each=each, callback=callback)
     if attempt.problem.constraints:
         attempt, found = _with_constraints(attempt, found, each=each, callback=callback)
     return attempt.certified(dataclasses.replace(found, iterations=(*tried, *found.iterations)))
 
 
-def _again(attempt: Attempt, problem: Problem, begin: Start, done: tuple[Iteration, ...]) -> Attempt:
+def _again(attempt: Attempt, problem: Problem, initial_guess: InitialGuess, done: tuple[Iteration, ...]) -> Attempt:
     """Another attempt, with what is left of the iterations."""
-    settings = dataclasses.replace(attempt.settings, max_iterations=max(attempt.left(done), 1))
-    return Attempt(problem, settings, begin, attempt.work.start, attempt.stop)
+    settings = dataclasses.replace(attempt.settings, max_iterations=max(attempt.iterations_left(done), 1))
+    return Attempt(problem, settings, initial_guess, attempt.work.start, attempt.stop)
 
 
 def _with_constraints(
-    attempt: Attempt, found: Found, *, each: bool, callback: Callback | None
-) -> tuple[Attempt, Found]:
+    attempt: Attempt, found: AttemptResult, *, each: bool, callback: Callback | None
+) -> tuple[Attempt, AttemptResult]:
     """Go on from what was found without the constraints; also which attempt has the answer in its memory."""
-    if attempt.stop.due or not attempt.left(found.iterations):
+    if attempt.stop.due or not attempt.iterations_left(found.iterations):
         if found.success and not attempt.work.keeps(attempt.work.constraint_values(found.states, found.controls)):
             status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS
             found = dataclasses.replace(found, status=status, detail="before the constraints could be met")
@@ -62,7 +62,9 @@ def _with_constraints(
     return _first_feasible(attempt, found, each=each, callback=callback)
 
 
-def _satisfy(attempt: Attempt, found: Found | None, *, each: bool, callback: Callback | None = None) -> Found:
+def _satisfy(
+    attempt: Attempt, found: AttemptResult | None, *, each: bool, callback: Callback | None = None
+) -> AttemptResult:
     """Go on from what was found without the constraints, or, without it, from the multipliers of another solution."""
     lagrangian = AugmentedLagrangian(attempt)
     if found is None:
@@ -77,12 +79,19 @@ def _satisfy(attempt: Attempt, found: Found | None, *, each: bool, callback: Cal
         found = dataclasses.replace(found, states=found.states.copy(), controls=found.controls.copy())
     before = found.iterations if found is not None else ()
     undamped = _undamped(attempt, lagrangian, before, each=each, callback=callback)
-    if undamped.success or not attempt.settings.safeguard or attempt.stop.due or not attempt.left(undamped.iterations):
+    if (
+        undamped.success
+        or not attempt.settings.safeguard
+        or attempt.stop.due
+        or not attempt.iterations_left(undamped.iterations)
+    ):
         return undamped
     return _damped(attempt, lagrangian, found, undamped, each=each, callback=callback)
 
 
-def _first_feasible(attempt: Attempt, found: Found, *, each: bool, callback: Callback | None) -> tuple[Attempt, Found]:
+def _first_feasible(
+    attempt: Attempt, found: AttemptResult, *, each: bool, callback: Callback | None
+) -> tuple[Attempt, AttemptResult]:
     """Where not even the problem without the constraints is solved: deep within obstacles, they cost beyond numbers.
 
     Without these costs there is a plan that keeps the constraints, from where they can come in, or there is none.
@@ -105,24 +114,24 @@ def _first_feasible(attempt: Attempt, found: Found, *, each: bool, callback: Cal
         for cost in terms_of(problem.stage_cost)
     ]
     plain = dataclasses.replace(problem, stage_cost=CostSum(tuple(costs)))
-    without = _again(attempt, plain, dataclasses.replace(attempt.begin, prior=None), found.iterations)
+    without = _again(attempt, plain, dataclasses.replace(attempt.initial_guess, prior=None), found.iterations)
     kept = without.finish(each=each, callback=told)
-    if kept.success and not attempt.stop.due and without.left(kept.iterations):
+    if kept.success and not attempt.stop.due and without.iterations_left(kept.iterations):
         kept = _satisfy(without, kept, each=each, callback=told)
     before = (*found.iterations, *(without_cost(iteration) for iteration in kept.iterations))
-    if not kept.success or attempt.stop.due or not attempt.left(before):
+    if not kept.success or attempt.stop.due or not attempt.iterations_left(before):
         # Of the plan, only what the constraints say is known: its certificate tells the cost.
         status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS if kept.success else kept.status
         return attempt, dataclasses.replace(kept, status=status, iterations=before, final=not kept.success, values={})
-    begin = dataclasses.replace(
-        attempt.begin, gain=kept.law[0].copy(), offset=kept.law[1].copy(), trajectory=None, prior=None,
+    initial_guess = dataclasses.replace(
+        attempt.initial_guess, gain=kept.law[0].copy(), offset=kept.law[1].copy(), trajectory=None, prior=None,
         cost_to_go=kept.values.get("cost_to_go"), multipliers=kept.multipliers,
     )  # fmt: skip
-    attempt = _again(attempt, problem, begin, before)
+    attempt = _again(attempt, problem, initial_guess, before)
     again = _satisfy(attempt, None, each=each, callback=callback) if kept.multipliers else None
     if again is None:
         again = attempt.finish(each=each, callback=callback)
-        if again.success and not attempt.stop.due and attempt.left(again.iterations):
+        if again.success and not attempt.stop.due and attempt.iterations_left(again.iterations):
             again = _satisfy(attempt, again, each=each, callback=callback)
     return attempt, dataclasses.replace(again, iterations=(*before, *again.iterations))
 
@@ -134,27 +143,27 @@ def _undamped(
     *,
     each: bool,
     callback: Callback | None,
-) -> Found:
+) -> AttemptResult:
     work = attempt.work
     work.memory["plan_cost"] = -np.inf  # of lower cost is not better now
-    log = np.zeros(min(ITERATIONS, max(attempt.left(before), 1)), LOG)
+    log = np.zeros(min(ITERATIONS, max(attempt.iterations_left(before), 1)), LOG)
     done: tuple[Iteration, ...] = ()
     since = 0
     while True:
-        ending = attempt.run_on(log, len(done) + 1, done=done, each=each, callback=callback)
-        done, since = ending.iterations, since + 1
-        stopped = ending.pass_failed or ending.outcome in (interface.CYCLING, interface.TIMED_OUT)
+        termination = attempt.run_on(log, len(done) + 1, done=done, each=each, callback=callback)
+        done, since = termination.iterations, since + 1
+        stopped = termination.pass_failed or termination.outcome in (interface.CYCLING, interface.TIMED_OUT)
         if stopped or not np.isfinite(done[-1].cost):
             break
         lagrangian.evaluate(work.states, work.controls)
-        settled = ending.outcome in (interface.CONVERGED, interface.COST_CONVERGED)
+        settled = termination.outcome in (interface.CONVERGED, interface.COST_CONVERGED)
         if len(done) == len(log) or (settled and lagrangian.solved):
             break
         rough = abs(done[-1].improvement) < ROUGH and done[-1].gap < ROUGH_GAP
         if settled or rough or since == PATIENCE:
             since = 0
             lagrangian.update()
-    found = attempt.found(dataclasses.replace(ending, iterations=before + done))
+    found = attempt.result(dataclasses.replace(termination, iterations=before + done))
     detail = found.detail or ("" if found.success else f"with constraints; {lagrangian.worst()}")
     if found.success and not lagrangian.solved:
         found = dataclasses.replace(found, status=Status.MAX_ITERATIONS)
@@ -165,12 +174,12 @@ def _undamped(
 def _damped(
     attempt: Attempt,
     lagrangian: AugmentedLagrangian,
-    found: Found | None,
-    undamped: Found,
+    found: AttemptResult | None,
+    undamped: AttemptResult,
     *,
     each: bool,
     callback: Callback | None,
-) -> Found:
+) -> AttemptResult:
     """The safeguard: from the plan without constraints or the last one with them, whichever is the better beginning."""
     work = attempt.work
     plans = [(work.states, work.controls, undamped.cost)]
@@ -191,20 +200,20 @@ def _damped(
     return _rounds(attempt, lagrangian, undamped.iterations, why, each=each, callback=callback)
 
 
-def refine(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> Found:
+def refine(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
     """Run an attempt to its end by steps that lower the cost alone, from where its first policy leads; certified.
 
     So it stays on the way round that it begins with, which undamped iterations would leave.
     """
     attempt.roll_out()
     cost = float(attempt.work.memory["plan_cost"])
-    optimality = attempt.look_back() if np.isfinite(cost) else np.nan
+    optimality = attempt.linearize_about_plan() if np.isfinite(cost) else np.nan
     if not np.isfinite(optimality):
         return attempt.certified(attempt.finish(each=each, callback=callback))
     if not attempt.problem.constraints:
         attempt.work.memory["merit"] = cost
-        damped = attempt.damp(before=(), each=each, callback=callback)
-        found = attempt.found_damped(damped, damped.status, damped.detail(attempt.problem.steps))
+        damped = attempt.run_damped(before=(), each=each, callback=callback)
+        found = attempt.damped_result(damped, damped.status, damped.detail(attempt.problem.steps))
         return attempt.certified(found)
     lagrangian = AugmentedLagrangian(attempt)
     lagrangian.evaluate(*attempt.work.plan)
@@ -220,7 +229,7 @@ def _rounds(
     *,
     each: bool,
     callback: Callback | None,
-) -> Found:
+) -> AttemptResult:
     """Damped iterations from the plan in the memory, and updated multipliers, until the constraints are met or can not
     be.
     """
@@ -232,19 +241,19 @@ def _rounds(
         work.memory["merit"] = work.memory["plan_cost"] + lagrangian.added()
         # Until the multipliers are about right, there is no point in a minimum to all its digits.
         limits = (ROUGH, ROUGHEST_GAP) if rough else (0.0, 0.0)
-        ending = attempt.damp(before=iterations, least=limits, each=each, callback=callback)
-        iterations = ending.iterations
+        termination = attempt.run_damped(before=iterations, least=limits, each=each, callback=callback)
+        iterations = termination.iterations
         lagrangian.evaluate(*work.plan)
-        if ending.success and lagrangian.solved:
+        if termination.success and lagrangian.solved:
             if not rough:
-                found = attempt.found_damped(ending, ending.status, why)
+                found = attempt.damped_result(termination, termination.status, why)
                 return dataclasses.replace(found, multipliers=lagrangian.multipliers())
-            if attempt.left(iterations) and not attempt.stop.due:
+            if attempt.iterations_left(iterations) and not attempt.stop.due:
                 rough = False
                 continue
         if rounds == ROUNDS or lagrangian.grown > LARGEST or lagrangian.stuck == STUCK:
             break
-        if attempt.stop.due or not attempt.left(iterations):
+        if attempt.stop.due or not attempt.iterations_left(iterations):
             break
         lagrangian.update()
         rough = rough and lagrangian.stuck == 0 and not lagrangian.nearly
@@ -253,5 +262,5 @@ def _rounds(
         status, detail = Status.INFEASIBLE, lagrangian.worst()
     if attempt.stop.due:
         status = Status.TIME_LIMIT
-    found = attempt.found_damped(ending, status, detail)
+    found = attempt.damped_result(termination, status, detail)
     return dataclasses.replace(found, multipliers=lagrangian.multipliers())

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import PPoly
 
-from lqrsim.codegen.user_functions import External
+from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import (
     Array,
     InputError,
@@ -217,7 +217,7 @@ def _initial_guess(problem: Problem, start: npt.ArrayLike | InitialPrior | None)
 
 
 def _iterate(
-    solver: "_Smoother", limits: _Limits, functions: list[External], callback: Callable[[Iteration], object] | None
+    solver: "_Smoother", limits: _Limits, functions: list[UserFunction], callback: Callable[[Iteration], object] | None
 ) -> tuple[list[Iteration], Status, str]:
     """Iterate until a limit is met: the log, how it ended, and where, if it is not converged."""
     iterations: list[Iteration] = []
@@ -324,7 +324,7 @@ def _at(where: str, failure: IntegrationFailure) -> str:
     return f"{where}, at {failure.time:.4g} s: {failure}"
 
 
-def _raise_interrupts(functions: list[External]) -> None:
+def _raise_interrupts(functions: list[UserFunction]) -> None:
     """Raise what is not an error, such as Ctrl-C, that compiled code met in a function of Python's."""
     for function in functions:
         if function.raised is not None and not isinstance(function.raised, Exception):

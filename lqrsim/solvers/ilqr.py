@@ -107,14 +107,14 @@ def _check(problem: Problem, settings: Settings) -> None:
 def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callback | None = None) -> Solution:
     """Solve; with `each`, a look after each iteration (see `iterate`)."""
     assert problem.start is not None
-    begin = resolve(settings.start, problem)
-    if begin.prior is not None:  # of a function, too
+    initial_guess = resolve(settings.start, problem)
+    if initial_guess.prior is not None:  # of a function, too
         raise InputError(_NO_PRIOR)
-    start, control = problem.start.copy(), begin.offset[0].copy()
+    start, control = problem.start.copy(), initial_guess.offset[0].copy()
     check_functions(problem, start, control)
     n, steps, zeros = len(start), problem.steps, np.zeros
-    policy = Policy(begin.gain.copy(), begin.offset.copy())
-    plan = Plan(zeros((steps + 1, n)), zeros(begin.offset.shape))
+    policy = Policy(initial_guess.gain.copy(), initial_guess.offset.copy())
+    plan = Plan(zeros((steps + 1, n)), zeros(initial_guess.offset.shape))
     states, controls = plan
     go = CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1))
     work = Descent(
@@ -129,15 +129,15 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     model = compiled.arguments(problem)
     stop = settings.stop_early()
     loop = compiled.core(problem).entry("ilqr", interface.ITERATE, 0, 0, options, model, work, log)
-    ending = iterate(
+    termination = iterate(
         problem,
         lambda first, last: loop(interface.ITERATE, first, last, options, model, work, log),
         log, settings.max_iterations, each=each, stop=stop, callback=callback,
     )  # fmt: skip
-    ending = check_outcome(problem, ending, start, control, refuse=each)
-    whole = ending.iterations != () and ending.failed < 0
-    if ending.outcome == interface.TIMED_OUT:  # the last backward pass was about the trajectory before the last one
-        count = len(ending.iterations)
+    termination = check_outcome(problem, termination, start, control, refuse=each)
+    whole = termination.iterations != () and termination.failed < 0
+    if termination.outcome == interface.TIMED_OUT:  # the last backward pass was about the trajectory before
+        count = len(termination.iterations)
         *_, failed = loop(interface.ITERATE, count, count, options, model, work, log)
         whole = failed < 0 and np.isfinite(states).all()
     if not whole:
@@ -145,7 +145,7 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
             0  # without a pass about the trajectory there is no feedback; what is left is to play the controls
         )
     offset = controls - np.einsum("tij,tj->ti", policy.gain, states[:-1]) if whole else controls.copy()
-    status, detail = ending.status, ending.detail(problem.steps)
+    status, detail = termination.status, termination.detail(problem.steps)
 
     def check(task: int, hessians: Array, out: Rows) -> None:
         checked = work._replace(
@@ -155,14 +155,14 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
 
     certificate, wrong = certified(
         problem, check, states, go.hessian if whole else None, violation=0.0,
-        claimed=ending.iterations[-1].cost if status.success else None,
+        claimed=termination.iterations[-1].cost if status.success else None,
         tolerance=settings.tolerance if status is Status.CONVERGED else None,
     )  # fmt: skip
     if wrong:
         status, detail = Status.NOT_CERTIFIED, f"of the plan that converged: {wrong}"
     solution = assemble(
-        problem, solver="ilqr", options=settings.options(begin), status=status, detail=detail,
-        iterations=ending.iterations, states=states, controls=controls, law=(policy.gain, offset),
+        problem, solver="ilqr", options=settings.options(initial_guess), status=status, detail=detail,
+        iterations=termination.iterations, states=states, controls=controls, law=(policy.gain, offset),
         certificate=certificate, gap=0.0, cost_to_go=Quadratic(*go) if whole else None,
     )  # fmt: skip
-    return stop.settle(solution)
+    return stop.finish(solution)

@@ -83,7 +83,7 @@ StartLike = Beginning | Callable[[Problem], Beginning]
 
 
 @dataclass(frozen=True)
-class Start:
+class InitialGuess:
     """The beginning of the first pass.
 
     Attributes:
@@ -103,7 +103,7 @@ class Start:
     prior: InitialPrior | None = None
     multipliers: tuple[Multipliers, ...] = ()
 
-    def rolled_out(self, problem: Problem, x: Array) -> "Start":
+    def rolled_out(self, problem: Problem, x: Array) -> "InitialGuess":
         """With the trajectory of the policy from a state (n,): what a backward pass that comes first is about.
 
         Where it leaves all numbers, the last state and control stay: the trajectory need not be feasible.
@@ -121,7 +121,7 @@ class Start:
         return replace(self, trajectory=Trajectory(np.array(states), np.array(controls), problem.dt))
 
 
-def resolve(start: StartLike, problem: Problem) -> Start:
+def resolve(start: StartLike, problem: Problem) -> InitialGuess:
     """The beginning that a caller asked for; by default the problem's nominal control, held.
 
     Raises:
@@ -146,16 +146,16 @@ def resolve(start: StartLike, problem: Problem) -> Start:
         if [one.values.shape for one in multipliers] != [(steps + 1, one.rows) for one in problem.constraint_terms]:
             multipliers = ()  # of other constraints
         summary = _summary(start, policy.gain, policy.offset)
-        return Start(policy.gain, policy.offset, value, None, summary, multipliers=multipliers)
+        return InitialGuess(policy.gain, policy.offset, value, None, summary, multipliers=multipliers)
     if isinstance(start, AffinePolicy):
         gain = check_array("start: gain", start.gain, (steps, m, n))
         offset = check_array("start: offset", start.offset, (steps, m))
-        return Start(gain, offset, None, None, _summary(start, gain, offset))
+        return InitialGuess(gain, offset, None, None, _summary(start, gain, offset))
     if isinstance(start, Trajectory):
         states = check_array("start: states", start.states, (steps + 1, n))
         controls = check_array("start: controls", start.controls, (steps, m))
         given = Trajectory(states, controls, problem.dt)
-        return Start(np.zeros((steps, m, n)), controls, None, given, _summary(start, states, controls))
+        return InitialGuess(np.zeros((steps, m, n)), controls, None, given, _summary(start, states, controls))
     wanted, given = problem.nominal_control if start is None else start, None
     try:
         given = numbers_of("start", wanted)
@@ -168,7 +168,7 @@ def resolve(start: StartLike, problem: Problem) -> Start:
         ) from None
     controls = check_array("start", controls, (steps, m))
     summary = controls[0] if (controls == controls[0]).all() else controls
-    return Start(np.zeros((steps, m, n)), controls, None, None, summary.tolist())
+    return InitialGuess(np.zeros((steps, m, n)), controls, None, None, summary.tolist())
 
 
 def _summary(start: object, *arrays: Array) -> str:

@@ -17,10 +17,10 @@ from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.records import Candidate
 from lqrsim.solvers.assembly import clearance_of
-from lqrsim.solvers.attempt import Attempt, Found
+from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import Callback, SmootherSettings, Stop, workers
 from lqrsim.solvers.constrained import finish, refine
-from lqrsim.solvers.initial_guess import InitialPrior, Start, resolve
+from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, resolve
 
 # `python experiments/benchmark_quality.py --sections ingredients` shows what each of these choices brings.
 STARTS = 7
@@ -139,10 +139,10 @@ class Search:
     def __init__(self, names: Sequence[str], attempts: Sequence[Attempt], *, each: bool, callback: Callback | None):
         self._named = list(zip(names, attempts, strict=True))
         self._each, self._callback = each, callback
-        self._finished: list[tuple[Attempt, Found]] = []
+        self._finished: list[tuple[Attempt, AttemptResult]] = []
 
     @property
-    def best(self) -> tuple[Attempt, Found]:
+    def best(self) -> tuple[Attempt, AttemptResult]:
         return self._finished[0]
 
     def run(self, threads: int) -> None:
@@ -168,7 +168,7 @@ class Search:
             return False
         (attempt, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
         if not found.success:
-            return attempt.left(found.iterations) > 0
+            return attempt.iterations_left(found.iterations) > 0
         places = found.states[:, position]
         if not np.linalg.norm(places[-1] - problem.goal[position]) <= max(radius, 1e-3):
             return True
@@ -185,8 +185,10 @@ class Search:
             boldest = choose(attempts, self._advance, threads)[0].finish(each=False)
             if stop.due:
                 break
-            begin = Start(boldest.law[0].copy(), boldest.law[1].copy(), None, None, f"a plan {times:g} times as bold")
-            attempt = Attempt(problem, settings, begin, start, stop)
+            initial_guess = InitialGuess(
+                boldest.law[0].copy(), boldest.law[1].copy(), None, None, f"a plan {times:g} times as bold"
+            )
+            attempt = Attempt(problem, settings, initial_guess, start, stop)
             self._named.append((f"a plan for {times:g} times the weight of obstacles and goal", attempt))
             found, best = refine(attempt, each=self._each, callback=self._callback), self.best[1]
             # The same optimum once more, a little different within the tolerances, is no other way.
@@ -204,7 +206,7 @@ class Search:
 
     def _finish(self, attempt: Attempt) -> None:
         if self._callback is not None:
-            for iteration in attempt.ending.iterations:
+            for iteration in attempt.termination.iterations:
                 try:
                     self._callback(iteration)
                 except BaseException as error:

@@ -154,8 +154,8 @@ def _solve(
     start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
     first = resolve(given[0][1], problem)
     check_functions(problem, start, first.offset[0].copy())
-    begins = [first, *(resolve(one, problem) for _, one in given[1:])]
-    attempts = [Attempt(problem, settings, begin, start, Stop()) for begin in begins]
+    initial_guesses = [first, *(resolve(one, problem) for _, one in given[1:])]
+    attempts = [Attempt(problem, settings, initial_guess, start, Stop()) for initial_guess in initial_guesses]
     stop = settings.stop_early()  # from now on: compiling does not count
     for attempt in attempts:
         attempt.stop = stop
@@ -167,12 +167,13 @@ def _solve(
     chosen, found = search.best
     assert found.certificate is not None
     solution = assemble(
-        problem, solver="smooth", options=settings.options(chosen.begin), status=found.status, detail=found.detail,
-        iterations=found.iterations, states=found.states, controls=found.controls, law=found.law,
+        problem, solver="smooth", options=settings.options(chosen.initial_guess), status=found.status,
+        detail=found.detail, iterations=found.iterations, states=found.states, controls=found.controls,
+        law=found.law,
         certificate=found.certificate, gap=found.gap, candidates=search.candidates(), multipliers=found.multipliers,
         **found.values,
     )  # fmt: skip
-    return stop.settle(solution)
+    return stop.finish(solution)
 
 
 def _check(problem: Problem, settings: SmootherSettings) -> None:

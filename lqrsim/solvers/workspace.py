@@ -22,7 +22,7 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.common import SmootherSettings
-from lqrsim.solvers.initial_guess import Start
+from lqrsim.solvers.initial_guess import InitialGuess
 
 
 class Workspace:
@@ -35,41 +35,45 @@ class Workspace:
       core: the compiled iterations. fixed: whether the start is given exactly. dual: which form it is.
     """
 
-    def __init__(self, problem: Problem, settings: SmootherSettings, begin: Start, start: Array) -> None:
+    def __init__(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
         n, steps, zeros = len(start), problem.steps, np.zeros
-        m = begin.offset.shape[1]
+        m = initial_guess.offset.shape[1]
         self.dual = settings.form == "dual"
         self.fixed = isinstance(problem.initial, FixedState)
         self.start = start
         go = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
-        if begin.cost_to_go is not None:
-            value = begin.cost_to_go
+        if initial_guess.cost_to_go is not None:
+            value = initial_guess.cost_to_go
             go = value.hessian.copy(), value.gradient.copy(), np.array(value.constant)
         come = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
         kept = steps if self.dual else 1  # the primal form finds its way back without
         back = zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))
         self.no_prior = Prior(zeros(n), zeros((steps + 1, n)))
         self.prior, self.prior_iterations = self.no_prior, 0
-        if begin.prior is not None:
-            about = np.broadcast_to(begin.prior.about, (steps + 1, n)).copy()
-            self.prior, self.prior_iterations = Prior(begin.prior.weight.copy(), about), begin.prior.iterations
+        if initial_guess.prior is not None:
+            about = np.broadcast_to(initial_guess.prior.about, (steps + 1, n)).copy()
+            self.prior, self.prior_iterations = (
+                Prior(initial_guess.prior.weight.copy(), about),
+                initial_guess.prior.iterations,
+            )
         # Without a trajectory to begin with: the start, and the controls with which the dynamics can run backwards.
-        guess = Plan(np.tile(start, (steps + 1, 1)), begin.offset.copy())
-        if begin.trajectory is not None:
-            guess = Plan(begin.trajectory.states.copy(), begin.trajectory.controls.copy())
+        guess = Plan(np.tile(start, (steps + 1, 1)), initial_guess.offset.copy())
+        if initial_guess.trajectory is not None:
+            guess = Plan(initial_guess.trajectory.states.copy(), initial_guess.trajectory.controls.copy())
         self.memory_rows = zeros(1, MEMORY)
         self.memory = self.memory_rows[0]
         spare = settings.constraint_tolerance
         self.multipliers = [compiled.no_multipliers(problem, one, spare) for one in problem.constraint_terms]
-        for array, known in zip(self.multipliers, begin.multipliers, strict=False):
+        for array, known in zip(self.multipliers, initial_guess.multipliers, strict=False):
             array[0], array[interface.HEADER :] = known.penalty, known.values.ravel()
         self.core = compiled.core(problem, settings.form)
         self.model = compiled.arguments(problem, multipliers=self.multipliers)
         self._problem, self._tolerance = problem, settings.constraint_tolerance
         self.arrays = records.Workspace(
             start=start, x_hat=start.copy(), x_hats=zeros((steps + 1, n)),
-            policy=Policy(begin.gain.copy(), begin.offset.copy()), to_go=CostToGo(*go), to_come=CostToCome(*come),
-            smoothing=Smoothing(*back), eased=self.model.stage, prior=self.prior, guess=guess,
+            policy=Policy(initial_guess.gain.copy(), initial_guess.offset.copy()), to_go=CostToGo(*go),
+            to_come=CostToCome(*come), smoothing=Smoothing(*back), eased=self.model.stage, prior=self.prior,
+            guess=guess,
             plan=Plan(guess.states.copy(), guess.controls.copy()),
             rollout=Plan(zeros((steps + 1, n)), zeros((steps, m))),
             kept=Policy(zeros((steps, m, n)), zeros((steps, m))), certificate=zeros(1, CERTIFICATE),
