@@ -25,7 +25,7 @@ from solver_benchmark.common import median, take_turns
 
 import lqrsim as ls
 from lqrsim.machine import description, processors
-from lqrsim.simulation.outcomes import outcomes
+from lqrsim.simulation.outcome_table import outcomes
 from lqrsim.versions import versions
 
 LEAST = 0.85  # of raw, one thread

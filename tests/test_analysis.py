@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 import lqrsim as ls
-from lqrsim.simulation.outcomes import Outcomes
+from lqrsim.simulation.outcome_table import Outcomes
 from lqrsim.stress.analysis import breaks, comparisons, degradation, modes, quantiles, success, worst
 from lqrsim.stress.specification import Cell
 

@@ -11,7 +11,7 @@ from whole_problems.claims import contradictions
 
 import lqrsim as ls
 from lqrsim.codegen import jit
-from lqrsim.results.records import Certificate, Iteration, Status
+from lqrsim.results.solution_parts import Certificate, Iteration, Status
 from lqrsim.solvers import certify
 from lqrsim.solvers.certify import faults
 

@@ -13,9 +13,9 @@ from tracking import hover, track, weave
 
 from lqrsim.errors import InputError
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.results import files
-from lqrsim.results.records import Status, Trajectory
+from lqrsim.results import save_load
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Status, Trajectory
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
@@ -423,6 +423,6 @@ def test_a_saved_policy_runs_as_the_one_that_was_saved(
     differential_drive: Scenario, drive_solution: Solution, tmp_path: Path
 ) -> None:
     """What is loaded is read-only."""
-    loaded = files.load_solution(files.save(drive_solution, tmp_path / "solution.npz"))
+    loaded = save_load.load_solution(save_load.save(drive_solution, tmp_path / "solution.npz"))
     runs = [simulate(differential_drive.plant(), solution) for solution in (drive_solution, loaded)]
     np.testing.assert_array_equal(runs[0].states, runs[1].states)

@@ -9,7 +9,7 @@ import pytest
 from point_mass import DT, ONE, RADIUS, Effort, Oracle, balls, check, problem
 
 import lqrsim as ls
-from lqrsim.results.records import Iteration, Status
+from lqrsim.results.solution_parts import Iteration, Status
 
 # As much is left to spare as the constraints are solved for to, and what that costs is no more than 1e-3 of all.
 TIGHT: dict[str, Any] = {"tolerance": 1e-7, "gap_tolerance": 1e-4, "constraint_tolerance": 1e-5}

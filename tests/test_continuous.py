@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.problem.linear_quadratic import Stage
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import riccati_ode
 from lqrsim.solvers.continuous import smooth_continuous, smooth_lq_continuous

@@ -11,7 +11,7 @@ from scipy.linalg import expm, solve_continuous_are
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.problem.linear_quadratic import Stage
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers.continuous import smooth_lq_continuous
 

@@ -7,7 +7,7 @@ from scipy.signal import welch
 from tracking import hover, weave
 
 from lqrsim.errors import InputError
-from lqrsim.results.records import Trajectory
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenes.scene import load_scene

@@ -16,10 +16,11 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.control.controllers import Control, Controller, Feedback
 from lqrsim.errors import InputError
-from lqrsim.results.goal import OF_RANGE, Target, endings
+from lqrsim.results.goal import OF_RANGE, Target
+from lqrsim.results.trial_outcome import endings
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import scene_from_xml
-from lqrsim.simulation.outcomes import OUTCOMES, Outcomes, outcomes
+from lqrsim.simulation.outcome_table import OUTCOMES, Outcomes, outcomes
 from lqrsim.simulation.plant import Plant
 from lqrsim.stress import trials
 from lqrsim.stress.campaign import Campaign, run_campaign

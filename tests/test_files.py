@@ -20,7 +20,7 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.results import files
+from lqrsim.results import save_load
 
 fuzzer: ModuleType = importlib.import_module("robustness.files")
 same = fuzzer.same
@@ -481,7 +481,7 @@ def test_a_failed_write_leaves_nothing_and_keeps_the_old_file(tmp_path: Path, dr
     path.write_text("old")
 
     def interrupted() -> None:
-        with files.replacing(path) as unfinished:
+        with save_load.replacing(path) as unfinished:
             unfinished.write_text("half")
             raise KeyboardInterrupt
 

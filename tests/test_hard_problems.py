@@ -8,7 +8,7 @@ import systems
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 
 
 def cubic(*, effort: float = 1.0, constant: float = 0.0) -> ls.Problem:

@@ -15,7 +15,7 @@ from scipy.optimize import approx_fprime
 import lqrsim as ls
 from lqrsim.codegen import jit
 from lqrsim.problem.derivative_check import evaluate
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 
 FIELDS: dict[str, Any] = {
     "states": {"angle": "rad", "speed": "rad/s"},

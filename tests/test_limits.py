@@ -13,7 +13,7 @@ from linear_quadratic import LinearQuadratic, solve_dense
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 
 TIGHT: dict[str, Any] = {"tolerance": 1e-12, "gap_tolerance": 1e-9}
 NO_LIMITS = (-np.inf, np.inf)

@@ -6,7 +6,7 @@ import pytest
 import lqrsim as ls
 from lqrsim.control.controllers import Replanning
 from lqrsim.results.rollout import Rollout
-from lqrsim.simulation.outcomes import OUTCOMES, outcomes
+from lqrsim.simulation.outcome_table import OUTCOMES, outcomes
 from lqrsim.simulation.plant import Plant
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.kernels.interface import ROW
+from lqrsim.kernels.declarations import ROW
 from lqrsim.kernels.signed_distance import signed_distance_derivatives
 from lqrsim.problem.costs import terms_of
 

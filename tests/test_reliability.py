@@ -16,7 +16,7 @@ from whole_problems import kkt
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.problem.costs import terms_of
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 
 # Six of the eleven kinds, of each family some: each is compiled where nothing is cached, some 5 seconds, before the
 # first test ends. benchmark_reliability.py draws all of them, by the hundred.

@@ -14,7 +14,7 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.reports.page import report
-from lqrsim.simulation.outcomes import Outcomes
+from lqrsim.simulation.outcome_table import Outcomes
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results
 from lqrsim.stress.specification import Campaign, Cell

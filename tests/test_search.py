@@ -10,7 +10,7 @@ from whole_problems import kkt
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.records import Iteration, Status
+from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.solvers.multistart import bends, guides, path
 
 STARTS = ["straight", *(f"{far} m to the {side}" for far in (1, 2, 3) for side in ("left", "right"))]

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 from lqrsim.solvers.initial_guess import StartLike
 
 FORMS = ("dual", "primal")

@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 from lqrsim.scenarios.packaged import quadrotor_queries
 
 PILLARS = [

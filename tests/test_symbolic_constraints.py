@@ -12,7 +12,7 @@ from whole_problems.claims import contradictions
 
 import lqrsim as ls
 from lqrsim.errors import Array, InputError
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 
 anything: Any = ls  # whose types nobody checks
 EXACT: dict[str, Any] = {"tolerance": 1e-10, "gap_tolerance": 1e-6, "constraint_tolerance": 1e-9}

@@ -24,7 +24,7 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.codegen import disk_cache
 from lqrsim.errors import Array, InputError
-from lqrsim.results import files
+from lqrsim.results import save_load
 from lqrsim.simulation.disturbances import ForceNoise
 from lqrsim.view import viewer
 from lqrsim.view.browser import Browser
@@ -98,7 +98,7 @@ def said(process: subprocess.Popen[str], text: str) -> str:
 def served(rollout: ls.Rollout, tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """A run is played; the port."""
     folder, port = tmp_path_factory.mktemp("served"), PORT
-    files.save(rollout, folder / "run.npz")
+    save_load.save(rollout, folder / "run.npz")
     with viewing(folder, "run.npz", "--port", str(port)) as process:
         text = said(process, "Ctrl-C ends it")
         assert f"http://localhost:{port}/" in text
@@ -217,7 +217,7 @@ web_server.serve = lambda handler, **options: serve(handler, **{{**options, {}}}
 )
 def test_a_server_that_is_not_private_is_refused(rollout: ls.Rollout, before: str, reason: str, tmp_path: Path) -> None:
     """MuJoCo's server is not what it is expected to be: what listens then is found out, and closed."""
-    files.save(rollout, tmp_path / "run.npz")
+    save_load.save(rollout, tmp_path / "run.npz")
     with viewing(tmp_path, "run.npz", "--port", str(PORT + 1), before=before) as process:
         assert re.search(f"{reason}; it was closed", said(process, "lqrsim: error"))
         assert process.wait(20) == 2
@@ -231,7 +231,7 @@ def test_a_server_that_is_not_known_is_refused(rollout: ls.Rollout, monkeypatch:
 
 
 def test_what_can_not_be_shown(rollout: ls.Rollout, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = str(files.save(rollout, tmp_path / "run.npz"))
+    path = str(save_load.save(rollout, tmp_path / "run.npz"))
     asked = (
         ([path, "--trial", "1"], "trial"),
         ([path, "--speed", "0"], "--speed"),
@@ -250,12 +250,12 @@ def test_a_display_that_is_gone(
     """MuJoCo's window would be waited for without end."""
     monkeypatch.setenv("DISPLAY", ":64321")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    assert main(["view", str(files.save(rollout, tmp_path / "run.npz"))]) == 2
+    assert main(["view", str(save_load.save(rollout, tmp_path / "run.npz"))]) == 2
     assert "--viewer browser" in capsys.readouterr().err
 
 
 def test_a_port_that_is_taken(rollout: ls.Rollout, tmp_path: Path) -> None:
-    files.save(rollout, tmp_path / "run.npz")
+    save_load.save(rollout, tmp_path / "run.npz")
     taken = socket.create_server(("127.0.0.1", PORT + 2))
     with taken, viewing(tmp_path, "run.npz", "--port", str(PORT + 2)) as process:
         assert "--port" in said(process, "already in use")

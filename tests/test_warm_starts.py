@@ -8,7 +8,7 @@ import pytest
 from comparing import fixed, same
 
 import lqrsim as ls
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 
 
 @pytest.mark.parametrize("kind", [fixed, replace], ids=["fixed", "soft"])

@@ -11,11 +11,11 @@ from whole_problems import draws, planar_quadrotor
 from whole_problems.claims import contradictions
 
 import lqrsim as ls
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 
 # Each kind is compiled where nothing is cached, some 5 seconds. Most of these are so by other tests, too; those that
 # are left out have nothing that these have not, and benchmark_claims.py draws them by the hundred.
-KINDS = ("linear", "pendulum", "parking", "car", "planar", "planar_free", "drive", "quadrotor")
+KINDS = ("linear", "pendulum", "parking", "planar", "drive", "quadrotor")
 pytestmark = pytest.mark.timeout(900)
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import lqrsim as ls
 from lqrsim.codegen import distances
 from lqrsim.errors import Array
-from lqrsim.kernels.interface import ROW
+from lqrsim.kernels.declarations import ROW
 from lqrsim.kernels.signed_distance import signed_distance_derivatives
 from lqrsim.scenes.world import KINDS
 

@@ -8,7 +8,7 @@ from reliability.common import mean, paper_start, progress
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.files import replacing
+from lqrsim.results.save_load import replacing
 from quality.common import (
     ALL,
     NONE,

@@ -18,8 +18,8 @@ from pathlib import Path
 import platformdirs
 
 from lqrsim.errors import InputError
-from lqrsim.results.files import replacing
 from lqrsim.results.hashing import sha256
+from lqrsim.results.save_load import replacing
 
 LIMIT = 256 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about one megabyte
 _SUFFIX = ".item"

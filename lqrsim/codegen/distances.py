@@ -8,7 +8,7 @@ import numpy.typing as npt
 from lqrsim.codegen.jit import Core, compiling
 from lqrsim.codegen.kernel_source import source_of
 from lqrsim.errors import Array
-from lqrsim.kernels import interface
+from lqrsim.kernels import declarations
 from lqrsim.kernels import signed_distance as kernel
 from lqrsim.scenes.world import World
 
@@ -41,4 +41,4 @@ def signed_distance_displaced(world_seen: World, points: Array, displaced: Array
 
 @cache
 def _distance_core() -> Core:
-    return Core(source_of(kernel), {"ROW": interface.ROW}, "distances to obstacles")
+    return Core(source_of(kernel), {"ROW": declarations.ROW}, "distances to obstacles")

@@ -19,7 +19,7 @@ import numpy as np
 
 from lqrsim.codegen.fingerprint import fingerprint, note_helpers
 from lqrsim.errors import Array, InputError, check_name, excerpt
-from lqrsim.kernels import interface, linear_algebra, rotation_ratios, signed_distance
+from lqrsim.kernels import declarations, linear_algebra, rotation_ratios, signed_distance
 
 LEVELS = ("symbolic", "compiled", "plain")
 
@@ -225,7 +225,7 @@ def plain_names(states: int, controls: int, functions: Sequence[UserFunction], p
             output[:] = value
 
     names: dict[str, Any] = {"N": states, "M": controls, "W": states + controls, "clear": linear_algebra.clear}
-    names["ROW"] = interface.ROW
+    names["ROW"] = declarations.ROW
     names |= {"stack": lambda *shape: np.empty(shape), "invoke": invoke, "invoke_writing": invoke}
     # NumPy's functions and not those of math, which raise where compiled code goes on with NaN or infinity.
     names |= vars(math) | {name: getattr(np, name) for name in vars(math) if callable(getattr(np, name, None))}

@@ -16,8 +16,8 @@ from lqrsim.results.archive import excerpt_of
 
 if TYPE_CHECKING:
     from lqrsim.problem.problem import Problem
-    from lqrsim.results.records import Iteration
     from lqrsim.results.solution import Solution
+    from lqrsim.results.solution_parts import Iteration
 
 
 def say(text: str = "") -> None:
@@ -60,7 +60,7 @@ def solve(problem: "Problem", solver: str, *, reach: float | None = None, **opti
     Args:
       reach: the solution's `goal_radius`.
     """
-    from lqrsim.results.records import Iteration
+    from lqrsim.results.solution_parts import Iteration
     from lqrsim.solvers.ilqr import ilqr
     from lqrsim.solvers.smoother import smooth
 

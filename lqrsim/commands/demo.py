@@ -8,7 +8,7 @@ import numpy as np
 
 from lqrsim.commands import console
 from lqrsim.errors import InputError
-from lqrsim.results import files
+from lqrsim.results import save_load
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
@@ -50,7 +50,7 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
         console.say(f"\n== {reference}: {scenario.summary}")
         solved = console.solve(scenario.problem, "smooth", reach=scenario.target_radius())
         solution = replace(solved, scenario=from_anywhere(reference))
-        console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
+        console.say(f"wrote {save_load.save(solution, folder / 'solution.npz')}")
         if solution.cost_to_go is not None:
             drawn = plot_policy(
                 solution, folder / "policy.png", world=scenario.scene.world, radius=scenario.robot.radius
@@ -99,7 +99,7 @@ def _execute(scenario: Scenario, solution: Solution, path: Path, seed: int, *, d
             **scenario.near_enough(),
         )  # fmt: skip
     console.say(rollout.summary())
-    console.say(f"wrote {files.save(rollout, path)}")
+    console.say(f"wrote {save_load.save(rollout, path)}")
     return rollout
 
 

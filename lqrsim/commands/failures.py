@@ -10,7 +10,7 @@ from lqrsim.commands.options import Folder, optional
 
 if TYPE_CHECKING:
     from lqrsim.results.rollout import Rollout
-    from lqrsim.stress.reliability import ReliabilityProblem
+    from lqrsim.stress.failure_search import ReliabilityProblem
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class Search:
     """Of all random draws. The same seed gives the same output."""
 
     def _problem(self) -> "ReliabilityProblem":
-        from lqrsim.stress.reliability import ReliabilityProblem
+        from lqrsim.stress.failure_search import ReliabilityProblem
 
         return ReliabilityProblem(
             self.scenario,

@@ -15,7 +15,7 @@ from lqrsim.commands import console
 from lqrsim.errors import check_name
 from lqrsim.machine import description
 from lqrsim.reports.paper import ScriptResult, results_page, verdicts
-from lqrsim.results.files import replacing
+from lqrsim.results.save_load import replacing
 
 # In the wheel experiments/ lies inside the package, in the repository beside it.
 _PACKAGED = [Path(__file__).parents[1] / "experiments", Path(__file__).parents[2] / "experiments"]

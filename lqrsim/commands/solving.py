@@ -72,7 +72,7 @@ class Solve:
         from lqrsim.commands import console
         from lqrsim.errors import InputError
         from lqrsim.problem.constraints import Clearance
-        from lqrsim.results import files
+        from lqrsim.results import save_load
         from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
 
         scenario = resolve(self.scenario)
@@ -99,7 +99,7 @@ class Solve:
             options["start"] = scenario.paper_start
         solved = console.solve(problem, self.solver, reach=scenario.target_radius(), **options)
         solution = replace(solved, scenario=from_anywhere(self.scenario))
-        console.say(f"wrote {files.save(solution, folder / 'solution.npz')}")
+        console.say(f"wrote {save_load.save(solution, folder / 'solution.npz')}")
         if self.figure is not None:
             from lqrsim.view.policy_plot import plot_policy
 
@@ -158,14 +158,14 @@ class Simulate:
         """Carry the command out; its exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError
-        from lqrsim.results import files
+        from lqrsim.results import save_load
         from lqrsim.scenarios.references import resolve
         from lqrsim.simulation.closed_loop import simulate
         from lqrsim.stress.sweeps import sweep
 
         folder = self.out or self.solution.parent
         console.check_output("--out", folder)
-        solution = files.load_solution(self.solution)
+        solution = save_load.load_solution(self.solution)
         if not self.scenario and not solution.scenario:
             raise InputError(
                 "--scenario: got none, and the solution names none, want the one whose robot and scene to use"
@@ -184,7 +184,7 @@ class Simulate:
                 **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             )
         console.say(rollout.summary())
-        console.say(f"wrote {files.save(rollout, folder / 'rollout.npz')}")
+        console.say(f"wrote {save_load.save(rollout, folder / 'rollout.npz')}")
         console.say(rollout.tally())
         return 0
 

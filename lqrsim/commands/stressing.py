@@ -117,7 +117,7 @@ class Replay:
     def run(self) -> int:
         """Carry the command out; its exit code."""
         from lqrsim.commands import console
-        from lqrsim.results import files
+        from lqrsim.results import save_load
         from lqrsim.stress.results import Results, differences, replay
         from lqrsim.stress.specification import Cell
         from lqrsim.versions import changed
@@ -136,7 +136,7 @@ class Replay:
             console.say(f"NOT as in the table: {one}")
         if not different:
             console.say("the same to the bit as in the table")
-        console.say(f"wrote {files.save(rollout, self.out)}")
+        console.say(f"wrote {save_load.save(rollout, self.out)}")
         return 1 if different else 0
 
 

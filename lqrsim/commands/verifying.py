@@ -33,17 +33,17 @@ class Verify:
     def run(self) -> int:
         """Carry the command out; its exit code: 1 if a test failed."""
         from lqrsim.commands import console
-        from lqrsim.results import files
+        from lqrsim.results import save_load
         from lqrsim.verify.ground_truth import ran_policy_of
         from lqrsim.verify.rollout_check import verify_run
         from lqrsim.verify.video_check import run_beside, verify_video
 
         is_run = self.file.suffix.lower() == ".npz"
         path = self.file if is_run else self.run_file or run_beside(self.file)
-        rollout, beside = files.load_rollout(path), path.with_name("solution.npz")
+        rollout, beside = save_load.load_rollout(path), path.with_name("solution.npz")
         solution = None
         if self.solution or os.path.isfile(beside):
-            solution = files.load_solution(self.solution or beside)
+            solution = save_load.load_solution(self.solution or beside)
             # What lies beside a run may be another's; what is given is meant.
             solution = solution if self.solution or ran_policy_of(solution, rollout) else None
         with console.progress("verifying", "frame") as progress:

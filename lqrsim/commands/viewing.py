@@ -61,7 +61,7 @@ class Render:
         """Carry the command out; its exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError
-        from lqrsim.results import files
+        from lqrsim.results import save_load
         from lqrsim.view.render import render, still
 
         if not self.rollouts:
@@ -73,8 +73,8 @@ class Render:
         if not is_still and (self.time is not None or self.every is not None):
             raise InputError(f"--time, --every: got them for {out.name}, want --out FILE.png: they are of stills")
         console.check_output("--out", out.parent, out.name)
-        runs = [files.load_rollout(path) for path in self.rollouts]
-        solutions = [files.load_solution(path) for path in self.solution]
+        runs = [save_load.load_rollout(path) for path in self.rollouts]
+        solutions = [save_load.load_solution(path) for path in self.solution]
         one_trial = len(self.trial) == 1
         options = {
             "trial": self.trial[0] if one_trial else self.trial, "camera": self.camera, "insets": self.inset,
@@ -127,7 +127,7 @@ class View:
         """Carry the command out; its exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import check_count, check_number, check_seed
-        from lqrsim.results import files
+        from lqrsim.results import save_load
         from lqrsim.scenarios.references import resolve
         from lqrsim.view import viewer
 
@@ -141,7 +141,7 @@ class View:
         kind = self.viewer if self.viewer != "auto" else "window" if viewer.has_display() else "browser"
         options = {"push": self.push, "speed": self.speed, "seconds": self.seconds}
         if self.what.endswith(".npz"):
-            rollout = files.load_rollout(self.what)
+            rollout = save_load.load_rollout(self.what)
             shown = viewer.arguments_for_rollout(rollout, self.trial)
 
             def go(screen: "Viewer") -> None:

@@ -13,8 +13,8 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.records import Trajectory
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers import compiled
 from lqrsim.solvers.smoother import smooth
 

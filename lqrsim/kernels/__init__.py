@@ -1,1 +1,1 @@
-"""All that is compiled, in the numba subset of Python; read `interface.py` first."""
+"""All that is compiled, in the numba subset of Python; read `declarations.py` first."""

@@ -1,4 +1,4 @@
-"""The augmented Lagrangian: what is added to the cost for constraints. The numba subset; see `interface.py`.
+"""The augmented Lagrangian: what is added to the cost for constraints. The numba subset; see `declarations.py`.
 
 For inequalities d >= 0, with multipliers lambda >= 0 and a penalty mu, it is
 
@@ -19,7 +19,7 @@ tolerance that is to be left to spare, and from HEADER on lambda, step by step. 
 
 from math import inf
 
-from lqrsim.kernels.interface import HEADER, W, constraint_slope, constraint_value, stack
+from lqrsim.kernels.declarations import HEADER, W, constraint_slope, constraint_value, stack
 
 EQUALITY = False  # whether the constraint's numbers are to be zero
 

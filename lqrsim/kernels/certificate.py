@@ -1,4 +1,4 @@
-"""What a plan really is, worked out from the problem by a short path of its own. The numba subset; see `interface.py`.
+"""What a plan really is, worked out from the problem by a short path of its own. The numba subset.
 
 Nothing of the passes, rollouts and line searches that found the plan is used: only the problem's own functions, their
 derivatives, and a Cholesky factor. `certify.py` compares with what a solver claims.
@@ -6,7 +6,7 @@ derivatives, and a Cholesky factor. `certify.py` compares with what a solver cla
 
 from math import nan
 
-from lqrsim.kernels.interface import (
+from lqrsim.kernels.declarations import (
     M,
     N,
     W,

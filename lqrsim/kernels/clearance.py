@@ -1,9 +1,9 @@
-"""The distance to each obstacle, less what there must be of it. The numba subset; see `interface.py`.
+"""The distance to each obstacle, less what there must be of it. The numba subset; see `declarations.py`.
 
 `data` has the least distance, then the ROW numbers of each obstacle.
 """
 
-from lqrsim.kernels.interface import ROW, stack
+from lqrsim.kernels.declarations import ROW, stack
 from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
 
 AXES = (0, 1, 2)  # which states are the position; two of them in a plane, whose third coordinate is 0

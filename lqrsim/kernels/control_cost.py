@@ -1,9 +1,9 @@
-"""`1/2 (u - about)' weight (u - about)`, of the control. The numba subset; see `interface.py`.
+"""`1/2 (u - about)' weight (u - about)`, of the control. The numba subset; see `declarations.py`.
 
 `data` has about (M,), then weight (M, M), row by row.
 """
 
-from lqrsim.kernels.interface import M, N
+from lqrsim.kernels.declarations import M, N
 
 
 def value(x, u, t, data):

@@ -1,4 +1,4 @@
-"""Limits of the controls. The numba subset; see `interface.py`.
+"""Limits of the controls. The numba subset; see `declarations.py`.
 
 A control that stands at a limit and would go beyond it is *fixed*: a constant in step and cost, with no gain.
 The backward pass finds out which controls are, by minimising within the limits where the state is expected to be; the
@@ -7,8 +7,9 @@ settles, each control minimises what is left of the cost within its limits: the 
 without a penalty or a multiplier. iLQR's steps become those of control-limited DDP (Tassa, Mansard and Todorov, 2014).
 """
 
-from lqrsim.kernels.interface import M, N, W, stack
-from lqrsim.kernels.linear_algebra import add_cost_to_go, minimize_control, within
+from lqrsim.kernels.cost_to_go import add_cost_to_go, minimize_control
+from lqrsim.kernels.declarations import M, N, W, stack
+from lqrsim.kernels.linear_algebra import within
 
 
 def fix_control(i, value, stage, step) -> float:

@@ -1,10 +1,10 @@
-"""Derivatives of a cost by central differences, where there are none. The numba subset; see `interface.py`.
+"""Derivatives of a cost by central differences, where there are none. The numba subset; see `declarations.py`.
 
 The step is the fourth root of the machine's precision, as a second derivative wants it.
 """
 
+from lqrsim.kernels.declarations import M, N, W, stack
 from lqrsim.kernels.function_cost import value
-from lqrsim.kernels.interface import M, N, W, stack
 
 AXES = (0,)  # the entries of (x, u) that the cost depends on
 

@@ -7,18 +7,7 @@ Levenberg-Marquardt is to Gauss-Newton, the damped iterations are to LQR smoothi
 
 from math import inf, isnan, nan
 
-from lqrsim.kernels.interface import (
-    DAMPED,
-    ILQR,
-    MAX_ITERATIONS,
-    PATIENCE,
-    REJECTED,
-    RUNNING,
-    STALLED,
-    M,
-    N,
-    stack,
-)
+from lqrsim.kernels.declarations import DAMPED, ILQR, MAX_ITERATIONS, PATIENCE, REJECTED, RUNNING, STALLED, M, N, stack
 from lqrsim.kernels.iterations import outcome_of, relative_improvement, relative_optimality, write_row
 from lqrsim.kernels.passes import backward_pass, copy, forward_pass, minimizers
 from lqrsim.kernels.records import Linearization

@@ -1,11 +1,11 @@
-"""What Python calls: one function a solver. The numba subset; see `interface.py`.
+"""What Python calls: one function a solver. The numba subset; see `declarations.py`.
 
 All that a solve can need is compiled at once, before it begins, and what its parts share is compiled once.
 """
 
 from lqrsim.kernels.certificate import certify
 from lqrsim.kernels.damped_iterations import damped_iterations
-from lqrsim.kernels.interface import CERTIFY, DAMP, EVALUATE
+from lqrsim.kernels.declarations import CERTIFY, DAMP, EVALUATE
 from lqrsim.kernels.iterations import ilqr_iterations, smoother_iterations
 
 

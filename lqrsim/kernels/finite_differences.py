@@ -1,10 +1,10 @@
-"""Derivatives by central differences, for functions that come without. The numba subset; see `kernels/interface.py`.
+"""Derivatives by central differences, for functions that come without. The numba subset; see `kernels/declarations.py`.
 
 The step is the cube root of the machine's precision: the error of the formula and that of rounding are both some 1e-10
 of the function's size then.
 """
 
-from lqrsim.kernels.interface import M, N, rate, stack
+from lqrsim.kernels.declarations import M, N, rate, stack
 
 
 def rate_jacobian(x, u, p, out, fx, fu):

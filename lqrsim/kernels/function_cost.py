@@ -1,4 +1,4 @@
-"""A cost that is a user's own function, called at its address. The numba subset; see `interface.py`.
+"""A cost that is a user's own function, called at its address. The numba subset; see `declarations.py`.
 
 `data` has the addresses of the function and of its derivatives, then the parameters. Where no derivatives are given,
 `cost_differences.py` has them.
@@ -6,7 +6,7 @@
 
 from math import nan
 
-from lqrsim.kernels.interface import W, invoke, invoke_writing, stack
+from lqrsim.kernels.declarations import W, invoke, invoke_writing, stack
 from lqrsim.kernels.linear_algebra import clear
 
 

@@ -1,4 +1,4 @@
-"""Dynamics that are a user's own functions, called at their addresses. The numba subset; see `interface.py`.
+"""Dynamics that are a user's own functions, called at their addresses. The numba subset; see `declarations.py`.
 
 `p` has the addresses of f and of its Jacobian, then the parameters. Where no Jacobian is given,
 `finite_differences.py` has it.
@@ -6,7 +6,7 @@
 
 from math import nan
 
-from lqrsim.kernels.interface import M, N, invoke, invoke_writing
+from lqrsim.kernels.declarations import M, N, invoke, invoke_writing
 from lqrsim.kernels.linear_algebra import clear
 
 

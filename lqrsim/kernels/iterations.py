@@ -1,13 +1,13 @@
-"""The iterations of the solvers, with nothing but compiled code between them. The numba subset; see `interface.py`.
+"""The iterations of the solvers, with nothing but compiled code between them. The numba subset; see `declarations.py`.
 
 Each function runs the iterations `first` to `last` - 1 and can be called again to go on: what it needs to remember is
 in its arrays. The log gets a row an iteration. All return how many iterations there are now, the outcome (a name in
-`interface.py`), and for a pass that failed whether it was the backward one and its step, else -1.
+`declarations.py`), and for a pass that failed whether it was the backward one and its step, else -1.
 """
 
 from math import inf, isnan, nan
 
-from lqrsim.kernels.interface import (
+from lqrsim.kernels.declarations import (
     CONVERGED,
     COST_CONVERGED,
     CYCLING,

@@ -1,7 +1,7 @@
-"""Both passes of a linear-quadratic problem, whose stages are given. The numba subset; see `interface.py`."""
+"""Both passes of a linear-quadratic problem, whose stages are given. The numba subset; see `declarations.py`."""
 
-from lqrsim.kernels.interface import N, W, minimizer, riccati_forward, stack
-from lqrsim.kernels.linear_algebra import riccati_backward
+from lqrsim.kernels.cost_to_go import riccati_backward
+from lqrsim.kernels.declarations import N, W, minimizer, riccati_forward, stack
 from lqrsim.kernels.records import Stage, Step
 
 

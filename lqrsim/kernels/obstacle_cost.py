@@ -1,11 +1,11 @@
-"""`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. The numba subset; see `interface.py`.
+"""`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. The numba subset; see `declarations.py`.
 
 `data` has the radius, the sharpness, the weight, how many obstacles there are, and the ROW numbers of each.
 """
 
 from math import exp
 
-from lqrsim.kernels.interface import ROW, stack
+from lqrsim.kernels.declarations import ROW, stack
 from lqrsim.kernels.linear_algebra import clear
 from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
 

@@ -1,4 +1,4 @@
-"""The passes of LQR smoothing. The numba subset; see `interface.py`, and `records.py` for what they are given.
+"""The passes of LQR smoothing. The numba subset; see `declarations.py`, and `records.py` for what they are given.
 
 A pass returns the step at which it failed, or -1, and whether all numbers there were finite.
 """
@@ -6,7 +6,7 @@ A pass returns the step at which it failed, or -1, and whether all numbers there
 from math import inf
 
 from lqrsim.kernels.control_limits import fix_controls_at_limits, riccati_backward_within
-from lqrsim.kernels.interface import (
+from lqrsim.kernels.declarations import (
     M,
     N,
     W,

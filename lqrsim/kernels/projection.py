@@ -1,8 +1,8 @@
-"""The nearest positive-semidefinite matrix. The numba subset; see `interface.py`."""
+"""The nearest positive-semidefinite matrix. The numba subset; see `declarations.py`."""
 
 from math import sqrt
 
-from lqrsim.kernels.interface import K, stack
+from lqrsim.kernels.declarations import K, stack
 
 
 def project(hessian, support):

@@ -1,9 +1,9 @@
-"""`1/2 (x - about)' weight (x - about)`, of the state. The numba subset; see `interface.py`.
+"""`1/2 (x - about)' weight (x - about)`, of the state. The numba subset; see `declarations.py`.
 
 `data` has about (N,), then weight (N, N), row by row.
 """
 
-from lqrsim.kernels.interface import N
+from lqrsim.kernels.declarations import N
 
 
 def value(x, u, t, data):

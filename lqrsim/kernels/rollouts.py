@@ -6,7 +6,7 @@ Shapes and names are those of `passes.py`.
 from math import isnan, nan
 
 from lqrsim.kernels.control_limits import minimize_within
-from lqrsim.kernels.interface import (
+from lqrsim.kernels.declarations import (
     M,
     N,
     W,

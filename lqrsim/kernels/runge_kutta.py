@@ -1,9 +1,9 @@
-"""One Runge-Kutta step with the control held, and its Jacobian. The numba subset; see `kernels/interface.py`.
+"""One Runge-Kutta step with the control held, and its Jacobian. The numba subset; see `kernels/declarations.py`.
 
 A negative `h` steps backwards in time: the approximate inverse `gbar` of the step, exact to O(h^5).
 """
 
-from lqrsim.kernels.interface import M, N, W, rate, rate_jacobian, stack
+from lqrsim.kernels.declarations import M, N, W, rate, rate_jacobian, stack
 
 
 def advance(x, u, p, h, out):

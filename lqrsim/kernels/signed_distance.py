@@ -1,11 +1,11 @@
-"""The distance to each primitive, and the one place where it is written down. The numba subset; see `interface.py`.
+"""The distance to each primitive, and the one place where it is written down. The numba subset; see `declarations.py`.
 
 Scalars, flat arrays, no allocation. `row` is where an obstacle's numbers start in a table flattened.
 """
 
 from math import inf, sqrt
 
-from lqrsim.kernels.interface import ROW, stack
+from lqrsim.kernels.declarations import ROW, stack
 
 
 def signed_distance(data, row: int, x: float, y: float, z: float) -> float:

@@ -189,7 +189,7 @@ class Dynamics:
 
     @cached_property
     def source(self) -> str:
-        """Source of `rate` and `rate_jacobian` of `kernels/interface.py`; symbolic dynamics are traced for it, once."""
+        """Source of `rate` and `rate_jacobian` of `kernels/declarations.py`; symbolic dynamics are traced, once."""
         if self.level != "symbolic":
             if self.jacobian is not None:
                 return source_of(function_dynamics)

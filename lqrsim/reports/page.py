@@ -16,8 +16,8 @@ from lqrsim.errors import InputError, check_count, check_function, check_kind, c
 from lqrsim.reports import tables
 from lqrsim.reports.curves import plot_errors, plot_success
 from lqrsim.reports.videos import base64_text, videos_of_worst
-from lqrsim.results.files import replacing
 from lqrsim.results.goal import tracking_unit
+from lqrsim.results.save_load import replacing
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress import analysis

@@ -1,4 +1,4 @@
-"""What comes out of running a policy: a `Rollout`. NumPy only; `files.py` writes it to disk and reads it back."""
+"""What comes out of running a policy: a `Rollout`. NumPy only; `save_load.py` writes it to disk and reads it back."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,8 +21,9 @@ from lqrsim.errors import (
     shaped,
 )
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.goal import Target, endings, tracking_error, tracking_unit
-from lqrsim.results.records import Trajectory
+from lqrsim.results.goal import Target, tracking_error, tracking_unit
+from lqrsim.results.solution_parts import Trajectory
+from lqrsim.results.trial_outcome import endings
 
 
 @dataclass(frozen=True, kw_only=True)

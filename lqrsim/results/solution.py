@@ -1,7 +1,7 @@
 """What comes out of a solve. NumPy only.
 
-`records.py` has the plan, the log and how it ended, `policy.py` the feedback law, `value_functions.py` the value
-functions. `files.py` writes a `Solution` to disk and reads it back; `rollout.py` has what comes out of running it.
+`solution_parts.py` has the plan, the log and how it ended, `policy.py` the feedback law, `value_functions.py` the value
+functions. `save_load.py` writes a `Solution` to disk and reads it back; `rollout.py` has what comes out of running it.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ from lqrsim.errors import (
 )
 from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.records import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
+from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 
 

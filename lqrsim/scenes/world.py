@@ -1,8 +1,4 @@
-"""Obstacles as primitives, and the one place where the distance to each is written down.
-
-`signed_distance` and `signed_distance_derivatives` are scalar functions in the subset of Python that numba compiles:
-they run here as they are, and `solvers/compiled.py` puts the same text into every compiled core.
-"""
+"""Obstacles as primitives, and the world of them; `kernels/signed_distance.py` has the distance to each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_array, check_items, check_name, check_number, check_text, real
-from lqrsim.kernels.interface import ROW
+from lqrsim.kernels.declarations import ROW
 from lqrsim.kernels.signed_distance import signed_distance
 
 # What a position may be of: space, or a plane by its two axes in their order.

@@ -7,7 +7,7 @@ import numpy as np
 from mujoco import batch
 
 from lqrsim.errors import Array, InputError, check_kind, excerpt, shaped
-from lqrsim.results.records import Trajectory
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.disturbances.base import Hook
 from lqrsim.simulation.plant import Plant

@@ -13,7 +13,7 @@ from lqrsim.errors import Array, InputError, check_kind, check_number, shaped, v
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
 from lqrsim.scenes.world import World
-from lqrsim.simulation import fitting
+from lqrsim.simulation import plant_validation
 
 MOST_STEPS = 100_000_000  # of the physics in a run: minutes or hours
 MOST_SUBSTEPS = 20_000  # physics steps in a control period; with more of them a run takes for ever
@@ -42,7 +42,7 @@ class Plant:
     def __init__(self, robot: Robot, scene: Scene) -> None:
         check_kind("robot", robot, Robot, "a Robot, such as Quadrotor()")
         check_kind("scene", scene, Scene, "a Scene, such as load_scene('cage')")
-        fitting.check_names(robot, scene)
+        plant_validation.check_names(robot, scene)
         space = robot.dynamics.state_coordinates
         self.robot, self.scene = robot, scene
         self.world = scene.world.seen_by(space.plane, space.offset) if space.position else World()
@@ -58,7 +58,7 @@ class Plant:
             batch.Batch(self.model, 1, 1)
         except ValueError as error:
             raise InputError(f"scene {scene.name}: got an MJCF that cannot be run in batches: {error}") from None
-        fitting.check_maps(self)
+        plant_validation.check_maps(self)
 
     @property
     def timestep(self) -> float:

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from lqrsim.control import law
 from lqrsim.errors import Array
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.records import Trajectory
+from lqrsim.results.solution_parts import Trajectory
 
 Mask = npt.NDArray[np.bool_]
 

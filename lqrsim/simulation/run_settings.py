@@ -21,8 +21,8 @@ from lqrsim.errors import (
 )
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.goal import Target
-from lqrsim.results.records import Trajectory
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.effects import MakeGenerator, seeded
 from lqrsim.simulation.physics import part_of

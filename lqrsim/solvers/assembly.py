@@ -7,8 +7,8 @@ from lqrsim.errors import Array
 from lqrsim.problem.constraints import Clearance
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.records import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.versions import versions
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import Array
-from lqrsim.kernels import interface
+from lqrsim.kernels import declarations
 from lqrsim.kernels.records import LOG, Plan, Policy, Rows, Settings
 from lqrsim.problem.problem import Problem
-from lqrsim.results.records import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
+from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers.certify import certified
 from lqrsim.solvers.common import Callback, SmootherSettings, Stop, Termination, check_outcome, iterate
 from lqrsim.solvers.initial_guess import InitialGuess
@@ -65,7 +65,7 @@ class Attempt:
         self.initial_guess = initial_guess
         self.work = Workspace(problem, settings, initial_guess, start)
         self.work.memory["watched"] = float(settings.safeguard)
-        self.termination = Termination((), interface.RUNNING, False, -1, "")
+        self.termination = Termination((), declarations.RUNNING, False, -1, "")
         self._log = np.zeros(settings.max_iterations, LOG)
         self._shares = initial_guess.prior.obstacles if initial_guess.prior is not None else ()
         self._loop = self.work.core.entry("smoother", *self._arguments(0, 0, self._log))
@@ -80,7 +80,7 @@ class Attempt:
 
     def run(self, last: int, *, each: bool, callback: Callback | None = None) -> None:
         """Go on until there are `last` iterations, or it ends; with `each`, a look after each (see `iterate`)."""
-        if self.termination.outcome != interface.RUNNING:
+        if self.termination.outcome != declarations.RUNNING:
             return
         if not self.termination.iterations and not self.run_opening_pass():
             return
@@ -89,7 +89,7 @@ class Attempt:
             min(last, self.settings.max_iterations), done=self.termination.iterations, look=self._violation,
             each=self._returns_each(each), stop=self.stop, callback=callback,
         )  # fmt: skip
-        if self.termination.outcome == interface.TIMED_OUT and not self.termination.iterations:
+        if self.termination.outcome == declarations.TIMED_OUT and not self.termination.iterations:
             self.roll_out()
 
     def run_on(
@@ -117,7 +117,7 @@ class Attempt:
         found = self.result(termination)
         if lost or found.success:
             return found
-        if termination.outcome == interface.TIMED_OUT or (
+        if termination.outcome == declarations.TIMED_OUT or (
             settings.safeguard and self.iterations_left(found.iterations) == 0
         ):
             return self.best(found)
@@ -165,7 +165,7 @@ class Attempt:
             status = Status.DIVERGED if found.status is Status.MAX_ITERATIONS else found.status
             return replace(found, status=status, detail=detail, iterations=damped.iterations, values={})
         status = damped.status
-        if damped.outcome == interface.STALLED:
+        if damped.outcome == declarations.STALLED:
             status, detail = self.termination.status, f"{detail}; from the best plan, no step lowers the cost any more"
         return self.damped_result(damped, status, detail)
 
@@ -200,7 +200,7 @@ class Attempt:
     def damped_result(self, damped: Termination, status: Status, detail: str) -> AttemptResult:
         """What damped iterations found: the plan, and what was modelled about it."""
         optimality = damped.iterations[-1].optimality if damped.iterations else np.nan
-        if damped.outcome in (interface.RUNNING, interface.TIMED_OUT):  # they were stopped, and did not look back
+        if damped.outcome in (declarations.RUNNING, declarations.TIMED_OUT):  # they were stopped, and did not look back
             return self.best(
                 AttemptResult(
                     status=status, detail=detail, iterations=damped.iterations, states=self.work.states,
@@ -270,7 +270,7 @@ class Attempt:
             arrays.policy, arrays.to_go,
         )  # fmt: skip
         if failed >= 0:
-            outcome = interface.NOT_POSITIVE_DEFINITE if good else interface.NOT_FINITE
+            outcome = declarations.NOT_POSITIVE_DEFINITE if good else declarations.NOT_FINITE
             self.termination = Termination((), outcome, True, failed, "")
         return failed < 0
 
@@ -288,7 +288,7 @@ class Attempt:
             guided=guided, prior_iterations=count
         )
         arrays = work.arrays._replace(eased=work.eased(share), prior=prior)
-        return interface.ITERATE, first, last, options, work.model, arrays, work.memory_rows, log
+        return declarations.ITERATE, first, last, options, work.model, arrays, work.memory_rows, log
 
     def _damped_arguments(
         self, first: int, last: int, log: Rows, most: int, trial: Plan, least: tuple[float, float] = (0.0, 0.0)
@@ -297,7 +297,7 @@ class Attempt:
         settings, work = self.settings, self.work
         options = self._settings(most, max(settings.tolerance, least[0]), max(settings.gap_tolerance, least[1]))
         arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
-        return interface.DAMP, first, last, options, work.model, arrays, work.memory_rows, log
+        return declarations.DAMP, first, last, options, work.model, arrays, work.memory_rows, log
 
     def _check_arguments(self, task: int, found: AttemptResult, hessians: Array, certificate: Rows) -> tuple[Any, ...]:
         """What it takes to certify a plan and its policy, with these Hessians of a cost-to-go."""

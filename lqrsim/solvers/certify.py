@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from lqrsim.errors import Array
-from lqrsim.kernels import interface
+from lqrsim.kernels import declarations
 from lqrsim.kernels.records import CERTIFICATE, Rows
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.records import Certificate
+from lqrsim.results.solution_parts import Certificate
 
 # What rounding may do. A policy's control is a sum of a few terms, and a step of the dynamics some hundred operations,
 # of which one amplifies what another has rounded.
@@ -49,7 +49,7 @@ def certified(
     """
     numbers, n = np.zeros(1, CERTIFICATE), states.shape[1]
     given = np.zeros((len(states), n, n)) if hessians is None else hessians
-    work(interface.CERTIFY, given, numbers)
+    work(declarations.CERTIFY, given, numbers)
     certificate = certificate_of(problem, numbers[0], states, violation=violation)
     if hessians is None:
         certificate = replace(certificate, optimality=np.inf)
@@ -57,7 +57,7 @@ def certified(
         return certificate, ""
     if tolerance is not None and not certificate.optimality < SLACK * tolerance:
         # Where controls stand at their limits, the Hessians of the Riccati pass are not those of the policy.
-        work(interface.EVALUATE, np.zeros_like(given), numbers)
+        work(declarations.EVALUATE, np.zeros_like(given), numbers)
         certificate = certificate_of(problem, numbers[0], states, violation=violation)
     rest = REST * float(numbers["scale"][0])
     return certificate, faults(certificate, claimed=claimed, rest=rest, tolerance=tolerance, kept=kept)

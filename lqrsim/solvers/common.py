@@ -22,40 +22,40 @@ from lqrsim.errors import (
     check_name,
     check_number,
 )
-from lqrsim.kernels import interface
+from lqrsim.kernels import declarations
 from lqrsim.kernels.records import Rows
 from lqrsim.machine import processors
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.records import Iteration, Status
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.solvers import compiled
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
 
 Callback = Callable[[Iteration], object]
 
 _STATUS = {
-    interface.RUNNING: Status.MAX_ITERATIONS,  # stopped from outside
-    interface.CONVERGED: Status.CONVERGED,
-    interface.COST_CONVERGED: Status.COST_CONVERGED,
-    interface.MAX_ITERATIONS: Status.MAX_ITERATIONS,
-    interface.DIVERGED: Status.DIVERGED,
-    interface.NOT_POSITIVE_DEFINITE: Status.NOT_POSITIVE_DEFINITE,
-    interface.NOT_FINITE: Status.NOT_FINITE,
-    interface.NO_START: Status.NOT_FINITE,
-    interface.STALLED: Status.MAX_ITERATIONS,
-    interface.CYCLING: Status.MAX_ITERATIONS,
-    interface.NO_PROGRESS: Status.MAX_ITERATIONS,
-    interface.TIMED_OUT: Status.TIME_LIMIT,
+    declarations.RUNNING: Status.MAX_ITERATIONS,  # stopped from outside
+    declarations.CONVERGED: Status.CONVERGED,
+    declarations.COST_CONVERGED: Status.COST_CONVERGED,
+    declarations.MAX_ITERATIONS: Status.MAX_ITERATIONS,
+    declarations.DIVERGED: Status.DIVERGED,
+    declarations.NOT_POSITIVE_DEFINITE: Status.NOT_POSITIVE_DEFINITE,
+    declarations.NOT_FINITE: Status.NOT_FINITE,
+    declarations.NO_START: Status.NOT_FINITE,
+    declarations.STALLED: Status.MAX_ITERATIONS,
+    declarations.CYCLING: Status.MAX_ITERATIONS,
+    declarations.NO_PROGRESS: Status.MAX_ITERATIONS,
+    declarations.TIMED_OUT: Status.TIME_LIMIT,
 }
 
 
 _METHODS = {
-    interface.SMOOTH: "smooth",
-    interface.DAMPED: "damped",
-    interface.REJECTED: "rejected",
-    interface.ILQR: "ilqr",
+    declarations.SMOOTH: "smooth",
+    declarations.DAMPED: "damped",
+    declarations.REJECTED: "rejected",
+    declarations.ILQR: "ilqr",
 }
 MOST_STARTS, MOST_THREADS = 10_000, 1024
 
@@ -174,7 +174,7 @@ class Termination:
     @property
     def pass_failed(self) -> bool:
         """Whether a pass of one more iteration was begun and not completed."""
-        return self.outcome in (interface.NOT_POSITIVE_DEFINITE, interface.NOT_FINITE)
+        return self.outcome in (declarations.NOT_POSITIVE_DEFINITE, declarations.NOT_FINITE)
 
     def detail(self, steps: int) -> str:
         """What there is to say besides the status."""
@@ -184,13 +184,13 @@ class Termination:
                 return self.raised
             place = f"{which} pass of iteration {len(self.iterations) + 1}, step {self.failed} of {steps}"
             return f"{place}: {self.raised}" if self.raised else place
-        if self.outcome == interface.NO_START:
+        if self.outcome == declarations.NO_START:
             return "rollout of the initial controls"
-        if self.outcome == interface.CYCLING:
+        if self.outcome == declarations.CYCLING:
             return "the iterations repeat themselves"
-        if self.outcome == interface.NO_PROGRESS:
+        if self.outcome == declarations.NO_PROGRESS:
             return "the least cost so far no longer falls"
-        return "the line search found no lower cost" if self.outcome == interface.STALLED else ""
+        return "the line search found no lower cost" if self.outcome == declarations.STALLED else ""
 
 
 def iterate(
@@ -225,11 +225,11 @@ def iterate(
     for function in functions:
         function.forget()
     iterations = list(done)
-    outcome, backward, failed = interface.RUNNING, False, -1
+    outcome, backward, failed = declarations.RUNNING, False, -1
     try:
-        while outcome == interface.RUNNING and len(iterations) < last:
+        while outcome == declarations.RUNNING and len(iterations) < last:
             if stop.due:
-                outcome = interface.TIMED_OUT
+                outcome = declarations.TIMED_OUT
                 break
             first = len(iterations)
             clock = time.perf_counter()
@@ -246,7 +246,7 @@ def iterate(
                 if function.raised is not None and not isinstance(function.raised, Exception):
                     raise function.raised  # Ctrl-C
     except BaseException as error:  # the callback's, or Ctrl-C: raised again when there is a solution
-        stop.error, outcome = error, interface.TIMED_OUT
+        stop.error, outcome = error, declarations.TIMED_OUT
     raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
     return Termination((*before, *iterations), outcome, backward, failed, "; ".join(raised))
 
@@ -334,5 +334,5 @@ def check_outcome(problem: Problem, termination: Termination, x: Array, u: Array
         except InputError as error:
             if refuse:
                 raise
-            return replace(termination, outcome=interface.NOT_FINITE, raised=str(error))
+            return replace(termination, outcome=declarations.NOT_FINITE, raised=str(error))
     return termination

@@ -20,15 +20,16 @@ from lqrsim.kernels import (
     augmented_lagrangian,
     certificate,
     control_limits,
+    cost_to_come_dual,
+    cost_to_come_primal,
+    cost_to_go,
     damped_iterations,
-    dual_form,
+    declarations,
     entry_points,
-    interface,
     iterations,
     linear_algebra,
     linear_quadratic_passes,
     passes,
-    primal_form,
     projection,
     rollouts,
     rotation_ratios,
@@ -50,7 +51,7 @@ _FIELDS = {"initial": "initial", "stage": "stage_cost", "final": "final_cost"}
 
 
 # The forms of the cost-to-come, and what brings each.
-FORMS = {"dual": dual_form, "primal": primal_form}
+FORMS = {"dual": cost_to_come_dual, "primal": cost_to_come_primal}
 
 
 def core(problem: Problem, form: str = "dual") -> Core:
@@ -83,7 +84,7 @@ def _core(
     return Core("\n\n".join(parts), {**_NAMES, "N": n, "M": m, "W": n + m}, what)
 
 
-_BASE = rotation_ratios, signed_distance, linear_algebra, runge_kutta
+_BASE = rotation_ratios, signed_distance, linear_algebra, cost_to_go, runge_kutta
 _SHARED = control_limits, passes, rollouts, iterations, damped_iterations, certificate, entry_points
 
 
@@ -91,12 +92,12 @@ _SHARED = control_limits, passes, rollouts, iterations, damped_iterations, certi
 def linear_quadratic(n: int, m: int, form: str) -> Core:
     """Those for linear-quadratic problems of that size; see `kernels/linear_quadratic_passes.py`."""
     with compiling:
-        parts = [source_of(module) for module in (linear_algebra, FORMS[form], linear_quadratic_passes)]
+        parts = [source_of(module) for module in (linear_algebra, cost_to_go, FORMS[form], linear_quadratic_passes)]
         return Core("\n\n".join(parts), {"N": n, "M": m, "W": n + m}, f"linear-quadratic, {n} states, {m} controls")
 
 
 # The numbers that have names: outcomes, methods, and the places of what is remembered.
-_NAMES = {name: value for name, value in vars(interface).items() if name.isupper() and len(name) > 1}
+_NAMES = {name: value for name, value in vars(declarations).items() if name.isupper() and len(name) > 1}
 
 
 def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> Model:

@@ -10,11 +10,11 @@ import dataclasses
 
 import numpy as np
 
-from lqrsim.kernels import interface
+from lqrsim.kernels import declarations
 from lqrsim.kernels.records import LOG
 from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
 from lqrsim.problem.problem import Problem
-from lqrsim.results.records import Iteration, Status
+from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import Callback
 from lqrsim.solvers.initial_guess import InitialGuess
@@ -152,11 +152,11 @@ def _undamped(
     while True:
         termination = attempt.run_on(log, len(done) + 1, done=done, each=each, callback=callback)
         done, since = termination.iterations, since + 1
-        stopped = termination.pass_failed or termination.outcome in (interface.CYCLING, interface.TIMED_OUT)
+        stopped = termination.pass_failed or termination.outcome in (declarations.CYCLING, declarations.TIMED_OUT)
         if stopped or not np.isfinite(done[-1].cost):
             break
         lagrangian.evaluate(work.states, work.controls)
-        settled = termination.outcome in (interface.CONVERGED, interface.COST_CONVERGED)
+        settled = termination.outcome in (declarations.CONVERGED, declarations.COST_CONVERGED)
         if len(done) == len(log) or (settled and lagrangian.solved):
             break
         rough = abs(done[-1].improvement) < ROUGH and done[-1].gap < ROUGH_GAP

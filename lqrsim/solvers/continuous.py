@@ -13,20 +13,11 @@ import numpy.typing as npt
 from scipy.interpolate import PPoly
 
 from lqrsim.codegen.user_functions import UserFunction
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_count,
-    check_function,
-    check_kind,
-    check_number,
-    excerpt,
-)
+from lqrsim.errors import Array, InputError, check_array, check_count, check_function, check_kind, check_number, excerpt
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.linear_quadratic import Stage, check_end
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.records import Iteration, Status
+from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers.continuous_solution import ContinuousSolution
 from lqrsim.solvers.initial_guess import InitialPrior

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_items, check_kind, check_number, excerpt, real
-from lqrsim.results.records import Iteration, Status
+from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers.riccati_ode import Pass
 

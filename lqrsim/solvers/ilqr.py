@@ -5,13 +5,13 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from lqrsim.errors import Array, InputError
-from lqrsim.kernels import interface
+from lqrsim.kernels import declarations
 from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Plan, Policy, Rows
 from lqrsim.kernels.records import Settings as KernelSettings
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.problem import Problem
-from lqrsim.results.records import Status
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import assemble
@@ -128,17 +128,17 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     )  # fmt: skip
     model = compiled.arguments(problem)
     stop = settings.stop_early()
-    loop = compiled.core(problem).entry("ilqr", interface.ITERATE, 0, 0, options, model, work, log)
+    loop = compiled.core(problem).entry("ilqr", declarations.ITERATE, 0, 0, options, model, work, log)
     termination = iterate(
         problem,
-        lambda first, last: loop(interface.ITERATE, first, last, options, model, work, log),
+        lambda first, last: loop(declarations.ITERATE, first, last, options, model, work, log),
         log, settings.max_iterations, each=each, stop=stop, callback=callback,
     )  # fmt: skip
     termination = check_outcome(problem, termination, start, control, refuse=each)
     whole = termination.iterations != () and termination.failed < 0
-    if termination.outcome == interface.TIMED_OUT:  # the last backward pass was about the trajectory before
+    if termination.outcome == declarations.TIMED_OUT:  # the last backward pass was about the trajectory before
         count = len(termination.iterations)
-        *_, failed = loop(interface.ITERATE, count, count, options, model, work, log)
+        *_, failed = loop(declarations.ITERATE, count, count, options, model, work, log)
         whole = failed < 0 and np.isfinite(states).all()
     if not whole:
         policy.gain[:] = (

@@ -10,8 +10,8 @@ from lqrsim.errors import Array, InputError, check_array, check_count, check_kin
 from lqrsim.problem.problem import Problem
 from lqrsim.results.hashing import sha256
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.records import Multipliers, Trajectory
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Multipliers, Trajectory
 from lqrsim.results.value_functions import Quadratic
 
 

@@ -13,8 +13,8 @@ from lqrsim.problem.problem import FixedState
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.records import Certificate, Iteration, Status, Trajectory
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Certificate, Iteration, Status, Trajectory
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.versions import versions

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from lqrsim.errors import Array
-from lqrsim.kernels import interface
+from lqrsim.kernels import declarations
 from lqrsim.problem.constraints import ConstraintTerm, allowed_violation, violation_of
-from lqrsim.results.records import Multipliers
+from lqrsim.results.solution_parts import Multipliers
 from lqrsim.results.value_functions import Moments
 from lqrsim.solvers.attempt import Attempt
 
@@ -21,7 +21,7 @@ GROWTH, LARGEST = 5.0, 1e4  # of the penalty; and how far it grows before that i
 def _forces(term: ConstraintTerm, array: Array, values: Array) -> Array:
     """What the multipliers become: lambda - mu d, of inequalities not below 0; 0 where they do not act."""
     acting = np.where(np.isinf(values), 0.0, values)
-    forces = array[interface.HEADER :] - array[0] * acting
+    forces = array[declarations.HEADER :] - array[0] * acting
     return np.where(np.isinf(values), 0.0, forces if term.equality else np.maximum(forces, 0.0))
 
 
@@ -29,7 +29,7 @@ def _missed(term: ConstraintTerm, array: Array, values: Array) -> float:
     """By how much a constraint is missed, or an inequality's multipliers are off, at most."""
     if term.equality:
         return float(np.abs(values).max(initial=0.0))
-    forces = array[interface.HEADER :] / array[0] if array[0] > 0 else 0.0
+    forces = array[declarations.HEADER :] / array[0] if array[0] > 0 else 0.0
     return float(np.abs(np.minimum(values, forces)).max(initial=0.0))
 
 
@@ -80,7 +80,7 @@ class AugmentedLagrangian:
         """No multipliers, and a penalty for each constraint that fits what it costs to change it."""
         self._restart()
         for which, (array, values) in enumerate(zip(self._work.multipliers, self._values, strict=True)):
-            array[interface.HEADER :] = 0.0
+            array[declarations.HEADER :] = 0.0
             if not self._first[which] > 0:
                 # Only now: once there is a penalty, it is what the passes say of curvature.
                 self._first[which] = PENALTY * self._curvature(which) if len(values) else 1.0
@@ -89,7 +89,7 @@ class AugmentedLagrangian:
     def update(self) -> None:
         """Take the forces for the multipliers; let the penalty grow where that helps too little."""
         for term, array, values in self._constraints():
-            array[interface.HEADER :] = _forces(term, array, values)
+            array[declarations.HEADER :] = _forces(term, array, values)
         missed = dict.fromkeys(self._tolerance, -np.inf)
         for term, _, values in self._constraints():
             short = np.abs(values).max(initial=0.0) if term.equality else -values.min(initial=np.inf)
@@ -111,7 +111,9 @@ class AugmentedLagrangian:
 
         def one(term: ConstraintTerm, array: Array, values: Array) -> float:
             forces = _forces(term, array, values)
-            return float((forces @ forces - array[interface.HEADER :] @ array[interface.HEADER :]) / (2 * array[0]))
+            return float(
+                (forces @ forces - array[declarations.HEADER :] @ array[declarations.HEADER :]) / (2 * array[0])
+            )
 
         return sum(self._each(one))
 

@@ -15,7 +15,7 @@ from lqrsim.errors import Array, InputError
 from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, terms_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
-from lqrsim.results.records import Candidate
+from lqrsim.results.solution_parts import Candidate
 from lqrsim.solvers.assembly import clearance_of
 from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import Callback, SmootherSettings, Stop, workers

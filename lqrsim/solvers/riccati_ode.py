@@ -23,7 +23,7 @@ from scipy.linalg.lapack import dposv  # pyright: ignore[reportAttributeAccessIs
 
 from lqrsim.errors import Array, check_number
 from lqrsim.problem.problem import Problem
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 from lqrsim.solvers import compiled
 from lqrsim.solvers.initial_guess import InitialPrior
 

@@ -6,17 +6,8 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import Array
-from lqrsim.kernels import interface, records
-from lqrsim.kernels.records import (
-    CERTIFICATE,
-    MEMORY,
-    CostToCome,
-    CostToGo,
-    Plan,
-    Policy,
-    Prior,
-    Smoothing,
-)
+from lqrsim.kernels import declarations, records
+from lqrsim.kernels.records import CERTIFICATE, MEMORY, CostToCome, CostToGo, Plan, Policy, Prior, Smoothing
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.value_functions import Moments, Quadratic
@@ -65,7 +56,7 @@ class Workspace:
         spare = settings.constraint_tolerance
         self.multipliers = [compiled.no_multipliers(problem, one, spare) for one in problem.constraint_terms]
         for array, known in zip(self.multipliers, initial_guess.multipliers, strict=False):
-            array[0], array[interface.HEADER :] = known.penalty, known.values.ravel()
+            array[0], array[declarations.HEADER :] = known.penalty, known.values.ravel()
         self.core = compiled.core(problem, settings.form)
         self.model = compiled.arguments(problem, multipliers=self.multipliers)
         self._problem, self._tolerance = problem, settings.constraint_tolerance
@@ -121,7 +112,7 @@ class Workspace:
 
     def constraint_values(self, states: Array, controls: Array) -> list[Array]:
         """Of each constraint (T+1, rows): not to be negative, or zero; where it does not act, infinite or zero."""
-        values = [np.empty(len(multipliers) - interface.HEADER) for multipliers in self.multipliers]
+        values = [np.empty(len(multipliers) - declarations.HEADER) for multipliers in self.multipliers]
         if values:
             self.core.evaluate_constraints(self._problem.steps, states, controls, self.model.stage, tuple(values))
         return [one.reshape(self._problem.steps + 1, -1) for one in values]

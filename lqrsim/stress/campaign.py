@@ -20,9 +20,9 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_count, check_function, check_kind, check_path, check_text, excerpt
 from lqrsim.machine import description, processors
-from lqrsim.results import files
+from lqrsim.results import save_load
 from lqrsim.results.hashing import sha256
-from lqrsim.results.records import Trajectory
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.stress import cluster, executors
@@ -168,7 +168,7 @@ def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Pat
         return
     policies = {}
     for policy, solution in solve(campaign.policies, scenario).items():
-        path = files.save(solution, folder / "policies" / f"{policy}.npz")
+        path = save_load.save(solution, folder / "policies" / f"{policy}.npz")
         policies[policy] = {"digest": digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
     about = {"versions": versions(), "machine": description(), "left_out": left_out(campaign.policies, scenario)}
     write_manifest(folder, specification | {"policies": policies} | about)

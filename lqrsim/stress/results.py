@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import InputError, check_count, check_flag, check_kind, check_name, check_path, check_text, excerpt
-from lqrsim.results import files
+from lqrsim.results import save_load
 from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.references import from_anywhere, resolve
-from lqrsim.simulation.outcomes import OUTCOMES, Outcomes
+from lqrsim.simulation.outcome_table import OUTCOMES, Outcomes
 from lqrsim.stress.analysis import alike
 from lqrsim.stress.manifest import cells_of, digest_of_solution, read_manifest
 from lqrsim.stress.specification import Campaign, Cell, Shard, shards_of
@@ -138,7 +138,7 @@ class Results:
     def solution(self, policy: str) -> Solution:
         """What a policy was made from. Raises InputError if its file is damaged."""
         path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
-        hashes, solution = self.manifest["policies"][policy], files.load_solution(path)
+        hashes, solution = self.manifest["policies"][policy], save_load.load_solution(path)
         if sha256(path.read_bytes()) != hashes["sha256"] or digest_of_solution(solution) != hashes["digest"]:
             raise InputError(f"policy: got {path}, which is damaged, want what the campaign wrote: run it elsewhere")
         return solution

@@ -16,8 +16,8 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lqrsim.results.files import replacing
 from lqrsim.results.hashing import sha256
+from lqrsim.results.save_load import replacing
 from lqrsim.stress.specification import Shard
 
 Table = dict[str, npt.NDArray[np.generic]]

@@ -15,7 +15,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.closed_loop import simulate
-from lqrsim.simulation.outcomes import Outcomes, outcomes
+from lqrsim.simulation.outcome_table import Outcomes, outcomes
 from lqrsim.solvers.ilqr import ilqr
 from lqrsim.solvers.smoother import smooth
 from lqrsim.stress.specification import POLICIES, Campaign, Cell, Shard

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from av.error import FFmpegError
 
 from lqrsim.errors import Array, InputError, check_count
-from lqrsim.results import files
+from lqrsim.results import save_load
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.verify import ground_truth, pixels
@@ -30,7 +30,7 @@ def run_beside(path: str | os.PathLike[str]) -> Path:
     metadata, folder = video_metadata.read(path), Path(path).parent
     for found in sorted(folder.glob("*.npz")):
         with contextlib.suppress(InputError):  # a solution, or what is damaged
-            if video_metadata.digest(files.load_rollout(found)) in metadata.runs:
+            if video_metadata.digest(save_load.load_rollout(found)) in metadata.runs:
                 return found
     raise InputError(f"run: got none, and none in {folder} is what the video says it shows, want the run's file")
 

@@ -10,9 +10,9 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_text
-from lqrsim.results.records import Trajectory
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenes.world import World
 from lqrsim.view import obstacle_plots, style
 from lqrsim.view.style import LIMIT, PLAN, RUNS

@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image
 
 from lqrsim.errors import InputError, check_function, check_name, check_number, check_path, excerpt
-from lqrsim.results.files import replacing
 from lqrsim.results.rollout import Rollout
+from lqrsim.results.save_load import replacing
 from lqrsim.results.solution import Solution
 from lqrsim.view import video_metadata
 from lqrsim.view.options import OVERLAYS, Overlay, Quality

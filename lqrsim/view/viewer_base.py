@@ -12,7 +12,7 @@ from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.records import Trajectory
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.view.decorative_geoms import PLAN_RGB, decorate
 from lqrsim.view.recorded_model import floor_below, robot_body
 

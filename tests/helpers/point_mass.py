@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.records import Status
+from lqrsim.results.solution_parts import Status
 
 DT, RADIUS, MARGIN = 0.1, 0.2, 0.1
 

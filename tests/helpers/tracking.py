@@ -4,8 +4,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.records import Certificate, Status, Trajectory
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Certificate, Status, Trajectory
 from lqrsim.robots.base import Robot
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor

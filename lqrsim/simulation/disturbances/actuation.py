@@ -8,7 +8,7 @@ import numpy as np
 from mujoco import batch
 
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number, excerpt
-from lqrsim.results.records import Trajectory
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
     Effect,

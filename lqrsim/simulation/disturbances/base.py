@@ -17,7 +17,7 @@ from mujoco import batch
 
 from lqrsim.errors import Array, InputError, check_array, check_function, check_number, excerpt, real, shaped
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.records import Trajectory
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.plant import Plant
 
 Hook = Callable[[int, Array], Array]

@@ -16,7 +16,7 @@ from mujoco import batch
 from scipy.special import ndtr, ndtri
 
 from lqrsim.errors import Array, InputError, check_number
-from lqrsim.results.records import Trajectory
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.actuation import check_gains
 from lqrsim.simulation.disturbances.base import Disturbance, Effect, Numbers, check_numbers, check_strength, fit, words
 from lqrsim.simulation.plant import Plant

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lqrsim.errors import Array, check_count, check_number
-from lqrsim.results.records import Trajectory
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
     Effect,

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lqrsim.errors import InputError
-from lqrsim.results.records import Trajectory
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import Effect, GaussianDisturbance, fit, normal, with_units, words
 from lqrsim.simulation.plant import Plant
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lqrsim.errors import Array, InputError, check_array, check_name, check_number
-from lqrsim.results.records import Trajectory
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import Disturbance, Effect, Numbers, check_numbers, fit, normal, times, words
 from lqrsim.simulation.plant import Plant
 

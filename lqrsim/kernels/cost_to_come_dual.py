@@ -4,13 +4,14 @@
 zero at a fixed start; neither the inverse dynamics nor an invertible A is needed. In the backward pass the costate, the
 slope of the cost-to-go at the minimiser, leads from each step to the one before (the modified Bryson-Frazier smoother).
 
-`primal_form.py` has functions of the same names; `passes.py` is written against either. With F = R^-1 P and h = R^-1 r,
-the control is eliminated by u = w - F x - h: the rest is At = A - B F, Qt = Q - P'F, qt = q - P'h, ct = c - B h.
+`cost_to_come_primal.py` has functions of the same names; `passes.py` is written against either. With F = R^-1 P and h =
+R^-1 r, the control is eliminated by u = w - F x - h: the rest is At = A - B F, Qt = Q - P'F, qt = q - P'h, ct = c - B
+h.
 """
 
 from math import sqrt
 
-from lqrsim.kernels.interface import M, N, stack
+from lqrsim.kernels.declarations import M, N, stack
 from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, offset, within
 from lqrsim.kernels.records import Reduced
 from lqrsim.kernels.runge_kutta import step_jacobian

@@ -27,7 +27,7 @@ from lqrsim.errors import (
     check_text,
 )
 from lqrsim.machine import description
-from lqrsim.results import files
+from lqrsim.results import save_load
 from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.scenarios.packaged import Scenario
@@ -368,8 +368,8 @@ def _write(
         "machine": description(),
         "found": found,
     }
-    files.save(rollout, folder / "rollout.npz")
-    with files.replacing(folder / f"{name}.json") as unfinished:
+    save_load.save(rollout, folder / "rollout.npz")
+    with save_load.replacing(folder / f"{name}.json") as unfinished:
         unfinished.write_text(json.dumps(contents, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return rollout
 

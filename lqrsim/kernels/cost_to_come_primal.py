@@ -1,16 +1,16 @@
 """The primal form, the paper's: the cost-to-come as a quadratic, along the dynamics run backwards. The numba subset.
 
-`dual_form.py` has functions of the same names; `passes.py` is written against either. Paper: Eqs. (14)-(21).
+`cost_to_come_dual.py` has functions of the same names; `passes.py` is written against either. Paper: Eqs. (14)-(21).
 """
 
-from lqrsim.kernels.interface import M, N, W, stack
+from lqrsim.kernels.cost_to_go import minimize_control
+from lqrsim.kernels.declarations import M, N, W, stack
 from lqrsim.kernels.linear_algebra import (
     affine,
     cholesky,
     cholesky_solve,
     clear,
     congruence,
-    minimize_control,
     offset,
     quadratic_at,
     within,

@@ -1,9 +1,9 @@
 """What a compiled core knows about its problem: the names that the kernels are written against.
 
-The modules of the numba subset, with one of `dual_form.py` and `primal_form.py`, and the sources that dynamics and
-costs write are joined into one text for each structure (see `solvers/compiled.py`), with these sizes as constants and
-these functions filled in. This module only declares them, so that each of those files can be read, linted and
-type-checked on its own.
+The modules of the numba subset, with one of `cost_to_come_dual.py` and `cost_to_come_primal.py`, and the sources that
+dynamics and costs write are joined into one text for each structure (see `solvers/compiled.py`), with these sizes as
+constants and these functions filled in. This module only declares them, so that each of those files can be read, linted
+and type-checked on its own.
 """
 
 import numpy as np
@@ -107,7 +107,7 @@ def final_quadratic(x, u, t, data, hessian, gradient) -> float:
     return 0.0
 
 
-# What the form of the cost-to-come brings; see `dual_form.py`, `primal_form.py` and `records.py`.
+# What the form of the cost-to-come brings; see `cost_to_come_dual.py`, `cost_to_come_primal.py` and `records.py`.
 
 
 def initial_cost_to_come(Q, q, constant, x, to_go, to_come) -> tuple[float, bool]:

@@ -19,9 +19,9 @@ from lqrsim.results.archive import Arrays, Header, opened, write
 from lqrsim.results.archive import replacing as replacing
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.records import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Moments, Quadratic
 
 VERSIONS = {"solution": 5, "rollout": 4}
