@@ -62,7 +62,7 @@ def _computed_by(folder: Path, config: Config) -> dict[str, list[Any]]:
     if not (folder / "lqrsim" / "__init__.py").is_file():
         raise SystemExit(f"checkout: got {folder}, want a folder with lqrsim/ in it")
     with tempfile.TemporaryDirectory() as cache:
-        code = f"import sys; sys.path[:0] = {[str(folder.resolve())]}; exec(open({__file__!r}).read())"
+        code = f"import json, runpy; compute = runpy.run_path({__file__!r})['compute']"
         code += f"; print(json.dumps(compute({config.queries}, {config.trials})))"
         environment = {**os.environ, "LQRSIM_CACHE_DIR": cache, "PYTHONPATH": str(folder.resolve())}
         done = subprocess.run([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, check=False)

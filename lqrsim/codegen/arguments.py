@@ -1,10 +1,9 @@
 """How arguments reach compiled code: arrays as pointers to blocks of constant shape, records of these, rows."""
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
-
-from lqrsim.kernels import records
 
 
 def kind_of(argument: Any) -> tuple[Any, ...]:
@@ -21,41 +20,51 @@ def kind_of(argument: Any) -> tuple[Any, ...]:
     return (next(name for types, name in kinds if isinstance(argument, types)),)
 
 
-def converted(name: str, kind: tuple[Any, ...]) -> str:
-    """The expression that makes of an argument what kernels take: pointers of arrays."""
+def leaves(arguments: Iterable[Any]) -> Iterator[Any]:
+    """The arguments with records taken apart: numba looks at named tuples in Python, at what is in them in C."""
+    for argument in arguments:
+        if isinstance(argument, tuple) and hasattr(argument, "_fields"):
+            yield from leaves(argument)
+        else:
+            yield argument
+
+
+def converted(kind: tuple[Any, ...], names: Iterator[str]) -> str:
+    """The expression that makes of the next leaves, by their names, what kernels take: pointers, records of these."""
     match kind[0]:
         case "array":
-            return f"pointer({name}, {kind[1:]})"
+            return f"pointer({next(names)}, {kind[1:]})"
         case "vectors":
+            name = next(names)
             return f"({' '.join(f'pointer({name}[{i}], ()),' for i in range(kind[1]))})"
         case "record":
-            fields = getattr(records, kind[1])._fields
-            parts = (converted(f"{name}.{field}", part) for field, part in zip(fields, kind[2:], strict=True))
-            return f"{kind[1]}({', '.join(parts)})"
-    return name
+            return f"{kind[1]}({', '.join(converted(part, names) for part in kind[2:])})"
+    return next(names)
 
 
-def signature_of(kinds: tuple[tuple[Any, ...], ...]) -> Any:
-    """The types of numba for arguments of these kinds."""
+def signature_of(kinds: Iterable[tuple[Any, ...]]) -> Any:
+    """The types of numba for the leaves of arguments of these kinds."""
     import numba
     from numba import types
 
-    def one(kind: tuple[Any, ...]) -> Any:
+    def each(kind: tuple[Any, ...]) -> Iterator[Any]:
         match kind[0]:
             case "array":
-                return types.Array(types.float64, len(kind), "C")
+                yield types.Array(types.float64, len(kind), "C")
             case "rows":
                 row = np.dtype([(name, np.float64) for name in kind[1:]])
-                return types.Array(numba.from_dtype(row), 1, "C")
+                yield types.Array(numba.from_dtype(row), 1, "C")
             case "vectors":
                 vector = types.Array(types.float64, 1, "C")
-                return types.UniTuple(vector, kind[1]) if kind[1] else types.Tuple(())
+                yield types.UniTuple(vector, kind[1]) if kind[1] else types.Tuple(())
             case "record":
-                return types.BaseTuple.from_types([one(part) for part in kind[2:]], getattr(records, kind[1]))
+                for part in kind[2:]:
+                    yield from each(part)
             case "bool":
-                return types.boolean
+                yield types.boolean
             case "int":
-                return types.int64
-        return types.float64
+                yield types.int64
+            case _:
+                yield types.float64
 
-    return tuple(one(kind) for kind in kinds)
+    return tuple(one for kind in kinds for one in each(kind))

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim.codegen import disk_cache as disk
-from lqrsim.codegen.arguments import converted, kind_of, signature_of
+from lqrsim.codegen.arguments import converted, kind_of, leaves, signature_of
 from lqrsim.codegen.fingerprint import fingerprint, note_helpers, stale
 from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError
@@ -99,15 +99,16 @@ class Core:
             if _lasting(dispatcher):
                 _keep(key, dispatcher, what)
         dispatcher.disable_compile()
-        return dispatcher
+        return lambda *arguments: dispatcher(*leaves(arguments))
 
     def _entry_source(self, name: str, kinds: tuple[Any, ...]) -> str:
-        """The function of that name under the name `entry`, which turns arrays into pointers first."""
+        """The function of that name under the name `entry`, which makes pointers and records of its arguments first."""
         functions = {node.name: node for node in ast.parse(self.source).body if isinstance(node, ast.FunctionDef)}
         node = functions[name]
-        names = (argument.arg for argument in node.args.args)
-        pairs = [(name, converted(name, kind)) for name, kind in zip(names, kinds, strict=True)]
-        lines = [f"{name} = {expression}" for name, expression in pairs if expression != name]
+        names = [f"leaf_{number}" for number in range(len(signature_of(kinds)))]
+        leaf = iter(names)
+        lines = [f"{one.arg} = {converted(kind, leaf)}" for one, kind in zip(node.args.args, kinds, strict=True)]
+        node.args.args = [ast.arg(name) for name in names]
         node.name, node.decorator_list = "entry", []
         node.body = [*ast.parse("\n".join(lines)).body, *node.body]
         return ast.unparse(node)
