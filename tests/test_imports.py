@@ -110,7 +110,7 @@ def imports(path: Path) -> list[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path.name}: a relative import"
             names = [f"{node.module}.{name.name}" for name in node.names]
-            # `from lqrsim.results import files` imports a module, `from lqrsim.errors import InputError` a name in one.
+            # `from lqrsim.results import save_load` imports a module, `from lqrsim.errors import Array` a name in one.
             found += [name if name.removeprefix("lqrsim.") in MODULES else str(node.module) for name in names]
     return found
 
