@@ -109,7 +109,8 @@ def _decrease(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | None)
     """`1/2 sum e' H^-1 e`: with the slopes e of the Lagrangian in the offsets of the policy, later controls responding.
 
     H is the curvature of the cost in one offset, all others held. Controls go no further than their limits, and at one
-    they do not respond. Multipliers are the solution's.
+    they do not respond. Multipliers are the solution's, and what leaves a constraint that acts costs its penalty: else
+    a small error of a multiplier would count as cost that could be saved by leaving it.
     """
     plan, gain = solution.trajectory, solution.policy.gain
     n, m = plan.states.shape[1], plan.controls.shape[1]
@@ -119,10 +120,15 @@ def _decrease(problem: ls.Problem, solution: ls.Solution, rate: kkt.Rate | None)
     _, gradient, hessian = kkt.cost_model(problem, problem.stage_cost, z, n, first=0)
     _, end_slope, end_curve = kkt.cost_model(problem, problem.final_cost, plan.states[-1:], n, first=-1)
     pull, along = np.zeros((problem.steps + 1, n + m)), constraints.points(plan)
+    bend = np.zeros((problem.steps + 1, n + m, n + m))
     for one, multipliers in zip(constraints.of(problem), solution.multipliers, strict=False):
-        pull -= np.einsum("tr,tri->ti", multipliers.values, one.slopes(along))
+        slopes = one.slopes(along)
+        pull -= np.einsum("tr,tri->ti", multipliers.values, slopes)
+        acting = multipliers.penalty * np.logical_and(one.acts, one.equality | (multipliers.values > 0))
+        bend += np.einsum("tr,tri,trj->tij", acting, slopes, slopes)
     gradient += pull[:-1]
-    costate, curve, total = end_slope[0] + pull[-1, :n], end_curve[0], 0.0
+    hessian = hessian + bend[:-1]
+    costate, curve, total = end_slope[0] + pull[-1, :n], end_curve[0] + bend[-1, :n, :n], 0.0
     low, high = np.array(problem.control_coordinates.low), np.array(problem.control_coordinates.high)
     for t in range(len(A) - 1, -1, -1):
         slope = gradient[t, n:] + B[t].T @ costate
