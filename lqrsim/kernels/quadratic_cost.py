@@ -1,31 +1,35 @@
-"""`1/2 (x - about)' weight (x - about)`, of the state. The numba subset; see `declarations.py`.
+"""`1/2 (z - about)' weight (z - about)`, z the state or the control. The numba subset; see `declarations.py`.
 
-`data` has about (N,), then weight (N, N), row by row.
+`data` has about (size,), then weight (size, size), row by row.
 """
 
-from lqrsim.kernels.declarations import N
+from lqrsim.kernels.declarations import M, N
+
+CONTROL = False  # whether it is of the control
 
 
 def value(x, u, t, data):
     """The cost."""
+    z, size = (u, M) if CONTROL else (x, N)
     total = 0.0
-    for i in range(N):
+    for i in range(size):
         slope = 0.0
-        for j in range(N):
-            slope += data[N + N * i + j] * (x[j] - data[j])
-        total += 0.5 * slope * (x[i] - data[i])
+        for j in range(size):
+            slope += data[size + size * i + j] * (z[j] - data[j])
+        total += 0.5 * slope * (z[i] - data[i])
     return total
 
 
 def derivatives(x, u, t, data, hessian, gradient):
-    """Add the Hessian and the gradient, and return the cost."""
+    """Add the Hessian and the gradient, in which the states come first, and return the cost."""
+    z, size, first = (u, M, N) if CONTROL else (x, N, 0)
     total = 0.0
-    for i in range(N):
+    for i in range(size):
         slope = 0.0
-        for j in range(N):
-            weight = data[N + N * i + j]
-            slope += weight * (x[j] - data[j])
-            hessian[i, j] += weight
-        gradient[i] += slope
-        total += 0.5 * slope * (x[i] - data[i])
+        for j in range(size):
+            weight = data[size + size * i + j]
+            slope += weight * (z[j] - data[j])
+            hessian[first + i, first + j] += weight
+        gradient[first + i] += slope
+        total += 0.5 * slope * (z[i] - data[i])
     return total

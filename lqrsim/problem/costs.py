@@ -30,7 +30,7 @@ from lqrsim.errors import (
     check_weight,
     excerpt,
 )
-from lqrsim.kernels import control_cost, cost_differences, function_cost, obstacle_cost, quadratic_cost
+from lqrsim.kernels import cost_differences, function_cost, obstacle_cost, quadratic_cost
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
 
@@ -125,7 +125,7 @@ class QuadraticCost(Cost):
 
     def bind(self, dynamics: Dynamics) -> Term:
         _check_size("QuadraticCost: weight", self.weight, len(dynamics.state_coordinates), "states")
-        return Term(source_of(quadratic_cost), np.concatenate([self.about, self.weight.ravel()]))
+        return Term(source_of(quadratic_cost, CONTROL=False), np.concatenate([self.about, self.weight.ravel()]))
 
 
 class ControlCost(Cost):
@@ -145,7 +145,7 @@ class ControlCost(Cost):
     def bind(self, dynamics: Dynamics) -> Term:
         _check_size("ControlCost: weight", self.weight, len(dynamics.control_coordinates), "controls")
         numbers = np.concatenate([self.about, self.weight.ravel()])
-        return Term(source_of(control_cost), numbers, uses_control=True)
+        return Term(source_of(quadratic_cost, CONTROL=True), numbers, uses_control=True)
 
 
 class ObstacleCost(Cost):
