@@ -85,7 +85,7 @@ class Core:
         if stored is None or not _restore(dispatcher, stored):
             what = f"{name} for {self.what}"
             compilations.append(what)
-            # A warning is what a script shows that has not set up logging, and half a minute of silence is worse.
+            # A warning is what a script shows that has not set up logging, and a long silence is worse.
             log = logger.warning if name in LONG else logger.debug
             last = disk.noted(name)
             took = "which can take a minute" if last is None else f"which took {last:.0f} s the last time"
@@ -289,10 +289,9 @@ def _uncollected() -> Iterator[None]:
 def _as_one() -> Iterator[None]:
     """Optimise and make machine code of the entry alone, into which all is linked that it calls, and not of each part.
 
-    numba does both. That takes twice as long (31 s of processor time in place of 16 for the quadrotor's smoother), and
-    then it is up to the linker which of two copies of a part runs: they differ in the last bit, so the run that
-    compiles and the one that loads would not give the same numbers. Both are why numba's own classes are replaced here,
-    for as long as a core is compiled, and only where they are as expected.
+    numba does both. That takes far longer, and then it is up to the linker which of two copies of a part runs: they
+    differ in the last bit, so the run that compiles and the one that loads would not give the same numbers. Both are
+    why numba's own classes are replaced here, for as long as a core is compiled, and only where they are as expected.
     """
     from numba.core import codegen, registry
     from numba.core.compiler_lock import global_compiler_lock
