@@ -27,7 +27,6 @@ from lqrsim.results.value_functions import Moments, Quadratic
 VERSIONS = {"solution": 5, "rollout": 4}
 
 # Shapes in letters: T steps, n states, m controls; the others stand for whatever it is, but the same in all of a file.
-Shapes = Mapping[str, str]
 _PLAN = {"trajectory.controls": "T m", "trajectory.states": "T+1 n"}
 
 _SOLUTION_ARRAYS = _PLAN | {

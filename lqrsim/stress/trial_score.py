@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtr
 
 from lqrsim.control.controllers import Controller
 from lqrsim.errors import (
@@ -222,8 +222,3 @@ class TrialScore:
 def normal_tail(distance: float) -> float:
     """Probability that a standard normal number is larger."""
     return float(ndtr(-distance))
-
-
-def normal_distance(probability: float) -> float:
-    """What a standard normal number exceeds with that probability."""
-    return float(-ndtri(probability))
