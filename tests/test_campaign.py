@@ -370,6 +370,36 @@ def test_a_shard_of_another_campaign_is_not_taken(reference: Results, tmp_path: 
     assert (other.folder / "shards" / name).read_bytes() == good
 
 
+SCRIPT = """
+import sys
+if {dies} and __name__ == "__mp_main__":
+    sys.exit(3)
+import lqrsim as ls
+campaign = ls.Campaign(scenario="quadrotor", sweeps={{"force": (ls.ForceNoise(0.1),)}}, policies=("smooth",), trials=1)
+ls.run_campaign(campaign, sys.argv[1], workers=1)
+"""
+
+
+@pytest.mark.parametrize(
+    ("dies", "got"),
+    [
+        (False, "a script that each worker runs as it starts"),
+        (True, "processes that do not start (its worker ended 3 times, at last with exit code 3)"),
+    ],
+)
+def test_a_script_that_its_workers_run_too_is_refused(dies: bool, got: str, tmp_path: Path) -> None:
+    """In one line, and without waiting for ever for a process that has died to take what no pipe holds at once."""
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT.format(dies=dies), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, script, tmp_path / "run"], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr.count("Traceback") == 1  # the script's own; none of a worker
+    wanted = 'run_campaign() called under `if __name__ == "__main__":`, or workers=0'
+    assert done.stderr.splitlines()[-1] == f"lqrsim.errors.InputError: workers: got {got}, want {wanted}"
+
+
 def test_a_full_disk_stops_it_until_there_is_room(
     reference: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

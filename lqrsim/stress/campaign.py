@@ -65,6 +65,7 @@ def run_campaign(
       InputError: something that is asked can not be run; the folder is another campaign's, no campaign's, being
         written, or on a full disk; or the cluster can not be reached.
     """
+    executors.end_if_started_by_import()
     check_kind("campaign", campaign, Campaign, "a Campaign")
     folder = check_path("folder", folder, "the path of a folder")
     workers = processors() if workers is None else check_count("workers", workers, at_least=0, at_most=MOST_WORKERS)

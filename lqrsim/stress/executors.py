@@ -30,6 +30,10 @@ ATTEMPTS = 3  # of a shard, and to start a process
 _START_TIMEOUT = 300.0  # s; a process that is not ready by then never will be
 _ONE_THREAD = ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMBA")
 _context = multiprocessing.get_context("spawn")  # forking a process that has threads is not safe
+_NAME = "lqrsim worker"
+_RUNS_THE_SCRIPT = 79  # exit code of a worker that would start the campaign once more
+_GUARD = 'run_campaign() called under `if __name__ == "__main__":`, or workers=0'
+_serving = False  # whether this process is a worker that has imported the caller's script
 
 
 def run_here(job: Job, shards: Iterable[Shard]) -> FinishedShards:
@@ -69,12 +73,11 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
                     continue
                 worker.end()
                 attempts[shard] += worker.ready
+                if worker.process.exitcode == _RUNS_THE_SCRIPT:
+                    raise InputError(f"workers: got a script that each worker runs as it starts, want {_GUARD}")
                 failed_starts = 0 if worker.ready else failed_starts + 1
                 if failed_starts == ATTEMPTS:
-                    raise InputError(
-                        f"workers: got processes that do not start ({answer}), want a script to call run() under"
-                        ' `if __name__ == "__main__":`, or workers=0'
-                    )
+                    raise InputError(f"workers: got processes that do not start ({answer}), want {_GUARD}")
                 if worker.late or attempts[shard] == ATTEMPTS:
                     yield shard, failed_work(job, shard, answer)
                 else:
@@ -84,12 +87,30 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
             worker.end()
 
 
+def end_if_started_by_import() -> None:
+    """End this process if it is a worker that imports the caller's script, which starts the campaign unguarded.
+
+    Python refuses only that such a process starts others, with a page of text from each, and after all that the script
+    does before. The driver reads the exit code.
+    """
+    if multiprocessing.current_process().name == _NAME and not _serving:
+        sys.exit(_RUNS_THE_SCRIPT)
+
+
 class _Worker:
-    """A process, and the shard that it has."""
+    """A process, and the shard that it has.
+
+    It says `STARTED` when it has imported the caller's script, is then given the job and the shard, and says `READY`
+    when it can begin. The job is not among the process's arguments: Python writes those to a pipe whose other end it
+    keeps open meanwhile, and if the process dies before it reads them it waits for ever, deaf to Ctrl-C.
+    """
+
+    STARTED, READY = "started", "ready"
 
     def __init__(self, job: Job) -> None:
+        self.job = job
         self.connection, theirs = _context.Pipe()
-        self.process = _context.Process(target=_serve, args=(theirs, job), name="lqrsim worker", daemon=True)
+        self.process = _context.Process(target=_serve, args=(theirs,), name=_NAME, daemon=True)
         with process.uninterrupted(), _surroundings(), _without_ctrl_c():
             self.process.start()
         theirs.close()  # so that its death is an end of file here
@@ -101,25 +122,29 @@ class _Worker:
         self.shard = shard
         if self.ready:
             self.deadline = time.monotonic() + time_limit
-        with contextlib.suppress(OSError):  # it has died, which its answer will tell
-            self.connection.send(shard)
+            with contextlib.suppress(OSError):  # it has died, which its answer will tell
+                self.connection.send(shard)
 
     def answer(self, time_limit: float) -> bytes | str | None:
         """The shard's file; or why there will be none; or None where it is still being done."""
         try:
             while self.connection.poll():
                 message = self.connection.recv()
-                if message is not None:
+                if message == self.STARTED:
+                    self.connection.send(self.job)
+                    self.connection.send(self.shard)
+                elif message == self.READY:
+                    self.ready = True  # its clock starts now
+                    self.deadline = time.monotonic() + time_limit
+                else:
                     return message
-                self.ready = True  # its clock starts now
-                self.deadline = time.monotonic() + time_limit
         except (EOFError, OSError):
             self.process.join(5.0)
             return f"its worker ended {ATTEMPTS} times, at last with {_exit(self.process.exitcode)}"
         if time.monotonic() < self.deadline:
             return None
         self.late = self.ready
-        return f"took longer than {time_limit:g} s, and was stopped"
+        return f"took longer than {time_limit if self.ready else _START_TIMEOUT:g} s, and was stopped"
 
     def end(self) -> None:
         """Stop the process, whatever it does."""
@@ -128,13 +153,20 @@ class _Worker:
         self.process.join()
 
 
-def _serve(connection: Connection, job: Job) -> None:
+def _serve(connection: Connection) -> None:
     """What a worker does."""
+    global _serving
+    _serving = True
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all of a terminal's processes; the driver decides
+    try:
+        connection.send(_Worker.STARTED)
+        job = connection.recv()
+    except (EOFError, OSError):  # the driver is gone
+        return
     prepare(job)
-    with contextlib.suppress(EOFError, OSError):  # the driver is gone
-        connection.send(None)
+    with contextlib.suppress(EOFError, OSError):
+        connection.send(_Worker.READY)
         while True:
             connection.send(work(job, connection.recv()))
 
