@@ -232,6 +232,26 @@ def test_what_a_plain_function_raises_ends_the_solve_with_its_words() -> None:
     assert set(calls) == {threading.get_ident()}
 
 
+@pytest.mark.parametrize(
+    ("start", "where"),
+    [
+        ([1.0], "rollout of the initial controls"),  # of which the angle grows from 0 beyond 0.5
+        (None, "the line search found no lower cost"),  # for the pendulum that hangs is to stand up
+    ],
+)
+def test_what_a_plain_function_raises_in_ilqr_is_said_in_its_words(start: list[float] | None, where: str) -> None:
+    def fragile(x, u, p):
+        if x[0] > 0.5:
+            raise ZeroDivisionError("the angle is beyond me")
+        return pendulum(x, u, p)
+
+    problem = swing(ls.Dynamics(fragile, level="plain", **FIELDS), COSTS["compiled"])
+    for solution in (ls.ilqr(problem, start=start), *ls.ilqr_many([problem], start=start)):
+        assert not solution.status.success
+        assert solution.detail.startswith(f"{where}: ")
+        assert solution.detail.endswith("fragile(x, u, p) raised ZeroDivisionError: the angle is beyond me")
+
+
 def test_ctrl_c_in_a_plain_function_stops_the_solve() -> None:
     calls = []
 

@@ -177,13 +177,16 @@ class Termination:
         return self.outcome in (declarations.NOT_POSITIVE_DEFINITE, declarations.NOT_FINITE)
 
     def detail(self, steps: int) -> str:
-        """What there is to say besides the status."""
+        """What there is to say besides the status: where it ended, and what a user's function raised there."""
+        raised = "" if self.success or self.outcome == declarations.TIMED_OUT else self.raised
+        return ": ".join(part for part in (self._place(steps), raised) if part)
+
+    def _place(self, steps: int) -> str:
         if self.pass_failed:
-            which = "backward" if self.backward else "forward"
             if self.iterations and self.failed < 0:
-                return self.raised
-            place = f"{which} pass of iteration {len(self.iterations) + 1}, step {self.failed} of {steps}"
-            return f"{place}: {self.raised}" if self.raised else place
+                return ""
+            which = "backward" if self.backward else "forward"
+            return f"{which} pass of iteration {len(self.iterations) + 1}, step {self.failed} of {steps}"
         if self.outcome == declarations.NO_START:
             return "rollout of the initial controls"
         if self.outcome == declarations.CYCLING:
