@@ -63,7 +63,8 @@ def run_campaign(
 
     Raises:
       InputError: something that is asked can not be run; the folder is another campaign's, no campaign's, being
-        written, or on a full disk; or the cluster can not be reached.
+        written, or on a full disk; the cluster can not be reached; or a script calls this with workers, and not under
+        `if __name__ == "__main__":`, so that each of them would call it again.
     """
     executors.end_if_started_by_import()
     check_kind("campaign", campaign, Campaign, "a Campaign")
