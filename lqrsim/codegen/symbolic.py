@@ -73,9 +73,17 @@ def _writers() -> str:
 
 
 def trace(
-    function: Callable[..., Any], states: int, controls: int, parameters: Sequence[str]
+    function: Callable[..., Any],
+    states: int,
+    controls: int,
+    parameters: Sequence[str],
+    *,
+    constants: Mapping[str, float] | None = None,
 ) -> tuple[list[Any], list[Any], list[Any]]:
     """Call `function(x, u, p)` with symbols.
+
+    Args:
+      constants: further attributes of p, which are numbers and not symbols.
 
     Returns:
       The expressions it returned (one, or a list of them), the symbols x[0], x[1], ..., and the symbols u[0], ....
@@ -88,6 +96,8 @@ def trace(
     x = [sympy.Symbol(f"x{i}", real=True) for i in range(states)]
     u = [sympy.Symbol(f"u{i}", real=True) for i in range(controls)]
     p = Parameters(**{name: sympy.Symbol(f"p{i}", real=True) for i, name in enumerate(parameters)})
+    for constant, value in (constants or {}).items():  # a whole number as one, so that x + 0 and 1 * x are x
+        setattr(p, constant, sympy.Integer(int(value)) if float(value).is_integer() else sympy.Float(value))
     name = getattr(function, "__qualname__", repr(function))
     try:
         returned = function(tuple(x), tuple(u), p)

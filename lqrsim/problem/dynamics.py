@@ -56,6 +56,10 @@ class Dynamics:
         attributes.
       states, controls: name -> unit, in order.
       parameters: name -> value. Values are data: changing one compiles nothing.
+      disturbances: what is unknown when planning, as a wind or the share of its force that a motor has left: name ->
+        the value that the plan takes for granted, mostly 0 or 1. To f they are parameters. Plans know them as constants
+        and are not slowed down; `disturbed` has them as parameters, for estimating them. Names with a meaning to
+        `uncertainty_of`: wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; all in the world's axes.
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
         x, y and z, in this order.
       plane, offset: in which plane a position of 2 states is, as "xz", and where that is along the third axis, in
@@ -79,6 +83,7 @@ class Dynamics:
         states: Mapping[str, str],
         controls: Mapping[str, str],
         parameters: Mapping[str, float] | None = None,
+        disturbances: Mapping[str, float] | None = None,
         position: Sequence[str] = (),
         plane: str = "",
         offset: float | None = None,
@@ -131,6 +136,12 @@ class Dynamics:
             level_of(jacobian, self.level)
             check_signature(jacobian, ("x", "u", "p", "fx", "fu"))
         self.parameters = symbolic.check_parameters(parameters)
+        self.disturbances = symbolic.check_parameters(disturbances)
+        twice = self.parameters.keys() & self.disturbances.keys()
+        if twice:
+            raise InputError(f"disturbances: got {min(twice)!r}, which is among the parameters, want other names")
+        if self.level != "symbolic":  # nothing is to be gained there from taking them for constants
+            self.parameters = self.parameters | self.disturbances
         self.state_coordinates = Coordinates(
             names=names,
             units=tuple(states.values()),
@@ -151,7 +162,7 @@ class Dynamics:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is derived and can not be pickled."""
-        return {name: value for name, value in vars(self).items() if name != "_plain"}
+        return {name: value for name, value in vars(self).items() if name not in ("_plain", "disturbed")}
 
     @property
     def name(self) -> str:
@@ -166,8 +177,18 @@ class Dynamics:
         """
         for name in values:
             check_name("parameters", name, self.parameters)
-        other = copy.copy(self)  # without `_plain`, which has the old values
+        other = copy.copy(self)  # without `_plain` and `disturbed`, which have the old values
         other.parameters = self.parameters | symbolic.check_parameters(values)
+        return other
+
+    @cached_property
+    def disturbed(self) -> "Dynamics":
+        """The same, but that the disturbances are parameters, too; at their values it moves as this does."""
+        if self.disturbances.keys() <= self.parameters.keys():
+            return self
+        other = copy.copy(self)
+        vars(other).pop("source", None)
+        other.parameters = self.parameters | self.disturbances
         return other
 
     @property
@@ -195,12 +216,17 @@ class Dynamics:
                 return source_of(function_dynamics)
             return f"{source_of(function_dynamics, 'rate')}\n\n{source_of(finite_differences)}"
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
-        details = ("dynamics", *names)
+        details = ("dynamics", *names, *self._constants.items())
         return symbolic.kept(self.f, details, lambda: {"source": self._trace()})["source"]
+
+    @property
+    def _constants(self) -> dict[str, float]:
+        """The disturbances that are taken for granted."""
+        return {name: value for name, value in self.disturbances.items() if name not in self.parameters}
 
     def _trace(self) -> str:
         n, m = len(self.state_coordinates), len(self.control_coordinates)
-        rates, x, u = symbolic.trace(self.f, n, m, list(self.parameters))
+        rates, x, u = symbolic.trace(self.f, n, m, list(self.parameters), constants=self._constants)
         if len(rates) != n:
             states = ", ".join(self.state_coordinates.names)
             raise InputError(f"{self.name}(x, u, p): got {len(rates)} entries, want {n}: one for each of {states}")

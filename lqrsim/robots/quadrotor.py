@@ -78,6 +78,7 @@ def _dynamics(robot: Quadrotor) -> Dynamics:
         states={name: unit for names, unit in units.items() for name in names.split()},
         controls={f"rotor_{i}": "N" for i in (1, 2, 3, 4)},
         parameters={name: getattr(robot, name) for name in constants},
+        disturbances={f"{what}_{axis}": 0.0 for what in ("wind", "force", "torque") for axis in "xyz"},
         position=("x", "y", "z"),
         rotation_vectors=(("rx", "ry", "rz"),),
         control_limits=(0.0, robot.max_force),
@@ -87,8 +88,11 @@ def _dynamics(robot: Quadrotor) -> Dynamics:
 def _rate(x: Any, u: Any, p: Any) -> list[Any]:
     velocity, rotation, w = x[3:6], x[6:9], x[9:12]
     thrust = rotations.rotate(rotation, [0, 0, sum(u)])
-    acceleration = [(thrust[i] - p.drag * velocity[i]) / p.mass for i in range(3)]
+    wind, force, push = ([getattr(p, f"{what}_{axis}") for axis in "xyz"] for what in ("wind", "force", "torque"))
+    acceleration = [(thrust[i] + force[i] - p.drag * (velocity[i] - wind[i])) / p.mass for i in range(3)]
     acceleration[2] -= p.gravity
     # The inertia is the same about each axis, so the gyroscopic term w x J w is zero.
     torque = [p.arm * (u[1] - u[3]), p.arm * (u[2] - u[0]), p.torque_ratio * (u[0] - u[1] + u[2] - u[3])]
+    turned = rotations.rotate([-angle for angle in rotation], push)  # into the body's axes
+    torque = [own + pushed for own, pushed in zip(torque, turned, strict=True)]
     return [*velocity, *acceleration, *rotations.vector_rate(rotation, w), *(t / p.inertia for t in torque)]
