@@ -6,6 +6,12 @@ from . import scenarios as scenarios
 from .control.controllers import Controller as Controller
 from .control.controllers import Feedback as Feedback
 from .control.controllers import Replanning as Replanning
+from .control.offset_free import OffsetFree as OffsetFree
+from .control.tracking import track as track
+from .control.tubes import Tube as Tube
+from .control.tubes import predict_tube as predict_tube
+from .control.uncertainty import Uncertainty as Uncertainty
+from .control.uncertainty import Unknown as Unknown
 from .errors import InputError as InputError
 from .problem.constraints import Clearance as Clearance
 from .problem.constraints import Constraint as Constraint

@@ -39,6 +39,21 @@ def signed_distance_displaced(world_seen: World, points: Array, displaced: Array
     return out.reshape(trials, count)
 
 
+def distances_with_normals(world_seen: World, points: npt.ArrayLike) -> tuple[Array, Array]:
+    """The signed distance of points (K, 2 or 3) to each obstacle, (K, O), and the directions in which it grows.
+
+    The directions are along the world's axes as seen, (K, O, 2 or 3).
+    """
+    points = np.asarray(points, dtype=np.float64)
+    flat, count = np.zeros((len(points), 3)), len(world_seen)
+    flat[:, : points.shape[1]] = points
+    out, normals = np.empty(len(flat) * count), np.empty((len(flat) * count, 3))
+    with compiling:
+        distances = _distance_core()
+    distances.each_with_normal(count, len(flat), np.array(world_seen.table).ravel(), flat, out, normals)
+    return out.reshape(-1, count), normals.reshape(len(flat), count, 3)[..., : points.shape[1]]
+
+
 @cache
 def _distance_core() -> Core:
     return Core(source_of(kernel), {"ROW": declarations.ROW}, "distances to obstacles")

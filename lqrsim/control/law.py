@@ -42,7 +42,14 @@ def turn_to_nearest(space: Coordinates, states: Array, nominal: Array) -> None:
 
 @cache
 def _policy_core(n: int, m: int, angles: tuple[int, ...], rotation_vectors: tuple[int, ...]) -> Core:
+    own = source_of(policy_evaluation, "apply_law", "turn_all")
+    source = f"{turn_source(angles, rotation_vectors)}\n{own}"
+    return Core(source, {"N": n, "M": m}, f"policies of {n} states and {m} controls")
+
+
+def turn_source(angles: tuple[int, ...], rotation_vectors: tuple[int, ...]) -> str:
+    """Source of `turn` of `kernels/policy_evaluation.py`."""
     turns = [f"    nearest_angle(x, nominal, {i})" for i in angles]
     turns += [f"    nearest_rotation(x, nominal, {i})" for i in rotation_vectors]
-    source = "\n".join([source_of(policy_evaluation), "def turn(x, nominal):", *(turns or ["    pass"])])
-    return Core(source, {"N": n, "M": m}, f"policies of {n} states and {m} controls")
+    functions = source_of(policy_evaluation, "nearest_angle", "nearest_rotation")
+    return "\n".join([functions, "def turn(x, nominal):", *(turns or ["    pass"])])

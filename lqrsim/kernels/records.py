@@ -202,6 +202,23 @@ class Descent(NamedTuple):
     certificate: Arrays
 
 
+class Predictor(NamedTuple):
+    """What takes estimates a control period on: see `estimation.py`.
+
+    Attributes:
+      parameters, dt: of the dynamics, as in `Model`. places: which of them are unknown, (P,).
+      lag: how much is left of the distance to a command at the end of a period, and in the mean over it, (2,).
+      transition: of the unknowns' states, (D, D). output: from these to the unknowns' values, (V, D).
+    """
+
+    parameters: Arrays
+    dt: float
+    places: Arrays
+    lag: Arrays
+    transition: Arrays
+    output: Arrays
+
+
 def _row(*names: str) -> np.dtype[np.void]:
     return np.dtype([(name, np.float64) for name in names])
 

@@ -157,3 +157,13 @@ def nearest_displaced(obstacles, count, each, data, points, displaced, out):
             distance = signed_distance(data, ROW * k, x, y, z)
             if not distance >= out[i]:
                 out[i] = distance
+
+
+def each_with_normal(obstacles, count, data, points, distances, normals):
+    """Write the distance to each obstacle of `count` points (any, 3), and which way it grows: (any,), (any, 3)."""
+    curve = stack(3, 3)
+    for i in range(count):
+        for k in range(obstacles):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            at = i * obstacles + k
+            distances[at] = signed_distance_derivatives(data, ROW * k, x, y, z, normals[at], curve)

@@ -58,8 +58,8 @@ class Dynamics:
       parameters: name -> value. Values are data: changing one compiles nothing.
       disturbances: what is unknown when planning, as a wind or the share of its force that a motor has left: name ->
         the value that the plan takes for granted, mostly 0 or 1. To f they are parameters. Plans know them as constants
-        and are not slowed down; `disturbed` has them as parameters, for estimating them. Names with a meaning to
-        `uncertainty_of`: wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; all in the world's axes.
+        and are not slowed down; `disturbed` has them as parameters, for estimating them. Names that `uncertainty_of`
+        knows: wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; in the world's axes.
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
         x, y and z, in this order.
       plane, offset: in which plane a position of 2 states is, as "xz", and where that is along the third axis, in
@@ -135,13 +135,7 @@ class Dynamics:
             check_function("jacobian", jacobian, "a function of (x, u, p, fx, fu)")
             level_of(jacobian, self.level)
             check_signature(jacobian, ("x", "u", "p", "fx", "fu"))
-        self.parameters = symbolic.check_parameters(parameters)
-        self.disturbances = symbolic.check_parameters(disturbances)
-        twice = self.parameters.keys() & self.disturbances.keys()
-        if twice:
-            raise InputError(f"disturbances: got {min(twice)!r}, which is among the parameters, want other names")
-        if self.level != "symbolic":  # nothing is to be gained there from taking them for constants
-            self.parameters = self.parameters | self.disturbances
+        self.parameters, self.disturbances = _parameters_of(parameters, disturbances, self.level)
         self.state_coordinates = Coordinates(
             names=names,
             units=tuple(states.values()),
@@ -297,6 +291,17 @@ class Dynamics:
     def _numbers(self) -> Array:
         """What `p` is in the compiled functions, with the places of the functions for their addresses."""
         return np.concatenate([np.arange(len(self.functions), dtype=np.float64), self.data])
+
+
+def _parameters_of(
+    parameters: Mapping[str, float] | None, disturbances: Mapping[str, float] | None, level: str
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Both, checked; where nothing is gained from taking disturbances for constants, they are among the parameters."""
+    own, unknown = symbolic.check_parameters(parameters), symbolic.check_parameters(disturbances)
+    twice = own.keys() & unknown.keys()
+    if twice:
+        raise InputError(f"disturbances: got {min(twice)!r}, which is among the parameters, want other names")
+    return (own if level == "symbolic" else own | unknown), unknown
 
 
 def _limits_of(control_limits: Limits | None, count: int) -> tuple[list[float], list[float]]:

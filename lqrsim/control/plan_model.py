@@ -1,0 +1,298 @@
+"""The linear model about a plan that tracking laws, filters and tubes are made of.
+
+A deviation from the plan is z = (e, a, d): of the state (n), of what the actuators have reached (m of them if they lag,
+else none), and the states of the unknowns (D). With u the deviation of the command,
+
+    z_{t+1} = F_t z_t + G_t u_t + c_t + w_t,   y_t = H_t e_t + v_t.
+
+c is what the lag does to a plan that does not know of it: the actuators' nominal is what they reach when they are given
+the planned controls.
+"""
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+
+from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order
+from lqrsim.codegen.kernel_source import source_of
+from lqrsim.control.law import turn_source
+from lqrsim.control.sensors import Sensor, sensor_of
+from lqrsim.control.uncertainty import GAIN, OFFSET, Uncertainty, Unknown, per_entry, shaping_filter
+from lqrsim.errors import Array
+from lqrsim.kernels import estimation, linear_algebra, rotation_ratios, runge_kutta
+from lqrsim.kernels.records import Predictor
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results.solution_parts import Trajectory
+
+STEP = 1e-5  # of a parameter for differences, relative to its standard deviation where that is larger than to 1
+
+
+@dataclass(frozen=True)
+class Lag:
+    """A first-order lag of the actuators over a control period: how much is left of the distance to the command at its
+    end, and in the mean over it.
+    """
+
+    left: float
+    mean: float
+
+    @classmethod
+    def of(cls, time_constant: float, dt: float) -> "Lag":
+        if time_constant == 0:
+            return cls(0.0, 0.0)
+        step = dt / time_constant
+        return cls(float(np.exp(-step)), float(-np.expm1(-step) / step))
+
+
+@dataclass(frozen=True)
+class PlanModel:
+    """A plan with what is uncertain about it, linearised.
+
+    Attributes:
+      dynamics: with the disturbances as parameters.
+      plan: nominal states (T+1, n) and controls (T, m).
+      uncertainty: what there is. sensor: what is measured.
+    """
+
+    dynamics: Dynamics
+    plan: Trajectory
+    uncertainty: Uncertainty
+    sensor: Sensor
+
+    @classmethod
+    def of(
+        cls, dynamics: Dynamics, plan: Trajectory, uncertainty: Uncertainty, sensor: Sensor | None = None
+    ) -> "PlanModel":
+        """Raises InputError where the uncertainty does not fit the dynamics."""
+        uncertainty.check(dynamics)
+        return cls(dynamics.disturbed, plan, uncertainty, sensor or sensor_of(None, dynamics.state_coordinates))
+
+    # Sizes.
+
+    @property
+    def n(self) -> int:
+        return self.plan.states.shape[1]
+
+    @property
+    def m(self) -> int:
+        return self.plan.controls.shape[1]
+
+    @cached_property
+    def lagging(self) -> int:
+        """How many entries of z the actuators take."""
+        return self.m if self.uncertainty.lag > 0 else 0
+
+    @cached_property
+    def lag(self) -> Lag:
+        return Lag.of(self.uncertainty.lag, self.plan.dt)
+
+    @cached_property
+    def remembered(self) -> tuple[Unknown, ...]:
+        """The unknowns that have states."""
+        return tuple(one for one in self.uncertainty.unknowns if not one.white)
+
+    @property
+    def size(self) -> int:
+        """Of z."""
+        return self.n + self.lagging + len(self.transition)
+
+    # What the unknowns do.
+
+    @cached_property
+    def parameters(self) -> tuple[str, ...]:
+        """Those of the dynamics that are unknown."""
+        named = (name for one in self.uncertainty.unknowns for name in one.shares)
+        return tuple(dict.fromkeys(name for name in named if name in self.dynamics.parameters))
+
+    @cached_property
+    def _filters(self) -> list[tuple[Array, Array, Array, Array]]:
+        return [shaping_filter(one, self.plan.dt) for one in self.remembered]
+
+    @cached_property
+    def transition(self) -> Array:
+        """Of the unknowns' states, (D, D)."""
+        return _diagonal([part[0] for part in self._filters])
+
+    @cached_property
+    def output(self) -> Array:
+        """From the unknowns' states to values of the parameters, and the gain and the offset of each control."""
+        columns = [
+            self._column(one)[:, None] * part[2] for one, part in zip(self.remembered, self._filters, strict=True)
+        ]
+        return np.concatenate([np.zeros((len(self.parameters) + 2 * self.m, 0)), *columns], axis=1)
+
+    def _column(self, unknown: Unknown) -> Array:
+        """Its shares of these values."""
+        controls, own = self.dynamics.control_coordinates.names, len(self.parameters)
+        column = np.zeros(own + 2 * self.m)
+        for name, share in unknown.shares.items():
+            if name.startswith(GAIN):
+                column[own + controls.index(name.removeprefix(GAIN))] = share
+            elif name.startswith(OFFSET):
+                column[own + self.m + controls.index(name.removeprefix(OFFSET))] = share
+            else:
+                column[self.parameters.index(name)] = share
+        return column
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        """What takes estimates on."""
+        lag = np.array([self.lag.left, self.lag.mean])
+        return Predictor(self.numbers, self.plan.dt, self.places, lag, self.transition, self.output)
+
+    # Along the plan.
+
+    @cached_property
+    def core(self) -> Core:
+        """Its kernels, compiled."""
+        with compiling:
+            space = self.dynamics.state_coordinates
+            sizes = {
+                "N": self.n, "M": self.m, "W": self.n + self.m, "LAG": self.lagging, "D": len(self.transition),
+                "Y": self.sensor.size, "P": len(self.parameters), "Z": self.size,
+                "V": len(self.parameters) + 2 * self.m, "NUMBERS": len(self.numbers),
+                "HELD": max(len(self.transition), 1),
+            }  # fmt: skip
+            sources = self.dynamics.source, self.sensor.source, turn_source(space.angles, space.rotation_vectors)
+            return _core(sources, tuple(sizes.items()), f"{self.dynamics.name} ({self.n} states, {self.m} controls)")
+
+    @cached_property
+    def numbers(self) -> Array:
+        """What the compiled dynamics take: addresses of functions, then parameters."""
+        addresses = [address_of(function) for function in self.dynamics.functions]
+        return np.array([*addresses, *self.dynamics.data], dtype=np.float64)
+
+    @cached_property
+    def places(self) -> Array:
+        """Where the unknown parameters are among the numbers."""
+        names, first = list(self.dynamics.parameters), len(self.dynamics.functions)
+        return np.array([first + names.index(name) for name in self.parameters], dtype=np.float64)
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """[A B] of each step, (T, n, n + m)."""
+        plan = self.plan
+        ahead, jacobian = np.empty((plan.steps, self.n)), np.empty((plan.steps, self.n, self.n + self.m))
+        states, controls = in_c_order(plan.states), in_c_order(plan.controls)
+        self.core.slopes_along(plan.steps, states, controls, self.numbers, plan.dt, ahead, jacobian)
+        return jacobian
+
+    @cached_property
+    def effects(self) -> Array:
+        """Of the parameters, gains and offsets on the next state, (T, n, P + 2 m)."""
+        plan, count = self.plan, len(self.parameters)
+        B = self.jacobian[:, :, self.n :]
+        slopes = np.empty((plan.steps, self.n, count))
+        if count:
+            values = np.array([self.dynamics.parameters[name] for name in self.parameters])
+            changes = STEP * np.maximum(np.abs(values), 1.0)
+            states, controls = in_c_order(plan.states), in_c_order(plan.controls)
+            self.core.parameter_slopes(
+                plan.steps, states, controls, self.numbers, plan.dt, self.places, changes, slopes
+            )
+        return np.concatenate([slopes, B * plan.controls[:, None, :], B], axis=2)
+
+    @cached_property
+    def E(self) -> Array:
+        """Of the unknowns' states on the next state, (T, n, D)."""
+        return self.effects @ self.output
+
+    @cached_property
+    def F(self) -> Array:
+        """(T, Z, Z)."""
+        n, a, lag = self.n, self.lagging, self.lag
+        F = np.zeros((self.plan.steps, self.size, self.size))
+        F[:, :n, :n] = self.jacobian[:, :, :n]
+        F[:, :n, n : n + a] = lag.mean * self.jacobian[:, :, n : n + a]
+        F[:, :n, n + a :] = self.E
+        F[:, n : n + a, n : n + a] = lag.left * np.eye(a)
+        F[:, n + a :, n + a :] = self.transition
+        return F
+
+    @cached_property
+    def G(self) -> Array:
+        """(T, Z, m)."""
+        n, a, lag = self.n, self.lagging, self.lag
+        G = np.zeros((self.plan.steps, self.size, self.m))
+        G[:, :n] = (1 - lag.mean) * self.jacobian[:, :, n:]
+        G[:, n : n + a] = (1 - lag.left) * np.eye(self.m)[:a]
+        return G
+
+    @cached_property
+    def reached(self) -> Array:
+        """What the actuators reach at each knot when they are given the planned controls, (T+1, m or none)."""
+        plan, a = self.plan, self.lagging
+        reached = np.zeros((plan.steps + 1, a))
+        reached[0] = plan.controls[0, :a]
+        for t in range(plan.steps if a else 0):
+            reached[t + 1] = plan.controls[t] + self.lag.left * (reached[t] - plan.controls[t])
+        return reached
+
+    @cached_property
+    def c(self) -> Array:
+        """(T, Z)."""
+        n, a = self.n, self.lagging
+        c = np.zeros((self.plan.steps, self.size))
+        if a:
+            behind = self.lag.mean * (self.reached[:-1] - self.plan.controls)
+            c[:, :n] = np.einsum("tij,tj->ti", self.jacobian[:, :, n:], behind)
+        return c
+
+    @cached_property
+    def H(self) -> Array:
+        """(T+1, Y, n)."""
+        H = np.empty((self.plan.steps + 1, self.sensor.size, self.n))
+        self.core.sensor_slopes(len(H), in_c_order(self.plan.states), self.sensor.data, H)
+        return H
+
+    # Noise.
+
+    @cached_property
+    def start(self) -> Array:
+        """Covariance of z at the start, (Z, Z)."""
+        std = per_entry("Uncertainty: start", self.uncertainty.start, self.dynamics.state_coordinates)
+        at_rest = np.zeros((self.lagging, self.lagging))
+        return _diagonal([np.diag(std**2), at_rest, *(part[3] for part in self._filters)])
+
+    @cached_property
+    def process_noise(self) -> Array:
+        """Covariance of w, (T, Z, Z)."""
+        n, white = self.n, [one for one in self.uncertainty.unknowns if one.white]
+        std = per_entry("Uncertainty: control", self.uncertainty.control, self.dynamics.control_coordinates)
+        columns = [self.jacobian[:, :, n:] * ((1 - self.lag.mean) * std)]
+        columns += [(self.effects @ (one.std * self._column(one)))[:, :, None] for one in white]
+        onto = np.concatenate(columns, axis=2)
+        noise = np.zeros((self.plan.steps, self.size, self.size))
+        noise[:, :n, :n] = onto @ onto.transpose(0, 2, 1)
+        first = n + self.lagging
+        noise[:, first:, first:] = _diagonal([part[1] for part in self._filters])
+        return noise
+
+    @cached_property
+    def shown_noise(self) -> Array:
+        """Variance of the noise on each state that is shown, (n,)."""
+        space = self.dynamics.state_coordinates
+        return per_entry("Uncertainty: measurement", self.uncertainty.measurement, space) ** 2
+
+    @cached_property
+    def measurement_noise(self) -> Array:
+        """Covariance of v, (T+1, Y, Y)."""
+        return (self.H * self.shown_noise) @ self.H.transpose(0, 2, 1)
+
+
+def _diagonal(blocks: list[Array]) -> Array:
+    """The blocks along the diagonal."""
+    size = sum(len(block) for block in blocks)
+    whole, at = np.zeros((size, size)), 0
+    for block in blocks:
+        whole[at : at + len(block), at : at + len(block)] = block
+        at += len(block)
+    return whole
+
+
+@cache
+def _core(sources: tuple[str, ...], sizes: tuple[tuple[str, int], ...], what: str) -> Core:
+    """The kernels with the sources of dynamics, sensors and `turn`."""
+    parts = [source_of(module) for module in (rotation_ratios, linear_algebra, runge_kutta)]
+    return Core("\n\n".join([*parts, *sources, source_of(estimation)]), dict(sizes), what)

@@ -1,0 +1,80 @@
+"""`track`: a policy that keeps a robot on a plan, whatever the plan was for."""
+
+import numpy as np
+
+from lqrsim.control.collision_chance import Surroundings
+from lqrsim.control.loop_moments import Loop
+from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.tolerances import Prediction, choose_tolerances, prediction_of
+from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of, tracking_laws
+from lqrsim.control.uncertainty import PerEntry, Uncertainty
+from lqrsim.errors import InputError, check_kind
+from lqrsim.problem.problem import Problem
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.solution import Solution
+
+
+def track(
+    problem: Problem,
+    solution: Solution,
+    *,
+    tolerate: PerEntry | None = None,
+    effort: PerEntry | None = None,
+    at_end: float = AT_END,
+    uncertainty: Uncertainty | None = None,
+) -> AffinePolicy:
+    """The policy that keeps to a plan: least squares of the deviations from it.
+
+    The policy of `smooth` is optimal for the problem's cost, which mostly does not mind being off the plan. This one is
+    optimal for staying on it. `dataclasses.replace(solution, policy=track(...))` is a solution that is saved, run and
+    drawn as any other.
+
+    Args:
+      problem: that was solved. solution: its solution, or any with a plan of the same system.
+      tolerate: how far each state may be off, by unit or name: {"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s": 0.2}. Only
+        the ratios to one another and to `effort` matter. By default those under which the robot is least likely to fail
+        under the uncertainty; see `tolerances.py`.
+      effort: what may be added to each control to get back; by default a quarter of its range.
+      at_end: the tolerances at the plan's end, relative to those before.
+      uncertainty: what runs will meet, as `uncertainty_of` makes it; only for choosing tolerances.
+
+    Raises:
+      InputError: the solution is of another system; tolerances or uncertainty do not fit it, or neither is given.
+    """
+    check_plan("track", problem, solution)
+    plan, dynamics = solution.trajectory, problem.dynamics
+    model = PlanModel.of(dynamics, plan, Uncertainty())
+    efforts = effort_of(effort, dynamics)
+    if tolerate is not None:
+        weights = Weights.of(tolerate, efforts, dynamics, at_end=at_end)
+    elif uncertainty is None:
+        raise InputError(
+            "track: tolerate: got none, want how far each state may be off, such as {'m': 0.05, 'm/s': 0.2}, or"
+            " uncertainty=, from which it is chosen"
+        )
+    else:
+        check_kind("track: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
+        truth = PlanModel.of(dynamics, plan, uncertainty)
+        space = solution.policy.control_coordinates
+        limits = np.array(space.low), np.array(space.high)
+        surroundings = Surroundings.of(problem, uncertainty.obstacles)
+
+        def predicted(tried: Weights) -> Prediction:
+            loop = Loop(truth, *tracking_laws(model, tried), None, *limits)
+            mean, covariance, across, _, saturation = loop.moments()
+            n = model.n
+            return prediction_of(
+                truth, mean[:, :n], covariance[:, :n, :n], across, float(saturation.mean()), surroundings,
+                solution.goal_radius,
+            )  # fmt: skip
+
+        weights = choose_tolerances(model, predicted, efforts, at_end).weights
+    gain, offset = tracking_laws(model, weights)
+    return AffinePolicy(
+        gain=gain,
+        offset=plan.controls + offset - np.einsum("tij,tj->ti", gain, plan.states[:-1]),
+        nominal=plan.states[:-1],
+        dt=plan.dt,
+        state_coordinates=dynamics.state_coordinates,
+        control_coordinates=solution.policy.control_coordinates,
+    )

@@ -1,0 +1,113 @@
+"""Laws that keep a robot on a plan, whatever the plan was for: one more backward pass, about the plan.
+
+The policy of `smooth` minimises the plan's cost, which mostly does not mind being off the plan. A tracking law
+minimises the deviation: with z = (e, a, d) as in `plan_model.py` and u the deviation of the command,
+
+    sum_t  e' Q e + (u + M_t d)' R (u + M_t d)  +  e_T' Q_T e_T.
+
+M_t d is what of the unknowns' effect on the next state the controls can undo: a control that only does that costs
+nothing, or a steady disturbance would leave a steady error.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.uncertainty import PerEntry, per_entry
+from lqrsim.errors import Array, InputError, check_kind, check_number
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.problem import Problem
+from lqrsim.results.solution import Solution
+
+CONTROL_SHARE = 0.25  # of the range between its limits that a control may be changed by, by default
+AT_END = 0.2  # the tolerances at the plan's end, relative to those before
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What deviations from a plan cost: 1 for what is just tolerated.
+
+    Attributes:
+      state: the diagonal of Q, (n,). control: of R, (m,). end: of Q_T, (n,).
+    """
+
+    state: Array
+    control: Array
+    end: Array
+
+    @classmethod
+    def of(cls, tolerate: PerEntry, effort: Array, dynamics: Dynamics, *, at_end: float = AT_END) -> "Weights":
+        """Of tolerances in the states' units and efforts (m,) in the controls'.
+
+        Raises:
+          InputError: a name or unit that there is not, or a tolerance that is not positive.
+        """
+        state = per_entry("tolerate", tolerate, dynamics.state_coordinates, above=0.0)
+        return cls(state**-2.0, effort**-2.0, (check_number("at_end", at_end, above=0.0) * state) ** -2.0)
+
+
+def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
+    """What may be added to each control, (m,). Raises InputError as `Weights.of`, or where there are no limits."""
+    controls = dynamics.control_coordinates
+    if effort is not None:
+        return per_entry("effort", effort, controls, above=0.0)
+    ranges = np.subtract(controls.high, controls.low)
+    for name, size in zip(controls.labels, ranges, strict=True):
+        if not np.isfinite(size):
+            raise InputError(f"effort: got none, and {name} has no limits to take it from, want it in its unit")
+    return CONTROL_SHARE * ranges
+
+
+def tracking_laws(model: PlanModel, weights: Weights) -> tuple[Array, Array]:
+    """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m)."""
+    n, m, steps = model.n, model.m, model.plan.steps
+    own = n + model.lagging  # what the controls can do something about
+    F, G, c = model.F[:, :own, :own], model.G[:, :own], model.c[:, :own]
+    E, transition = model.F[:, :own, own:], model.transition
+    Q, R = np.zeros((own, own)), np.diag(weights.control)
+    Q[range(n), range(n)] = weights.state
+    undo = R @ _undoing(model, weights)
+    gain, offset = np.empty((steps, m, model.size)), np.empty((steps, m))
+    # The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a); what d alone costs changes no law.
+    S, D, s = np.zeros((own, own)), np.zeros((own, len(transition))), np.zeros(own)
+    S[range(n), range(n)] = weights.end
+    for t in range(steps - 1, -1, -1):
+        SF, ahead = S @ F[t], S @ E[t] + D @ transition
+        slope = S @ c[t] + s
+        to_control = G[t].T
+        right = np.concatenate([to_control @ SF, to_control @ ahead + undo[t], (to_control @ slope)[:, None]], axis=1)
+        law = -np.linalg.solve(R + to_control @ S @ G[t], right)
+        gain[t], offset[t] = law[:, :-1], law[:, -1]
+        left = F[t].T
+        cross = SF.T @ G[t]
+        S = Q + left @ SF + cross @ law[:, :own]
+        S = 0.5 * (S + S.T)
+        D = left @ ahead + cross @ law[:, own:-1]
+        s = left @ slope + cross @ law[:, -1]
+    return gain, offset
+
+
+def _undoing(model: PlanModel, weights: Weights) -> Array:
+    """M, (T, m, D): the controls that undo, in one step and as far as they can, what the unknowns do."""
+    B = model.jacobian[:, :, model.n :]
+    weighed = B.transpose(0, 2, 1) * weights.state
+    curve = weighed @ B
+    curve += 1e-9 * np.trace(curve, axis1=1, axis2=2)[:, None, None] * np.eye(model.m) + 1e-300 * np.eye(model.m)
+    return np.linalg.solve(curve, weighed @ model.E)
+
+
+def check_plan(who: str, problem: Problem, solution: Solution) -> None:
+    """Raise InputError unless the solution has a finite plan of the problem's system and control period."""
+    check_kind(f"{who}: problem", problem, Problem, "a Problem, such as scenario.problem")
+    check_kind(f"{who}: solution", solution, Solution, "a Solution of it")
+    dynamics, policy, plan = problem.dynamics, solution.policy, solution.trajectory
+    names = policy.state_coordinates.names, policy.control_coordinates.names
+    if names != (dynamics.state_coordinates.names, dynamics.control_coordinates.names):
+        raise InputError(f"{who}: solution: got one of another system, want the problem's")
+    if plan.dt != problem.dt:
+        raise InputError(
+            f"{who}: solution: got a control period of {plan.dt:g} s, want the problem's, {problem.dt:g} s"
+        )
+    if not (np.isfinite(plan.states).all() and np.isfinite(plan.controls).all()):
+        raise InputError(f"{who}: solution: got a plan that is not finite ({solution.status.name}), want one that is")

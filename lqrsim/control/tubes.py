@@ -1,0 +1,112 @@
+"""Where a closed loop will be: the covariance of its deviation from the plan, and how likely it is to collide.
+
+LQG-MP (van den Berg, Abbeel and Goldberg 2011): with the linear model about the plan, the true state and the estimate
+are jointly Gaussian, and known before any run; `loop_moments.py` has the recursion.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lqrsim.control.collision_chance import Surroundings, collision_chance
+from lqrsim.control.controllers import Controller, Feedback
+from lqrsim.control.loop_moments import Loop
+from lqrsim.control.offset_free import OffsetFree
+from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.tracking_laws import check_plan
+from lqrsim.control.uncertainty import Uncertainty
+from lqrsim.errors import Array, InputError, check_kind
+from lqrsim.problem.problem import Problem
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tube:
+    """Where the closed loop will be about its plan.
+
+    Attributes:
+      plan: nominal states and controls. state_coordinates: what the states are.
+      mean: of the deviation of the state, (T+1, n). covariance: of it, (T+1, n, n).
+      estimate_covariance: of the error of the estimate, before each measurement, (T+1, n, n); None without a filter.
+      command: standard deviation of each command, before it is limited, (T, m).
+      saturation: share of the commands that are beyond the limits, (T, m).
+      step_chance: the chance of being in collision at each knot, (T+1,); bounded by the sum over obstacles.
+      collision_chance: of colliding at all.
+    """
+
+    plan: Trajectory
+    state_coordinates: Coordinates
+    mean: Array
+    covariance: Array
+    estimate_covariance: Array | None
+    command: Array
+    saturation: Array
+    step_chance: Array
+    collision_chance: float
+
+    @cached_property
+    def position_covariance(self) -> Array:
+        """(T+1, 2 or 3, 2 or 3)."""
+        place = list(self.state_coordinates.position)
+        return self.covariance[:, place][:, :, place]
+
+
+def predict_tube(
+    problem: Problem, solution: Solution, uncertainty: Uncertainty, controller: Controller | AffinePolicy | None = None
+) -> Tube:
+    """Where a run will be about its plan, and how likely it is to collide, before any run.
+
+    Args:
+      problem: that was solved, with the obstacles in its costs and constraints. solution: with the plan.
+      uncertainty: what the run meets. controller: what runs it: an OffsetFree, a Feedback or a policy; by default the
+        solution's policy.
+
+    Raises:
+      InputError: something does not fit the system; the controller is of another kind; or the uncertainty has a latency
+        or a delay, which the linear model does not have.
+    """
+    check_plan("predict_tube", problem, solution)
+    check_kind("predict_tube: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
+    plan = solution.trajectory
+    if isinstance(controller, OffsetFree):
+        loop = controller.loop()
+    else:
+        asked: object = controller.policy if isinstance(controller, Feedback) else controller
+        wanted = "an OffsetFree, a Feedback or an AffinePolicy"
+        policy = (
+            solution.policy if asked is None else check_kind("predict_tube: controller", asked, AffinePolicy, wanted)
+        )
+        model = PlanModel.of(problem.dynamics, plan, uncertainty)
+        at_plan = policy.state_coordinates.nearest(plan.states[:-1], policy.nominal)
+        offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls
+        space = policy.control_coordinates
+        loop = Loop(model, policy.gain, offset, None, np.array(space.low), np.array(space.high))
+    return tube_of(loop, Surroundings.of(problem, uncertainty.obstacles))
+
+
+def tube_of(loop: Loop, surroundings: Surroundings) -> Tube:
+    """The tube of a closed loop among obstacles. Raises InputError for what the linear model does not have."""
+    model = loop.model
+    for field in ("latency", "delay"):
+        if getattr(model.uncertainty, field):
+            raise InputError(
+                f"Uncertainty: {field}: got {getattr(model.uncertainty, field)} control periods, want 0 for a tube:"
+                " it takes measurements and commands as they come"
+            )
+    mean, covariance, across, std, saturation = loop.moments()
+    n, size = model.n, model.size
+    estimate = None
+    if loop.filter_gain is not None:
+        truth, guess = covariance[:, :n, :n], covariance[:, size : size + n, size : size + n]
+        both = covariance[:, :n, size : size + n]
+        estimate = truth + guess - both - both.transpose(0, 2, 1)
+    chance, total = collision_chance(model.plan.states + mean[:, :n], covariance[:, :n, :n], across, surroundings)
+    return Tube(
+        plan=model.plan, state_coordinates=model.dynamics.state_coordinates, mean=mean[:, :n],
+        covariance=covariance[:, :n, :n], estimate_covariance=estimate, command=std, saturation=saturation,
+        step_chance=chance, collision_chance=total,
+    )  # fmt: skip

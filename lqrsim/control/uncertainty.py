@@ -1,0 +1,272 @@
+"""What a run meets that its plan does not know, in numbers: what filters, tracking laws and tubes are made of.
+
+All of it is zero-mean and Gaussian. `lqrsim.uncertainty_of` makes one of disturbances as `simulate` takes them; a
+person with a robot of their own can write one down.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_items,
+    check_kind,
+    check_name,
+    check_number,
+    check_text,
+    excerpt,
+    real,
+)
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results.coordinates import Coordinates
+
+# A number for all, one for each, or by name or by unit: {"m": 0.05, "m/s": 0.2}, {"x": 0.05}.
+PerEntry = float | Sequence[float] | Mapping[str, float]
+
+MEAN = 0.2  # standard deviation of the mean of what varies, for a filter, relative to its own
+GAIN, OFFSET = "gain of ", "offset of "  # before the name of a control
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A number that the plan takes for granted and that is not so: a stationary Gaussian process about that value.
+
+    Args:
+      of: a parameter or a disturbance of the dynamics ("mass", "wind_x"), or "gain of <control>", of which 0.1 is 10 %
+        more than commanded, or "offset of <control>"; or several of them with their shares, {"wind_x": 0.6, "wind_y":
+        0.8} for what blows in that direction.
+      std: standard deviation from the plan's value, in its unit.
+      time_constant: seconds in which the correlation falls to 1/e; infinite for a constant, 0 for what is drawn anew in
+        each control period.
+      order: 1, or 2 for what passes (1 + sqrt(3) s) / (1 + s)^2, s in time constants: Dryden's wind across and upward.
+      drift: by how much it wanders off besides, as a random walk, per root of a second.
+
+    Raises:
+      InputError: a number is out of range.
+    """
+
+    of: str | Mapping[str, float]
+    std: float
+    time_constant: float = np.inf
+    order: int = 1
+    drift: float = 0.0
+
+    def __post_init__(self) -> None:
+        shares = {self.of: 1.0} if isinstance(self.of, str) else self.of
+        check_kind("Unknown: of", shares, Mapping, "a name, or a dictionary of name: share")
+        if not shares:
+            raise InputError("Unknown: of: got no name, want at least one")
+        for name, share in shares.items():
+            check_text("Unknown: of", name, "the name of a parameter")
+            check_number(f"Unknown: of: {name}", share)
+        object.__setattr__(self, "std", check_number("Unknown: std", self.std, at_least=0.0))
+        object.__setattr__(self, "drift", check_number("Unknown: drift", self.drift, at_least=0.0))
+        if self.time_constant != np.inf:
+            constant = check_number("Unknown: time_constant", self.time_constant, at_least=0.0)
+            object.__setattr__(self, "time_constant", constant)
+        check_count("Unknown: order", self.order, at_most=2)
+        if self.order == 2 and not 0 < self.time_constant < np.inf:
+            raise InputError(f"Unknown: order: got 2 with a time constant of {self.time_constant:g} s, want 1")
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """What it is of -> its share."""
+        return {self.of: 1.0} if isinstance(self.of, str) else dict(self.of)
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return " and ".join(self.shares)
+
+    @property
+    def constant(self) -> bool:
+        """Whether it is drawn once, though it may drift."""
+        return self.time_constant == np.inf
+
+    @property
+    def white(self) -> bool:
+        """Whether there is nothing to remember of it."""
+        return self.time_constant == 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uncertainty:
+    """All that a run meets and that its plan does not know.
+
+    Numbers for states or controls are one for all, one for each, or by name or unit: {"m": 0.005, "m/s": 0.05}.
+
+    Attributes:
+      unknowns: parameters, winds, forces, actuators' gains and offsets.
+      start: standard deviation of where a run begins, of each state.
+      control: of white noise on each control. measurement: of white noise on each state that is measured.
+      lag: time constant in s with which the actuators follow their commands.
+      delay: control periods by which commands come late. latency: by which measurements do.
+      loss: share of the measurements that get lost.
+      obstacles: standard deviation in m, along each of the world's axes, of where an obstacle is; planes stay.
+      left_out: what was stated besides and no linear model has; for the record.
+
+    Raises:
+      InputError: a number is out of range.
+    """
+
+    unknowns: Sequence[Unknown] = ()
+    start: PerEntry = 0.0
+    control: PerEntry = 0.0
+    measurement: PerEntry = 0.0
+    lag: float = 0.0
+    delay: int = 0
+    latency: int = 0
+    loss: float = 0.0
+    obstacles: float = 0.0
+    left_out: Sequence[str] = field(default=(), compare=False)
+
+    def __post_init__(self) -> None:
+        unknowns = check_items("Uncertainty: unknowns", self.unknowns, Unknown, "a tuple of Unknown")
+        object.__setattr__(self, "unknowns", unknowns)
+        object.__setattr__(self, "lag", check_number("Uncertainty: lag", self.lag, at_least=0.0))
+        for name in ("delay", "latency"):
+            count = check_count(f"Uncertainty: {name}", getattr(self, name), at_least=0, at_most=1000)
+            object.__setattr__(self, name, count)
+        object.__setattr__(self, "loss", check_number("Uncertainty: loss", self.loss, at_least=0.0, at_most=1.0))
+        object.__setattr__(self, "obstacles", check_number("Uncertainty: obstacles", self.obstacles, at_least=0.0))
+        left_out = check_items("Uncertainty: left_out", self.left_out, str, "a tuple of texts")
+        object.__setattr__(self, "left_out", left_out)
+
+    def check(self, dynamics: Dynamics) -> None:
+        """Raise InputError unless all of it fits the dynamics; the field is named, and what there is to choose from."""
+        states, controls = dynamics.state_coordinates, dynamics.control_coordinates
+        per_entry("Uncertainty: start", self.start, states)
+        per_entry("Uncertainty: measurement", self.measurement, states)
+        per_entry("Uncertainty: control", self.control, controls)
+        for unknown in self.unknowns:
+            for name in unknown.shares:
+                check_name("Uncertainty: unknowns", name, possible_unknowns(dynamics))
+
+    def steady(self, memory: float, share: float = MEAN) -> "Uncertainty":
+        """The same for a filter: what varies may have a mean that is not zero, and what is constant may change.
+
+        That is what leaves no steady error: a filter that believes in a constant stops listening, and one that believes
+        in a wind that always comes back to zero is always a little wrong about one that does not.
+
+        Args:
+          memory: seconds in which a constant may wander by its standard deviation.
+          share: of what varies, the standard deviation of its mean, relative to its own.
+        """
+        constants: dict[tuple[tuple[str, float], ...], list[Unknown]] = {}
+        for one in self.unknowns:
+            constants.setdefault(tuple(sorted(one.shares.items())), []).append(one)
+        kept = []
+        for same in constants.values():
+            std = float(np.hypot.reduce([one.std * (1.0 if one.constant else share) for one in same]))
+            drift = float(np.hypot.reduce([one.drift for one in same if one.constant] or [0.0]))
+            kept.append(Unknown(same[0].of, std, drift=max(drift, std / np.sqrt(memory))))
+        return replace(self, unknowns=(*kept, *(one for one in self.unknowns if not one.constant)))
+
+    @property
+    def as_steady(self) -> "Uncertainty":
+        """This, with the unknowns in the order of `steady`: means that are zero have a standard deviation of 0."""
+        return self.steady(np.inf, share=0.0)
+
+
+def possible_unknowns(dynamics: Dynamics) -> list[str]:
+    """All that an Unknown can be of."""
+    controls = dynamics.control_coordinates.names
+    own = dynamics.disturbed.parameters
+    return [*own, *(GAIN + name for name in controls), *(OFFSET + name for name in controls)]
+
+
+def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float | None = None) -> Array:
+    """Numbers as one for each entry, (len(space),); those by name win over those by unit, the rest are 0.
+
+    Args:
+      above: what each must exceed; by default they must not be negative, and need not be there for all.
+
+    Raises:
+      InputError: a name or unit that there is not, another number of them, or one that is out of range.
+    """
+    if isinstance(numbers, Mapping):
+        units = list(dict.fromkeys(unit for unit in space.units if unit))
+        values = np.full(len(space), np.nan)
+        for of in (units, list(space.names)):
+            for name, value in numbers.items():
+                check_name(field, name, [*space.names, *units])
+                if name in of:
+                    value = check_number(f"{field}: {name}", value)
+                    chosen = space.names if of is not units else space.units
+                    values[[i for i, one in enumerate(chosen) if one == name]] = value
+        missing = [name for name, value in zip(space.names, values, strict=True) if np.isnan(value)]
+        if missing and above is not None:
+            raise InputError(f"{field}: got none for {', '.join(missing)}, want one for each state, by name or unit")
+        values = np.nan_to_num(values)
+    elif real(field, numbers).ndim == 0:
+        values = np.full(len(space), check_number(field, numbers))
+    else:
+        values = check_array(field, numbers, (None,)).copy()
+        if len(values) != len(space):
+            raise InputError(f"{field}: got {len(values)} numbers, want {len(space)}: {', '.join(space.labels)}")
+    wrong = values < 0 if above is None else values <= above
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        want = "at least 0" if above is None else f"more than {above:g}"
+        raise InputError(f"{field}: got {values[i]:g} for {space.names[i]}, want {want}")
+    return values
+
+
+def shaping_filter(unknown: Unknown, dt: float) -> tuple[Array, Array, Array, Array]:
+    """The process as x' = F x + w, its value h x: F (k, k), the covariance of w (k, k), h (k,), covariance of x at 0.
+
+    k is 0 for what is white, 1 or 2. The second order is made of p, with p'' + 2 p' + p = 2 w, and p', which are of
+    variance 1 each and uncorrelated when stationary.
+    """
+    std, drift = unknown.std, unknown.drift
+    if unknown.white:
+        return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0))
+    step = dt / unknown.time_constant
+    keep = np.exp(-step)
+    if unknown.order == 1:
+        fresh = std * std * -np.expm1(-2 * step) + drift * drift * dt
+        return np.full((1, 1), keep), np.full((1, 1), fresh), np.ones(1), np.full((1, 1), std * std)
+    F = keep * np.array([[1 + step, step], [-step, 1 - step]])
+    return F, np.eye(2) - F @ F.T, std / 2 * np.array([1.0, np.sqrt(3.0)]), np.eye(2)
+
+
+def gathered(parts: Iterable[Uncertainty]) -> Uncertainty:
+    """Several as one: what is of the same kind adds up.
+
+    Raises:
+      InputError: the numbers of two are not of the same form.
+    """
+    total = Uncertainty()
+    for one in parts:
+        numbers = {
+            name: _added(name, getattr(total, name), getattr(one, name)) for name in ("start", "control", "measurement")
+        }
+        total = Uncertainty(
+            unknowns=(*total.unknowns, *one.unknowns),
+            **numbers,
+            lag=total.lag + one.lag,  # of two in a row, about
+            delay=total.delay + one.delay,
+            latency=total.latency + one.latency,
+            loss=1 - (1 - total.loss) * (1 - one.loss),
+            obstacles=float(np.hypot(total.obstacles, one.obstacles)),
+            left_out=(*total.left_out, *one.left_out),
+        )
+    return total
+
+
+def _added(name: str, first: PerEntry, second: PerEntry) -> PerEntry:
+    """Standard deviations of the sum of two."""
+    for one, other in ((first, second), (second, first)):
+        if not isinstance(one, Mapping) and np.ndim(one) == 0 and one == 0:
+            return other
+    if isinstance(first, Mapping) or isinstance(second, Mapping):
+        raise InputError(
+            f"Uncertainty: {name}: got two by name or unit, {excerpt(first)} and {excerpt(second)}, want one"
+        )
+    both = np.hypot(np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64))
+    return float(both) if both.ndim == 0 else tuple(both.tolist())
