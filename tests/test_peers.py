@@ -221,7 +221,7 @@ def test_rotorpy_turns_the_body_back(peers: ModuleType, flight: Any) -> None:
     At an angle of 1e-4 rad, to 1e-6 of that; the rotors' layout and the sign of yaw are our dynamics', not RotorPy's.
     """
     _, robot, solution = flight
-    gains = peers.rotorpy.BEST
+    gains = peers.rotorpy.BEST_AT_LIGHT
     control = peers.RotorPy(robot, replace_plan(solution, hover=robot.hover_force)).start(1)
     for angle in 1e-4 * np.eye(3):
         state = np.concatenate([np.zeros(6), angle, np.zeros(3)])
