@@ -130,7 +130,7 @@ def main(config: Config) -> dict[str, dict[str, int]]:
         "RotorPy, default gains": Tuning(DEFAULT, False),
         "RotorPy, best at light": Tuning(BEST_AT_LIGHT, False),
         "RotorPy, the same, drag fed forward": Tuning(BEST_AT_LIGHT, True),
-        "RotorPy, best at moderate": Tuning(BEST_AT_MODERATE, False),
+        "RotorPy, best at moderate": Tuning(BEST_AT_MODERATE, True),
     }
     found: dict[str, dict[str, int]] = {}
     for law, tuning in laws.items():

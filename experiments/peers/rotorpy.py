@@ -46,7 +46,7 @@ class Gains:
 
 DEFAULT = Gains((6.5, 6.5, 15.0), (4.0, 4.0, 9.0), 310.0, 57.0)
 BEST_AT_LIGHT = Gains((15.0, 15.0, 15.0), (4.65, 4.65, 6.97), 100.0, 20.0)
-BEST_AT_MODERATE = Gains((10.0, 10.0, 8.0), (3.79, 3.79, 3.39), 60.0, 15.49)
+BEST_AT_MODERATE = Gains((10.0, 10.0, 8.0), (3.79, 3.79, 3.39), 60.0, 15.49)  # with feed_drag
 
 
 class RotorPy(Controller):
