@@ -92,6 +92,7 @@ from .simulation.outcome_table import outcomes as outcomes
 from .simulation.plant import Plant as Plant
 from .simulation.plant_check import PlantCheck as PlantCheck
 from .simulation.plant_check import check_plant as check_plant
+from .simulation.uncertainty_of import uncertainty_of as uncertainty_of
 from .solvers.continuous import smooth_continuous as smooth_continuous
 from .solvers.continuous import smooth_lq_continuous as smooth_lq_continuous
 from .solvers.continuous_solution import ContinuousSolution as ContinuousSolution

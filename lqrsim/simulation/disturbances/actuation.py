@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from mujoco import batch
 
+from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number, excerpt
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import (
@@ -16,6 +17,7 @@ from lqrsim.simulation.disturbances.base import (
     check_numbers,
     check_strength,
     fit,
+    left_out,
     times,
     with_units,
 )
@@ -56,6 +58,9 @@ class ControlDelay(Disturbance):
 
         return Effect(actuate=actuate)
 
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return Uncertainty(delay=self.periods)
+
 
 @dataclass(frozen=True)
 class MotorLag(Disturbance):
@@ -94,6 +99,9 @@ class MotorLag(Disturbance):
             return controls + mean * behind
 
         return Effect(actuate=actuate)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return Uncertainty(lag=self.time_constant)
 
 
 @dataclass(frozen=True)
@@ -175,6 +183,12 @@ class Saturation(Disturbance):
         low, high = self.limits(plant)
         return Effect(actuate=lambda step, controls: np.clip(controls, low, high))
 
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        space = plant.robot.dynamics.control_coordinates
+        if np.array_equal(self.limits(plant), (space.low, space.high)):
+            return Uncertainty()
+        return left_out(self, plant, "a law keeps the robot's own limits, and narrower ones are not linear")
+
 
 @dataclass(frozen=True)
 class ActuatorLoss(Disturbance):
@@ -234,6 +248,11 @@ class ActuatorLoss(Disturbance):
             return controls
 
         return Effect(alter=alter, actuate=actuate)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        if self.remaining == 1:
+            return Uncertainty()
+        return left_out(self, plant, "it is no small deviation, and comes once")
 
 
 def check_gains(disturbance: Disturbance, plant: Plant) -> None:

@@ -3,11 +3,11 @@
 To add one, subclass `Disturbance` and give it a `start`. It is called once a run, and returns what the closed loop then
 calls in every control period, on all trials at once: functions, so that they may look at the state (wind that depends
 on where the robot is) or remember the past (a delay). `scaled` says what a multiple of it is, for sweeps; `check`
-refuses a plant that cannot have it.
+refuses a plant that cannot have it; `uncertainty` says what filters, tracking laws and tubes are to make of it.
 """
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from mujoco import batch
 
+from lqrsim.control.uncertainty import Uncertainty, Unknown, possible_unknowns
 from lqrsim.errors import Array, InputError, check_array, check_function, check_number, excerpt, real, shaped
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
@@ -80,6 +81,10 @@ class Disturbance(abc.ABC):
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
         """Raise InputError if the plant cannot have this disturbance."""
 
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        """What it is in numbers, for `uncertainty_of`; unless it is overridden, it is left out, which is said."""
+        return left_out(self, plant, f"{type(self).__name__} does not override `uncertainty`")
+
     @abc.abstractmethod
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         """Begin a run of one trial a generator. A trial's numbers may come from its own generator only.
@@ -109,6 +114,26 @@ class GaussianDisturbance(Disturbance):
     def scaled(self, strength: float) -> Self:
         """The standard deviation so many times as large."""
         return replace(self, std=times(self, self.std, strength))
+
+
+def left_out(disturbance: Disturbance, plant: Plant, why: str) -> Uncertainty:
+    """Of a disturbance that no linear model has: nothing but its words, and why."""
+    return Uncertainty(left_out=(f"{disturbance.describe(plant)}: {why}",))
+
+
+def unknowns_of(disturbance: Disturbance, plant: Plant, wanted: Iterable[Unknown]) -> Uncertainty:
+    """Those that are more than zero; what the robot's dynamics do not have is left out by name."""
+    known, missing = possible_unknowns(plant.robot.dynamics), dict[str, None]()
+    kept = list[Unknown]()
+    for one in wanted:
+        if one.std == 0:
+            continue
+        missing |= dict.fromkeys(name for name in one.shares if name not in known)
+        shares = {name: share for name, share in one.shares.items() if name in known}
+        if shares:
+            kept.append(replace(one, of=shares))
+    why = f"the dynamics of robot {plant.robot.name} have no {', '.join(missing)}"
+    return Uncertainty(unknowns=kept, left_out=left_out(disturbance, plant, why).left_out if missing else ())
 
 
 def normal(generators: Sequence[np.random.Generator], steps: int, size: int) -> Array:

@@ -1,7 +1,8 @@
 """Robots that are not quite the model that the policy was made for.
 
 Each of these multiplies something in a trial's own MuJoCo model by a factor: 1 plus a normal number that is cut at
-three standard deviations, drawn for each trial; or a fixed factor.
+three standard deviations, drawn for each trial; or a fixed factor. To filters and tubes a fixed factor is unknown as
+well: of mean 1, and of a standard deviation that is its distance from 1.
 """
 
 import abc
@@ -15,13 +16,26 @@ import numpy.typing as npt
 from mujoco import batch
 from scipy.special import ndtr, ndtri
 
+from lqrsim.control.uncertainty import GAIN, Uncertainty, Unknown
 from lqrsim.errors import Array, InputError, check_number
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.actuation import check_gains
-from lqrsim.simulation.disturbances.base import Disturbance, Effect, Numbers, check_numbers, check_strength, fit, words
+from lqrsim.simulation.disturbances.base import (
+    Disturbance,
+    Effect,
+    Numbers,
+    check_numbers,
+    check_strength,
+    fit,
+    left_out,
+    unknowns_of,
+    words,
+)
 from lqrsim.simulation.plant import Plant
 
 CUT = 3.0  # standard deviations
+# Of a standard normal number that is cut there.
+CUT_STD = float(np.sqrt(1 - 2 * CUT * np.exp(-(CUT**2) / 2) / np.sqrt(2 * np.pi) / (ndtr(CUT) - ndtr(-CUT))))
 
 
 @dataclass(frozen=True)
@@ -72,6 +86,13 @@ class Mismatch(Disturbance):
         factor = np.asarray(self.factor) ** strength
         return replace(self, factor=float(factor) if factor.ndim == 0 else tuple(factor.tolist()))
 
+    def spread(self, plant: Plant) -> Array:
+        """Standard deviation of each part's factor about 1, (parts,); of a fixed factor, how far it is from 1."""
+        parts = self.parts(plant)
+        if self.factor is None:
+            return np.full(len(parts), CUT_STD * (self.std or 0.0))
+        return np.abs(fit(self, self.factor, parts, "factor") - 1)
+
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         self.check(plant)
         parts = self.parts(plant)
@@ -96,6 +117,9 @@ class MassMismatch(Mismatch):
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         simulations.expand("body_mass")[:, bodies(plant)] *= factors
 
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return parameter_unknown(self, plant, "mass")
+
 
 class InertiaMismatch(Mismatch):
     """Another inertia of the robot's bodies about their centres of mass, by one factor about all axes; the mass stays.
@@ -110,6 +134,11 @@ class InertiaMismatch(Mismatch):
 
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         simulations.expand("body_inertia")[:, bodies(plant)] *= factors[:, :, None]
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        if not self.spread(plant).any():
+            return Uncertainty()
+        return left_out(self, plant, "it changes what controls do, and not where an undisturbed run goes")
 
 
 class ThrustMismatch(Mismatch):
@@ -133,6 +162,9 @@ class ThrustMismatch(Mismatch):
 
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         simulations.expand("actuator_gainprm")[:, plant.ctrl] *= factors[:, :, None]
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return gain_unknowns(self, plant, plant.robot.actuators)
 
 
 class WheelMismatch(Mismatch):
@@ -164,6 +196,9 @@ class WheelRadiusMismatch(WheelMismatch):
         raised = plant.model.geom_size[wheels, 0] * (factors - 1)
         simulations.expand("body_pos")[:, hubs] += raised[:, :, None] * upward(plant, hubs)
 
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return gain_unknowns(self, plant, [driven_by(plant, hub) for hub in treads(plant)[1]])
+
 
 class AxleMismatch(WheelMismatch):
     """Wheels that are further apart, or closer together.
@@ -181,6 +216,9 @@ class AxleMismatch(WheelMismatch):
         from_middle = plant.model.body_pos[hubs] - plant.model.body_pos[hubs].mean(axis=0)
         simulations.expand("body_pos")[:, hubs] += (factors - 1)[:, :, None] * from_middle
 
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return parameter_unknown(self, plant, "axle_length")
+
 
 class FrictionMismatch(WheelMismatch):
     """Another sliding friction between the wheels and the floor, the same for all wheels.
@@ -196,6 +234,60 @@ class FrictionMismatch(WheelMismatch):
     def multiply(self, plant: Plant, simulations: batch.Batch, factors: Array) -> None:
         wheels, _ = treads(plant)
         simulations.expand("geom_friction")[:, wheels, 0] *= factors
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        if not self.spread(plant).any():
+            return Uncertainty()
+        return left_out(self, plant, "the dynamics that plans are made with have no friction")
+
+
+def parameter_unknown(mismatch: Mismatch, plant: Plant, name: str) -> Uncertainty:
+    """Of what multiplies a parameter of the dynamics."""
+    nominal = abs(plant.robot.dynamics.disturbed.parameters.get(name, 1.0))
+    return unknowns_of(mismatch, plant, [Unknown(name, nominal * float(mismatch.spread(plant)[0]))])
+
+
+def gain_unknowns(mismatch: Mismatch, plant: Plant, actuators: Sequence[str | None]) -> Uncertainty:
+    """Of what multiplies the effects of actuators, one a part."""
+    controls, wanted, lost = controls_of(plant), list[Unknown](), list[str]()
+    for part, actuator, std in zip(mismatch.parts(plant), actuators, mismatch.spread(plant), strict=True):
+        if actuator in controls:
+            wanted.append(Unknown(GAIN + controls[actuator], float(std)))
+        elif std > 0:
+            lost.append(part)
+    known = unknowns_of(mismatch, plant, wanted)
+    if not lost:
+        return known
+    return replace(known, left_out=left_out(mismatch, plant, f"no control is that of {', '.join(lost)} alone").left_out)
+
+
+def controls_of(plant: Plant) -> dict[str | None, str]:
+    """Actuator -> the control that it is proportional to, where it is the only one that follows it."""
+    names = plant.robot.dynamics.control_coordinates.names
+    each = (much * np.eye(len(names)) for much in (0.0, 1.0, 2.0))
+    none, one, two = (np.array([plant.robot.actuation(row) for row in rows]) for rows in each)
+    follows = (one != none) | (two != none) | ~np.isfinite(one + two)  # (controls, actuators)
+    found: dict[str | None, str] = {}
+    for j, actuator in enumerate(plant.robot.actuators):
+        followed = np.flatnonzero(follows[:, j])
+        if len(followed) == 1:
+            i = followed[0]
+            proportional = none[i, j] == 0 and np.isclose(two[i, j], 2 * one[i, j], rtol=1e-9, atol=0)
+            if proportional and follows[i].sum() == 1:
+                found[actuator] = names[i]
+    return found
+
+
+def driven_by(plant: Plant, body: int) -> str | None:
+    """The one of the robot's actuators that turns a body's joint; None if there is none, or several."""
+    model = plant.model
+    found = [
+        name
+        for name, number in zip(plant.robot.actuators, plant.ctrl, strict=True)
+        if model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_JOINT
+        and model.jnt_bodyid[model.actuator_trnid[number, 0]] == body
+    ]
+    return found[0] if len(found) == 1 else None
 
 
 def cut_normal(generator: np.random.Generator) -> float:

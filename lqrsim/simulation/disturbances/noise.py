@@ -5,15 +5,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lqrsim.control.uncertainty import Uncertainty, Unknown
 from lqrsim.errors import InputError, check_array, check_number
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import (
     Disturbance,
     Effect,
     GaussianDisturbance,
+    Numbers,
     fit,
+    left_out,
     normal,
     times,
+    unknowns_of,
     with_units,
     words,
 )
@@ -35,6 +39,10 @@ class ControlNoise(GaussianDisturbance):
         noise = std * normal(generators, plan.steps, len(std))
         return Effect(actuate=lambda step, controls: controls + noise[:, step])
 
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        std = fit(self, self.std, plant.robot.dynamics.control_coordinates.names)
+        return Uncertainty(control=tuple(std.tolist()) if std.any() else 0.0)
+
 
 class MeasurementNoise(GaussianDisturbance):
     """White noise on each state that the policy is shown.
@@ -50,6 +58,10 @@ class MeasurementNoise(GaussianDisturbance):
         std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
         noise = std * normal(generators, plan.steps + 1, len(std))
         return Effect(measure=lambda step, states: states + noise[:, step])
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
+        return Uncertainty(measurement=tuple(std.tolist()) if std.any() else 0.0)
 
 
 class ForceNoise(GaussianDisturbance):
@@ -68,6 +80,9 @@ class ForceNoise(GaussianDisturbance):
         forces = fit(self, self.std, "xyz") * normal(generators, plan.steps, 3)
         return Effect(force=lambda step, states: forces[:, step])
 
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return unknowns_of(self, plant, drawn_anew("force", self.std))
+
 
 class TorqueNoise(GaussianDisturbance):
     """A random torque on the robot, redrawn each control period and held over it.
@@ -84,6 +99,9 @@ class TorqueNoise(GaussianDisturbance):
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         torques = fit(self, self.std, "xyz") * normal(generators, plan.steps, 3)
         return Effect(torque=lambda step, states: torques[:, step])
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return unknowns_of(self, plant, drawn_anew("torque", self.std))
 
 
 @dataclass(frozen=True)
@@ -115,3 +133,14 @@ class Push(Disturbance):
         forces = np.zeros((plan.steps, 3))
         forces[period] = np.array(self.impulse) / plan.dt
         return Effect(force=lambda step, states: np.broadcast_to(forces[step], (len(states), 3)))
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return left_out(self, plant, "it comes once, and no noise does") if any(self.impulse) else Uncertainty()
+
+
+def drawn_anew(what: str, std: Numbers) -> list[Unknown]:
+    """White noise along the world's axes, of which std is one number or three."""
+    return [
+        Unknown(f"{what}_{axis}", float(one), time_constant=0.0)
+        for axis, one in zip("xyz", np.broadcast_to(np.asarray(std, dtype=np.float64), 3), strict=True)
+    ]

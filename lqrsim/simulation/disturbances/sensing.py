@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, check_count, check_number
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import (
@@ -16,6 +17,7 @@ from lqrsim.simulation.disturbances.base import (
     GaussianDisturbance,
     check_strength,
     fit,
+    left_out,
     normal,
     times,
     uniform,
@@ -38,6 +40,11 @@ class MeasurementBias(GaussianDisturbance):
         std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
         bias = std * normal(generators, 1, len(std))[:, 0]
         return Effect(measure=lambda step, states: states + bias)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        if not np.any(self.std):
+            return Uncertainty()
+        return left_out(self, plant, "no measurement tells it from the state itself")
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,9 @@ class MeasurementLatency(Disturbance):
             return seen.pop(0) if len(seen) > self.periods else seen[0].copy()
 
         return Effect(measure=measure)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        return Uncertainty(latency=self.periods)
 
 
 @dataclass(frozen=True)
@@ -129,6 +139,11 @@ class Dropouts(Disturbance):
         length = 1 / self.loss.to_good
         return f"{100 * self.loss.lost:.3g} % of {what} lost, in bad spells of {length:.3g} control periods on average"
 
+    @property
+    def share(self) -> float:
+        """That is lost, in the long run."""
+        return self.loss.lost if isinstance(self.loss, GilbertElliott) else self.loss
+
     def _scaled_loss(self, strength: float) -> float | GilbertElliott:
         strength, loss = check_strength(self, strength), self.loss
         if not isinstance(loss, GilbertElliott):
@@ -173,6 +188,10 @@ class MeasurementDropouts(Dropouts):
 
         return Effect(measure=measure)
 
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        """As if each were lost on its own."""
+        return Uncertainty(loss=self.share)
+
 
 @dataclass(frozen=True)
 class CommandDropouts(Dropouts):
@@ -200,6 +219,11 @@ class CommandDropouts(Dropouts):
             return last.copy()
 
         return Effect(actuate=actuate)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        if self.share == 0:
+            return Uncertainty()
+        return left_out(self, plant, "what it does depends on how the commands change, and no noise does")
 
 
 def counted(periods: int) -> str:

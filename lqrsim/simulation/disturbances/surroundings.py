@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import InputError
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.base import Effect, GaussianDisturbance, fit, normal, with_units, words
@@ -24,6 +25,10 @@ class InitialStateError(GaussianDisturbance):
         std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
         error = std * normal(generators, 1, len(std))[:, 0]
         return Effect(initial_states=lambda states: states + error)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        std = fit(self, self.std, plant.robot.dynamics.state_coordinates.names)
+        return Uncertainty(start=tuple(std.tolist()) if std.any() else 0.0)
 
 
 class DisplacedObstacles(GaussianDisturbance):
@@ -52,3 +57,8 @@ class DisplacedObstacles(GaussianDisturbance):
         if plant.robot.dynamics.state_coordinates.from_above:
             displaced[..., 2] = 0.0
         return Effect(displaced=displaced)
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        """One number for all axes: their rms, of those that count."""
+        axes = 2 if plant.robot.dynamics.state_coordinates.from_above else 3
+        return Uncertainty(obstacles=float(np.sqrt(np.mean(fit(self, self.std, "xyz")[:axes] ** 2))))

@@ -5,9 +5,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lqrsim.control.uncertainty import Uncertainty, Unknown
 from lqrsim.errors import Array, InputError, check_array, check_name, check_number
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.simulation.disturbances.base import Disturbance, Effect, Numbers, check_numbers, fit, normal, times, words
+from lqrsim.simulation.disturbances.base import (
+    Disturbance,
+    Effect,
+    Numbers,
+    check_numbers,
+    fit,
+    normal,
+    times,
+    unknowns_of,
+    words,
+)
 from lqrsim.simulation.plant import Plant
 
 FOOT = 0.3048  # m
@@ -55,6 +66,11 @@ class MeanWind(Wind):
         self.check(plant)
         return self.blow(plant, np.broadcast_to(self.velocity, (len(generators), plan.steps, 3)))
 
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        """A constant of mean zero whose standard deviation is this wind, as if it could blow the other way as well."""
+        winds = zip("xyz", self.velocity, strict=True)
+        return unknowns_of(self, plant, [Unknown(f"wind_{axis}", abs(speed)) for axis, speed in winds])
+
 
 @dataclass(frozen=True)
 class Gusts(Wind):
@@ -84,6 +100,10 @@ class Gusts(Wind):
         self.check(plant)
         noise = normal(generators, plan.steps, 3)
         return self.blow(plant, fit(self, self.std, "xyz") * first_order(noise, plan.dt / self.time_constant))
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        winds = zip("xyz", fit(self, self.std, "xyz"), strict=True)
+        return unknowns_of(self, plant, [Unknown(f"wind_{axis}", std, self.time_constant) for axis, std in winds])
 
 
 @dataclass(frozen=True)
@@ -154,6 +174,20 @@ class Dryden(Wind):
         upward = self.std[2] * second_order(noise[..., 3:], steps[2])
         cosine, sine = np.cos(self.direction), np.sin(self.direction)
         return self.blow(plant, np.stack([cosine * along - sine * across, sine * along + cosine * across, upward], -1))
+
+    def uncertainty(self, plant: Plant) -> Uncertainty:
+        if self.wind_at_20_ft == 0:
+            return Uncertainty()
+        constants = np.array(self.lengths) / self.airspeed
+        cosine, sine = np.cos(self.direction), np.sin(self.direction)
+        # The cosine of a right angle is no zero, but a rounding error.
+        along, across = (
+            {name: float(share) for name, share in zip(("wind_x", "wind_y"), shares, strict=True) if abs(share) > 1e-12}
+            for shares in ((cosine, sine), (-sine, cosine))
+        )
+        processes = (along, 1), (across, 2), ("wind_z", 2)
+        parts = zip(processes, self.std, constants, strict=True)
+        return unknowns_of(self, plant, [Unknown(of, std, constant, order) for (of, order), std, constant in parts])
 
 
 def first_order(noise: Array, step: float) -> Array:
