@@ -71,13 +71,15 @@ def choose_tolerances(
         tolerate = _of_units(model.dynamics.state_coordinates.units, reach[periods])
         weights = Weights.of(tuple(tolerate.tolist()), effort, model.dynamics, at_end=at_end)
         found.append(Choice(tolerate, periods * model.plan.dt, weights, predicted(weights)))
-    narrowest = min(one.predicted.width for one in found)
+    # What is a thousandth of the plan's extent is narrow enough.
+    extent = float(np.ptp(model.plan.states, axis=0).max()) or 1.0
+    narrowest = max(min(one.predicted.width for one in found), 1e-3 * extent)
 
     def worth(one: Choice) -> float:
         told = one.predicted
-        return told.chance + FRAGILE * told.saturation**2 + NARROW * told.width / max(narrowest, 1e-12)
+        return told.chance + FRAGILE * told.saturation**2 + NARROW * max(told.width / narrowest, 1.0)
 
-    return min(found, key=worth)
+    return min(reversed(found), key=worth)  # of equals the gentlest
 
 
 def reach_of(model: PlanModel, effort: Array, periods: int) -> dict[int, Array]:
