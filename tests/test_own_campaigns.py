@@ -86,7 +86,8 @@ def test_what_cannot_keep_constraints_is_left_out_and_said_so(
 
 
 def test_asked_by_name_it_is_refused(elsewhere: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    wanted = "policies: got ilqr, which cannot keep the scenario's constraints, want some of smooth, open_loop, replan"
+    wanted = "policies: got ilqr, which cannot keep the scenario's constraints, want some of smooth, open_loop, replan,"
+    wanted += " track, offset_free"
     assert main(["stress", "own file.py:walled", "--policies", "ilqr", "smooth", *FEW]) == 2
     assert capsys.readouterr().err == f"lqrsim: error: {wanted}\n"
     assert not (elsewhere / "runs").exists()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,8 +77,9 @@ def test_presets_of_the_quadrotor_are_the_numbers_written_out(cage, name):
     units = cage.robot.dynamics.state_coordinates
     measured = {"m": 0.005 * k, "m/s": 0.05 * k, "rad": 0.005 * k, "rad/s": 0.005 * k}
     np.testing.assert_allclose(per_entry("", stated.measurement, units), per_entry("", measured, units), rtol=1e-12)
-    np.testing.assert_allclose(stated.start, 0.01 * k, rtol=1e-12)
-    np.testing.assert_allclose(stated.control, 0.0371 * k, rtol=1e-12)  # 1 % of 3.71 N
+    np.testing.assert_allclose(per_entry("", stated.start, units), 0.01 * k, rtol=1e-12)
+    controls = cage.robot.dynamics.control_coordinates
+    np.testing.assert_allclose(per_entry("", stated.control, controls), 0.0371 * k, rtol=1e-12)  # 1 % of 3.71 N
     numbers = stated.lag, stated.loss, stated.obstacles, stated.delay, stated.latency
     np.testing.assert_allclose(numbers, (0.024 * k, 0.01 * k, 0.01 * k, 0, 0), rtol=1e-12)
     of = named(stated)
@@ -160,7 +162,8 @@ def test_one_simulated_step_scatters_as_stated(cage):
     deviation = ends.states[:, 1] - solution.trajectory.states[1]
     x, u, model = solution.trajectory.states[0], solution.trajectory.controls[0], robot.dynamics.disturbed
     a, b, _ = model.linearize(x, u, DT)
-    columns = [a * np.array(stated.start), b * np.array(stated.control)]
+    spaces = robot.dynamics.state_coordinates, robot.dynamics.control_coordinates
+    columns = [a * per_entry("", stated.start, spaces[0]), b * per_entry("", stated.control, spaces[1])]
     for one in stated.unknowns:
         if (control := one.name.removeprefix("gain of ")) != one.name:
             i = robot.dynamics.control_coordinates.names.index(control)
@@ -219,7 +222,8 @@ def test_losses_in_bursts_count_by_their_share(cage):
 
 def test_several_add_up(cage):
     twice = ls.uncertainty_of(cage, [ls.ControlNoise(0.03), ls.ControlNoise([0.04] * 4), ls.ControlDelay(1)] * 2)
-    np.testing.assert_allclose(twice.control, np.sqrt(2) * 0.05, rtol=1e-12)
+    controls = cage.robot.dynamics.control_coordinates
+    np.testing.assert_allclose(per_entry("", twice.control, controls), np.sqrt(2) * 0.05, rtol=1e-12)
     assert twice.delay == 2
 
 
@@ -250,7 +254,7 @@ def test_only_what_a_control_does_alone_and_in_proportion_is_its_gain():
 class Own(ls.Disturbance):
     """One of a user's own."""
 
-    told: object = None
+    told: Any = None
 
     def start(self, plant, plan, generators):
         return ls.Effect()
@@ -279,6 +283,6 @@ def test_what_does_not_fit_is_refused(cage, arena):
     with pytest.raises(InputError, match=r"^MeasurementNoise: std: got 3 numbers, want 1 or 12"):
         ls.uncertainty_of(cage, [ls.MeasurementNoise([0.1] * 3)])
     with pytest.raises(InputError, match=r"^disturbances: got 'light'"):
-        ls.uncertainty_of(cage, "light")
+        ls.uncertainty_of(cage, "light")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match=r"^plant: got "):
-        ls.uncertainty_of("cage", [])
+        ls.uncertainty_of("cage", [])  # pyright: ignore[reportArgumentType]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lqrsim.reports.curves import LINES, MARKERS
+from lqrsim.reports.curves import COLOURS, LINES, MARKERS
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress.campaign import POLICIES
 from lqrsim.view import style
@@ -15,7 +15,10 @@ from paper.common import Result, Settings, figure
 
 NAMES = {"differential_drive": "differential drive", "quadrotor": "quadrotor"}
 ASIDE = {"moderate": -3, "severe": 3}  # points; the last three presets are so close that their names would touch
-WORDS = {"smooth": "smoothing", "ilqr": "iLQR", "open_loop": "open loop", "replan": "replanning"}
+WORDS = {
+    "smooth": "smoothing", "ilqr": "iLQR", "open_loop": "open loop", "replan": "replanning", "track": "tracking",
+    "offset_free": "offset-free",
+}  # fmt: skip
 
 
 def draw_together(config: Settings, result: Result) -> None:
@@ -30,15 +33,17 @@ def draw_together(config: Settings, result: Result) -> None:
 
 
 def draw_success(axes: Axes, cells: Sequence[dict[str, Any]]) -> None:
-    for number, policy in enumerate(POLICIES):
+    there = {cell["policy"] for cell in cells}
+    for number, policy in enumerate(policy for policy in POLICIES if policy in there):
         mine = [cell for cell in cells if cell["policy"] == policy]
         strengths = [cell["strength"] for cell in mine]
         value, low, high = 100 * np.array([cell["band"] for cell in mine]).T
-        axes.fill_between(strengths, low, high, color=RUNS[number], alpha=0.15, linewidth=0)
+        axes.fill_between(strengths, low, high, color=COLOURS[number], alpha=0.15, linewidth=0)
         # Curves may lie on each other: those below are wider, and their markers larger.
         axes.plot(
-            strengths, value, LINES[number], color=RUNS[number], marker=MARKERS[number], markersize=8 - 1.2 * number,
-            linewidth=2.4 - 0.4 * number, markerfacecolor="white", label=WORDS[policy], clip_on=False, zorder=3,
+            strengths, value, linestyle=LINES[number], color=COLOURS[number], marker=MARKERS[number],
+            markersize=8 - 1.2 * number, linewidth=2.4 - 0.4 * number, markerfacecolor="white", label=WORDS[policy],
+            clip_on=False, zorder=3,
         )  # fmt: skip
     for name, strength in PRESETS.items():
         axes.axvline(strength, color=LIMIT, linestyle=":", linewidth=0.8)

@@ -118,6 +118,7 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
             if fits(disturbances[name], place)
         },
         "preset": ({"name": "light", "plant": plant},),
+        "uncertainty_of": ({"plant": plant, "disturbances": [noise]},),
         "Effect": (effect,),
         "Plant": ({"robot": robot, "scene": place.scenario.scene}, 0.3),
         "Plant.substeps": ({"self": plant, "period": 1 / 6},),
@@ -149,7 +150,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
     asked = {
         "scenario": reference, "sweeps": {"noise": (ls.ControlNoise(0.1),)}, "strengths": (0.0, 1.0),
         "policies": ("open_loop",), "trials": 2, "seed": 0, "replan_every": 0.5, "goal_radius": 0.1,
-        "goal_tolerance": None, "shard": 2, "time_limit": 60.0,
+        "goal_tolerance": None, "shard": 2, "time_limit": 60.0, "stated": None,
     }  # fmt: skip
     campaign = ls.Campaign(**asked)
     results = ls.run_campaign(campaign, place.folder / "campaign", workers=0)
@@ -211,7 +212,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
         },),
         "ReliabilityProblem": ({
             "scenario": reference, "sweep": "light", "strength": 1.0, "policy": "smooth", "failure": "miss",
-            "goal_radius": 0.1, "goal_tolerance": None,
+            "goal_radius": 0.1, "goal_tolerance": None, "stated": None,
         },),
         **{
             f"ReliabilityProblem.{name}": ({

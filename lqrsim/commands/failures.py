@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Folder, optional
+from lqrsim.commands.options import Folder, Policy, optional
 
 if TYPE_CHECKING:
     from lqrsim.results.rollout import Rollout
@@ -23,8 +23,10 @@ class Search:
     """Disturbances, as in `lqrsim stress`; by default those of the scenario's demo, which its policy should survive."""
     strength: Annotated[float, arg(metavar="FACTOR")] = 1.0
     """What the disturbances are multiplied by."""
-    policy: Literal["smooth", "ilqr", "open_loop", "replan"] = "smooth"
+    policy: Policy = "smooth"
     """As in `lqrsim stress`."""
+    stated: Annotated[str | None, optional("NAME")] = None
+    """Disturbances that track or offset_free is made for, as in `lqrsim stress`. By default moderate."""
     failure: Literal["collision", "miss"] = "collision"
     """collision: with an obstacle, or lost. miss: any trial that does not reach its goal."""
     goal_radius: Annotated[float | None, optional("METRES")] = None
@@ -42,6 +44,7 @@ class Search:
             sweep=self.sweep,
             strength=self.strength,
             policy=self.policy,
+            stated=self.stated,
             failure=self.failure,
             goal_radius=self.goal_radius,
             goal_tolerance=self.goal_tolerance,

@@ -1,7 +1,7 @@
 """What the options of several commands share."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import arg
 
@@ -11,4 +11,6 @@ def optional(metavar: str) -> object:
     return arg(metavar=metavar, help_behavior_hint="")
 
 
+Policy = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
+ControllerName = Literal["feedback", "track", "offset_free", "replan"]
 Folder = Annotated[Path | None, optional("FOLDER")]

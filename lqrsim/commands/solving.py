@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Folder, optional
+from lqrsim.commands.options import ControllerName, Folder, optional
 
 if TYPE_CHECKING:
     from lqrsim.simulation.disturbances import Disturbance
@@ -129,6 +129,11 @@ class Simulate:
     """Folder for rollout.npz. By default that of the solution."""
     open_loop: bool = False
     """Execute the plan without feedback: its controls, whatever the state."""
+    controller: ControllerName = "feedback"
+    """feedback: the solution's policy. track: keeps to its plan. offset_free: the same, and estimates the state and
+    what disturbs it. replan: solves again as it goes, each tenth of the horizon."""
+    stated: Annotated[str | None, optional("NAME")] = None
+    """Disturbances that track or offset_free is made for: a set by name, as below. By default moderate."""
     disturbances: Annotated[tuple[str, ...], optional("NAME ...")] = ()
     """Sets by name, as in `lqrsim stress --sweep`: a preset (calm, light, moderate, strong, severe), or scenario for
     those of the scenario's demo; NAME:KIND for one kind of them alone. What the options below say comes on top."""
@@ -162,7 +167,10 @@ class Simulate:
         from lqrsim.scenarios.references import resolve
         from lqrsim.simulation.closed_loop import simulate
         from lqrsim.stress.sweeps import sweep
+        from lqrsim.stress.trials import controller_by_name
 
+        if self.open_loop and self.controller != "feedback":
+            raise InputError(f"--open-loop: got it with --controller {self.controller}, want one of them")
         folder = self.out or self.solution.parent
         console.check_output("--out", folder)
         solution = save_load.load_solution(self.solution)
@@ -171,11 +179,15 @@ class Simulate:
                 "--scenario: got none, and the solution names none, want the one whose robot and scene to use"
             )
         scenario = resolve(self.scenario or solution.scenario, registered_only=not self.scenario)
+        if self.open_loop:
+            solution = solution.open_loop()
+        law = controller_by_name(self.controller, scenario, solution, self.stated)
         named = [one.scaled(self.strength) for name in self.disturbances for one in sweep(name, scenario)]
         with console.progress("simulating", "step") as progress:
             rollout = simulate(
                 scenario.plant(),
-                solution.open_loop() if self.open_loop else solution,
+                solution,
+                controller=law,
                 disturbances=[*named, *self._single_disturbances()],
                 seed=self.seed,
                 trials=self.trials,

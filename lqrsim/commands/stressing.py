@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Folder, optional
+from lqrsim.commands.options import Folder, Policy, optional
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,11 +28,13 @@ class Stress:
     NAME:KIND for one kind of them alone."""
     strengths: Annotated[tuple[float, ...], arg(metavar="FACTOR ...")] = (0.0, 0.5, 1.0, 1.5, 2.0)
     """What the disturbances are multiplied by; 0.5 and 2 make light calm and moderate."""
-    policies: Annotated[
-        tuple[Literal["smooth", "ilqr", "open_loop", "replan"], ...] | None, arg(help_behavior_hint="")
-    ] = None
-    """open_loop: the plan of smooth without feedback. replan: solves again as it goes. All meet the same numbers. By
-    default all four; ilqr is left out where the scenario has constraints, which it cannot keep."""
+    policies: Annotated[tuple[Policy, ...] | None, arg(help_behavior_hint="")] = None
+    """open_loop: the plan of smooth without feedback. replan: solves again as it goes. track: keeps to the plan of
+    smooth. offset_free: the same, and estimates the state and what disturbs it. All meet the same numbers. By default
+    the first four; ilqr is left out where the scenario has constraints, which it cannot keep."""
+    stated: Annotated[str | None, optional("NAME")] = None
+    """Disturbances that track and offset_free are made for, named as above; they are told no more of what they meet. By
+    default moderate."""
     trials: int = 200
     """Of each sweep, strength and policy."""
     seed: int = 0
@@ -62,7 +64,7 @@ class Stress:
         """Carry the command out; its exit code."""
         from lqrsim.commands import console
         from lqrsim.scenarios.references import folder_name, resolve
-        from lqrsim.stress.campaign import Campaign, run_campaign
+        from lqrsim.stress.campaign import USUAL, Campaign, run_campaign
         from lqrsim.stress.results import Results
         from lqrsim.stress.sweeps import sweep
         from lqrsim.stress.trials import possible_policies
@@ -76,7 +78,8 @@ class Stress:
                 scenario=self.scenario,
                 sweeps={name: sweep(name, scenario) for name in self.sweep},
                 strengths=self.strengths,
-                policies=possible_policies(scenario) if self.policies is None else self.policies,
+                policies=possible_policies(scenario, USUAL) if self.policies is None else self.policies,
+                stated=None if self.stated is None else sweep(self.stated, scenario),
                 trials=self.trials,
                 seed=self.seed,
                 replan_every=self.replan_every,

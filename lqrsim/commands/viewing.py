@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import optional
+from lqrsim.commands.options import ControllerName, optional
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
@@ -120,15 +120,20 @@ class View:
     """What else goes wrong in a live run: the scenario's disturbances, so many times as strong."""
     seed: int = 0
     """Of their random draws."""
+    controller: ControllerName = "feedback"
+    """What flies or drives a live run, as in `lqrsim simulate`."""
+    stated: Annotated[str | None, optional("NAME")] = None
+    """Disturbances that track or offset_free is made for, as in `lqrsim simulate`. By default moderate."""
     push: Annotated[float, arg(metavar="M/S")] = 0.3
     """By how much a key changes the robot's velocity."""
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
         from lqrsim.commands import console
-        from lqrsim.errors import check_count, check_number, check_seed
+        from lqrsim.errors import InputError, check_count, check_number, check_seed
         from lqrsim.results import save_load
         from lqrsim.scenarios.references import resolve
+        from lqrsim.stress.trials import controller_by_name
         from lqrsim.view import viewer
 
         check_number("--speed", self.speed, at_least=0.01, at_most=100)
@@ -141,6 +146,8 @@ class View:
         kind = self.viewer if self.viewer != "auto" else "window" if viewer.has_display() else "browser"
         options = {"push": self.push, "speed": self.speed, "seconds": self.seconds}
         if self.what.endswith(".npz"):
+            if self.controller != "feedback" or self.stated is not None:
+                raise InputError(f"--controller, --stated: got one with {self.what}, want them with a SCENARIO")
             rollout = save_load.load_rollout(self.what)
             shown = viewer.arguments_for_rollout(rollout, self.trial)
 
@@ -151,11 +158,13 @@ class View:
             plant = scenario.plant()
             solution = console.solve(scenario.problem, "smooth", reach=scenario.target_radius())
             shown = viewer.arguments_for_plant(plant, solution)
+            law = controller_by_name(self.controller, scenario, solution, self.stated)
             wrong = [one.scaled(self.disturbances) for one in scenario.disturbances if self.disturbances]
 
             def go(screen: "Viewer") -> None:
                 console.say(viewer.KEYS)
-                viewer.live(plant, solution, screen, disturbances=wrong, seed=self.seed, ended=console.say)
+                options = {"controller": law, "disturbances": wrong, "seed": self.seed}
+                viewer.live(plant, solution, screen, ended=console.say, **options)
 
         with viewer.open_viewer(kind, self.port, title=f"lqrsim {self.what}", **shown, **options) as screen:
             console.say(screen.instructions)

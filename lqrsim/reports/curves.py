@@ -14,7 +14,10 @@ from lqrsim.view import style
 from lqrsim.view.style import RUNS
 
 SIZE = 5.2, 3.7
-LINES, MARKERS = ("-", "--", "-.", ":"), ("o", "s", "^", "D", "v")
+# One for each policy; in grey they are told apart by lines and markers, too.
+COLOURS = (*RUNS, "#e69f00", "#882255")
+LINES = ("-", "--", "-.", ":", (0, (6, 1.5, 1, 1.5, 1, 1.5)), (0, (8, 2)))
+MARKERS = ("o", "s", "^", "D", "v", "P")
 
 
 def plot_success(curves: Mapping[str, Sequence[Success]], path: str | os.PathLike[str]) -> Path:
@@ -59,12 +62,12 @@ def plot_errors(curves: Mapping[str, Mapping[float, Array]], path: str | os.Path
 
 def _draw(axes: Axes, number: int, name: str, strengths: Sequence[float], band: Sequence[Array] | Array) -> None:
     low, value, high = band
-    colour = RUNS[number % len(RUNS)]
+    colour = COLOURS[number % len(COLOURS)]
     axes.fill_between(strengths, low, high, color=colour, alpha=0.15, linewidth=0)
     # Curves may lie on each other: those below are wider, and their markers larger.
     wide = max(4 - number, 1)
     axes.plot(
-        strengths, value, LINES[number % len(LINES)], color=colour, marker=MARKERS[number % len(MARKERS)],
+        strengths, value, linestyle=LINES[number % len(LINES)], color=colour, marker=MARKERS[number % len(MARKERS)],
         markersize=3 + 1.3 * wide, linewidth=0.8 + 0.4 * wide, markerfacecolor="white", label=name, clip_on=False,
     )  # fmt: skip
 

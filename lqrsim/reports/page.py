@@ -20,9 +20,11 @@ from lqrsim.results.goal import tracking_unit
 from lqrsim.results.save_load import replacing
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
+from lqrsim.simulation.uncertainty_of import uncertainty_of
 from lqrsim.stress import analysis
 from lqrsim.stress.results import Results
-from lqrsim.stress.specification import Campaign, Cell
+from lqrsim.stress.specification import TOLD, Campaign, Cell
+from lqrsim.stress.trials import stated_disturbances
 
 MOST_VIDEOS = 100  # a page with more is too large for a browser
 
@@ -146,6 +148,13 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
             f" numbers in each, of seed {campaign.seed}."
         ],
     }
+    if told := [policy for policy in tables.policies(table) if policy in TOLD]:
+        stated = stated_disturbances(scenario, campaign.stated)
+        unknown = uncertainty_of(scenario.plant(), stated).left_out
+        facts["Stated"] = [
+            f"{' and '.join(told)}: made for {_describe(stated, scenario)}.",
+            *([f"Not part of it: {'; '.join(unknown)}."] if unknown else []),
+        ]
     if manifest.get("versions"):
         facts["Versions"] = [", ".join(f"{name} {version}" for name, version in manifest["versions"].items())]
     if manifest.get("machine"):

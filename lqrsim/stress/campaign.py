@@ -30,11 +30,20 @@ from lqrsim.stress.lock import sole_writer
 from lqrsim.stress.manifest import NAME, digest_of_solution, read_manifest, write_manifest
 from lqrsim.stress.results import Results
 from lqrsim.stress.specification import POLICIES as POLICIES
+from lqrsim.stress.specification import TOLD, Shard
+from lqrsim.stress.specification import USUAL as USUAL
 from lqrsim.stress.specification import Campaign as Campaign
 from lqrsim.stress.specification import Cell as Cell
-from lqrsim.stress.specification import Shard
 from lqrsim.stress.trial_tables import Damaged, write
-from lqrsim.stress.trials import Job, left_out, possible_policies, solve, without_diagnostics
+from lqrsim.stress.trials import (
+    Job,
+    controller_of,
+    left_out,
+    possible_policies,
+    solve,
+    stated_uncertainty,
+    without_diagnostics,
+)
 from lqrsim.versions import changed, versions
 
 _log = logging.getLogger("lqrsim")
@@ -143,6 +152,8 @@ def _check_runnable(campaign: Campaign, scenario: Scenario) -> None:
                 raise InputError(f"sweeps: {cell.sweep} at strength {cell.strength:g}: {error}") from None
             except Exception:  # may depend on the trial, or on the plan; then it is those trials' error
                 _log.debug("%s cannot be started beforehand", disturbance, exc_info=True)
+    if {*TOLD} & {*campaign.policies}:
+        stated_uncertainty(scenario, campaign.stated)
     if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
         raise InputError(f"replan_every: got {campaign.replan_every:g} s, want at least {problem.dt:g}")
 
@@ -168,8 +179,10 @@ def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Pat
     if os.path.exists(folder / NAME):
         _check_same_campaign(specification, read_manifest(folder), folder)
         return
-    policies = {}
-    for policy, solution in solve(campaign.policies, scenario).items():
+    policies, solutions = {}, solve(campaign.policies, scenario, campaign.stated)
+    for policy in {*TOLD} & {*campaign.policies}:  # what cannot be made is not begun
+        controller_of(policy, scenario, solutions[policy], stated=campaign.stated)
+    for policy, solution in solutions.items():
         path = save_load.save(solution, folder / "policies" / f"{policy}.npz")
         policies[policy] = {"digest": digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
     about = {"versions": versions(), "machine": description(), "left_out": left_out(campaign.policies, scenario)}
@@ -194,7 +207,7 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
 
 def _code(campaign: Campaign) -> dict[str, str | None]:
     """Hash of the file of each disturbance that is not lqrsim's own; None where it is in none."""
-    kinds = {type(one) for sweep in campaign.sweeps.values() for one in sweep}
+    kinds = {type(one) for sweep in (*campaign.sweeps.values(), campaign.stated or ()) for one in sweep}
     hashes: dict[str, str | None] = {}
     for kind in sorted(kinds, key=lambda kind: kind.__qualname__):
         if kind.__module__.partition(".")[0] != "lqrsim":

@@ -36,11 +36,11 @@ from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress.design_point import DesignPoint, LargestEffect, largest_effects, smallest_failure
 from lqrsim.stress.manifest import digest_of_solution
 from lqrsim.stress.multilevel_splitting import MOST, SplittingResult, split
-from lqrsim.stress.specification import POLICIES, disturbance_as_json
+from lqrsim.stress.specification import POLICIES, check_told, disturbance_as_json
 from lqrsim.stress.statistics import Estimate
 from lqrsim.stress.sweeps import sweep
 from lqrsim.stress.trial_score import TrialScore, collision, miss
-from lqrsim.stress.trials import controller, solve
+from lqrsim.stress.trials import controller_of, solve
 from lqrsim.versions import versions
 
 FAILURES = {"collision": collision, "miss": miss}
@@ -56,7 +56,8 @@ class ReliabilityProblem:
       scenario: what is run, as `lqrsim solve` takes it.
       sweep: disturbances, as `lqrsim stress` names them; by default those of the scenario's demo.
       strength: what they are multiplied by.
-      policy: as in `Campaign`.
+      policy: as in `Campaign`. stated: disturbances that "track" or "offset_free" is made for, by name like `sweep`; by
+        default as in `Campaign`.
       failure: "collision", with an obstacle, or lost; "miss", any trial that does not reach its goal.
       goal_radius, goal_tolerance: how near the goal counts as having reached it, as in `simulate`; by default as the
         scenario has it.
@@ -73,12 +74,16 @@ class ReliabilityProblem:
     failure: str = "collision"
     goal_radius: float | None = None
     goal_tolerance: float | None = None
+    stated: str | None = None
 
     def __post_init__(self) -> None:
         check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=4000)
         check_text("sweep", self.sweep, "a name, such as 'light'")
         object.__setattr__(self, "strength", check_number("strength", self.strength, above=0.0))
         check_name("policy", self.policy, POLICIES)
+        if self.stated is not None:
+            check_told("stated", (self.policy,))
+            check_text("stated", self.stated, "a name, such as 'light'")
         check_name("failure", self.failure, FAILURES)
         for field in ("goal_radius", "goal_tolerance"):
             if (value := getattr(self, field)) is not None:
@@ -93,12 +98,13 @@ class ReliabilityProblem:
             raise InputError(
                 f"failure: got 'collision' for {self.scenario}, where nothing measures how near it is, want 'miss'"
             )
-        solution = solve((self.policy,), scenario)[self.policy]
+        stated = None if self.stated is None else sweep(self.stated, scenario)
+        solution = solve((self.policy,), scenario, stated)[self.policy]
         score = TrialScore(
             plant,
             solution,
             disturbances,
-            controller=controller(self.policy, scenario, solution),
+            controller=controller_of(self.policy, scenario, solution, stated=stated),
             **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             failure=FAILURES[self.failure],
         )

@@ -20,7 +20,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.stress.specification import POLICIES, Campaign, Cell
 from lqrsim.stress.trial_tables import write
 
-FORMAT, VERSION, NAME = "lqrsim campaign", 3, "manifest.json"
+FORMAT, VERSION, NAME = "lqrsim campaign", 4, "manifest.json"
 _LARGEST = 1 << 26  # bytes
 
 _HASH = schema.line
@@ -36,6 +36,7 @@ _CAMPAIGN = schema.record(
             ("replan_every", "goal_radius", "goal_tolerance"), schema.optional(schema.number(above=0.0))
         ),
         "shard": schema.count, "time_limit": schema.number(above=0.0),
+        "stated": schema.optional(schema.listed(_DISTURBANCE)),
     }
 )  # fmt: skip
 _MANIFEST = schema.record(
@@ -93,7 +94,7 @@ def _check(manifest: dict[str, Any]) -> None:
 def _cells(campaign: Mapping[str, Any]) -> list[list[Any]]:
     """Each policy, sweep and strength, in the order of their numbers. Raises InputError if it is no campaign."""
     # Its disturbances may be a user's, and are made only where that user's file was named.
-    bare = Campaign(**{**campaign, "sweeps": dict.fromkeys(campaign["sweeps"], ())})
+    bare = Campaign(**{**campaign, "sweeps": dict.fromkeys(campaign["sweeps"], ()), "stated": None})
     return [[cell.policy, cell.sweep, cell.strength] for cell in bare.cells]
 
 

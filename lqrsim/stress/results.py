@@ -93,9 +93,10 @@ class Results:
     def summary(self) -> str:
         """A line for each cell: how its trials ended, how sure the rate is; then where the plans end, and errors."""
         width = max(len(name) for name in ["sweep", *self.manifest["campaign"]["sweeps"]])
+        wide = max(10, *(len(policy) for policy in self.manifest["policies"]))
         others = [name for name in OUTCOMES if name != "reached"]
         interval = f"reached, {100 * CONFIDENCE:g} % interval"
-        head = f"{'sweep':<{width}} {'strength':>8} {'policy':<10} {interval:>33}"
+        head = f"{'sweep':<{width}} {'strength':>8} {'policy':<{wide}} {interval:>33}"
         lines, reasons = [head + "".join(f" {name:>9}" for name in others)], Counter[str]()
         for cell in self.cells:
             ends = self.tally(cell, partial=True)
@@ -106,7 +107,7 @@ class Results:
             share = f"{among:>13} {100 * sure.value:5.1f} [{100 * sure.low:5.1f}, {100 * sure.high:5.1f}]"
             if alike(self.outcomes(cell, partial=True)):
                 share = f"{among:>13} deterministic: 1 run"
-            line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<10} {share:>33}"
+            line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {share:>33}"
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
             if ends["error"]:
                 reasons.update(self.reasons(cell).values())

@@ -25,7 +25,9 @@ from lqrsim.scenarios.references import from_anywhere
 from lqrsim.simulation.disturbances import Disturbance
 
 _FILES = 1_000_000  # of shards in a folder
-POLICIES = ("smooth", "ilqr", "open_loop", "replan")
+POLICIES = ("smooth", "ilqr", "open_loop", "replan", "track", "offset_free")
+TOLD = ("track", "offset_free")  # which are made for stated disturbances
+USUAL = tuple(policy for policy in POLICIES if policy not in TOLD)  # which are run unless others are asked for
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,10 @@ class Campaign:
       scenario: what is run, as `lqrsim solve` takes it.
       sweeps: name -> disturbances at strength 1. strengths: what they are multiplied by.
       policies: which of POLICIES: "smooth" is lqrsim.smooth's, "ilqr" that of lqrsim.ilqr; "open_loop" is the plan of
-        smooth without feedback; "replan" solves again and again as it goes.
+        smooth without feedback; "replan" solves again and again as it goes; "track" and "offset_free" keep to the plan
+        of smooth, by lqrsim.track and lqrsim.OffsetFree. By default the first four.
+      stated: the disturbances that "track" and "offset_free" are made for, whatever they then meet; by default those of
+        the preset "moderate", for one policy has to do for all strengths, and that is in the middle.
       trials: of each cell. seed: of all random numbers.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
       goal_radius, goal_tolerance: how near the goal counts as having reached it, as in `simulate`; by default as the
@@ -105,7 +110,7 @@ class Campaign:
     scenario: str
     sweeps: Mapping[str, tuple[Disturbance, ...]]
     strengths: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0)
-    policies: tuple[str, ...] = POLICIES
+    policies: tuple[str, ...] = USUAL
     trials: int = 200
     seed: int = 0
     replan_every: float | None = None
@@ -113,6 +118,7 @@ class Campaign:
     goal_tolerance: float | None = None
     shard: int = 500
     time_limit: float = 300.0
+    stated: tuple[Disturbance, ...] | None = None
 
     def __post_init__(self) -> None:
         check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=4000)
@@ -136,6 +142,13 @@ class Campaign:
                 raise InputError(f"{field}: got {excerpt(values)}, want at least one, and each once")
             object.__setattr__(self, field, values)
         object.__setattr__(self, "sweeps", sweeps)
+        if self.stated is not None:
+            check_told("stated", policies)
+            wanted = "a tuple of disturbances, such as (ControlNoise(0.05),)"
+            stated = check_items("stated", self.stated, Disturbance, wanted)
+            if not stated:
+                raise InputError("stated: got none, want at least one disturbance, or None for the default")
+            object.__setattr__(self, "stated", stated)
         for field in ("trials", "shard"):
             object.__setattr__(self, field, check_count(field, getattr(self, field)))
         object.__setattr__(self, "seed", check_seed("seed", self.seed))
@@ -173,7 +186,9 @@ class Campaign:
         sweeps = {
             name: [disturbance_as_json(disturbance) for disturbance in sweep] for name, sweep in self.sweeps.items()
         }
-        return fields | {"sweeps": sweeps, "strengths": list(self.strengths), "policies": list(self.policies)}
+        stated = None if self.stated is None else [disturbance_as_json(disturbance) for disturbance in self.stated]
+        lists = {"strengths": list(self.strengths), "policies": list(self.policies)}
+        return fields | {"sweeps": sweeps, "stated": stated} | lists
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> "Campaign":
@@ -187,11 +202,20 @@ class Campaign:
             sweeps = {
                 name: tuple(_disturbance_from_json(one) for one in sweep) for name, sweep in fields["sweeps"].items()
             }
-            return cls(**{**fields, "sweeps": sweeps})
+            stated = fields["stated"]
+            if stated is not None:
+                stated = tuple(_disturbance_from_json(one) for one in stated)
+            return cls(**{**fields, "sweeps": sweeps, "stated": stated})
         except InputError:
             raise
         except Exception as error:  # whatever a disturbance raises of settings that are not its own
             raise InputError(f"campaign: got {excerpt(fields)}, want what lqrsim wrote ({error})") from None
+
+
+def check_told(field: str, policies: Sequence[str]) -> None:
+    """Raise InputError if none of the policies is made for stated disturbances."""
+    if not {*TOLD} & {*policies}:
+        raise InputError(f"{field}: got it with {', '.join(policies)}, want it with {' or '.join(TOLD)}, or none")
 
 
 def disturbance_as_json(disturbance: Disturbance) -> dict[str, Any]:

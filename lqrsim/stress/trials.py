@@ -9,19 +9,29 @@ from typing import Any
 import numpy as np
 
 from lqrsim.control.controllers import Controller, Feedback, Replanning
-from lqrsim.errors import InputError, told
+from lqrsim.control.offset_free import OffsetFree
+from lqrsim.control.tracking import track
+from lqrsim.control.uncertainty import Uncertainty
+from lqrsim.errors import InputError, check_name, told
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.closed_loop import simulate
+from lqrsim.simulation.disturbances import Disturbance, preset
 from lqrsim.simulation.outcome_table import Outcomes, outcomes
+from lqrsim.simulation.uncertainty_of import uncertainty_of
 from lqrsim.solvers.ilqr import ilqr
 from lqrsim.solvers.smoother import smooth
-from lqrsim.stress.specification import POLICIES, Campaign, Cell, Shard
+from lqrsim.stress.specification import POLICIES, TOLD, Campaign, Cell, Shard, check_told
+from lqrsim.stress.sweeps import sweep
 from lqrsim.stress.trial_tables import Table, pack
 
 _log = logging.getLogger("lqrsim")
+
+CONTROLLERS = ("feedback", "track", "offset_free", "replan")
+_RUN_BY = {"replan": "replan", "offset_free": "offset_free"}  # the other policies are those of their solutions
+_STATED = "moderate"  # the preset that is stated by default
 
 
 @dataclass(frozen=True)
@@ -48,12 +58,17 @@ def without_diagnostics(solution: Solution) -> Solution:
     )
 
 
-def solve(policies: tuple[str, ...], scenario: Scenario) -> dict[str, Solution]:
-    """The solution behind each policy. Raises InputError if one can not be run at all."""
+def solve(
+    policies: tuple[str, ...], scenario: Scenario, stated: Sequence[Disturbance] | None = None
+) -> dict[str, Solution]:
+    """The solution behind each policy, those made for what is stated included. Raises InputError if one cannot be run.
+
+    That of "track" has its law; that of "offset_free" is the plan that it keeps to, with the policy of "smooth".
+    """
     solutions: dict[str, Solution] = {}
     if {*policies} - {"ilqr"}:
         smoothed = smooth(scenario.problem)
-        solutions |= {"smooth": smoothed, "open_loop": smoothed.open_loop(), "replan": smoothed}
+        solutions |= dict.fromkeys(("smooth", "replan", *TOLD), smoothed) | {"open_loop": smoothed.open_loop()}
     if "ilqr" in policies:
         solutions["ilqr"] = ilqr(scenario.problem)
     for policy in policies:
@@ -62,12 +77,28 @@ def solve(policies: tuple[str, ...], scenario: Scenario) -> dict[str, Solution]:
         solutions[policy] = replace(solutions[policy], goal_radius=scenario.target_radius())
         if not solutions[policy].success:
             _log.warning("%s did not converge (%s); its plan is run as it is", policy, solutions[policy].status.name)
+    if "track" in policies:
+        law = track(scenario.problem, solutions["track"], uncertainty=stated_uncertainty(scenario, stated))
+        solutions["track"] = replace(solutions["track"], policy=law)
     return {policy: solutions[policy] for policy in policies}
 
 
-def possible_policies(scenario: Scenario) -> tuple[str, ...]:
-    """The policies that the scenario can have: all of POLICIES, but for those that cannot keep its constraints."""
-    return tuple(policy for policy in POLICIES if not (policy == "ilqr" and scenario.problem.constraints))
+def stated_disturbances(scenario: Scenario, stated: Sequence[Disturbance] | None = None) -> Sequence[Disturbance]:
+    """Those, or by default a preset's."""
+    return preset(_STATED, scenario.plant()) if stated is None else stated
+
+
+def stated_uncertainty(scenario: Scenario, stated: Sequence[Disturbance] | None = None) -> Uncertainty:
+    """What "track" and "offset_free" are made for. Raises InputError where the scenario's robot cannot have it."""
+    try:
+        return uncertainty_of(scenario.plant(), stated_disturbances(scenario, stated))
+    except InputError as error:
+        raise InputError(f"stated: {error}") from None
+
+
+def possible_policies(scenario: Scenario, among: Sequence[str] = POLICIES) -> tuple[str, ...]:
+    """Those of the policies that the scenario can have: all, but for those that cannot keep its constraints."""
+    return tuple(policy for policy in among if not (policy == "ilqr" and scenario.problem.constraints))
 
 
 def left_out(policies: Sequence[str], scenario: Scenario) -> str:
@@ -76,13 +107,65 @@ def left_out(policies: Sequence[str], scenario: Scenario) -> str:
     return f"left out: {', '.join(missing)}, which cannot keep the scenario's constraints" if missing else ""
 
 
-def controller(policy: str, scenario: Scenario, solution: Solution, replan_every: float | None = None) -> Controller:
-    """What runs a policy; by default it plans again each tenth of the horizon."""
+def controller(
+    name: str,
+    scenario: Scenario,
+    solution: Solution,
+    *,
+    stated: Sequence[Disturbance] | None = None,
+    replan_every: float | None = None,
+) -> Controller:
+    """One of CONTROLLERS, about a solution of the scenario.
+
+    Args:
+      name: "feedback", the solution's policy; "track" and "offset_free", `lqrsim.track` and `lqrsim.OffsetFree` about
+        its plan; "replan", which solves again as it goes.
+      stated: disturbances that "track" and "offset_free" are made for, as in `Campaign`.
+      replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
+
+    Raises:
+      InputError: there is none of that name, or it does not fit the scenario and the solution.
+    """
     problem = scenario.problem
-    if policy != "replan":
-        return Feedback(solution.policy)
-    every = max(problem.dt, problem.steps * problem.dt / 10) if replan_every is None else replan_every
-    return Replanning(problem, solution, every=every)
+    match check_name("controller", name, CONTROLLERS):
+        case "track":
+            return Feedback(track(problem, solution, uncertainty=stated_uncertainty(scenario, stated)))
+        case "offset_free":
+            return OffsetFree(problem, solution, stated_uncertainty(scenario, stated))
+        case "replan":
+            if solution.problem_digest != problem.digest:
+                raise InputError(
+                    f"controller: got replan for a solution of another problem than that of {scenario.name}, want one"
+                    f" that was solved as the scenario has it, or another of {', '.join(CONTROLLERS)}"
+                )
+            every = max(problem.dt, problem.steps * problem.dt / 10) if replan_every is None else replan_every
+            return Replanning(problem, solution, every=every)
+    return Feedback(solution.policy)
+
+
+def controller_by_name(name: str, scenario: Scenario, solution: Solution, stated: str | None = None) -> Controller:
+    """The same, but that what is stated is named, as `sweep` names it.
+
+    Raises:
+      InputError: as `controller`; or there is no such name, or a controller that has no use for it.
+    """
+    if stated is None:
+        return controller(name, scenario, solution)
+    check_told("stated", (name,))
+    return controller(name, scenario, solution, stated=sweep(stated, scenario))
+
+
+def controller_of(
+    policy: str,
+    scenario: Scenario,
+    solution: Solution,
+    *,
+    stated: Sequence[Disturbance] | None = None,
+    replan_every: float | None = None,
+) -> Controller:
+    """What runs one of POLICIES, given what `solve` has for it."""
+    name = _RUN_BY.get(policy, "feedback")
+    return controller(name, scenario, solution, stated=stated, replan_every=replan_every)
 
 
 class Trials:
@@ -96,6 +179,7 @@ class Trials:
         self.campaign, self.scenario, self.solutions = campaign, scenario, solutions
         self.plant = scenario.plant()
         self.controller: Controller | None = None
+        self._made: dict[str, Controller] = {}
 
     def run(self, cell: Cell, first: int, count: int = 1, *, frames: bool, contacts: bool) -> Rollout:
         """So many trials of a cell, from the first on."""
@@ -115,9 +199,12 @@ class Trials:
         )
 
     def warm_up(self) -> None:
-        """Have everything compiled, by an undisturbed trial."""
+        """Have everything compiled, by undisturbed trials."""
         solution = next(iter(self.solutions.values()))
         self.outcomes(simulate(self.plant, solution, frames=False, contacts=False, threads=1))
+        if (solution := self.solutions.get("offset_free")) is not None:  # whose filter is compiled, too
+            law = self._controller("offset_free")
+            simulate(self.plant, solution, controller=law, frames=False, contacts=False, threads=1)
 
     def outcomes(self, rollout: Rollout) -> Outcomes:
         """How the trials of a rollout ended."""
@@ -151,7 +238,11 @@ class Trials:
             return failed(trial, 1, told(error))
 
     def _controller(self, policy: str) -> Controller:
-        return controller(policy, self.scenario, self.solutions[policy], self.campaign.replan_every)
+        """Made once, for its gains take a while; a run begins it anew."""
+        if policy not in self._made:
+            options = {"stated": self.campaign.stated, "replan_every": self.campaign.replan_every}
+            self._made[policy] = controller_of(policy, self.scenario, self.solutions[policy], **options)
+        return self._made[policy]
 
 
 def failed(first: int, count: int, reason: str) -> Table:

@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from lqrsim.control.controllers import Controller
 from lqrsim.errors import Array, InputError
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -141,6 +142,7 @@ def live(
     viewer: Viewer,
     *,
     disturbances: Sequence[Disturbance] = (),
+    controller: Controller | None = None,
     seed: int = 0,
     ended: Callable[[str], object] = lambda line: None,
 ) -> None:
@@ -164,7 +166,8 @@ def live(
     with contextlib.suppress(ViewerClosed):
         while True:
             with contextlib.suppress(RestartRequested):
-                rollout = simulate(plant, solution, disturbances=everything, seed=seed, first_trial=run, watch=watch)
+                options = {"controller": controller, "disturbances": everything, "seed": seed, "first_trial": run}
+                rollout = simulate(plant, solution, watch=watch, **options)
                 ended(rollout.summary().splitlines()[-1].strip().replace("trial", "run"))
                 viewer.wait(PAUSE_SECONDS)
             run += 1

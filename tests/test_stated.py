@@ -1,0 +1,243 @@
+"""Policies that are made for stated disturbances, by name: in campaigns, searches for failures, and commands."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim.cli import main
+from lqrsim.errors import InputError
+from lqrsim.reports.curves import COLOURS, LINES, MARKERS
+from lqrsim.stress.campaign import _code
+from lqrsim.stress.manifest import read_manifest
+from lqrsim.stress.specification import POLICIES, TOLD, USUAL
+from lqrsim.stress.trials import CONTROLLERS, controller, controller_of, solve
+
+LIGHT = (ls.ControlNoise(0.02), ls.MeasurementNoise(0.01), ls.AxleMismatch(0.01), ls.MotorLag(0.05))
+CAMPAIGN = ls.Campaign(
+    scenario="differential_drive",
+    sweeps={"own": LIGHT},
+    strengths=(2.0,),
+    policies=POLICIES,
+    replan_every=12.0,
+    trials=8,
+    shard=4,
+    stated=LIGHT,
+)
+
+
+def shards(results: ls.Results) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((results.folder / "shards").iterdir())}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> ls.Results:
+    return ls.run_campaign(CAMPAIGN, tmp_path_factory.mktemp("stated") / "here", workers=0)
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory, differential_drive: ls.Scenario, drive_solution: ls.Solution):
+    path = tmp_path_factory.mktemp("solved") / "solution.npz"
+    return ls.save(replace(drive_solution, scenario="differential_drive"), path)
+
+
+# Campaigns.
+
+
+@pytest.mark.parametrize(("workers", "batch"), [(1, 3), (2, 1)])
+def test_all_six_have_the_same_bits_in_other_processes_and_in_any_batch(
+    results: ls.Results, tmp_path: Path, workers: int, batch: int
+) -> None:
+    again = ls.run_campaign(CAMPAIGN, tmp_path, workers=workers, batch=batch)
+    assert len(shards(again)) == 12
+    assert shards(again) == shards(results)
+
+
+def test_trials_are_those_of_the_controllers_as_users_make_them(
+    results: ls.Results, differential_drive: ls.Scenario, drive_solution: ls.Solution
+) -> None:
+    plant, problem = differential_drive.plant(), differential_drive.problem
+    stated, wrong = ls.uncertainty_of(plant, LIGHT), [one.scaled(2.0) for one in LIGHT]
+    plan = replace(drive_solution, goal_radius=differential_drive.target_radius())
+    made = {
+        "track": ls.Feedback(ls.track(problem, plan, uncertainty=stated)),
+        "offset_free": ls.OffsetFree(problem, plan, stated),
+    }
+    for policy, law in made.items():
+        rollout = ls.simulate(plant, plan, controller=law, disturbances=wrong, trials=8, contacts=False)
+        rows, own = results.outcomes(ls.Cell(policy, "own", 2.0)), ls.outcomes(rollout, problem)
+        np.testing.assert_array_equal(rows.rms, own.rms)
+        np.testing.assert_array_equal(rows.clearance, own.clearance)
+        np.testing.assert_array_equal(rows.outcome, own.outcome)
+    assert results.solution("track").policy.digest == made["track"].digest
+    again = ls.replay(results, ls.Cell("offset_free", "own", 2.0), 5)
+    wanted = ls.simulate(plant, plan, controller=made["offset_free"], disturbances=wrong, first_trial=5)
+    np.testing.assert_array_equal(again.states, wanted.states)
+
+
+def test_what_is_stated_is_written_down_and_part_of_the_digest(results: ls.Results, tmp_path: Path) -> None:
+    assert ls.Campaign.from_json(json.loads(json.dumps(CAMPAIGN.as_json()))) == CAMPAIGN
+    assert results.manifest["campaign"]["stated"][2] == {
+        "kind": "AxleMismatch",
+        "settings": {"std": 0.01, "factor": None},
+    }
+    other = replace(CAMPAIGN, stated=(ls.ControlNoise(0.1), ls.MeasurementNoise(0.01)), trials=1)
+    with pytest.raises(InputError, match=r"^stated: got .*want .* or another folder"):
+        ls.run_campaign(replace(other, trials=8), results.folder, workers=0)
+    small = replace(other, policies=("track",), strengths=(1.0,))
+    digests = []
+    for number, stated in enumerate((None, LIGHT, other.stated)):
+        ls.run_campaign(replace(small, stated=stated), tmp_path / str(number), workers=0)
+        digests.append(read_manifest(tmp_path / str(number))["digest"])
+    assert len(set(digests)) == 3
+
+
+def test_by_default_the_preset_in_the_middle_is_stated(
+    differential_drive: ls.Scenario, drive_solution: ls.Solution
+) -> None:
+    moderate = ls.preset("moderate", differential_drive.plant())
+    for policy in TOLD:
+        digests = []
+        for stated in (None, moderate):
+            solution = solve((policy,), differential_drive, stated)[policy]
+            digests.append(controller_of(policy, differential_drive, solution, stated=stated).digest)
+        assert digests[0] == digests[1]
+
+
+@dataclass(frozen=True)
+class Own(ls.ControlNoise):
+    """One of a user's own."""
+
+
+def test_the_file_of_a_stated_disturbance_of_ones_own_is_hashed_too() -> None:
+    assert list(_code(replace(CAMPAIGN, stated=(Own(0.1),)))) == ["Own"]
+
+
+def test_the_usual_four_are_run_unless_others_are_asked_for() -> None:
+    assert ls.Campaign(scenario="quadrotor", sweeps={"own": LIGHT}).policies == USUAL == POLICIES[:4]
+    assert len({*COLOURS}) == len({*LINES}) == len({*MARKERS}) == len(POLICIES)
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"stated": ()}, "^stated: got none, want at least one disturbance"),
+        ({"stated": "light"}, "^stated: got 'light', want a tuple of disturbances"),
+        ({"policies": ("smooth", "replan")}, "^stated: got it with smooth, replan, want it with track or offset_free"),
+        ({"policies": ("tracking",)}, "^policies: got 'tracking', want .*track"),
+    ],
+)
+def test_campaigns_that_make_no_sense_are_refused(changes: dict[str, object], line: str) -> None:
+    with pytest.raises(InputError, match=line):
+        replace(CAMPAIGN, **changes)  # pyright: ignore[reportArgumentType]
+
+
+def test_what_the_robot_cannot_have_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^stated: Gusts: got robot differential_drive, which has no drag"):
+        ls.run_campaign(replace(CAMPAIGN, stated=(ls.Gusts(),)), tmp_path / "new", workers=0)
+    assert not (tmp_path / "new").exists()
+
+
+# Searches for failures.
+
+
+@pytest.mark.parametrize("policy", TOLD)
+def test_rare_and_break_run_them(policy: str, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
+    problem = ls.ReliabilityProblem("differential_drive", sweep="light", policy=policy, stated="severe")
+    severe = ls.uncertainty_of(differential_drive.plant(), ls.preset("severe", differential_drive.plant()))
+    plan = replace(drive_solution, goal_radius=differential_drive.target_radius())
+    law = (
+        ls.Feedback(ls.track(differential_drive.problem, plan, uncertainty=severe))
+        if policy == "track"
+        else ls.OffsetFree(differential_drive.problem, plan, severe)
+    )
+    assert problem.score.controller is not None
+    assert problem.score.controller.digest == law.digest
+    numbers = np.random.default_rng(0).standard_normal((2, problem.score.size))
+    rollout = problem.score.rollout(numbers, frames=False)
+    assert rollout.policy_digest == law.digest
+    assert (problem.score(numbers) < 0).all()  # they do not collide
+
+
+def test_searches_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(InputError, match=r"^stated: got it with smooth, want it with track or offset_free"):
+        ls.ReliabilityProblem("differential_drive", stated="light")
+    problem = ls.ReliabilityProblem("differential_drive", policy="track", stated="gale")
+    with pytest.raises(InputError, match=r"^sweep: got 'gale', want .*light"):
+        _ = problem.score
+
+
+# The command line.
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_simulate_runs_a_controller_by_its_name(
+    name: str, solved: Path, tmp_path: Path, differential_drive: ls.Scenario
+) -> None:
+    told = ["--stated", "light"] if name in TOLD else []
+    options = ["--disturbances", "light", "--trials", "3", "--out", str(tmp_path), "--controller", name, *told]
+    assert main(["simulate", str(solved), *options]) == 0
+    solution, plant = ls.load_solution(solved), differential_drive.plant()
+    light = ls.preset("light", plant)
+    stated, problem = ls.uncertainty_of(plant, light), differential_drive.problem
+    law = {
+        "feedback": lambda: ls.Feedback(solution.policy),
+        "track": lambda: ls.Feedback(ls.track(problem, solution, uncertainty=stated)),
+        "offset_free": lambda: ls.OffsetFree(problem, solution, stated),
+        "replan": lambda: ls.Replanning(problem, solution, every=problem.steps * problem.dt / 10),
+    }[name]()
+    wanted = ls.simulate(plant, solution, controller=law, disturbances=light, trials=3)
+    found = ls.load_rollout(tmp_path / "rollout.npz")
+    np.testing.assert_array_equal(found.states, wanted.states)
+    assert found.policy_digest == law.digest
+
+
+def test_a_plan_with_a_clearance_is_tracked_but_not_planned_again_without_it(
+    differential_drive: ls.Scenario,
+) -> None:
+    clear = ls.Clearance(differential_drive.scene.world, radius=differential_drive.robot.radius, margin=0.05)
+    solution = ls.smooth(replace(differential_drive.problem, constraints=[clear]))
+    assert controller("track", differential_drive, solution).digest
+    with pytest.raises(InputError, match=r"^controller: got replan for a solution of another problem"):
+        controller("replan", differential_drive, solution)
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ("--controller track --open-loop", "--open-loop: got it with --controller track, want one of them"),
+        ("--stated light", "stated: got it with feedback, want it with track or offset_free, or none"),
+        ("--controller track --stated gale", "sweep: got 'gale', want one of: scenario, calm"),
+    ],
+)
+def test_commands_that_make_no_sense_are_refused(
+    options: str, line: str, solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", str(solved), "--out", str(tmp_path), *options.split()]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"lqrsim: error: {line}")
+    assert said.count("\n") == 1
+
+
+def test_view_takes_a_controller_for_live_runs_only(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = str(solved.with_name("rollout.npz"))
+    solution = ls.load_solution(solved)
+    ls.save(ls.simulate(ls.scenarios.differential_drive().plant(), solution), run)
+    assert main(["view", run, "--controller", "track"]) == 2
+    assert "--controller, --stated: got one with" in capsys.readouterr().err
+    assert main(["view", "differential_drive", "--viewer", "browser", "--stated", "light"]) == 2
+    assert "stated: got it with feedback, want it with track or offset_free" in capsys.readouterr().err
+
+
+def test_stress_takes_the_new_ones_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = "--policies smooth track offset_free --stated calm --strengths 1 --trials 2 --workers 0 --sweep light"
+    assert main(["stress", "differential_drive", *options.split(), "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    rows = [line for line in printed if line.startswith("light")]
+    assert [line.split()[2] for line in rows] == ["smooth", "track", "offset_free"]
+    assert len({len(line) for line in rows}) == 1  # in columns, though a name is longer than others
+    plant = ls.scenarios.differential_drive().plant()
+    assert ls.Results(tmp_path).campaign.stated == tuple(ls.preset("calm", plant))
