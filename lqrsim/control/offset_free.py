@@ -15,6 +15,7 @@ from lqrsim.control.controllers import Control, Controller
 from lqrsim.control.kalman import check_observable, kalman_filter
 from lqrsim.control.loop_moments import Loop
 from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.policy_of_filter import policy_of
 from lqrsim.control.sensors import Sensors, sensor_of
 from lqrsim.control.tolerances import Prediction, choose_tolerances, with_filter
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of, tracking_laws
@@ -25,6 +26,7 @@ from lqrsim.kernels.records import Limits, Policy
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
+from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.solution import Solution
 
 
@@ -127,6 +129,11 @@ class OffsetFree(Controller):
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self.nominal[:-1])
         return Loop(truth, self.gain, offset, self.filter.gain, *_limits(self))
+
+    @property
+    def policy(self) -> OutputFeedbackPolicy:
+        """The same for a robot, with NumPy alone: predictions are linear about the plan. `save` writes it to a file."""
+        return policy_of(self)
 
     @property
     def digest(self) -> str:

@@ -120,3 +120,15 @@ def _rate(n: int, m: int, k: int) -> Callable[[Any, Any, Any], list[Any]]:
 def double_integrator(**options: Any) -> Linear:
     """A mass of 1 kg along a line, pushed by its control and by d0."""
     return linear([[0, 1], [0, 0]], [[0], [1]], [[0], [1]], **options)
+
+
+def law_of(
+    system: Linear, *, unknowns: Sequence[ls.Unknown] = (ls.Unknown("d0", 0.5),), **options: Any
+) -> ls.OffsetFree:
+    """Output feedback for it, with noise; the rest is of Uncertainty, but for `sensors`."""
+    sensors = options.pop("sensors", None)
+    stated: dict[str, Any] = {"unknowns": unknowns, "start": 0.3, "measurement": 0.1, "control": 0.2}
+    uncertainty = ls.Uncertainty(**(stated | options))
+    return ls.OffsetFree(
+        system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, sensors=sensors, record=True
+    )
