@@ -36,8 +36,10 @@ from .problem.problem import FixedState as FixedState
 from .problem.problem import Problem as Problem
 from .reports.page import report as report
 from .results.coordinates import Coordinates as Coordinates
+from .results.output_feedback import OutputFeedbackPolicy as OutputFeedbackPolicy
 from .results.policy import AffinePolicy as AffinePolicy
 from .results.rollout import Rollout as Rollout
+from .results.save_load import load_policy as load_policy
 from .results.save_load import load_rollout as load_rollout
 from .results.save_load import load_solution as load_solution
 from .results.save_load import save as save

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from linear_plans import double_integrator, law_of
 
 import lqrsim as ls
 from lqrsim import robots
@@ -85,6 +86,7 @@ def test_a_policy_is_loaded_with_numpy_alone(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     ls.save(drive_solution, "solution.npz")
+    ls.save(law_of(double_integrator(limits=(-1.0, 1.0))).policy, "policy.npz")
     control = run_page("file_format.md")["control"]
     for t in (0.0, 3.3, 24.99, 30.0):
         state = drive_solution.trajectory.states[min(int(6 * t), 149)] + [0.02, -0.01, 6 * np.pi + 0.1]

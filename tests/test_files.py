@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import hashlib
 import importlib
 import io
 import json
@@ -17,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from spoiling import content_hash, contents, rewrite
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -57,43 +57,6 @@ def test_a_policy_is_read_with_numpy_alone(saved: Path, drive_solution: ls.Solut
         state[i] -= 2 * np.pi * np.round((state[i] - nominal[step, i]) / (2 * np.pi))
     control = np.clip(gain[step] @ state + offset[step], meta["controls"]["low"], meta["controls"]["high"])
     np.testing.assert_allclose(control, drive_solution.policy(state, t), rtol=0, atol=1e-12)
-
-
-def content_hash(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> str:
-    """The hash in a file, as docs/file_format.md describes it, and not as the package computes it."""
-    text = json.dumps({k: v for k, v in meta.items() if k != "sha256"}, sort_keys=True, separators=(",", ":"))
-    found = hashlib.sha256(text.encode())
-    for name, array in sorted(arrays.items()):
-        found.update(f"\n{name} {array.dtype.str} {array.shape}\n".encode() + array.tobytes())
-    return found.hexdigest()
-
-
-def contents(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    with np.load(path) as archive:
-        arrays = dict(archive)
-    return arrays, json.loads(str(arrays.pop("meta")))
-
-
-def rewrite(path: Path, *, sealed: Any = True, **changes: Any) -> None:
-    """Change what a file says, as another program could: with the hash that belongs to it, or the old one.
-
-    An array replaces one, None takes one out, and a function changes it; anything else is metadata.
-    """
-    arrays, meta = contents(path)
-    for name, change in changes.items():
-        if name in arrays:
-            array = arrays.pop(name)
-            if change is not None:
-                changed: Any = change(array) if callable(change) else change
-                arrays[name] = np.asarray(changed)
-        elif isinstance(change, np.ndarray):
-            arrays[name] = change
-        else:
-            meta[name] = change(meta[name]) if callable(change) else change
-    if sealed:
-        meta["sha256"] = content_hash(arrays, meta)
-    with path.open("wb") as file:
-        np.savez(file, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
 
 
 def _save_bare_array(path: Path) -> None:
@@ -386,7 +349,7 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path: Path, drive_solut
         changed = dataclasses.replace(drive_solution, **change)
         with pytest.raises(ls.InputError, match="result: got a solution that cannot be written"):
             ls.save(changed, path)
-    with pytest.raises(ls.InputError, match="result: got 'it', want a Solution or a Rollout"):
+    with pytest.raises(ls.InputError, match="result: got 'it', want a Solution, a Rollout, an AffinePolicy or an Out"):
         ls.save("it", path)  # pyright: ignore[reportArgumentType]
     assert not path.exists()
 

@@ -2,7 +2,7 @@
 
 import abc
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -40,6 +40,13 @@ class Controller(abc.ABC):
     @abc.abstractmethod
     def spaces(self) -> tuple[Coordinates, Coordinates]:
         """Of the states that it wants to be shown, and of its controls."""
+
+    def lost(self) -> Mapping[int, str]:
+        """The trials of the last run whose state it has lost -> why, in a line. They end there, as diverged.
+
+        Asked after each control period. It is for what estimates; what just follows measurements loses none.
+        """
+        return {}
 
     def summary(self) -> str:
         """What there is to say of the last run, in a line; empty if nothing."""

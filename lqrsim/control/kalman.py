@@ -57,7 +57,7 @@ def check_observable(who: str, model: PlanModel) -> None:
             effect = model.F[t] @ effect
     states = [len(part[0]) for part in model._filters]
     for unknown, last, count in zip(model.remembered, np.cumsum(states), states, strict=True):
-        if not seen[last - count : last].max() > 0:
+        if (unknown.std or unknown.drift) and not seen[last - count : last].max() > 0:
             measured = ", ".join(model.sensor.names)
             raise InputError(
                 f"{who}: unknowns: got {unknown.name}, which changes nothing of what is measured ({measured}),"

@@ -4,6 +4,7 @@ A Kalman filter estimates the state, what the actuators have reached, and what d
 follows all of it.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -14,15 +15,18 @@ from lqrsim.control.controllers import Control, Controller
 from lqrsim.control.kalman import check_observable, kalman_filter
 from lqrsim.control.loop_moments import Loop
 from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.policy_of_filter import policy_of
 from lqrsim.control.sensors import Sensors, sensor_of
 from lqrsim.control.tolerances import Prediction, choose_tolerances, with_filter
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of, tracking_laws
 from lqrsim.control.uncertainty import PerEntry, Uncertainty, per_entry
-from lqrsim.errors import Array, check_kind, check_number
+from lqrsim.errors import Array, check_flag, check_kind, check_number
+from lqrsim.kernels.estimation import FAR
 from lqrsim.kernels.records import Limits, Policy
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
+from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.solution import Solution
 
 INEXACT = 0.02  # how far a control is off from its command, at least, relative to the tolerated effort
@@ -44,6 +48,16 @@ class OffsetFree(Controller):
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
         SymPy symbols, as in `Dynamics`, that does not depend on u.
       memory: in s, by default the plan's horizon.
+      record: whether to keep what the filter makes of the last run, for holding it against `filter`: see there.
+
+    Attributes:
+      model, filter: the linear model about the plan, with z = (state, what the actuators have reached, unknowns), and
+        the filter's gains and covariances. gain, offset: of the law, (T, m, Z) and (T, m).
+      estimates: with `record`, the estimates (T+1, K, Z) of the K trials of the last run, each with the measurement of
+        its knot: NaN where none was taken in, which is so of the last knot, and of as many more as measurements are
+        late. Their errors have the covariances `filter.corrected`. Else None.
+      innovations: likewise what measurements differed by from what was expected, (T+1, K, Y), of the covariances
+        `filter.innovation`; NaN where a measurement got lost, too.
 
     Raises:
       InputError: something does not fit the system; or an unknown changes nothing of what is measured.
@@ -60,12 +74,17 @@ class OffsetFree(Controller):
         at_end: float = AT_END,
         sensors: Sensors = None,
         memory: float | None = None,
+        record: bool = False,
     ) -> None:
         check_plan("OffsetFree", problem, solution)
         check_kind("OffsetFree: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
         plan = solution.trajectory
         memory = plan.horizon if memory is None else check_number("OffsetFree: memory", memory, above=0.0)
         self.problem, self.solution, self.uncertainty = problem, solution, uncertainty
+        self.record = check_flag("OffsetFree: record", record)
+        self.estimates: Array | None = None
+        self.innovations: Array | None = None
+        self._lost: Mapping[int, str] = {}
         sensor = sensor_of(sensors, problem.dynamics.state_coordinates)
         efforts = effort_of(effort, problem.dynamics)
         self.model = PlanModel.of(problem.dynamics, plan, for_filter(uncertainty, memory, efforts, problem), sensor)
@@ -97,7 +116,15 @@ class OffsetFree(Controller):
         return np.concatenate([plan.states, model.reached, unknowns], axis=1)
 
     def start(self, trials: int) -> Control:
-        return _Run(self, trials).control
+        self.estimates = self.innovations = None
+        run = _Run(self, trials)
+        if self.record:
+            self.estimates, self.innovations = run.estimated, run.surprises
+        self._lost = run.lost
+        return run.control
+
+    def lost(self) -> Mapping[int, str]:
+        return self._lost
 
     def loop(self) -> Loop:
         """The closed loop about the plan, as matrices, with the uncertainty as it was stated."""
@@ -107,9 +134,17 @@ class OffsetFree(Controller):
         return Loop(truth, self.gain, offset, self.filter.gain, *_limits(self))
 
     @property
+    def policy(self) -> OutputFeedbackPolicy:
+        """The same for a robot, with NumPy alone: predictions are linear about the plan. `save` writes it to a file."""
+        return policy_of(self)
+
+    @property
     def digest(self) -> str:
-        parts = (self.gain, self.offset, self.nominal, self.filter.gain, self.model.output, self.model.transition)
-        return sha256(*parts, self.model.dynamics.source, self.model.dynamics.data, self.model.sensor.source)[:16]
+        model, limits = self.model, np.array(_limits(self))
+        parts = (self.gain, self.offset, self.nominal, self.filter.gain, model.output, model.transition, limits)
+        numbers = np.array([model.plan.dt, self.uncertainty.lag, self.uncertainty.latency, self.uncertainty.delay])
+        sources = model.dynamics.source, model.dynamics.data, model.sensor.source, model.sensor.data
+        return sha256(*parts, numbers, *sources)[:16]
 
     @property
     def spaces(self) -> tuple[Coordinates, Coordinates]:
@@ -126,7 +161,13 @@ class _Run:
     def __init__(self, law: OffsetFree, trials: int) -> None:
         self.law, self.trials, self.model = law, trials, law.model
         self.estimates = np.tile(law.nominal[0], (trials, 1))  # of the knot that the newest measurement is of
-        self.last = np.full((trials, law.model.n), np.nan)
+        # What is shown until the first measurement comes, if that gets lost, is where the plan begins.
+        self.last = np.tile(law.solution.trajectory.states[0], (trials, 1))
+        self.lost: dict[int, str] = {}
+        self.differences = np.empty((trials, law.model.sensor.size))
+        knots = law.model.plan.steps + 1 if law.record else 0
+        self.estimated = np.full((knots, trials, law.model.size), np.nan)
+        self.surprises = np.full((knots, trials, law.model.sensor.size), np.nan)
         self.commands: list[Array] = []  # since that knot, the oldest first
         self.limits = Limits(*_limits(law))
         self.latency, self.delay = law.uncertainty.latency, law.uncertainty.delay
@@ -138,16 +179,18 @@ class _Run:
 
     def control(self, step: int, shown: Array) -> Array:
         law, core, steps = self.law, self.model.core, self.model.plan.steps
-        knot = max(step - self.latency, 0)
         if step >= self.latency:  # before, there is nothing new
-            if knot:
+            if step > self.latency:
                 self._predict(self.estimates, self.commands.pop(0))
+            knot = min(step - self.latency, steps)  # after the horizon the last gain stays in force
             lost = (shown == self.last).all(axis=1).astype(np.float64)
             self.last[:] = shown
             core.correct(
                 self.trials, in_c_order(shown), lost, in_c_order(self.model.plan.states[knot]), law.filter.gain[knot],
-                self.model.sensor.data, self.estimates,
+                self.model.sensor.data, self.estimates, self.differences,
             )  # fmt: skip
+            if law.record and step - self.latency <= steps:
+                self.estimated[knot], self.surprises[knot] = self.estimates, self.differences
         ahead = self.estimates
         if self.commands:
             ahead = ahead.copy()
@@ -158,7 +201,17 @@ class _Run:
         near = in_c_order(self.model.plan.states[t])
         core.command(self.trials, ahead, near, Policy(law.gain[t], law.offset[t]), self.limits, out)
         self.commands.append(out.copy())
+        self._look_for_lost(ahead)
         return out
+
+    def _look_for_lost(self, estimates: Array) -> None:
+        """Notes whose estimates are not finite, or beyond all that a robot can be."""
+        places = np.empty(self.trials)
+        self.model.core.diverged(self.trials, estimates, places)
+        for k in np.flatnonzero(places < self.model.size):
+            i = int(places[k])
+            what = f"is beyond {FAR:g}" if np.isfinite(estimates[k, i]) else "is not finite"
+            self.lost.setdefault(int(k), f"the estimate of {self.model.names[i]} {what}")
 
     def _predict(self, estimates: Array, commands: Array) -> None:
         """A control period on."""

@@ -70,6 +70,14 @@ class PlanModel:
         uncertainty.check(dynamics)
         return cls(dynamics.disturbed, plan, uncertainty, sensor or sensor_of(None, dynamics.state_coordinates))
 
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """What messages call the entries of z, (Z,)."""
+        controls = self.dynamics.control_coordinates.names[: self.lagging]
+        counts = [len(part[0]) for part in self._filters]
+        unknowns = (one.name for one, count in zip(self.remembered, counts, strict=True) for _ in range(count))
+        return (*self.dynamics.state_coordinates.names, *(f"what {one} has reached" for one in controls), *unknowns)
+
     # Sizes.
 
     @property
@@ -262,11 +270,11 @@ class PlanModel:
         """Covariance of w, (T, Z, Z)."""
         n, white = self.n, [one for one in self.uncertainty.unknowns if one.white]
         std = per_entry("Uncertainty: control", self.uncertainty.control, self.dynamics.control_coordinates)
-        columns = [self.jacobian[:, :, n:] * ((1 - self.lag.mean) * std)]
-        columns += [(self.effects @ (one.std * self._column(one)))[:, :, None] for one in white]
-        onto = np.concatenate(columns, axis=2)
-        noise = np.zeros((self.plan.steps, self.size, self.size))
-        noise[:, :n, :n] = onto @ onto.transpose(0, 2, 1)
+        commanded = self.G * std  # before the lag: what the actuators have reached keeps some of it
+        noise = commanded @ commanded.transpose(0, 2, 1)
+        for one in white:
+            onto = self.effects @ (one.std * self._column(one))
+            noise[:, :n, :n] += onto[:, :, None] * onto[:, None, :]
         first = n + self.lagging
         noise[:, first:, first:] = _diagonal([part[1] for part in self._filters])
         return noise
@@ -297,4 +305,4 @@ def _diagonal(blocks: list[Array]) -> Array:
 def _core(sources: tuple[str, ...], sizes: tuple[tuple[str, int], ...], what: str) -> Core:
     """The kernels with the sources of dynamics, sensors and `turn`."""
     parts = [source_of(module) for module in (rotation_ratios, linear_algebra, runge_kutta)]
-    return Core("\n\n".join([*parts, *sources, source_of(estimation)]), dict(sizes), what)
+    return Core("\n\n".join([*parts, *sources, source_of(estimation, FAR=estimation.FAR)]), dict(sizes), what)

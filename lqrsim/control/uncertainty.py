@@ -44,7 +44,7 @@ class Unknown:
       time_constant: seconds in which the correlation falls to 1/e; infinite for a constant, 0 for what is drawn anew in
         each control period.
       order: 1, or 2 for what passes (1 + sqrt(3) s) / (1 + s)^2, s in time constants: Dryden's wind across and upward.
-      drift: by how much it wanders off besides, as a random walk, per root of a second.
+      drift: by how much a constant wanders off, as a random walk, per root of a second; others have none.
 
     Raises:
       InputError: a number is out of range.
@@ -72,6 +72,9 @@ class Unknown:
         check_count("Unknown: order", self.order, at_most=2)
         if self.order == 2 and not 0 < self.time_constant < np.inf:
             raise InputError(f"Unknown: order: got 2 with a time constant of {self.time_constant:g} s, want 1")
+        if self.drift and not self.constant:
+            constant = f"{self.drift:g} with a time constant of {self.time_constant:g} s"
+            raise InputError(f"Unknown: drift: got {constant}, want 0, or another Unknown of the same that is constant")
 
     @property
     def shares(self) -> dict[str, float]:
@@ -229,7 +232,7 @@ def shaping_filter(unknown: Unknown, dt: float) -> tuple[Array, Array, Array, Ar
     step = dt / unknown.time_constant
     keep = np.exp(-step)
     if unknown.order == 1:
-        fresh = std * std * -np.expm1(-2 * step) + drift * drift * dt
+        fresh = std * std * -np.expm1(-2 * step) + drift * drift * dt  # one of the two is zero
         return np.full((1, 1), keep), np.full((1, 1), fresh), np.ones(1), np.full((1, 1), std * std)
     F = keep * np.array([[1 + step, step], [-step, 1 - step]])
     return F, np.eye(2) - F @ F.T, std / 2 * np.array([1.0, np.sqrt(3.0)]), np.eye(2)

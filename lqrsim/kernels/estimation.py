@@ -5,7 +5,7 @@ the unknowns (D). The unknowns' values, `output` times these, are of so many par
 gain and the offset of each control.
 """
 
-from math import isfinite
+from math import nan
 
 from lqrsim.kernels.declarations import M, N, stack
 from lqrsim.kernels.policy_evaluation import turn
@@ -14,6 +14,7 @@ from lqrsim.kernels.runge_kutta import advance, step_jacobian
 LAG, D, Y = 0, 1, 1  # lagging actuators, states of unknowns, measured numbers; each core has its own
 P, Z, V = 1, 1, 1  # unknown parameters; N + LAG + D; P + 2 M
 NUMBERS, HELD = 1, 1  # that the dynamics have; D, and at least 1
+FAR = 1e9  # of an estimate, in its unit: nothing of a robot is
 
 
 def measure(x, data, out) -> None:
@@ -65,17 +66,19 @@ def parameter_slopes(steps, states, controls, p, dt, which, changes, slopes) -> 
         q[k] = p[k]
 
 
-def correct(count, shown, lost, near, gain, data, estimates) -> None:
+def correct(count, shown, lost, near, gain, data, estimates, innovations) -> None:
     """Take a measurement into the estimates (count, Z), but where it was lost: lost (count,) is 1 there.
 
     The states that are shown (count, N) are taken to the representatives nearest to the estimates, and these nearest to
-    `near` (N,).
+    `near` (N,). Writes what measurements differ by from what was expected, (count, Y); NaN where they were lost.
     """
     x, seen, expected = stack(N), stack(Y), stack(Y)
     for k in range(count):
         z = estimates[k]
         turn(z, near)
         if lost[k] != 0.0:
+            for j in range(Y):
+                innovations[k, j] = nan
             continue
         for i in range(N):
             x[i] = shown[k, i]
@@ -84,6 +87,7 @@ def correct(count, shown, lost, near, gain, data, estimates) -> None:
         measure(z, data, expected)
         for j in range(Y):
             seen[j] -= expected[j]
+            innovations[k, j] = seen[j]
         for i in range(Z):
             total = z[i]
             for j in range(Y):
@@ -138,9 +142,9 @@ def command(count, estimates, near, law, limits, out) -> None:
 
 
 def diverged(count, estimates, out) -> None:
-    """Write 1 for the estimates that are not finite, (count,)."""
+    """Write which entry of each estimate is the first that is not finite or beyond `FAR`, (count,); Z where none is."""
     for k in range(count):
-        out[k] = 0.0
-        for i in range(Z):
-            if not isfinite(estimates[k, i]):
-                out[k] = 1.0
+        out[k] = Z
+        for i in range(Z - 1, -1, -1):
+            if not abs(estimates[k, i]) <= FAR:
+                out[k] = i

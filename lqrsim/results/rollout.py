@@ -52,9 +52,9 @@ class Rollout:
       collided_at: (K,) seconds to the first collision, at a knot or between two; infinite where there was none.
       obstacles: (K) names of what they collided with; empty where there was none.
       diverged_at: (K,) seconds to the knot from which on the simulation was unstable, or what the policy was shown was
-        not finite; infinite where neither was. The states are NaN from there on.
+        not finite, or its filter had diverged; infinite where nothing was. The states are NaN from there on.
       failed_at: (K,) seconds to the knot at which the controller failed; infinite where it did not. From there on, too.
-      reasons: (K) why it failed; empty where it did not.
+      reasons: (K) why it failed, or what of its filter diverged; empty where neither was so.
       frame_times: (F,) seconds; frames: (K, F, nq) MuJoCo's qpos then, for drawing.
       disturbances: one description each. seed, first_trial: what the draws came from.
       versions: of lqrsim and the libraries that the bits depend on, and the processor.
@@ -155,8 +155,11 @@ class Rollout:
             said = check_items(f"Rollout: {words}", getattr(self, words), str, "a text for each trial")
             if len(said) != trials:
                 raise InputError(f"Rollout: {words}: got {len(said)}, want one for each of the {trials} trials")
-            for text, time in zip(said, times.tolist(), strict=True):
-                if bool(text) != np.isfinite(time):
+            may_say = np.isfinite(times)
+            if words == "reasons":  # of a filter, too
+                may_say |= np.isfinite(self.diverged_at)
+            for text, time, may in zip(said, times.tolist(), may_say, strict=True):
+                if bool(text) != np.isfinite(time) and not (text and may):
                     wanted = "a text where it is finite, and none elsewhere"
                     raise InputError(f"Rollout: {words}: got {excerpt(text)} at {name} {time:g}, want {wanted}")
             object.__setattr__(self, words, said)
@@ -236,7 +239,7 @@ class Rollout:
 
     @property
     def diverged(self) -> npt.NDArray[np.bool_]:
-        """Whether a trial ended as its simulation became unstable, (K,)."""
+        """Whether a trial ended as its simulation became unstable, or its filter diverged, (K,)."""
         return self._endings[0] == "diverged"
 
     @property
@@ -263,8 +266,8 @@ class Rollout:
     def _line(self, k: int) -> str:
         outcome, counts, name = self.outcome[k], self.counts[k], f"trial {self.first_trial + k}"
         when = f"after {self.ended[k]:.2f} s" if self.ended[k] > 0 else "at once"
-        if outcome == "error":
-            return f"{name}: error {when}: {self.reasons[k]}"
+        if outcome in ("error", "diverged") and self.reasons[k]:
+            return f"{name}: {outcome} {when}: {self.reasons[k]}"
         if not counts.any():
             return f"{name}: {outcome} {when}"
         if outcome in ("collided", "diverged"):

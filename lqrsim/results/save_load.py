@@ -1,4 +1,4 @@
-"""Solutions and rollouts on disk: arrays by name, and everything that is not an array in one JSON text.
+"""Solutions, policies and rollouts on disk: arrays by name, and everything that is not an array in one JSON text.
 
 `docs/file_format.md` says what is in them and loads a policy elsewhere, with NumPy alone; `results/archive.py` has the
 rest. The tables here say what belongs into a file. What is saved and what is loaded are both held to them.
@@ -18,13 +18,15 @@ from lqrsim.results import schema
 from lqrsim.results.archive import Arrays, Header, opened, write
 from lqrsim.results.archive import replacing as replacing
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.output_feedback import SHAPES as OUTPUT_FEEDBACK
+from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Moments, Quadratic
 
-VERSIONS = {"solution": 5, "rollout": 4}
+VERSIONS = {"solution": 5, "rollout": 4, "policy": 1}
 
 # Shapes in letters: T steps, n states, m controls; the others stand for whatever it is, but the same in all of a file.
 _PLAN = {"trajectory.controls": "T m", "trajectory.states": "T+1 n"}
@@ -49,6 +51,10 @@ _ROLLOUT_ARRAYS = {  # of the same names in a Rollout
     "collided_at": "K", "diverged_at": "K", "failed_at": "K", "frame_times": "F", "frames": "K F nq",
 }  # fmt: skip
 _ROLLOUT_OPTIONAL: tuple[dict[str, str], ...] = ({"goal": "n"},)
+_POLICY_ARRAYS = {  # of each kind; of the same names in the classes
+    "affine": {"gain": "T m n", "offset": "T m", "nominal": "T n"},
+    "output feedback": OUTPUT_FEEDBACK,
+}
 _CERTIFICATE = tuple(field.name for field in fields(Certificate))  # before the gap, in the array of that name
 _DTYPES = {"contacts": "<i8"}  # all others are <f8
 
@@ -79,19 +85,28 @@ _ROLLOUT_TEXTS: dict[str, schema.Check] = {  # of the same names in a Rollout
     "first_trial": schema.count, "versions": schema.mapped(schema.line), "disturbances": schema.listed(schema.text),
     "obstacles": schema.listed(schema.line), "reasons": schema.listed(schema.line),
 }  # fmt: skip
+_POLICY_TEXTS: dict[str, schema.Check] = {
+    "kind": schema.one_of(_POLICY_ARRAYS), "measured": schema.optional(schema.record(_COORDINATES)),
+}  # fmt: skip
+
+Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy
 
 
-def save(result: Solution | Rollout, path: str | os.PathLike[str]) -> Path:
-    """Write a solution or a rollout; the file is whole or not there. Returns its path.
+def save(result: Saved, path: str | os.PathLike[str]) -> Path:
+    """Write a solution, a rollout or a policy alone; the file is whole or not there. Returns its path.
 
     Raises:
       InputError: the file cannot be written; or what it would hold could not be read again.
     """
     path = check_path("output", path)
-    check_kind("result", result, (Solution, Rollout), "a Solution or a Rollout")
-    kind = "solution" if isinstance(result, Solution) else "rollout"
+    wanted = "a Solution, a Rollout, an AffinePolicy or an OutputFeedbackPolicy"
+    check_kind("result", result, (Solution, Rollout, AffinePolicy, OutputFeedbackPolicy), wanted)
+    kind = "solution" if isinstance(result, Solution) else "rollout" if isinstance(result, Rollout) else "policy"
     try:
-        arrays, texts = _solution_parts(result) if isinstance(result, Solution) else _rollout_parts(result)
+        if isinstance(result, Solution):
+            arrays, texts = _solution_parts(result)
+        else:
+            arrays, texts = _rollout_parts(result) if isinstance(result, Rollout) else _policy_parts(result)
         meta = schema.parse(schema.canonical({"format": f"lqrsim {kind}", "version": VERSIONS[kind], **texts}))
         arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         headers = {name: Header(array.dtype.str, array.shape) for name, array in arrays.items()}
@@ -119,6 +134,11 @@ def load_rollout(path: str | os.PathLike[str]) -> Rollout:
     return _load(path, "rollout")
 
 
+def load_policy(path: str | os.PathLike[str]) -> AffinePolicy | OutputFeedbackPolicy:
+    """Read what `save` wrote of a policy alone. Raises InputError as `load_solution` does."""
+    return _load(path, "policy")
+
+
 def _load(path: str | os.PathLike[str], kind: str) -> Any:
     with opened(check_path(kind, path), kind, VERSIONS[kind]) as archive:
         _check(kind, archive.headers, archive.meta)
@@ -127,11 +147,15 @@ def _load(path: str | os.PathLike[str], kind: str) -> Any:
 
 def _check(kind: str, headers: Mapping[str, Header], meta: dict[str, Any]) -> None:
     """Raise InputError unless the text is as it must be, and the arrays are those, of those shapes, that go with it."""
-    own = _ROLLOUT_TEXTS if kind == "rollout" else _SOLUTION_TEXTS | _SOLUTION_LISTS
-    schema.record(_COMMON | own)("meta", meta)
+    schema.record(_COMMON | _TEXTS[kind])("meta", meta)
     sizes = {"n": len(meta["states"]["names"]), "m": len(meta["controls"]["names"])}
     if kind == "rollout":
         wanted, groups = _PLAN | _ROLLOUT_ARRAYS, _ROLLOUT_OPTIONAL
+    elif kind == "policy":
+        wanted, groups = _POLICY_ARRAYS[meta["kind"]], ()
+        if (meta["measured"] is None) != (meta["kind"] == "affine"):
+            raise InputError("meta.measured: got none of output feedback, or some of an affine policy")
+        sizes |= {"Y": len(meta["measured"]["names"])} if meta["measured"] else {}
     else:
         sizes |= {"iterations": len(meta["methods"]), "candidates": len(meta["candidates"])}
         wanted = _SOLUTION_ARRAYS | {f"multipliers.{i}": f"T+1 rows{i}" for i in range(len(meta["penalties"]))}
@@ -280,7 +304,29 @@ def _rollout(arrays: Arrays, meta: dict[str, Any]) -> Rollout:
     )
 
 
-_MAKERS = {"solution": _solution, "rollout": _rollout}
+def _policy_parts(policy: AffinePolicy | OutputFeedbackPolicy) -> tuple[Arrays, dict[str, Any]]:
+    kind, measured = "affine", None
+    if isinstance(policy, OutputFeedbackPolicy):
+        kind, measured = "output feedback", asdict(policy.measured_coordinates)
+    arrays: Arrays = {name: getattr(policy, name) for name in _POLICY_ARRAYS[kind]}
+    return arrays, {
+        "kind": kind, "measured": measured, "dt": policy.dt,
+        "states": asdict(policy.state_coordinates), "controls": asdict(policy.control_coordinates),
+    }  # fmt: skip
+
+
+def _policy(arrays: Arrays, meta: dict[str, Any]) -> AffinePolicy | OutputFeedbackPolicy:
+    states, controls = _coordinates(meta["states"]), _coordinates(meta["controls"])
+    rest: dict[str, Any] = {"dt": float(meta["dt"]), "state_coordinates": states, "control_coordinates": controls}
+    for name, array in arrays.items():
+        check_array(name, array, (None,) * array.ndim, infinite=name == "nominal")
+    if meta["kind"] == "affine":
+        return AffinePolicy(**arrays, **rest)
+    return OutputFeedbackPolicy(**arrays, **rest, measured_coordinates=_coordinates(meta["measured"]))
+
+
+_MAKERS = {"solution": _solution, "rollout": _rollout, "policy": _policy}
+_TEXTS = {"solution": _SOLUTION_TEXTS | _SOLUTION_LISTS, "rollout": _ROLLOUT_TEXTS, "policy": _POLICY_TEXTS}
 
 
 def _coordinates(texts: Mapping[str, Any]) -> Coordinates:

@@ -48,9 +48,10 @@ def simulate(
 
     In each control period: read the true state, measure it, ask the policy, disturb its command, saturate, push, step.
 
-    A trial ends with the first collision, as `collisions.py` defines it, when it becomes unstable, or when the
-    controller fails: raises an exception, which ends all the trials that it was asked for, or returns what are no
-    controls of theirs. What is recorded after a collision does not count; after the others it is NaN.
+    A trial ends with the first collision, as `collisions.py` defines it, when it becomes unstable, when the filter of
+    its controller diverges, or when the controller fails: raises an exception, which ends all the trials that it was
+    asked for, or returns what are no controls of theirs. What is recorded after a collision does not count; after the
+    others it is NaN.
 
     Args:
       disturbances: what goes wrong, in the order in which it happens. Each has its own stream of random numbers.
@@ -145,6 +146,7 @@ class Loop:
         except Exception as error:  # of a controller, whatever it is: these trials failed
             commands, failed = np.zeros(shape), np.ones(len(shown), dtype=bool)
             reasons = [told(error)] * len(shown)
+        self.records.mislead(step, self.settings.law.lost())
         self.records.fail(step, failed, reasons)
         self.records.commanded[:, step] = commands
         return np.where(failed[:, None], self.settings.plan.controls[step], commands)

@@ -1,6 +1,6 @@
 """What is recorded of a run, and the `Rollout` that is made of it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,8 @@ class Recorder:
       states, measured: (K, T+1, n). clearance: (K, T+1). commanded, applied: (K, T, m). wrench: (K, T, 6).
       contacts: (K,) control periods in contact.
       lost_since: (K,) the knot from which on a trial's records mean nothing; T+1 for those that were never lost.
-      failed_since: (K,) the knot at which its controller failed; T+1 where it did not. reasons: (K) why it failed.
+      failed_since: (K,) the knot at which its controller failed; T+1 where it did not.
+      reasons: (K) why it failed, or was lost, where there is more to say than that.
       frames: MuJoCo's qpos (K, nq), one after the other.
     """
 
@@ -45,10 +46,19 @@ class Recorder:
         if rows.any():
             self.lost_since[rows] = np.minimum(self.lost_since[rows], step)
 
+    def mislead(self, step: int, reasons: Mapping[int, str]) -> None:
+        """What the controller believes of these trials means nothing from this knot on. Who is over cannot be lost."""
+        over = self.over(step)
+        for row, reason in reasons.items():
+            if not over[row]:
+                self.lost_since[row] = step
+                self.reasons[row] = f"filter at {step * self.plan.dt:.4g} s: {reason}"
+
     def fail(self, step: int, rows: Mask, reasons: Iterable[str]) -> None:
-        """The controllers of these trials (K,) failed at this knot; a reason for each. The first one counts."""
+        """The controllers of these trials (K,) failed at this knot; a reason for each. Who is over cannot fail."""
+        over = self.over(step)
         for row, reason in zip(np.flatnonzero(rows), reasons, strict=True):
-            if self.failed_since[row] > step:
+            if not over[row]:
                 self.failed_since[row] = step
                 self.reasons[row] = f"controller at {step * self.plan.dt:.4g} s: {reason}"
 

@@ -109,7 +109,7 @@ class Results:
                 share = f"{among:>13} deterministic: 1 run"
             line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {share:>33}"
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
-            if ends["error"]:
+            if ends["error"] or ends["diverged"]:
                 reasons.update(self.reasons(cell).values())
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
         lines += self.plans()
@@ -128,7 +128,7 @@ class Results:
         return lines
 
     def reasons(self, cell: Cell) -> dict[int, str]:
-        """Why trials of a cell are an "error", by their numbers."""
+        """Why trials of a cell are an "error", or have a filter that diverged, by their numbers."""
         return {
             int(trial): str(reason)
             for _, table in self.tables(cell, partial=True)

@@ -229,7 +229,7 @@ class Trials:
         rollout = self.run(cell, first, count, frames=False, contacts=False)
         reasons = np.array(rollout.reasons, dtype=np.str_)
         table = self.outcomes(rollout).columns()
-        return table | {"reason": np.where(table["outcome"] == "error", reasons, "")}
+        return table | {"reason": np.where(np.isin(table["outcome"], ("diverged", "error")), reasons, "")}
 
     def _row(self, cell: Cell, trial: int) -> Table:
         try:

@@ -1,0 +1,259 @@
+"""The filter against dense Gaussian conditioning, its consistency in 1,000 trials, and the same bits in any batch.
+
+It is the compiled filter that runs, through `OffsetFree.start`. The trials are NumPy's.
+"""
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from linear_plans import DT, Linear, double_integrator, linear
+from scipy.linalg import expm
+from scipy.stats import binom, chi2
+
+import lqrsim as ls
+from lqrsim.control.kalman import kalman_filter
+from lqrsim.control.plan_model import PlanModel
+from lqrsim.errors import Array
+
+NOISE = {"measurement": 0.1, "start": 0.3, "control": 0.2}
+CONSTANT = ls.Unknown("d0", 0.7)
+PASSING = ls.Unknown("d0", 0.5, time_constant=0.4, order=2)
+# Unknowns, lag, sensors.
+CASES = (
+    ((), 0.0, None),
+    ((CONSTANT, PASSING), 0.06, None),
+    ((ls.Unknown("d0", 0.7, time_constant=0.5), ls.Unknown("d0", 0.4, time_constant=0.0)), 0.06, ("s0",)),
+    ((CONSTANT, ls.Unknown("offset of u0", 0.2, time_constant=0.3)), 0.0, [[1.0, 0.5]]),
+)
+
+
+def law_of(system: Linear, case: int, *, record: bool = True, **noise: float) -> ls.OffsetFree:
+    unknowns, lag, sensors = CASES[case]
+    uncertainty = ls.Uncertainty(unknowns=unknowns, lag=lag, **(NOISE | noise))  # type: ignore[arg-type]
+    return ls.OffsetFree(
+        system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, sensors=sensors, memory=5.0,
+        record=record,
+    )  # fmt: skip
+
+
+def conditional(model: PlanModel, inputs: Array, measured: Array, t: int) -> tuple[Array, Array]:
+    """E[z_t | y_0 .. y_t] and its covariance, of deviations: one Gaussian of all knots, conditioned by blocks."""
+    size, T = model.size, t + 1
+    blocks = [model.start, *model.process_noise[:t]]
+    to = np.zeros((T * size, T * size))  # from the start and the process noise to all z
+    known = np.zeros((T, size))
+    for i in range(T):
+        rows = slice(i * size, (i + 1) * size)
+        if i:
+            to[rows] = model.F[i - 1] @ to[(i - 1) * size : i * size]
+            known[i] = model.F[i - 1] @ known[i - 1] + model.G[i - 1] @ inputs[i - 1] + model.c[i - 1]
+        to[rows, rows] = np.eye(size)
+    noise, H = np.zeros((T * size, T * size)), np.zeros((T * model.sensor.size, T * size))
+    V, y = np.zeros((len(H), len(H))), np.zeros(len(H))
+    for i in range(T):
+        noise[i * size : (i + 1) * size, i * size : (i + 1) * size] = blocks[i]
+        seen = slice(i * model.sensor.size, (i + 1) * model.sensor.size)
+        H[seen, i * size : i * size + model.n] = model.H[i]
+        V[seen, seen] = model.H[i] @ np.diag(model.shown_noise) @ model.H[i].T
+        y[seen] = model.H[i] @ (measured[i] - known[i, : model.n])
+    prior = to @ noise @ to.T
+    gain = np.linalg.solve(H @ prior @ H.T + V, H @ prior).T
+    last = slice(t * size, T * size)
+    return known[t] + (gain @ y)[last], (prior - gain @ H @ prior)[last, last]
+
+
+@hypothesis.given(st.integers(0, len(CASES) - 1), st.integers(0, 10**6), st.booleans())
+@hypothesis.settings(max_examples=20)
+def test_the_estimate_is_the_dense_conditional_mean(case: int, seed: int, unstable: bool) -> None:
+    """Mean and covariance after each measurement, whatever is measured: 1e-8 of their size."""
+    rng, steps = np.random.default_rng(seed), 6
+    rates = rng.normal(size=(2, 2)) + (1.0 if unstable else -2.0) * np.eye(2)
+    system = linear(
+        rates, rng.normal(size=(2, 1)), rng.normal(size=(2, 1)), start=rng.normal(size=2),
+        controls=rng.normal(size=(steps, 1)),
+    )  # fmt: skip
+    law = law_of(system, case)
+    control, plan = law.start(1), system.plan
+    off = rng.normal(size=(steps + 1, 2))
+    inputs = np.array([control(t, (plan.states[t] + off[t])[None])[0] for t in range(steps + 1)])[:steps]
+    assert law.estimates is not None
+    for t in range(steps + 1):
+        mean, covariance = conditional(law.model, inputs - plan.controls, off, t)
+        estimate = law.estimates[t, 0] - law.nominal[t]
+        np.testing.assert_allclose(estimate, mean, rtol=0, atol=1e-8 * (1 + np.abs(mean).max()))
+        largest = np.abs(covariance).max()
+        np.testing.assert_allclose(law.filter.corrected[t], covariance, rtol=0, atol=1e-8 * (1 + largest))
+
+
+class Truth:
+    """K runs of a double integrator under exactly the stated noise."""
+
+    def __init__(self, law: ls.OffsetFree, system: Linear, trials: int, rng: np.random.Generator) -> None:
+        self.system, self.rng, self.uncertainty = system, rng, law.model.uncertainty
+        self.x = system.plan.states[0] + NOISE["start"] * rng.normal(size=(trials, 2))
+        self.reached = np.tile(system.plan.controls[0], (trials, 1))
+        self.unknowns: list[Array] = []
+        for one in self.uncertainty.unknowns:
+            width = 0 if one.white else one.order
+            self.unknowns.append((1.0 if one.order == 2 else one.std) * rng.normal(size=(trials, width)))
+
+    def measured(self) -> Array:
+        return self.x + NOISE["measurement"] * self.rng.normal(size=self.x.shape)
+
+    def z(self, lags: bool) -> Array:
+        """As the filter has it."""
+        return np.concatenate([self.x, *([self.reached] if lags else []), *self.unknowns], axis=1)
+
+    def step(self, commands: Array) -> None:
+        rng, commands = self.rng, commands + NOISE["control"] * self.rng.normal(size=commands.shape)
+        push, offset = np.zeros((len(commands), 1)), np.zeros((len(commands), 1))
+        for i, one in enumerate(self.uncertainty.unknowns):
+            state, step = self.unknowns[i], DT / one.time_constant if one.time_constant else np.inf
+            if one.white:
+                value = one.std * rng.normal(size=(len(commands), 1))
+            elif one.order == 2:
+                value = state @ np.array([[0.5], [np.sqrt(3.0) / 2]]) * one.std
+                move = expm(step * np.array([[0.0, 1.0], [-1.0, -2.0]]))
+                fresh = np.linalg.cholesky(np.eye(2) - move @ move.T)
+                self.unknowns[i] = state @ move.T + rng.normal(size=state.shape) @ fresh.T
+            else:
+                value = state
+                fresh = one.std * np.sqrt(1 - np.exp(-2 * step)) + one.drift * np.sqrt(DT)
+                self.unknowns[i] = np.exp(-step) * state + fresh * rng.normal(size=state.shape)
+            (offset if "offset" in one.name else push)[:] += value
+        applied, lag = commands, self.uncertainty.lag
+        if lag:
+            left = np.exp(-DT / lag)
+            applied = commands + (1 - left) * lag / DT * (self.reached - commands)
+            self.reached = commands + left * (self.reached - commands)
+        self.x = self.x @ self.system.A.T + (applied + offset) @ self.system.B.T + push @ self.system.E.T
+
+
+@pytest.mark.parametrize("case", range(len(CASES)))
+def test_it_is_consistent_in_a_thousand_trials(case: int) -> None:
+    """Mean NEES and NIS over the trials within the 95 % bands of chi-square, knot by knot.
+
+    Of so many knots a few may be out: no more than a binomial with 5 % exceeds once in a thousand. Innovations are
+    independent from knot to knot, so for NIS that is exact; errors are not, so for NEES it is a guide.
+    """
+    trials, steps = 1000, 40
+    system = double_integrator(start=[1.0, 0.0], controls=np.sin(np.arange(steps) / 5)[:, None])
+    law = law_of(system, case)
+    truth = Truth(law, system, trials, np.random.default_rng(case))
+    control, true = law.start(trials), []
+    for t in range(steps + 1):
+        true.append(truth.z(lags=CASES[case][1] > 0))
+        truth.step(control(t, truth.measured()))
+    assert law.estimates is not None
+    assert law.innovations is not None
+    for values, covariances in ((law.estimates - true, law.filter.corrected), (law.innovations, law.filter.innovation)):
+        kept = covariances[0].diagonal() > 0  # what the start is known to be, as what actuators have reached, has none
+        means = []
+        for t, covariance in enumerate(covariances):
+            own = slice(None) if t else kept
+            value, inside = values[t][:, own], covariance[own][:, own]
+            means.append((value * np.linalg.solve(inside, value.T).T).sum(axis=1).mean() / value.shape[1])
+        sizes = [kept.sum()] + [len(kept)] * steps
+        low, high = (
+            np.array([chi2.ppf(level, trials * one) / (trials * one) for one in sizes]) for level in (0.025, 0.975)
+        )
+        out = ((np.array(means) < low) | (np.array(means) > high)).sum()
+        assert out <= binom.ppf(0.999, steps + 1, 0.05), (out, means)
+
+
+def test_a_wrong_noise_is_found_out() -> None:
+    """The same test sees a filter that believes in half of the noise."""
+    trials, steps = 1000, 20
+    system = double_integrator(controls=np.zeros((steps, 1)))
+    law = law_of(system, 0, measurement=0.05)
+    truth = Truth(law, system, trials, np.random.default_rng(0))
+    control = law.start(trials)
+    for t in range(steps + 1):
+        truth.step(control(t, truth.measured()))
+    assert law.innovations is not None
+    nis = np.einsum("tki,tij,tkj->tk", law.innovations, np.linalg.inv(law.filter.innovation), law.innovations).mean(
+        axis=1
+    )
+    assert (nis > chi2.ppf(0.975, 2 * trials) / trials).all()
+
+
+def test_covariances_stay_positive_without_any_noise() -> None:
+    """Sensors without noise make a singular matrix: nothing is less than zero beyond rounding, and nothing is lost."""
+    system = linear(np.diag([0.5, -1.0]), [[1.0], [2.0]], [[1.0], [0.0]], controls=np.ones((100, 1)))
+    uncertainty = ls.Uncertainty(unknowns=[CONSTANT], start=[1.0, 1e-6], lag=0.05)
+    filtered = kalman_filter(PlanModel.of(system.problem.dynamics, system.plan, uncertainty))
+    for covariance in (*filtered.predicted, *filtered.corrected):
+        assert np.linalg.eigvalsh(covariance).min() > -1e-14
+    law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
+    control, x, reached = law.start(1), system.plan.states[0] + [0.7, -1e-6], system.plan.controls[0]
+    left = np.exp(-DT / 0.05)
+    for t in range(system.plan.steps):
+        command = control(t, x[None])[0]
+        applied = command + (1 - left) * 0.05 / DT * (reached - command)
+        reached = command + left * (reached - command)
+        x = system.A @ x + system.B @ applied + system.E @ [0.9]
+    assert law.estimates is not None
+    np.testing.assert_allclose(law.estimates[-2, 0, -1], 0.9, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("case", [1, 3])
+def test_each_trial_of_a_batch_has_the_bits_that_it_has_alone(case: int) -> None:
+    steps = 10
+    system = double_integrator(controls=np.ones((steps, 1)), limits=(-3.0, 3.0))
+    law = law_of(system, case)
+    shown = np.random.default_rng(1).normal(size=(steps, 64, 2))
+    shown[4, ::3] = shown[3, ::3]  # lost
+
+    def run(chosen: slice) -> tuple[bytes, bytes]:
+        control = law.start(len(shown[0, chosen]))
+        commands = np.array([control(t, shown[t, chosen]) for t in range(steps)])
+        assert law.estimates is not None
+        return commands.transpose(1, 0, 2).tobytes(), law.estimates[:steps].transpose(1, 0, 2).tobytes()
+
+    whole = run(slice(0, 64))
+    for count in (1, 7):
+        parts = [run(slice(first, first + count)) for first in range(0, 64, count)]
+        assert b"".join(part[0] for part in parts) == whole[0]
+        assert b"".join(part[1] for part in parts) == whole[1]
+
+
+def test_so_has_the_quadrotor(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    unknowns = [ls.Unknown(f"wind_{axis}", 1.0) for axis in "xyz"] + [ls.Unknown("mass", 0.02)]
+    uncertainty = ls.Uncertainty(unknowns=unknowns, measurement=0.01, start=0.01, lag=0.02)
+    law = ls.OffsetFree(
+        quadrotor.problem, quadrotor_solution, uncertainty, tolerate={"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}
+    )
+    plan, rng = quadrotor_solution.trajectory, np.random.default_rng(0)
+    shown = plan.states[:12, None] + 0.02 * rng.normal(size=(12, 64, 12))
+
+    def run(chosen: slice) -> bytes:
+        control = law.start(len(shown[0, chosen]))
+        return np.array([control(t, shown[t, chosen]) for t in range(12)]).transpose(1, 0, 2).tobytes()
+
+    whole = run(slice(0, 64))
+    for count in (1, 7):
+        assert b"".join(run(slice(first, first + count)) for first in range(0, 64, count)) == whole
+
+
+def test_what_is_recorded_has_gaps_where_nothing_came() -> None:
+    system = double_integrator(steps=6)
+    uncertainty = ls.Uncertainty(unknowns=[CONSTANT], latency=2, **NOISE)  # type: ignore[arg-type]
+    law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
+    control = law.start(2)
+    shown = np.random.default_rng(0).normal(size=(6, 2, 2))
+    shown[4, 1] = shown[3, 1]
+    for t in range(6):
+        control(t, shown[t])
+    assert law.estimates is not None
+    assert law.innovations is not None
+    assert law.estimates.shape == (7, 2, 3)
+    assert law.innovations.shape == (7, 2, 2)
+    # Measurements of knots 0 to 3 came, at steps 2 to 5; that of knot 2 got lost on the way to the second trial.
+    assert np.isfinite(law.estimates[:4]).all()
+    assert np.isnan(law.estimates[4:]).all()
+    assert np.isfinite(law.innovations[:4]).all(axis=2).tolist() == [[True] * 2, [True] * 2, [True, False], [True] * 2]
+    quiet = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0)
+    quiet.start(2)
+    assert quiet.estimates is None
+    assert quiet.innovations is None

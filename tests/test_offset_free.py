@@ -1,0 +1,258 @@
+"""Output feedback: what is late, lost or beyond the limits, steady disturbances, filters that diverge, bad input."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from linear_plans import DT, Linear, double_integrator
+from tracking import hover, track
+
+import lqrsim as ls
+from lqrsim.errors import Array
+from lqrsim.simulation.disturbances import GilbertElliott
+from lqrsim.simulation.plant import Plant
+
+TOLERATE = {"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}
+PUSH = ls.Unknown("d0", 0.5)
+
+
+def generators(count: int) -> list[np.random.Generator]:
+    return [np.random.default_rng(seed) for seed in range(count)]
+
+
+def run(
+    system: Linear, law: ls.OffsetFree, effects: list[ls.Effect], *, off: Array, push: float = 0.0,
+    limit: float = np.inf,
+) -> tuple[Array, Array]:  # fmt: skip
+    """States (T+1, K, n) and commands (T, K, m) of a linear system in NumPy, with lqrsim's disturbances."""
+    x, control = system.plan.states[0] + off, law.start(len(off))
+    states, commands = [x], []
+    for t in range(system.plan.steps):
+        shown, command = x.copy(), None
+        for effect in effects:
+            shown = effect.measure(t, shown) if effect.measure else shown
+        command = control(t, shown)
+        commands.append(command)
+        for effect in effects:
+            command = effect.actuate(t, command) if effect.actuate else command
+        applied = np.clip(command, -limit, limit)
+        x = x @ system.A.T + applied @ system.B.T + push * system.E[:, 0]
+        states.append(x)
+    return np.array(states), np.array(commands)
+
+
+def plant_of() -> Plant:
+    """What of a plant ControlDelay, MeasurementLatency and MeasurementDropouts look at: nothing."""
+    return None  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(("latency", "delay"), [(0, 0), (2, 0), (0, 3), (3, 2)])
+def test_what_is_late_is_taken_in_where_it_belongs(latency: int, delay: int) -> None:
+    """Without noise each command is the law's of the true state when it acts, to 1e-9."""
+    steps = 30
+    system = double_integrator(start=[1.0, 0.0], controls=np.cos(np.arange(steps) / 4)[:, None])
+    uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.3, latency=latency, delay=delay)
+    law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0)
+    late = [ls.MeasurementLatency(latency), ls.ControlDelay(delay)]
+    effects = [one.start(plant_of(), system.plan, generators(2)) for one in late]
+    states, commands = run(system, law, effects, off=np.array([[0.3, -0.2], [-0.1, 0.4]]))
+    true = np.concatenate([states, np.zeros((steps + 1, 2, 1))], axis=2)
+    for step in range(latency, steps - delay):
+        t = step + delay
+        wanted = true[t] @ law.gain[t].T + law.offset[t]
+        np.testing.assert_allclose(commands[step], wanted, rtol=0, atol=1e-9 * (1 + np.abs(wanted).max()))
+    # A law that is told nothing of it does something else.
+    unaware = replace(uncertainty, latency=0, delay=0)
+    other = ls.OffsetFree(system.problem, system.solution, unaware, tolerate=0.5, effort=2.0)
+    effects = [one.start(plant_of(), system.plan, generators(2)) for one in late]
+    _, theirs = run(system, other, effects, off=np.array([[0.3, -0.2], [-0.1, 0.4]]))
+    assert (np.abs(theirs - commands).max() > 0.1) == bool(latency + delay)
+
+
+def test_lost_measurements_are_predicted() -> None:
+    """Half of them get lost, in bursts: without noise the estimate stays that of the true state, to 1e-9."""
+    steps = 40
+    system = double_integrator(start=[1.0, 0.0], controls=np.cos(np.arange(steps) / 4)[:, None])
+    uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.3, loss=0.5)
+    law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
+    dropouts = ls.MeasurementDropouts(GilbertElliott(0.3, 0.3)).start(plant_of(), system.plan, generators(20))
+    states, _ = run(system, law, [dropouts], off=0.3 * np.random.default_rng(0).normal(size=(20, 2)))
+    assert law.estimates is not None
+    assert law.innovations is not None
+    lost = np.isnan(law.innovations[:-1]).any(axis=2)
+    assert 0.3 < lost.mean() < 0.7
+    came_first = ~lost[0]
+    assert 0 < came_first.sum() < 20
+    errors = np.abs(law.estimates[:-1, :, :2] - states[:-1])[:, came_first]
+    assert errors.max() < 1e-9
+    # Until the first measurement comes, the plan's first state is shown: it is not taken for one.
+    first = np.argmin(lost, axis=0)
+    for k in np.flatnonzero(~came_first):
+        np.testing.assert_allclose(law.estimates[: first[k], k, -1], 0.0, rtol=0, atol=1e-12)
+
+
+def test_nothing_winds_up_at_the_limits() -> None:
+    """Two seconds at the limit: the filter knows what was applied. One that is told the unclipped command does not."""
+    steps, limit = 60, 1.0
+    far, push = np.array([[2.5, 0.0]]), 0.3
+    errors, estimates, at_limit = {}, {}, None
+    for name, limits in (("clipped", (-limit, limit)), ("unclipped", (-1e6, 1e6))):
+        system = double_integrator(controls=np.zeros((steps, 1)), limits=limits)
+        uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.5, measurement=0.01)
+        law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.1, effort=1.0, record=True)
+        states, commands = run(system, law, [], off=far, push=push, limit=limit)
+        assert law.estimates is not None
+        estimates[name], errors[name] = law.estimates[:, 0, -1], states[:, 0, 0]
+        if name == "clipped":
+            at_limit = int(np.argmax(np.abs(commands[:, 0, 0]) < limit))
+    assert at_limit is not None
+    assert at_limit >= 8  # on the way there; the way to brake is at the other limit
+    assert abs(estimates["clipped"][20] - push) < 0.01
+    assert abs(estimates["unclipped"][20] - push) > 1.0
+    assert np.abs(errors["clipped"][45:]).max() < 0.1
+    assert np.abs(errors["unclipped"][45:]).max() > 0.5
+
+
+@pytest.fixture(scope="module")
+def standing(quadrotor: ls.Scenario) -> ls.Solution:
+    """Twenty seconds of hovering in the middle of the cage."""
+    return track(quadrotor.robot, np.zeros(12), np.full((600, 4), quadrotor.robot.hover_force), 1 / 30)
+
+
+@pytest.mark.parametrize(
+    "disturbance",
+    [
+        ls.MeanWind((3.0, 0.0, 0.0)),
+        ls.MeanWind((-1.7, 1.7, 1.7)),
+        ls.MassMismatch(factor=0.8),
+        ls.MassMismatch(factor=1.2),
+    ],
+    ids=str,
+)
+def test_steady_disturbances_leave_no_error(
+    quadrotor: ls.Scenario, standing: ls.Solution, disturbance: ls.Disturbance
+) -> None:
+    """Hovering for 20 s in MuJoCo without noise: below 1 cm from 10 s on.
+
+    In wind it hovers tilted, where the law's linear model is a little wrong: some millimetres stay. The estimates are
+    right: it is the law that has the model about the plan alone.
+    """
+    unknowns = [ls.Unknown(f"wind_{axis}", 1.0) for axis in "xyz"] + [ls.Unknown("mass", 0.05)]
+    measured = {"m": 5e-3, "m/s": 5e-2, "rad": 5e-3, "rad/s": 5e-3}
+    uncertainty = ls.Uncertainty(unknowns=unknowns, start=0.01, measurement=measured)
+    law = ls.OffsetFree(quadrotor.problem, standing, uncertainty, tolerate=TOLERATE)
+    rollout = ls.simulate(quadrotor.plant(), standing, controller=law, disturbances=[disturbance])
+    error = rollout.tracking_error[0]
+    assert error.max() > 0.005  # it is a disturbance
+    assert error[300:].max() < 0.01
+
+
+# Filters that diverge.
+
+
+def diverging(quadrotor: ls.Scenario) -> tuple[ls.Solution, ls.OffsetFree, list[ls.Disturbance]]:
+    """It believes that it knows nothing of its drag: estimates of it that are negative make predictions explode."""
+    plan, uncertainty = hover(), ls.Uncertainty(unknowns=[ls.Unknown("drag", 5.0)], measurement=0.02, start=0.01)
+    law = ls.OffsetFree(quadrotor.problem, plan, uncertainty, tolerate=TOLERATE)
+    return plan, law, [ls.MeasurementNoise(0.02), ls.ForceNoise(1.0)]
+
+
+def test_a_filter_that_diverges_ends_its_trial_and_says_so(quadrotor: ls.Scenario) -> None:
+    plan, law, noise = diverging(quadrotor)
+    rollout = ls.simulate(quadrotor.plant(), plan, controller=law, disturbances=noise, trials=8)
+    ended = np.array(rollout.outcome) == "diverged"
+    assert 0 < ended.sum() < 8
+    for k in range(8):
+        alone = ls.simulate(quadrotor.plant(), plan, controller=law, disturbances=noise, first_trial=k)
+        np.testing.assert_array_equal(alone.states[0], rollout.states[k])
+        assert alone.reasons == (rollout.reasons[k],)
+        if not ended[k]:
+            continue
+        step = round(rollout.diverged_at[k] / plan.trajectory.dt)
+        assert rollout.reasons[k].startswith(f"filter at {step / 30:.4g} s: the estimate of ")
+        assert rollout.reasons[k].endswith((" is not finite", " is beyond 1e+09"))
+        assert np.isfinite(rollout.states[k, :step]).all()
+        assert np.isnan(rollout.states[k, step:]).all()
+        assert np.isnan(rollout.applied[k, step:]).all()
+        assert f"trial {k}: diverged after {rollout.diverged_at[k]:.2f} s: filter at" in rollout.summary()
+    assert ls.outcomes(rollout).outcome.tolist() == list(rollout.outcome)
+
+
+def test_so_says_its_file(quadrotor: ls.Scenario, tmp_path) -> None:
+    plan, law, noise = diverging(quadrotor)
+    rollout = ls.simulate(quadrotor.plant(), plan, controller=law, disturbances=noise, trials=8)
+    again = ls.load_rollout(ls.save(rollout, tmp_path / "rollout.npz"))
+    assert again.reasons == rollout.reasons
+    assert again.outcome == rollout.outcome
+    with pytest.raises(ls.InputError, match="Rollout: reasons: got 'it is'"):
+        replace(rollout, reasons=("it is",) * 8)
+
+
+# What does not fit.
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"sensors": "x"}, "sensors: got 'x', want a tuple of names"),
+        ({"sensors": ("x", "q")}, "sensors: got 'q', want one of: x, y, z, vx"),
+        ({"sensors": ("x", "x")}, "sensors: got ('x', 'x'), want at least one state, and each once"),
+        ({"sensors": ()}, "sensors: got (), want at least one state"),
+        ({"sensors": np.ones((2, 3))}, "sensors: got shape (2, 3), want (any, 12)"),
+        ({"sensors": np.ones((0, 12))}, "sensors: got no rows"),
+        ({"sensors": np.full((1, 12), np.nan)}, "sensors: got nan at index"),
+        ({"sensors": lambda x: x}, "want a function of (x, u, p)"),
+        ({"sensors": lambda x, u, p: [x[0] * u[0]]}, "u"),
+        ({"sensors": 3.0}, "sensors: got"),
+        ({"tolerate": {"m": 0.05}}, "tolerate: got none for vx, vy"),
+        ({"tolerate": {"feet": 0.05}}, "tolerate: got 'feet', want one of: x, y"),
+        ({"effort": [1.0, 2.0]}, "effort: got 2 numbers, want 4: rotor_1"),
+        ({"at_end": -1.0}, "at_end: got -1"),
+        ({"memory": 0.0}, "OffsetFree: memory: got 0"),
+        ({"record": "yes"}, "OffsetFree: record: got 'yes', want"),
+        ({"uncertainty": {"start": 0.1}}, "OffsetFree: uncertainty: got {'start': 0.1}, want an Uncertainty"),
+        (
+            {"uncertainty": ls.Uncertainty(unknowns=[ls.Unknown("gain of rotor_7", 0.1)])},
+            "Uncertainty: unknowns: got 'gain of rotor_7', want one of: mass",
+        ),
+        (
+            {"uncertainty": ls.Uncertainty(unknowns=[ls.Unknown("force_x", 0.1)]), "sensors": ("rx", "ry", "rz")},
+            "OffsetFree: unknowns: got force_x, which changes nothing of what is measured (rx, ry, rz), want sensors",
+        ),
+        (
+            {"uncertainty": ls.Uncertainty(unknowns=[ls.Unknown({"wind_x": 1, "wind_y": 1}, 0.1)]), "sensors": ("z",)},
+            "OffsetFree: unknowns: got wind_x and wind_y, which changes nothing of what is measured (z), want sensors",
+        ),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_in_a_line(quadrotor: ls.Scenario, options: dict, says: str) -> None:
+    given = {"uncertainty": ls.Uncertainty(start=0.1, measurement=0.01), "tolerate": TOLERATE} | options
+    with pytest.raises(ls.InputError) as caught:
+        ls.OffsetFree(quadrotor.problem, hover(), **given)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_what_has_no_spread_is_no_reason_to_refuse(quadrotor: ls.Scenario) -> None:
+    """A Dryden wind of strength 0 changes nothing, and nobody wants to see it."""
+    calm = ls.Unknown("wind_x", 0.0, time_constant=1.0, order=2)
+    law = ls.OffsetFree(
+        quadrotor.problem, hover(), ls.Uncertainty(unknowns=[calm], measurement=0.01), tolerate=TOLERATE
+    )
+    assert np.isfinite(law.gain).all()
+
+
+def test_the_digest_is_of_all_that_the_controls_depend_on() -> None:
+    system, digests = double_integrator(steps=5), set()
+    base = {"unknowns": [PUSH], "start": 0.1, "measurement": 0.1}
+    changes = [{}, {"latency": 1}, {"delay": 1}, {"lag": 0.1}, {"measurement": 0.2}, {"unknowns": []}]
+    for change in changes:
+        uncertainty = ls.Uncertainty(**(base | change))  # type: ignore[arg-type]
+        digests.add(ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=1.0).digest)
+    limited = double_integrator(steps=5, limits=(-1.0, 1.0))
+    uncertainty = ls.Uncertainty(**base)  # type: ignore[arg-type]
+    for sensors in (None, ("s0",), [[1.0, DT]]):
+        law = ls.OffsetFree(limited.problem, limited.solution, uncertainty, tolerate=0.5, effort=1.0, sensors=sensors)
+        digests.add(law.digest)
+    assert len(digests) == len(changes) + 3

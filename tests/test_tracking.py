@@ -1,0 +1,263 @@
+"""Tracking laws against dense least squares of the same cost and a plain Riccati recursion; what is refused."""
+
+import importlib.util
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from linear_plans import DT, Linear, by_hand, linear
+from scipy.linalg import expm
+
+import lqrsim as ls
+from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.tracking_laws import Weights, tracking_laws
+from lqrsim.errors import Array
+
+# States, controls, pushes; unknowns; whether the actuators lag. Sizes compile, numbers do not.
+STRUCTURES = (
+    (2, 1, 1, (), False),
+    (2, 1, 1, ("constant",), True),
+    (3, 2, 1, ("constant", "second", "offset"), False),
+    (3, 2, 2, ("first", "shared", "gain"), True),
+)
+UNKNOWNS = {
+    "constant": ls.Unknown("d0", 0.7),
+    "first": ls.Unknown("d0", 0.7, time_constant=0.5),
+    "second": ls.Unknown("d0", 0.7, time_constant=0.4, order=2),
+    "shared": ls.Unknown({"d0": 0.6, "d1": -0.8}, 1.5),
+    "gain": ls.Unknown("gain of u1", 0.1),
+    "offset": ls.Unknown("offset of u0", 0.2),
+}
+
+
+def drawn(structure: int, seed: int, *, unstable: bool, steps: int = 8) -> tuple[Linear, ls.Uncertainty]:
+    """A system of that structure about a plan that moves."""
+    n, m, k, names, lags = STRUCTURES[structure]
+    rng = np.random.default_rng(seed)
+    rates = rng.normal(size=(n, n)) + (1.0 if unstable else -2.0) * np.eye(n)
+    system = linear(
+        rates, rng.normal(size=(n, m)), rng.normal(size=(n, k)), start=rng.normal(size=n),
+        controls=rng.normal(size=(steps, m)),
+    )  # fmt: skip
+    return system, ls.Uncertainty(unknowns=[UNKNOWNS[name] for name in names], lag=0.06 if lags else 0.0)
+
+
+class Oracle:
+    """The run that follows from commands (T, m), stated as absolute numbers, and its cost as a sum of squares."""
+
+    def __init__(self, system: Linear, uncertainty: ls.Uncertainty, weights: Weights) -> None:
+        self.system, self.weights = system, weights
+        m = system.B.shape[1]
+        self.lag = uncertainty.lag
+        step = DT / self.lag if self.lag else np.inf
+        self.left = np.exp(-step)
+        self.mean = (1 - np.exp(-step)) / step
+        # Each unknown: how its states go on, and what of d, gains and offsets it is.
+        self.unknowns = [self._unknown(one, m) for one in uncertainty.unknowns]
+
+    def _unknown(self, one: ls.Unknown, m: int) -> tuple[Array, Array, dict[str, float]]:
+        step = DT / one.time_constant
+        if one.order == 2:
+            move = expm(step * np.array([[0.0, 1.0], [-1.0, -2.0]]))
+            return move, one.std / 2 * np.array([1.0, np.sqrt(3.0)]), one.shares
+        return np.full((1, 1), np.exp(-step)), np.ones(1), one.shares
+
+    @property
+    def states_of_unknowns(self) -> int:
+        return sum(len(move) for move, _, _ in self.unknowns)
+
+    def push(self, d: Array, t: int) -> Array:
+        """What the unknowns add to the next state, to first order about the planned controls."""
+        total, place = np.zeros(len(self.system.A)), 0
+        for move, out, shares in self.unknowns:
+            value = out @ d[place : place + len(move)]
+            place += len(move)
+            for name, share in shares.items():
+                i = int(name[-1])
+                if name.startswith("gain"):
+                    total += self.system.B[:, i] * self.system.plan.controls[t, i] * share * value
+                elif name.startswith("offset"):
+                    total += self.system.B[:, i] * share * value
+                else:
+                    total += self.system.E[:, i] * share * value
+        return total
+
+    def undone(self, d: Array, t: int) -> Array:
+        """The controls whose effect on the next state is nearest to that, in tolerances."""
+        root = np.sqrt(self.weights.state)
+        return np.linalg.lstsq(root[:, None] * self.system.B, root * self.push(d, t), rcond=None)[0]
+
+    def residuals(self, commands: Array, e: Array, a: Array, d: Array) -> Array:
+        """The roots of all that the cost adds up, of a run that begins off the plan by e, a and d."""
+        system, plan, weights = self.system, self.system.plan, self.weights
+        x, reached, d = plan.states[0] + e, plan.controls[0] + a, d.copy()
+        found = []
+        for t, command in enumerate(commands):
+            found.append(np.sqrt(weights.state) * (x - plan.states[t]))
+            found.append(np.sqrt(weights.control) * (command - plan.controls[t] + self.undone(d, t)))
+            applied = command
+            if self.lag:
+                applied = command + self.mean * (reached - command)
+                reached = command + self.left * (reached - command)
+            x = system.A @ x + system.B @ applied + self.push(d, t)
+            place = 0
+            for move, _, _ in self.unknowns:
+                d[place : place + len(move)] = move @ d[place : place + len(move)]
+                place += len(move)
+        return np.concatenate([*found, np.sqrt(weights.end) * (x - plan.states[-1])])
+
+    def best(self, e: Array, a: Array, d: Array) -> Array:
+        """The commands (T, m) of least squares: residuals are affine in them."""
+        shape = self.system.plan.controls.shape
+        size = shape[0] * shape[1]
+        base = self.residuals(np.zeros(shape), e, a, d)
+        slope = np.array([self.residuals(one.reshape(shape), e, a, d) - base for one in np.eye(size)]).T
+        return np.linalg.lstsq(slope, -base, rcond=None)[0].reshape(shape)
+
+
+@hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.booleans())
+@hypothesis.settings(max_examples=25)
+def test_laws_are_dense_least_squares_of_the_same_cost(structure: int, seed: int, unstable: bool) -> None:
+    """Commands of a run that begins anywhere, within 1e-6 of their size: `undo` leaves 1e-9 of its matrix unsolved."""
+    system, uncertainty = drawn(structure, seed, unstable=unstable)
+    rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
+    model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
+    weights = Weights(rng.uniform(0.5, 4, n), rng.uniform(0.5, 4, m), rng.uniform(1, 20, n))
+    gain, offset = tracking_laws(model, weights)
+    oracle = Oracle(system, uncertainty, weights)
+    e, a, d = rng.normal(size=n), rng.normal(size=m), rng.normal(size=oracle.states_of_unknowns)
+    commands = oracle.best(e, a, d)
+    # The law in closed loop, on the oracle's run: knot by knot, the rest of the commands changes nothing of the past.
+    z = np.concatenate([e, a[: model.lagging], d])
+    for t in range(system.plan.steps):
+        u = gain[t] @ z + offset[t]
+        np.testing.assert_allclose(system.plan.controls[t] + u, commands[t], rtol=0, atol=1e-6 * (1 + np.abs(u).max()))
+        z = model.F[t] @ z + model.G[t] @ u + model.c[t]
+
+
+@hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.booleans())
+@hypothesis.settings(max_examples=15)
+def test_the_linear_model_is_the_run(structure: int, seed: int, unstable: bool) -> None:
+    """F, G and c against the oracle's run, which is stated as absolute numbers: 1e-9."""
+    system, uncertainty = drawn(structure, seed, unstable=unstable)
+    rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
+    model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
+    oracle = Oracle(system, uncertainty, Weights(np.ones(n), np.ones(m), np.ones(n)))
+    e, a, d = rng.normal(size=n), rng.normal(size=m), rng.normal(size=oracle.states_of_unknowns)
+    changes = rng.normal(size=(system.plan.steps, m))
+    z, seen = np.concatenate([e, a[: model.lagging], d]), []
+    for t in range(system.plan.steps):
+        seen.append(z[:n])
+        z = model.F[t] @ z + model.G[t] @ changes[t] + model.c[t]
+    run = oracle.residuals(system.plan.controls + changes, e, a, d)
+    expected = np.stack([*run[:-n].reshape(-1, n + m)[:, :n], run[-n:]])
+    np.testing.assert_allclose([*seen, z[:n]], expected, rtol=0, atol=1e-9 * (1 + np.abs(expected).max()))
+
+
+def test_without_unknowns_they_are_those_of_a_plain_riccati_recursion() -> None:
+    system, _ = drawn(2, 5, unstable=True)
+    A, B, plan = system.A, system.B, system.plan
+    policy = ls.track(system.problem, system.solution, tolerate=0.5, effort=2.0, at_end=0.1)
+    S = np.eye(3) / 0.05**2
+    for t in range(plan.steps - 1, -1, -1):
+        gain = -np.linalg.solve(np.eye(2) / 4 + B.T @ S @ B, B.T @ S @ A)
+        S = np.eye(3) / 0.25 + gain.T @ gain / 4 + (A + B @ gain).T @ S @ (A + B @ gain)
+        np.testing.assert_allclose(policy.gain[t], gain, rtol=0, atol=1e-9)
+        # On the plan nothing is added.
+        np.testing.assert_allclose(policy(plan.states[t], t * DT), plan.controls[t], rtol=0, atol=1e-12)
+
+
+def test_they_keep_to_a_plan_that_a_cost_was_indifferent_to() -> None:
+    """About a plan of the linear-quadratic solver: pushed off, the law is back while the plan's own drifts away."""
+    system = linear([[0, 1], [0, 0]], [[0], [1]], [[0], [1]], start=[1.0, 0.0], controls=np.zeros((60, 1)))
+    problem, solution = system.problem, ls.smooth(system.problem)
+    law = ls.track(problem, solution, tolerate={"s0": 0.05, "s1": 0.5}, effort=1.0)
+    plan, ends = solution.trajectory, {}
+    for name, policy in (("track", law), ("plan", solution.policy)):
+        x = plan.states[0] + [0.3, 0.0]
+        for t in range(plan.steps):
+            x = system.A @ x + system.B @ policy(x, t * DT)
+        ends[name] = abs(x - plan.states[-1]).max()
+    assert ends["track"] < 1e-3
+    assert ends["plan"] > 10 * ends["track"]
+
+
+def test_drakes_finite_horizon_regulator_has_the_same_gains() -> None:
+    if importlib.util.find_spec("peers.drake") is None or importlib.util.find_spec("pydrake") is None:
+        pytest.skip("Drake is not installed")
+    drake = importlib.import_module("peers.drake")
+    system, _ = drawn(0, 3, unstable=True)
+    policy = ls.track(system.problem, system.solution, tolerate=0.5, effort=2.0)
+    n, m = system.B.shape
+    steps = np.ones((len(policy.gain), 1, 1))
+    found, _ = drake.finite_horizon_gains(
+        system.A * steps, system.B * steps, np.eye(n) / 0.25, np.eye(m) / 4, np.eye(n) / 0.01
+    )
+    np.testing.assert_allclose(policy.gain, -found, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"effort": 1.0}, "track: tolerate: got none, want how far"),
+        ({"tolerate": {"feet": 1.0}, "effort": 1.0}, "tolerate: got 'feet', want one of: s0, s1, m"),
+        ({"tolerate": {"s0": 1.0}, "effort": 1.0}, "tolerate: got none for s1, want one for each state"),
+        ({"tolerate": -1.0, "effort": 1.0}, "tolerate: got -1 for s0, want more than 0"),
+        ({"tolerate": [1.0, 0.0], "effort": 1.0}, "tolerate: got 0 for s1, want more than 0"),
+        ({"tolerate": [1.0] * 3, "effort": 1.0}, "tolerate: got 3 numbers, want 2: s0"),
+        ({"tolerate": np.nan, "effort": 1.0}, "tolerate: got nan, want a finite number"),
+        ({"tolerate": 1.0}, "effort: got none, and u0 (N) has no limits"),
+        ({"tolerate": 1.0, "effort": {"u7": 1.0}}, "effort: got 'u7', want one of: u0, N"),
+        ({"tolerate": 1.0, "effort": 1.0, "at_end": 0.0}, "at_end: got 0.0, want"),
+        ({"uncertainty": 0.1, "effort": 1.0}, "track: uncertainty: got 0.1, want an Uncertainty"),
+        (
+            {"uncertainty": ls.Uncertainty(unknowns=[ls.Unknown("wind_x", 1.0)]), "effort": 1.0},
+            "Uncertainty: unknowns: got 'wind_x', want one of: a00",
+        ),
+        ({"uncertainty": ls.Uncertainty(start={"rad": 1.0}), "effort": 1.0}, "start: got 'rad', want one of: s0, s1"),
+        (
+            {"uncertainty": ls.Uncertainty(measurement=[1.0]), "effort": 1.0},
+            "Uncertainty: measurement: got 1 numbers, want 2: s0",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_a_line(options: dict, says: str) -> None:
+    system, _ = drawn(0, 1, unstable=False)
+    with pytest.raises(ls.InputError) as caught:
+        ls.track(system.problem, system.solution, **options)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: ls.Unknown("d0", -1.0), "Unknown: std: got -1"),
+        (lambda: ls.Unknown("d0", 1.0, time_constant=-1.0), "Unknown: time_constant: got -1"),
+        (lambda: ls.Unknown("d0", 1.0, order=3), "Unknown: order: got 3"),
+        (lambda: ls.Unknown("d0", 1.0, order=2), "Unknown: order: got 2 with a time constant of inf s, want 1"),
+        (lambda: ls.Unknown("d0", 1.0, time_constant=1.0, drift=0.1), "Unknown: drift: got 0.1 with a time constant"),
+        (lambda: ls.Unknown({}, 1.0), "Unknown: of: got no name"),
+        (lambda: ls.Uncertainty(lag=-0.1), "Uncertainty: lag: got -0.1"),
+        (lambda: ls.Uncertainty(loss=1.5), "Uncertainty: loss: got 1.5"),
+        (lambda: ls.Uncertainty(delay=1.5), "Uncertainty: delay: got 1.5"),  # type: ignore[arg-type]
+        (lambda: ls.Uncertainty(unknowns=["wind_x"]), "Uncertainty: unknowns: got"),  # type: ignore[list-item]
+        (lambda: ls.Uncertainty(unknowns=ls.Unknown("d0", 1.0)), "Uncertainty: unknowns: got"),  # type: ignore[arg-type]
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(make, says: str) -> None:
+    with pytest.raises(ls.InputError) as caught:
+        make()
+    assert str(caught.value).startswith(says)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_solution_of_another_system_is_refused() -> None:
+    system, _ = drawn(0, 1, unstable=False)
+    other, _ = drawn(2, 1, unstable=False)
+    with pytest.raises(ls.InputError, match="track: solution: got one of another system"):
+        ls.track(system.problem, other.solution, tolerate=1.0, effort=1.0)
+    lost = ls.Trajectory(np.full_like(system.plan.states, np.nan), system.plan.controls, DT)
+    with pytest.raises(ls.InputError, match="track: solution: got a plan that is not finite"):
+        ls.track(system.problem, by_hand(lost, system.solution.policy), tolerate=1.0, effort=1.0)
