@@ -3,6 +3,8 @@
 from . import robots as robots
 from . import rotations as rotations
 from . import scenarios as scenarios
+from .control.chance_constrained import SafePlan as SafePlan
+from .control.chance_constrained import smooth_chance_constrained as smooth_chance_constrained
 from .control.controllers import Controller as Controller
 from .control.controllers import Feedback as Feedback
 from .control.controllers import Replanning as Replanning

@@ -1,4 +1,7 @@
-"""Other people's solvers are told the problem that lqrsim solves. Needs the `bench` extra, and Crocoddyl g++ too."""
+"""Other people's solvers and controllers are told the problem that lqrsim solves, and gains agree with theirs.
+
+Needs the `bench` extra, and Crocoddyl g++ too.
+"""
 
 import importlib
 from dataclasses import replace
@@ -175,3 +178,177 @@ def test_ipopt_keeps_bounds_and_clearance(peers: ModuleType) -> None:
     states = peers.rollout(problem, answer.controls)
     np.testing.assert_allclose(states, answer.states, atol=1e-6)
     assert peers.clearance_of(problem, states)[1:].min() > clearance - 1e-6
+
+
+@pytest.fixture(scope="module")
+def flight(peers: ModuleType) -> tuple[ls.Scenario, ls.Quadrotor, ls.Solution]:
+    """The quadrotor's query and its plan, where RotorPy can fly it."""
+    scenario = ls.scenarios.quadrotor()
+    robot, solution = scenario.plant().robot, ls.smooth(scenario.problem)
+    assert isinstance(robot, ls.Quadrotor)
+    try:
+        peers.RotorPy(robot, solution)
+    except peers.Unavailable as error:
+        pytest.skip(str(error))
+    return scenario, robot, solution
+
+
+def test_rotorpy_asks_for_the_thrust_of_the_plan_and_its_attitude(peers: ModuleType, flight: Any) -> None:
+    """On the plan, turning as fast as it wants, it asks for the plan's thrust and no torque: 1e-9 N."""
+    _, robot, solution = flight
+    plan = solution.trajectory
+    control = peers.RotorPy(robot, solution, feed_drag=True).start(1)
+    yaw_rates = peers.rotorpy.flat_outputs(robot, plan, feed_drag=True)["yaw_dot"]
+    for step, (state, controls) in enumerate(zip(plan.states[:-1], plan.controls, strict=True)):
+        shown = np.concatenate([state[:9], [0, 0, yaw_rates[step]]])[None]
+        np.testing.assert_allclose(control(step, shown)[0], np.full(4, controls.mean()), rtol=0, atol=1e-9)
+
+
+def test_rotorpy_is_told_the_motion_of_the_plan(peers: ModuleType, flight: Any) -> None:
+    """Its acceleration against second differences of the position, to 0.02 m/s2 of up to 1.8: their own error."""
+    _, robot, solution = flight
+    plan = solution.trajectory
+    told, more = (peers.rotorpy.flat_outputs(robot, plan, feed_drag=feed) for feed in (False, True))
+    place = plan.states[:, :3]
+    np.testing.assert_allclose(told["x_ddot"][1:], np.diff(place, 2, axis=0) / plan.dt**2, rtol=0, atol=0.02)
+    drag = robot.drag / robot.mass * plan.states[:-1, 3:6]
+    np.testing.assert_allclose(more["x_ddot"] - told["x_ddot"], drag, rtol=0, atol=1e-12)
+
+
+def test_rotorpy_turns_the_body_back(peers: ModuleType, flight: Any) -> None:
+    """To first order in the angle, about each axis: the angular acceleration of our dynamics is -attitude gain x angle.
+
+    At an angle of 1e-4 rad, to 1e-6 of that; the rotors' layout and the sign of yaw are our dynamics', not RotorPy's.
+    """
+    _, robot, solution = flight
+    gains = peers.rotorpy.BEST_AT_LIGHT
+    control = peers.RotorPy(robot, replace_plan(solution, hover=robot.hover_force)).start(1)
+    for angle in 1e-4 * np.eye(3):
+        state = np.concatenate([np.zeros(6), angle, np.zeros(3)])
+        (forces,) = control(0, state[None])
+        turning = robot.dynamics.rate(state, forces)[9:12]
+        np.testing.assert_allclose(turning, -gains.attitude * angle, rtol=0, atol=1e-6 * gains.attitude * 1e-4)
+        assert forces.sum() == pytest.approx(4 * robot.hover_force, rel=1e-6)
+
+
+def replace_plan(solution: ls.Solution, *, hover: float) -> ls.Solution:
+    """With a plan that hovers at the origin."""
+    plan = solution.trajectory
+    at_rest = ls.Trajectory(np.zeros_like(plan.states), np.full_like(plan.controls, hover), plan.dt)
+    return replace(solution, trajectory=at_rest)
+
+
+def test_rotorpy_flies_the_plan(peers: ModuleType, flight: Any) -> None:
+    """It stays within 0.15 m of it undisturbed, and at preset light reaches the goal in more trials than the policy.
+
+    Trials are the same alone.
+    """
+    scenario, robot, solution = flight
+    law, plant = peers.RotorPy(robot, solution), scenario.plant()
+    calm = ls.simulate(plant, solution, controller=law, frames=False)
+    assert calm.outcome == ("reached",)
+    assert calm.tracking_error.max() < 0.15
+    disturbances = ls.preset("light", plant)
+    light, policy, last = (
+        ls.simulate(
+            plant, solution, controller=controller, disturbances=disturbances, frames=False, trials=20 - first,
+            first_trial=first,
+        )
+        for controller, first in ((law, 0), (None, 0), (law, 19))
+    )  # fmt: skip
+    assert light.outcome.count("reached") > policy.outcome.count("reached") + 5
+    np.testing.assert_array_equal(light.states[19], last.states[0])
+
+
+def drake(peers: ModuleType) -> ModuleType:
+    try:
+        peers.drake.stationary_gains(np.eye(1), np.eye(1), np.eye(1), np.eye(1))
+    except peers.Unavailable as error:
+        pytest.skip(str(error))
+    return peers.drake
+
+
+def tracking_problem() -> tuple[Array, Array, Array, Array]:
+    """A, B (a row a step), Q, R of the quadrotor, about its plan."""
+    problem = ls.scenarios.quadrotor().problem
+    plan = ls.smooth(problem).trajectory
+    steps = [
+        problem.dynamics.linearize(x, u, problem.dt)[:2] for x, u in zip(plan.states[:-1], plan.controls, strict=True)
+    ]
+    A, B = (np.array(each) for each in zip(*steps, strict=True))
+    return A, B, np.diag(np.repeat([50.0, 5.0, 5.0, 0.5], 3)), np.eye(4)
+
+
+def gains_of_smooth_lq(A: Array, B: Array, Q: Array, R: Array, Qf: Array) -> Array:
+    """The gains (T, m, n) of our backward pass."""
+    n = len(Q)
+    solution = ls.smooth_lq(
+        ls.Stage(A=A, B=B, Q=Q, R=R), initial=ls.FixedState(np.zeros(n)), final=ls.Quadratic(Qf, np.zeros(n), 0.0)
+    )
+    assert solution.status is ls.Status.CONVERGED
+    return solution.policy.gain
+
+
+def random_weights(rng: np.random.Generator, size: int) -> Array:
+    root = rng.normal(size=(size, size))
+    return root @ root.T + 0.1 * np.eye(size)
+
+
+@pytest.mark.parametrize("radius", [0.5, 1.0, 1.7])
+def test_drakes_gains_of_steps_are_those_of_a_riccati_recursion(peers: ModuleType, radius: float) -> None:
+    """To 1e-12 of the largest, over sixty steps that all differ, A with eigenvalues of up to that size."""
+    rng, steps, n, m = np.random.default_rng(0), 60, 4, 2
+    A, B = rng.normal(size=(steps, n, n)), rng.normal(size=(steps, n, m))
+    A *= radius / np.abs(np.linalg.eigvals(A)).max(axis=1)[:, None, None]
+    Q, R = (np.array([random_weights(rng, size) for _ in range(steps)]) for size in (n, m))
+    Qf = random_weights(rng, n)
+    gains, values = drake(peers).finite_horizon_gains(A, B, Q, R, Qf)
+    S = Qf
+    np.testing.assert_array_equal(values[-1], S)
+    for t in reversed(range(steps)):
+        K = np.linalg.solve(R[t] + B[t].T @ S @ B[t], B[t].T @ S @ A[t])
+        S = Q[t] + A[t].T @ S @ (A[t] - B[t] @ K)
+        np.testing.assert_allclose(gains[t], K, rtol=0, atol=1e-12 * np.abs(K).max())
+        np.testing.assert_allclose(values[t], S, rtol=0, atol=1e-12 * np.abs(S).max())
+
+
+def test_the_backward_pass_along_a_plan_is_drakes(peers: ModuleType) -> None:
+    """Tracking gains along the quadrotor's plan, to 1e-12 of the largest; and those that go on for ever, to 1e-9."""
+    A, B, Q, R = tracking_problem()
+    K, _ = drake(peers).finite_horizon_gains(A, B, Q, R, 3 * Q)
+    np.testing.assert_allclose(gains_of_smooth_lq(A, B, Q, R, 3 * Q), -K, rtol=0, atol=1e-12 * np.abs(K).max())
+    stationary, _ = peers.drake.stationary_gains(A[0], B[0], Q, R)
+    As, Bs = (np.repeat(each[:1], 1000, axis=0) for each in (A, B))
+    ours = gains_of_smooth_lq(As, Bs, Q, R, 3 * Q)[0]
+    np.testing.assert_allclose(ours, -stationary, rtol=0, atol=1e-9 * np.abs(stationary).max())
+
+
+def test_the_backward_pass_tends_to_drakes_in_continuous_time(peers: ModuleType) -> None:
+    """An error proportional to the step, of a system that changes with time; and `smooth_lq_continuous` to 1e-7."""
+    rng, n, m, knots = np.random.default_rng(3), 3, 2, np.linspace(0.0, 1.0, 11)
+    (A0, A1), (B0, B1) = rng.normal(size=(2, n, n)), rng.normal(size=(2, n, m))
+    Q, R, Qf = np.eye(n), np.eye(m), 2 * np.eye(n)
+
+    def at(t: float) -> tuple[Array, Array]:
+        return A0 + t * A1, B0 + t * B1
+
+    A, B = (np.array(each) for each in zip(*(at(t) for t in knots), strict=True))
+    K, S = drake(peers).continuous_gains(A, B, Q, R, Qf, knots)
+    end = ls.Quadratic(Qf, np.zeros(n), 0.0)
+
+    def stage(t: float) -> ls.Stage:
+        A, B = at(t)
+        return ls.Stage(A=A, B=B, Q=Q, R=R)
+
+    whole = ls.smooth_lq_continuous(stage, horizon=1.0, initial=ls.Quadratic(np.eye(n), np.zeros(n), 0.0), final=end)
+    for t, value in zip(knots, S, strict=True):
+        np.testing.assert_allclose(whole.cost_to_go(t).hessian, value, rtol=0, atol=1e-7 * np.abs(S).max())
+    errors: list[float] = []
+    for parts in (8, 16, 32, 64):
+        steps = 10 * parts
+        dt = 1.0 / steps
+        rates = [at(dt * t) for t in range(steps)]
+        A, B = np.array([np.eye(n) + dt * rate for rate, _ in rates]), np.array([dt * rate for _, rate in rates])
+        errors.append(np.abs(gains_of_smooth_lq(A, B, dt * Q, dt * R, Qf)[::parts] + K[:-1]).max())
+    np.testing.assert_allclose(np.divide(errors[:-1], errors[1:]), 2.0, rtol=0.05)
+    assert errors[-1] < 0.02 * np.abs(K).max()

@@ -23,11 +23,13 @@ class Surroundings:
     """What a robot must not touch.
 
     Attributes:
-      worlds: with the radius to keep from each, as the robot sees them. position: which states are its place.
+      worlds: with the radius to keep from each. seen: the worlds as the robot sees them.
+      position: which states are its place.
       std: of where an obstacle is, in m.
     """
 
     worlds: tuple[tuple[World, float], ...]
+    seen: tuple[World, ...]
     position: tuple[int, ...]
     std: float
 
@@ -39,13 +41,23 @@ class Surroundings:
         for one in (*problem.obstacle_costs, *clearances):
             if not any(world is one.world and radius == one.radius for world, radius in worlds):
                 worlds.append((one.world, one.radius))
-        seen = tuple((world.seen_by(space.plane, space.offset), radius) for world, radius in worlds)
-        return cls(tuple(pair for pair in seen if len(pair[0])), space.position, std)
+        pairs = [(pair, pair[0].seen_by(space.plane, space.offset)) for pair in worlds]
+        pairs = [(pair, seen) for pair, seen in pairs if len(seen)]
+        return cls(tuple(pair for pair, _ in pairs), tuple(seen for _, seen in pairs), space.position, std)
+
+    def keep_away(self, margin: Array) -> list[Clearance]:
+        """Constraints that keep a margin from each obstacle, (T+1, O)."""
+        kept, first = [], 0
+        for (world, radius), seen in zip(self.worlds, self.seen, strict=True):
+            kept.append(Clearance(world, radius=radius, margin=margin[:, first : first + len(seen)]))
+            first += len(seen)
+        return kept
 
     def clearances(self, states: Array) -> tuple[Array, Array, Array]:
         """At states (K, n): to each obstacle (K, O), in which direction that grows (K, O, p), and its variance (O,)."""
         places = states[:, list(self.position)]
-        parts = [(*distances_with_normals(world, places), radius, world) for world, radius in self.worlds]
+        worlds = [(seen, radius) for (_, radius), seen in zip(self.worlds, self.seen, strict=True)]
+        parts = [(*distances_with_normals(world, places), radius, world) for world, radius in worlds]
         if not parts:
             return np.zeros((len(states), 0)), np.zeros((len(states), 0, len(self.position))), np.zeros(0)
         fixed = [[one.kind == "plane" for one in world.obstacles] for *_, world in parts]
@@ -54,6 +66,20 @@ class Surroundings:
             np.concatenate([normals for _, normals, *_ in parts], axis=1),
             np.where(np.concatenate(fixed), 0.0, self.std**2),
         )
+
+    def spread(self, states: Array, covariance: Array) -> tuple[Array, Array]:
+        """Clearances at mean states (T+1, n), and their standard deviations, both (T+1, O)."""
+        place = list(self.position)
+        clearance, normal, displaced = self.clearances(states)
+        variance = np.einsum("toi,tij,toj->to", normal, covariance[:, place][:, :, place], normal) + displaced
+        return clearance, np.maximum(np.sqrt(np.maximum(variance, 0.0)), 1e-12)
+
+    def correlation(self, states: Array, across: Array, std: Array) -> Array:
+        """Of each clearance with that of the step before, (T, O)."""
+        place = list(self.position)
+        _, normal, displaced = self.clearances(states)
+        shared = np.einsum("toi,tij,toj->to", normal[1:], across[:, place][:, :, place], normal[:-1]) + displaced
+        return np.clip(shared / (std[1:] * std[:-1]), -1.0, 1.0)
 
 
 def collision_chance(
@@ -64,16 +90,15 @@ def collision_chance(
     Args:
       states: means, (T+1, n). covariance: (T+1, n, n). across: of each state with the one before it, (T, n, n).
     """
-    clearance, normal, displaced = surroundings.clearances(states)
-    place = list(surroundings.position)
-    if not place or not clearance.shape[1]:
+    if not surroundings.worlds:
         return np.zeros(len(states)), 0.0
-    std = np.sqrt(np.einsum("toi,tij,toj->to", normal, covariance[:, place][:, :, place], normal) + displaced)
-    std = np.maximum(std, 1e-12)
-    shared = np.einsum("toi,tij,toj->to", normal[1:], across[:, place][:, :, place], normal[:-1]) + displaced
-    margin = clearance / std
+    clearance, std = surroundings.spread(states, covariance)
+    return chance_of_clearances(clearance / std, surroundings.correlation(states, across, std))
+
+
+def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, float]:
+    """The same of clearances in standard deviations (T+1, O), and the correlation of each with that before (T, O)."""
     each = ndtr(-margin)
-    correlation = np.clip(shared / (std[1:] * std[:-1]), -1.0, 1.0)
     # Who is in collision at a knot and was not at the one before.
     begins = each[1:] - both_below(-margin[1:], -margin[:-1], correlation)
     expected = each[0].sum() + np.maximum(begins, 0.0).sum()

@@ -132,7 +132,8 @@ class Replanning(Controller):
         done = step - first
         here = law.state_coordinates.nearest(state, law.nominal[done])
         try:
-            problem = replace(self.problem, initial=FixedState(here), steps=left)
+            constraints = [one.ahead(step) for one in self.problem.constraints]
+            problem = replace(self.problem, initial=FixedState(here), steps=left, constraints=constraints)
         except InputError as error:  # it begins within an obstacle
             self.kept[str(error)] += 1
             return law, first

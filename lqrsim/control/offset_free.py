@@ -17,13 +17,15 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.sensors import Sensors, sensor_of
 from lqrsim.control.tolerances import Prediction, choose_tolerances, with_filter
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of, tracking_laws
-from lqrsim.control.uncertainty import PerEntry, Uncertainty
+from lqrsim.control.uncertainty import PerEntry, Uncertainty, per_entry
 from lqrsim.errors import Array, check_kind, check_number
 from lqrsim.kernels.records import Limits, Policy
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 from lqrsim.results.solution import Solution
+
+INEXACT = 0.02  # how far a control is off from its command, at least, relative to the tolerated effort
 
 
 class OffsetFree(Controller):
@@ -65,10 +67,11 @@ class OffsetFree(Controller):
         memory = plan.horizon if memory is None else check_number("OffsetFree: memory", memory, above=0.0)
         self.problem, self.solution, self.uncertainty = problem, solution, uncertainty
         sensor = sensor_of(sensors, problem.dynamics.state_coordinates)
-        self.model = PlanModel.of(problem.dynamics, plan, uncertainty.steady(memory), sensor)
+        efforts = effort_of(effort, problem.dynamics)
+        self.model = PlanModel.of(problem.dynamics, plan, for_filter(uncertainty, memory, efforts, problem), sensor)
         check_observable("OffsetFree", self.model)
         self.filter = kalman_filter(self.model)
-        self.weights = self._weights(tolerate, effort_of(effort, problem.dynamics), at_end)
+        self.weights = self._weights(tolerate, efforts, at_end)
         self.gain, offset = tracking_laws(self.model, self.weights)
         # In what the filter estimates, and not in deviations from the plan.
         self.nominal = self._nominal()
@@ -160,6 +163,16 @@ class _Run:
     def _predict(self, estimates: Array, commands: Array) -> None:
         """A control period on."""
         self.model.core.predict(self.trials, in_c_order(commands), self.model.predictor, estimates)
+
+
+def for_filter(uncertainty: Uncertainty, memory: float, effort: Array, problem: Problem) -> Uncertainty:
+    """What a filter is to believe: see `Uncertainty.steady`; and that no command is carried out exactly.
+
+    Without that, a filter that is told of no noise would listen to no measurement.
+    """
+    stated = per_entry("Uncertainty: control", uncertainty.control, problem.dynamics.control_coordinates)
+    wrong = np.hypot(stated, INEXACT * effort)
+    return replace(uncertainty.steady(memory), control=tuple(wrong.tolist()))
 
 
 def _limits(law: OffsetFree) -> tuple[Array, Array]:

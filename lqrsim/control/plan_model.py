@@ -30,8 +30,10 @@ STEP = 1e-5  # of a parameter for differences, relative to its standard deviatio
 
 @dataclass(frozen=True)
 class Lag:
-    """A first-order lag of the actuators over a control period: how much is left of the distance to the command at its
-    end, and in the mean over it.
+    """A first-order lag of the actuators over a control period.
+
+    Attributes:
+      left: how much of the distance to the command is left at its end. mean: in the mean over it.
     """
 
     left: float

@@ -24,7 +24,9 @@ from lqrsim.control.tracking_laws import Weights, tracking_laws
 from lqrsim.errors import Array
 
 PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # that a deviation may take to be gone
-UNLIKELY = 1e-4  # chance of failing below which it does not matter what it is
+# What a tube of twice the width of the narrowest counts for as a chance of failing: little, so that it decides where
+# the plan is clear of everything, or collides whatever the law.
+NARROW = 0.02
 # What the square of the share of commands beyond the limits adds to the chance of failing. Measured: of the quadrotor's
 # flights through the cage under the presets, about so many fail besides those that are predicted to.
 FRAGILE = 3.0
@@ -59,20 +61,25 @@ def choose_tolerances(
     """The tolerances for a law about a plan.
 
     Args:
-      predicted: what becomes of the law with such weights.
+      predicted: what becomes of a law with such weights.
       effort: what may be added to each control, (m,). at_end: as in `track`.
     """
-    reach, found = reach_of(model, effort, PERIODS[-1]), list[tuple[float, Choice]]()
+    reach, found = reach_of(model, effort, PERIODS[-1]), list[Choice]()
     for periods in PERIODS:
         if periods > max(model.plan.steps // 2, PERIODS[0]):
             break
         tolerate = _of_units(model.dynamics.state_coordinates.units, reach[periods])
         weights = Weights.of(tuple(tolerate.tolist()), effort, model.dynamics, at_end=at_end)
-        told = predicted(weights)
-        # Where nothing is to be hit or missed, the narrower tube is the better one.
-        score = told.width if np.isnan(told.chance) else max(told.chance, UNLIKELY)
-        found.append((score + FRAGILE * told.saturation**2, Choice(tolerate, periods * model.plan.dt, weights, told)))
-    return min(found, key=lambda one: one[0])[1]
+        found.append(Choice(tolerate, periods * model.plan.dt, weights, predicted(weights)))
+    # What is a thousandth of the plan's extent is narrow enough.
+    extent = float(np.ptp(model.plan.states, axis=0).max()) or 1.0
+    narrowest = max(min(one.predicted.width for one in found), 1e-3 * extent)
+
+    def worth(one: Choice) -> float:
+        told = one.predicted
+        return told.chance + FRAGILE * told.saturation**2 + NARROW * max(told.width / narrowest, 1.0)
+
+    return min(reversed(found), key=worth)  # of equals the gentlest
 
 
 def reach_of(model: PlanModel, effort: Array, periods: int) -> dict[int, Array]:
@@ -112,9 +119,8 @@ def prediction_of(
         if radius is not None:
             widest = float(np.sqrt(max(np.linalg.eigvalsh(covariance[-1][place][:, place])[-1], 0.0)))
             miss = 2 * float(ndtr(-radius / max(widest, 1e-12)))
-    chance = collide + miss if surroundings.worlds or (place and radius is not None) else np.nan
     variances = np.diagonal(covariance, axis1=1, axis2=2)[:, place or list(range(plan.shape[1]))] / scale**2
-    return Prediction(chance, float(np.sqrt(variances.sum(axis=1).mean())), saturation)
+    return Prediction(collide + miss, float(np.sqrt(variances.sum(axis=1).mean())), saturation)
 
 
 def with_filter(

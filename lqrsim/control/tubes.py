@@ -32,6 +32,7 @@ class Tube:
     Attributes:
       plan: nominal states and controls. state_coordinates: what the states are.
       mean: of the deviation of the state, (T+1, n). covariance: of it, (T+1, n, n).
+      across: of the deviation with that of the knot before, (T, n, n).
       estimate_covariance: of the error of the estimate, before each measurement, (T+1, n, n); None without a filter.
       command: standard deviation of each command, before it is limited, (T, m).
       saturation: share of the commands that are beyond the limits, (T, m).
@@ -43,6 +44,7 @@ class Tube:
     state_coordinates: Coordinates
     mean: Array
     covariance: Array
+    across: Array
     estimate_covariance: Array | None
     command: Array
     saturation: Array
@@ -121,6 +123,7 @@ def tube_of(loop: Loop, surroundings: Surroundings) -> Tube:
     chance, total = collision_chance(model.plan.states + mean[:, :n], covariance[:, :n, :n], across, surroundings)
     return Tube(
         plan=model.plan, state_coordinates=model.dynamics.state_coordinates, mean=mean[:, :n],
-        covariance=covariance[:, :n, :n], estimate_covariance=estimate, command=std, saturation=saturation,
+        covariance=covariance[:, :n, :n], across=across, estimate_covariance=estimate, command=std,
+        saturation=saturation,
         step_chance=chance, collision_chance=total,
     )  # fmt: skip

@@ -26,6 +26,7 @@ from lqrsim.errors import (
     check_name,
     check_number,
     excerpt,
+    real,
 )
 from lqrsim.kernels import clearance, state_bound
 from lqrsim.problem.costs import check_source
@@ -78,6 +79,10 @@ class Constraint(abc.ABC):
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         """This constraint for a system. Raises InputError if it does not fit."""
 
+    def ahead(self, steps: int) -> "Constraint":
+        """What is left of it after so many steps: itself, unless it says something else of each."""
+        return self
+
 
 class Clearance(Constraint):
     """At least `margin` between the robot and each obstacle, at the steps; walls are obstacles too.
@@ -90,15 +95,28 @@ class Clearance(Constraint):
 
     Args:
       world: the obstacles; a robot in the plane sees them as for an ObstacleCost.
-      radius: of the robot, in metres. margin: what is to be left beyond that, in metres.
+      radius: of the robot, in metres.
+      margin: what is to be left beyond that, in metres; a number, or one for each of the T + 1 knots, or (T + 1, O),
+        one for each knot and obstacle, as the robot sees the world.
     """
 
-    def __init__(self, world: World, *, radius: float, margin: float = 0.0) -> None:
+    def __init__(self, world: World, *, radius: float, margin: float | npt.ArrayLike = 0.0) -> None:
         if not isinstance(world, World):
             raise InputError(f"Clearance: world: got {excerpt(world)}, want a World, such as scene.world")
         self.world = world
         self.radius = check_number("Clearance: radius", radius, at_least=0.0)
-        self.margin = check_number("Clearance: margin", margin)
+        given = real("Clearance: margin", margin)
+        if given.ndim == 0:
+            self.margin: float | Array = check_number("Clearance: margin", margin)
+        else:
+            self.margin = check_array("Clearance: margin", margin, (None,) * min(given.ndim, 2))
+            if not self.margin.size:
+                raise InputError("Clearance: margin: got no numbers, want one, or one for each knot")
+
+    def ahead(self, steps: int) -> "Clearance":
+        if not isinstance(self.margin, np.ndarray):
+            return self
+        return Clearance(self.world, radius=self.radius, margin=self.margin[min(steps, len(self.margin) - 1) :])
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         space = dynamics.state_coordinates
@@ -106,11 +124,21 @@ class Clearance(Constraint):
         if not position:
             raise InputError("Clearance: got dynamics without a position, want Dynamics(..., position=(names))")
         world = self.world.seen_by(space.plane, space.offset)
+        margins = np.atleast_1d(self.margin).reshape(np.shape(self.margin)[0] if np.ndim(self.margin) else 1, -1)
+        if margins.shape[1] not in (1, len(world)):
+            want = f"{len(world)}, one an obstacle: {', '.join(world.names)}"
+            raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
+
+        def describe(row: int) -> str:
+            own = margins[:, row % margins.shape[1]]
+            low, high = f"{own.min():g}", f"{own.max():g}"
+            return f"a clearance of {low if low == high else f'{low} to {high}'} m to obstacle {world.names[row]!r}"
+
         return ConstraintTerm(
             source=source_of(clearance, AXES=position),
-            data=np.concatenate([[self.radius + self.margin], world.table.ravel()]),
+            data=np.concatenate([margins.shape, (self.radius + margins).ravel(), world.table.ravel()]),
             rows=len(world),
-            describe=lambda row: f"a clearance of {self.margin:g} m to obstacle {world.names[row]!r}",
+            describe=describe,
         )
 
 
@@ -296,6 +324,11 @@ def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, steps: int) 
             term = constraint._bind_to_goal(dynamics, goals, steps)
         else:
             term = constraint.bind(dynamics)
+        margins = len(np.atleast_1d(constraint.margin)) if isinstance(constraint, Clearance) else 1
+        if margins not in (1, steps + 1):
+            raise InputError(
+                f"Clearance: margin: got {margins} numbers, want one, or one for each of {steps + 1} knots"
+            )
         terms.append(check_kind(f"{type(constraint).__name__}.bind", term, ConstraintTerm, "a ConstraintTerm"))
     return tuple(terms)
 

@@ -1,0 +1,212 @@
+"""Plans that keep so far from obstacles, step by step, that they collide no more often than is asked.
+
+The clearance that a step needs is a number of standard deviations of where the robot will be. That number is the same
+for all steps, and such that the chance of colliding at all, as `collision_chance.py` counts it, is what is asked. A
+plan with that clearance has a tube of its own, so it is found by solving again, a few times.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ndtri
+
+from lqrsim.control.collision_chance import Surroundings, chance_of_clearances
+from lqrsim.control.controllers import Controller, Feedback
+from lqrsim.control.offset_free import OffsetFree
+from lqrsim.control.tubes import Tube, predict_tube
+from lqrsim.control.uncertainty import Uncertainty
+from lqrsim.errors import Array, InputError, check_count, check_function, check_kind, check_number
+from lqrsim.problem.problem import Problem
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.solution import Solution
+from lqrsim.solvers.smoother import smooth
+
+# How far below what is asked a plan may be, and is not made cheaper any more.
+ENOUGH = 0.5
+AIM = 0.8  # of what is asked, the chance that a next plan is to have
+MakeController = Callable[[Problem, Solution], Controller | AffinePolicy]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SafePlan:
+    """A plan with its predicted chance of collision.
+
+    Attributes:
+      problem: with the clearances that were found as constraints. solution: of it.
+      controller: what runs it. tube: where that will be; `tube.collision_chance` is the chance.
+      asked: the chance that was asked for.
+      rounds: clearance's smallest and largest margin in m, cost and predicted chance of each plan that was solved for.
+    """
+
+    problem: Problem
+    solution: Solution
+    controller: Controller
+    tube: Tube
+    asked: float
+    rounds: tuple[tuple[float, float, float, float], ...]
+
+    @property
+    def success(self) -> bool:
+        """Whether the plan is a solution, and its predicted chance of collision no more than was asked."""
+        return self.solution.success and self.tube.collision_chance <= self.asked
+
+    def __str__(self) -> str:
+        lines = [f"{self.solution.summary()}", "  margin (m)       cost        chance of collision"]
+        lines += [f"  {low:5.3f} to {high:5.3f}  {cost:10.6g}  {chance:.3g}" for low, high, cost, chance in self.rounds]
+        verdict = "as asked" if self.success else "MORE than asked" if self.solution.success else "no solution"
+        return "\n".join([*lines, f"  asked: {self.asked:g}, predicted: {self.tube.collision_chance:.3g} ({verdict})"])
+
+
+def smooth_chance_constrained(
+    problem: Problem,
+    uncertainty: Uncertainty,
+    *,
+    chance: float = 1e-3,
+    controller: MakeController | None = None,
+    rounds: int = 8,
+    progress: Callable[[int, int], object] | None = None,
+) -> SafePlan:
+    """A plan whose predicted chance of collision is at most what is asked, at little more cost than need be.
+
+    It ends where the chance is between half of what is asked and that, or where the plan without any clearance is safe
+    enough. Where nothing is, it returns the safest plan that it found, with `success` False: say with print(plan) how
+    far it got, and allow more, estimate better, or have another way round.
+
+    Args:
+      problem: with obstacles in its costs or constraints. uncertainty: what runs meet; see `uncertainty_of`.
+      chance: of collision, between 0 and 1.
+      controller: (problem, solution) -> what runs the plan, an OffsetFree, a Feedback or a policy; by default an
+        OffsetFree for the uncertainty, with tolerances chosen for the second plan.
+      rounds: plans to solve for, at most. progress: called with the rounds that are done, and all of them.
+
+    Raises:
+      InputError: there are no obstacles, an option is out of range, or something does not fit the system.
+    """
+    check_kind("problem", problem, Problem, "a Problem, such as scenario.problem")
+    check_kind("uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
+    chance = check_number("chance", chance, above=0.0, below=1.0)
+    check_count("rounds", rounds)
+    check_function("controller", controller, "a function of problem and solution, or None", arguments=2)
+    check_function("progress", progress, "a function of how many rounds are done, of how many", arguments=2)
+    surroundings = Surroundings.of(problem, uncertainty.obstacles)
+    if not surroundings.worlds:
+        raise InputError("problem: got one without obstacles, want an ObstacleCost or a Clearance among its terms")
+    search = _Search(problem, uncertainty, chance, controller, surroundings)
+    search.solve(None)
+    for done in range(rounds):
+        if progress is not None:
+            progress(done, rounds)
+        deviations = search.next_deviations()
+        if deviations is None:
+            break
+        search.solve(deviations)
+    return search.result()
+
+
+class _Search:
+    """The plans so far, and the number of standard deviations that each kept."""
+
+    def __init__(
+        self, problem: Problem, uncertainty: Uncertainty, asked: float, make: MakeController | None,
+        surroundings: Surroundings,
+    ) -> None:  # fmt: skip
+        self.problem, self.uncertainty, self.asked = problem, uncertainty, asked
+        self.make, self.surroundings = make, surroundings
+        self.plans: list[SafePlan] = []
+        self.tolerate: tuple[float, ...] | None = None
+        self.lines: list[tuple[float, float, float, float]] = []
+        # Of standard deviations: the most that are too few, the fewest that are enough, the fewest without a plan.
+        self.too_few, self.enough, self.impossible = 0.0, np.inf, np.inf
+
+    def solve(self, deviations: float | None) -> None:
+        """Plan with so many standard deviations of clearance, and predict what becomes of it."""
+        problem, start, margin = self.problem, None, np.zeros(1)
+        if deviations is not None:
+            base = self.plans[-1]
+            margin = deviations * self._deviation(base)
+            if len(self.plans) == 1:
+                margin = np.full_like(margin, np.sqrt((margin**2).mean()))
+            kept = self.surroundings.keep_away(margin)
+            problem = replace(problem, constraints=(*problem.constraints, *kept))
+            # The first plan may cut through obstacles: from there the way round would be as it happens.
+            start = base.solution.trajectory if len(self.plans) > 1 else None
+        solution = smooth(problem, start=start) if start is not None else smooth(problem)
+        if not solution.success and start is not None:
+            solution = smooth(problem)
+        if not solution.success and self.plans:
+            self.impossible = min(self.impossible, deviations or 0.0)
+            return
+        controller = self._controller(problem, solution)
+        tube = predict_tube(problem, solution, self.uncertainty, controller)
+        self.lines.append((float(margin.min()), float(margin.max()), solution.cost, tube.collision_chance))
+        self.plans.append(
+            SafePlan(
+                problem=problem, solution=solution, controller=controller, tube=tube, asked=self.asked,
+                rounds=tuple(self.lines),
+            )
+        )  # fmt: skip
+        if deviations is not None:
+            if tube.collision_chance <= self.asked:
+                self.enough = min(self.enough, deviations)
+            else:
+                self.too_few = max(self.too_few, deviations)
+
+    def _controller(self, problem: Problem, solution: Solution) -> Controller:
+        if self.make is not None:
+            made = self.make(problem, solution)
+            return Feedback(made) if isinstance(made, AffinePolicy) else made
+        law = OffsetFree(problem, solution, self.uncertainty, tolerate=self.tolerate)
+        if len(self.plans) == 1:  # one law for all later plans, so that of two the one with more room is the safer
+            self.tolerate = tuple((law.weights.state**-0.5).tolist())
+        return law
+
+    def _deviation(self, plan: SafePlan) -> Array:
+        """Standard deviation of the clearance to each obstacle, at each knot, (T+1, O)."""
+        states = plan.solution.trajectory.states + plan.tube.mean
+        return self.surroundings.spread(states, plan.tube.covariance)[1]
+
+    def next_deviations(self) -> float | None:
+        """How many standard deviations to try next; None where there is no use in more."""
+        plan = self.plans[-1]
+        chance = plan.tube.collision_chance
+        first = len(self.plans) == 1 and self.impossible == np.inf
+        if first and (chance <= self.asked or not plan.solution.success):
+            return None
+        if not first and np.isfinite(self.enough) and self._best().tube.collision_chance >= ENOUGH * self.asked:
+            return None
+        if np.isfinite(self.impossible):  # between what has a plan and what has none
+            low = self.too_few if not np.isfinite(self.enough) else None
+            if low is None or self.impossible - low < 0.05 * self.impossible:
+                return None
+            return (low + self.impossible) / 2
+        wanted = float(-ndtri(self.asked)) if first else self._needed(plan)
+        if np.isfinite(self.enough) and not self.too_few < wanted < self.enough:
+            wanted = (self.too_few + self.enough) / 2
+        elif not np.isfinite(self.enough) and wanted <= self.too_few:
+            wanted = 1.05 * self.too_few
+        known = [one for one in (self.too_few, self.enough) if np.isfinite(one) and one > 0]
+        return None if any(abs(wanted - one) < 0.003 * one for one in known) else float(wanted)
+
+    def _needed(self, plan: SafePlan) -> float:
+        """Of how many standard deviations the plan would be as safe as asked, if all that is nearer moved out there."""
+        states, tube = plan.solution.trajectory.states + plan.tube.mean, plan.tube
+        clearance, std = self.surroundings.spread(states, tube.covariance)
+        correlation = self.surroundings.correlation(states, tube.across, std)
+        low, high = 0.0, 12.0
+        for _ in range(40):
+            middle = (low + high) / 2
+            moved = np.maximum(clearance, middle * std)
+            safe = chance_of_clearances(moved / std, correlation)[1] <= AIM * self.asked
+            low, high = (low, middle) if safe else (middle, high)
+        return high
+
+    def _best(self) -> SafePlan:
+        """Of those that are safe enough the cheapest, or else the safest."""
+        safe = [plan for plan in self.plans if plan.success]
+        if safe:
+            return min(safe, key=lambda plan: plan.solution.cost)
+        return min(self.plans, key=lambda plan: (not plan.solution.success, plan.tube.collision_chance))
+
+    def result(self) -> SafePlan:
+        return replace(self._best(), rounds=tuple(self.lines))
