@@ -54,7 +54,9 @@ class Contest:
     def __init__(self, name: str, rate: float, seed: int) -> None:
         scenario = ls.scenarios.get(name)
         self.rate, self.solution = rate, ls.smooth(scenario.problem)
-        self.rollout = ls.simulate(scenario.plant(), self.solution, disturbances=scenario.disturbances, seed=seed)
+        plant, wrong = scenario.plant(), scenario.disturbances
+        tube = ls.predict_tube(scenario.problem, self.solution, ls.uncertainty_of(plant, wrong))
+        self.rollout = tube.added_to(ls.simulate(plant, self.solution, disturbances=wrong, seed=seed))
         self.frames = int(self.rollout.times[-1] * rate + 1e-9) + 1
 
     def bare(self) -> float:
@@ -94,7 +96,7 @@ def main(config: Config) -> dict[str, Any]:
             take = {
                 "bare": contest.bare,
                 PLAIN: lambda contest=contest: contest.video(Path(folder), overlays=()),
-                FULL: lambda contest=contest: contest.video(Path(folder), solution=contest.solution),
+                FULL: lambda contest=contest: contest.video(Path(folder)),
             }
             if number == 0:
                 take["bare"]()  # the first of a process is slow

@@ -59,8 +59,9 @@ def measure(name: str, config: Config, folder: Path) -> dict[str, dict[str, Any]
     """What verification finds, by what is verified."""
     scenario = ls.scenarios.get(name)
     solution, plant = ls.smooth(scenario.problem), scenario.plant()
+    tube = ls.predict_tube(scenario.problem, solution, ls.uncertainty_of(plant, scenario.disturbances))
     run, other = (
-        ls.simulate(plant, solution, disturbances=scenario.disturbances, seed=seed)
+        tube.added_to(ls.simulate(plant, solution, disturbances=scenario.disturbances, seed=seed))
         for seed in (config.seed, config.seed + 1)
     )
     video, changed = folder / f"{name}.mp4", folder / f"{name}_changed.mp4"
@@ -73,7 +74,7 @@ def measure(name: str, config: Config, folder: Path) -> dict[str, dict[str, Any]
             bar.update(done - bar.n)
 
         options = {"camera": camera, "insets": insets, "quality": quality, "fps": fps}
-        ls.render(run, video, solution=solution, progress=progress, **options)
+        ls.render(run, video, progress=progress, **options)
     found = {
         RUN: verdict(ls.verify_run(run, solution=solution)),
         VIDEO: verdict(ls.verify_video(video, run, solution=solution)),

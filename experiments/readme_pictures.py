@@ -27,7 +27,7 @@ PICTURES = {
     "videos/readme_quadrotor.gif": (
         SOLVE_QUADROTOR,
         RUN_QUADROTOR,
-        f"lqrsim render {QUADROTOR}/rollout.npz --solution {QUADROTOR}/solution.npz --camera chase --inset top side"
+        f"lqrsim render {QUADROTOR}/rollout.npz --camera chase --inset top side"
         " --overlays plan ghost trace forces tube caption --size 680 382 --fps 12 --out videos/readme_quadrotor.gif",
     ),
     "videos/readme_feedback.gif": (

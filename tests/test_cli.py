@@ -130,6 +130,29 @@ def test_simulate_with_disturbances_by_name_and_without_feedback(solved: Path, t
     assert main(["simulate", str(solved), "--disturbances", "gale"]) == 2
 
 
+def test_simulate_predicts_where_the_run_will_be_or_says_why_not(
+    solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario, solution = ls.scenarios.differential_drive(), ls.load_solution(solved)
+    plant, noise = scenario.plant(), [ls.ControlNoise(0.05), ls.MeasurementNoise(0.01)]
+    rollout = simulate(solved, tmp_path, "--control-noise", "0.05", "--measurement-noise", "0.01", "--open-loop")
+    assert "tube" not in capsys.readouterr().out
+    tube = ls.predict_tube(scenario.problem, solution.open_loop(), ls.uncertainty_of(plant, noise))
+    assert rollout.tube is not None
+    np.testing.assert_array_equal(rollout.tube, tube.covariance[:, :2, :2])
+    np.testing.assert_array_equal(rollout.collision_chance, tube.step_chance)
+    # Without feedback the wheels' noise adds up: the heading is off by the root of the time.
+    std = np.sqrt(tube.covariance[:, 2, 2])
+    np.testing.assert_allclose(std, np.sqrt(np.arange(151)) * np.sqrt(2) * 0.05 / 0.258 / 6, rtol=1e-6)
+
+    pushed = simulate(solved, tmp_path, "--control-noise", "0.05", "--push", "1", "0", "0", "2.5")
+    assert pushed.tube is not None
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "tube" in line]
+    assert line.startswith("the predicted tube leaves out push of (1, 0, 0) N s at 2.5 s")
+    assert simulate(solved, tmp_path).tube is None
+    assert "tube" not in capsys.readouterr().out
+
+
 def test_simulate_with_another_seed_is_another_run(solved: Path, tmp_path: Path) -> None:
     runs = [simulate(solved, tmp_path / seed, "--control-noise", "0.05", "--seed", seed) for seed in ("1", "1", "2")]
     np.testing.assert_array_equal(runs[0].states, runs[1].states)

@@ -108,6 +108,66 @@ def test_a_rollout_survives_and_is_saved_again_as_it_was(saved: Path, run: Path,
         assert ls.save(one, path.with_name("again.npz")).read_bytes() == path.read_bytes()
 
 
+@pytest.fixture
+def predicted(rollout: ls.Rollout) -> ls.Rollout:
+    """With a tube, as `Tube.added_to` makes it."""
+    factors = np.random.default_rng(5).normal(size=(151, 2, 2))
+    return dataclasses.replace(
+        rollout, tube=factors @ factors.transpose(0, 2, 1), collision_chance=np.linspace(0.0, 1.0, 151)
+    )
+
+
+def test_a_predicted_tube_survives_and_files_without_it_have_none(
+    tmp_path: Path, run: Path, predicted: ls.Rollout
+) -> None:
+    path = ls.save(predicted, tmp_path / "tube.npz")
+    loaded = ls.load_rollout(path)
+    assert same(loaded, predicted)
+    assert ls.save(loaded, tmp_path / "again.npz").read_bytes() == path.read_bytes()
+    arrays, meta = contents(path)
+    assert (arrays["tube"].shape, arrays["collision_chance"].shape) == ((151, 2, 2), (151,))
+    without, of_old = contents(run)
+    assert arrays.keys() - without.keys() == {"tube", "collision_chance"}
+    assert meta["version"] == of_old["version"] == 4
+    assert (ls.load_rollout(run).tube, ls.load_rollout(run).collision_chance) == (None, None)
+
+
+def skewed(tube: np.ndarray) -> np.ndarray:
+    """One entry changed, and not the one across."""
+    tube = tube.copy()
+    tube[7, 0, 1] += 1e-3
+    return tube
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tube": lambda a: a[:-1]}, r"tube: got shape \(150, 2, 2\), want \(T\+1, p, p\)"),
+        ({"tube": lambda a: a[:, :1, :1].copy()}, r"tube: got shape \(151, 1, 1\), want \(T\+1, p, p\)"),
+        ({"tube": lambda a: a.astype(np.int64)}, "tube: got numbers of type <i8, want <f8"),
+        ({"tube": lambda a: a * np.nan}, r"tube: got nan at index \[0, 0, 0\], want finite numbers"),
+        ({"tube": lambda a: a + np.inf}, "tube: got inf at index"),
+        ({"tube": skewed}, "tube: got .* at knot 7, want a symmetric matrix"),
+        ({"tube": lambda a: -a}, "tube: got .* at knot 0, want no negative variance"),
+        ({"collision_chance": lambda a: a + 0.5}, "collision_chance: got .*, want chances from 0 to 1"),
+        ({"collision_chance": lambda a: a[1:]}, r"collision_chance: got shape \(150,\), want \(T\+1\)"),
+        ({"collision_chance": lambda a: a * np.nan}, "collision_chance: got nan at index"),
+    ],
+)
+def test_a_damaged_tube_gets_one_line(
+    tmp_path: Path, predicted: ls.Rollout, changes: dict[str, Any], message: str
+) -> None:
+    path = ls.save(predicted, tmp_path / "tube.npz")
+    rewrite(path, **changes)
+    with pytest.raises(ls.InputError, match=message) as caught:
+        ls.load_rollout(path)
+    assert "\n" not in str(caught.value)
+    rewrite(ls.save(predicted, path), sealed=False, **changes)  # as damage is
+    with pytest.raises(ls.InputError, match=r"tube\.npz") as caught:
+        ls.load_rollout(path)
+    assert "\n" not in str(caught.value)
+
+
 def test_the_hash_is_of_the_content(saved: Path, run: Path) -> None:
     for path in (saved, run):
         arrays, meta = contents(path)

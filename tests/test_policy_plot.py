@@ -11,14 +11,15 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 import lqrsim as ls
-from lqrsim.view.ellipsoids import outlines
+from lqrsim.control.tubes import Tube, predict_tube
+from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.obstacle_plots import draw_projected
 from lqrsim.view.policy_plot import draw, strength
 
 
-def drawn(solution: ls.Solution, scenario: ls.Scenario) -> Figure:
+def drawn(solution: ls.Solution, scenario: ls.Scenario, tube: Tube | None = None) -> Figure:
     figure = Figure()
-    draw(figure, solution, scenario.scene.world, scenario.robot.radius)
+    draw(figure, solution, scenario.scene.world, scenario.robot.radius, tube)
     return figure
 
 
@@ -57,7 +58,7 @@ def test_outlines_lie_where_the_total_cost_is_two_above_its_least(
     go, come = solution.cost_to_go, solution.cost_to_come
     least = solution.total_cost.minimum()
     hidden = [i for i in range(12) if i not in states]
-    for knot, outline in zip(knots, outlines(solution, states, knots), strict=True):
+    for knot, outline in zip(knots, Ellipsoids.of_cost(solution, states).outlines()[knots], strict=True):
         hessian, gradient = go.hessian[knot], go.gradient[knot]
         precise = np.linalg.inv(come.covariance[knot])
         both, slope = hessian + precise, gradient - precise @ come.mean[knot]
@@ -74,7 +75,7 @@ def test_outlines_lie_where_the_total_cost_is_two_above_its_least(
             assert cost - least[knot] == pytest.approx(2.0, rel=1e-3)
 
 
-def test_the_tube_that_is_drawn_is_that_of_every_knot(
+def test_the_tube_of_the_cost_that_is_drawn_is_that_of_every_knot(
     drive_solution: ls.Solution, differential_drive: ls.Scenario
 ) -> None:
     """Against both value functions, whose minimum and curvature are worked out here: two standard deviations about it.
@@ -95,6 +96,70 @@ def test_the_tube_that_is_drawn_is_that_of_every_knot(
         np.testing.assert_allclose(np.sum(away @ np.linalg.inv(block) * away, axis=1), 4.0, rtol=1e-3)
         # All the way round: evenly spread over the ellipse, points vary as much as half of its square.
         np.testing.assert_allclose(away.T @ away / len(away), 2 * block, rtol=0, atol=1e-3 * np.abs(block).max())
+
+
+@pytest.fixture(scope="module")
+def drive_tube(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> Tube:
+    uncertainty = ls.uncertainty_of(differential_drive.plant(), [ls.ControlNoise(0.05)])
+    return predict_tube(differential_drive.problem, drive_solution, uncertainty)
+
+
+def test_a_predicted_tube_is_drawn_at_every_knot_with_the_half_axes_of_its_covariance(
+    drive_solution: ls.Solution, differential_drive: ls.Scenario, drive_tube: Tube
+) -> None:
+    """Half axes: the farthest and the nearest point of an outline, against the eigenvalues of the covariance."""
+    figure = drawn(drive_solution, differential_drive, drive_tube)
+    tube, *_ = [one for one in figure.axes[0].collections if isinstance(one, PolyCollection)]
+    assert len(tube.get_paths()) == 151
+    assert str(tube.get_label()).startswith("predicted: 2 sigma")
+    for knot, path in enumerate(tube.get_paths()):
+        away = np.asarray(path.vertices) - drive_solution.trajectory.states[knot, :2]
+        distances = np.linalg.norm(away, axis=1)
+        half_axes = 2 * np.sqrt(np.maximum(np.linalg.eigvals(drive_tube.covariance[knot, :2, :2]).real, 0))
+        # The outline of 48 points has one at each end of both axes.
+        assert sorted(half_axes) == pytest.approx([distances.min(), distances.max()], rel=1e-9, abs=1e-12)
+    (chance,) = [line for axes in figure.axes for line in axes.lines if axes.get_ylabel() == "chance"]
+    shown = np.asarray(chance.get_ydata())
+    np.testing.assert_array_equal(shown[drive_tube.step_chance > 0], drive_tube.step_chance[drive_tube.step_chance > 0])
+
+
+def test_a_tube_ends_where_it_would_hide_the_picture(drive_solution: ls.Solution) -> None:
+    """Ten times the plan's length at the end; drawn until its half axis is a fifth of the diagonal."""
+    places = drive_solution.trajectory.states[:, :2]
+    std = np.linspace(0, 30.0, 151)
+    tube = Ellipsoids.predicted(places, np.einsum("t,ij->tij", std**2, np.eye(2)))
+    largest = 0.2 * np.hypot(*np.ptp(places, axis=0))
+    assert len(tube.centres) == np.count_nonzero(2 * std <= largest)
+    assert 2 < len(tube.centres) < 20
+    assert tube.label.endswith(f"drawn up to {largest:.2g} m")
+    assert Ellipsoids.predicted(places, np.zeros((151, 2, 2))).label == "predicted: 2 sigma, 95 % in each direction"
+
+
+def test_shadows_in_a_plane_are_marginals() -> None:
+    """The shadow of an ellipsoid along a direction, against the silhouette of many of its points."""
+    covariance = np.array([[0.05, 0.02, 0.0], [0.02, 0.09, -0.03], [0.0, -0.03, 0.04]])
+    solid = Ellipsoids(np.zeros((1, 3)), covariance[None])
+    half_axes, rotations = solid.axes()
+    ball = np.random.default_rng(0).normal(size=(200_000, 3))
+    surface = (ball / np.linalg.norm(ball, axis=1, keepdims=True) * half_axes[0]) @ rotations[0].T
+    onto = np.linalg.qr(np.array([[1.0, 2.0], [0.5, -1.0], [0.3, 0.7]]))[0].T
+    outline = solid.seen_in(onto).outlines()[0]
+    for angle in np.linspace(0, np.pi, 7):
+        look = np.array([np.cos(angle), np.sin(angle)])
+        # 48 points see their farthest end within (pi / 48)^2 / 2 of it, 200,000 within a thousandth.
+        assert (outline @ look).max() == pytest.approx((surface @ onto.T @ look).max(), rel=4e-3)
+
+
+def test_a_tube_of_another_plan_is_refused(
+    drive_solution: ls.Solution, differential_drive: ls.Scenario, drive_tube: Tube, tmp_path: Path
+) -> None:
+    look: dict = {"world": differential_drive.scene.world, "radius": 0.2}
+    moved = replace(drive_tube.plan, states=drive_tube.plan.states + 0.1)
+    with pytest.raises(ls.InputError, match="tube: got one of another plan"):
+        ls.plot_policy(drive_solution, tmp_path / "p.png", tube=replace(drive_tube, plan=moved), **look)
+    with pytest.raises(ls.InputError, match="tube: got 3, want a Tube"):
+        ls.plot_policy(drive_solution, tmp_path / "p.png", tube=3, **look)  # pyright: ignore[reportArgumentType]
+    assert not list(tmp_path.iterdir())
 
 
 def test_strength_is_the_answer_in_the_worst_direction(quadrotor_solution: ls.Solution) -> None:

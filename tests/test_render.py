@@ -14,8 +14,8 @@ from PIL import Image, ImageSequence
 
 import lqrsim as ls
 from lqrsim.view import gl, video_metadata
-from lqrsim.view.options import OVERLAYS, Overlay
-from lqrsim.view.overlays import ELLIPSOIDS, Overlays, Scale
+from lqrsim.view.options import ALL_OVERLAYS, Overlay
+from lqrsim.view.overlays import COST_TUBE, TUBE, Overlays, Scale
 from lqrsim.view.picture import PictureOptions, open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.render import render, still
@@ -241,31 +241,97 @@ def test_marker_is_where_the_calibration_says(camera: str, rollout: ls.Rollout, 
 @draws
 def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solution, tmp_path: Path) -> None:
     """Each changes the picture, and only where it is: a few percent of it."""
-    noisy = dataclasses.replace(flight, measured=flight.states + 0.05 * np.sin(np.arange(12)))
+    tube = np.tile(np.diag([0.01, 0.02, 0.01]), (len(flight.times), 1, 1))
+    noisy = dataclasses.replace(flight, measured=flight.states + 0.05 * np.sin(np.arange(12)), tube=tube)
 
     def shown(*overlays: Overlay) -> np.ndarray:
         options: dict = {"time": 2.1, "size": (640, 360), "overlays": overlays, "solution": quadrotor_solution}
         return pixels(still(noisy, tmp_path / "still.png", **options))
 
     bare = shown()
-    for overlay in OVERLAYS:
+    for overlay in ALL_OVERLAYS:
         changed = (np.abs(shown(overlay) - bare).max(axis=2) > 10).mean()
         assert 1e-4 < changed < (0.2 if overlay == "caption" else 0.05), overlay
     moved = dataclasses.replace(flight.plan, states=flight.plan.states + 0.1)
+    options: dict = {"overlays": ("cost_tube",), "size": SMALL}
     with pytest.raises(ls.InputError, match="solution: got one with another plan"):
-        still(dataclasses.replace(flight, plan=moved), tmp_path / "still.png", solution=quadrotor_solution)
+        still(dataclasses.replace(flight, plan=moved), tmp_path / "a.png", solution=quadrotor_solution, **options)
+    with pytest.raises(ls.InputError, match="solution: got None with the overlay cost_tube"):
+        still(flight, tmp_path / "a.png", **options)
 
 
-def test_tube_is_the_shadow_of_what_the_total_cost_allows(flight: ls.Rollout, quadrotor_solution: ls.Solution) -> None:
+def test_predicted_tube_has_the_half_axes_of_its_covariance(flight: ls.Rollout, drive: ls.Rollout) -> None:
+    """Against the covariance: an ellipsoid's points are 2 standard deviations off the plan, in every direction."""
+    rng = np.random.default_rng(1)
+    for run, size in ((flight, 3), (drive, 2)):
+        factors = 0.1 * rng.normal(size=(len(run.times), size, size))
+        tube = factors @ factors.transpose(0, 2, 1)
+        assert Overlays(RecordedTrial(run, 0), None, ("tube",), Scale(1.0, 1.0)).tube is None
+        recorded = RecordedTrial(dataclasses.replace(run, tube=tube), 0)
+        overlays = Overlays(recorded, None, ("tube",), Scale(1.0, 1.0))
+        assert overlays.tube is not None
+        assert [text for text, colour in overlays.legend_entries() if colour == TUBE] == [overlays.tube.label]
+        for knot, centre, half_axes, rotation in zip(overlays.tube.knots, *overlays.tube.in_world, strict=True):
+            assert centre[:size] == pytest.approx(run.plan.states[knot, :size])
+            np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+            assert np.linalg.det(rotation) == pytest.approx(1)
+            ends = (rotation * half_axes)[:size, :size].T  # those that are not across the floor
+            inverse = np.linalg.inv(tube[knot])
+            np.testing.assert_allclose(np.einsum("ki,ij,kj->k", ends, inverse, ends), 4.0, rtol=1e-6)
+
+
+@draws
+def test_half_axes_of_a_tube_in_pixels(flight: ls.Rollout, tmp_path: Path) -> None:
+    """One ellipsoid where a plan begins, far from the rest of it, from above: as wide as the camera says."""
+    states = np.tile(flight.plan.states[75], (151, 1))
+    states[1:, 0] += 10.0
+    tube = np.zeros((151, 3, 3))
+    tube[0] = np.diag([0.3**2, 0.15**2, 0.1**2])
+    run = dataclasses.replace(flight, plan=dataclasses.replace(flight.plan, states=states), tube=tube)
+    options = PictureOptions(camera="top", overlays=("tube",), size=(1280, 720))
+    with open_picture(run, options) as drawn:
+        with_it = drawn.draw(4.0).astype(int)
+        camera, recorded = drawn.panes[0].camera, drawn.parts[0].recorded
+        assert camera is not None
+        centre = recorded.planned(0.0)
+        ends = np.array([centre + sign * 2 * std * axis for std, axis in ((0.3, np.eye(3)[0]), (0.15, np.eye(3)[1]))
+                         for sign in (-1, 1)])  # fmt: skip
+        places = np.array([camera.project(end, (1280, 720)) for end in ends])
+    with open_picture(dataclasses.replace(run, tube=None), options) as drawn:
+        changed = np.abs(with_it - drawn.draw(4.0)).max(axis=2) > 4
+    middle = places.mean(axis=0)
+    rows, columns = np.nonzero(changed)
+    near = (np.abs(columns - middle[0]) < 200) & (np.abs(rows - middle[1]) < 200)
+    for axis, found in enumerate((columns[near], rows[near])):
+        want = np.ptp(places[:, axis])
+        assert want > 40
+        assert found.max() - found.min() + 1 == pytest.approx(want, abs=3)  # pixels
+
+
+@draws
+def test_tube_is_seen_in_a_video(drive: ls.Rollout, tmp_path: Path) -> None:
+    tube = dataclasses.replace(drive, tube=np.tile(0.01 * np.eye(2), (len(drive.times), 1, 1)))
+    options: dict = {"size": SMALL, "fps": 0.5, "overlays": ("plan", "tube")}
+    with_it = decode(render(tube, tmp_path / "with.mp4", **options))
+    without = decode(render(drive, tmp_path / "without.mp4", **options))
+    assert len(with_it) == len(without)
+    assert all((np.abs(a - b).max(axis=2) > 20).mean() > 0.003 for a, b in zip(with_it, without, strict=True))
+
+
+def test_tube_of_the_cost_is_the_shadow_of_what_the_total_cost_allows(
+    flight: ls.Rollout, quadrotor_solution: ls.Solution
+) -> None:
     """Against the cost: of all states with a position on the ellipsoid its least is 2 above the least of all."""
-    overlays = Overlays(RecordedTrial(flight, 0), quadrotor_solution, ("tube",), Scale(1.0, 1.0))
-    assert overlays.tube is not None
+    overlays = Overlays(RecordedTrial(flight, 0), quadrotor_solution, ("cost_tube",), Scale(1.0, 1.0))
+    assert overlays.cost_tube is not None
+    assert overlays.legend_entries() == [("2 sigma of the cost: total ≤ least + 2", COST_TUBE)]
     go, come = quadrotor_solution.cost_to_go, quadrotor_solution.cost_to_come
     assert go is not None
     assert isinstance(come, ls.Moments)
-    knots = np.unique(np.linspace(0, flight.plan.steps, ELLIPSOIDS).astype(int))
+    knots = overlays.cost_tube.knots
+    assert (knots[0], knots[-1]) == (0, flight.plan.steps)
     for number in (3, 12, 20):
-        centre, half_axes, rotation = (part[number] for part in overlays.tube)
+        centre, half_axes, rotation = (part[number] for part in overlays.cost_tube.in_world)
         knot = knots[number]
         hessian = go.hessian[knot] + np.linalg.inv(come.covariance[knot])
         shown, hidden = hessian[:3, :3], hessian[3:, 3:]

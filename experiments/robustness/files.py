@@ -27,6 +27,8 @@ import numpy as np
 from tqdm import tqdm
 
 import lqrsim as ls
+from lqrsim.control.tubes import predict_tube
+from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import LONGEST, InputError
 from lqrsim.simulation.disturbances import MeasurementNoise
 from lqrsim.stress.campaign import Campaign, run_campaign
@@ -212,11 +214,13 @@ def originals() -> dict[str, ls.Solution | ls.Rollout]:
     assert found.candidates
     assert kept.multipliers
     disturbances = [*scenario.disturbances, MeasurementNoise(0.001)]
+    run = ls.simulate(scenario.plant(), found, disturbances=disturbances, trials=2)
+    tube = predict_tube(scenario.problem, found, Uncertainty(control=0.05, measurement={"m": 0.01, "rad": 0.02}))
     return {
         "solution": dataclasses.replace(found, multipliers=kept.multipliers, scenario="differential_drive"),
         "kept": kept,
         "bare": ls.ilqr(scenario.problem, max_iterations=2),
-        "rollout": ls.simulate(scenario.plant(), found, disturbances=disturbances, trials=2),
+        "rollout": tube.added_to(run),
     }
 
 

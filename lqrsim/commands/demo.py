@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lqrsim.commands import console
+from lqrsim.control.tubes import Tube
 from lqrsim.errors import InputError
 from lqrsim.results import save_load
 from lqrsim.results.rollout import Rollout
@@ -14,6 +15,8 @@ from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
 from lqrsim.simulation.closed_loop import simulate
+from lqrsim.simulation.disturbances import Disturbance
+from lqrsim.simulation.tube_under import tube_under
 from lqrsim.view import gl
 from lqrsim.view.plots import plot_run
 from lqrsim.view.policy_plot import plot_policy
@@ -51,16 +54,17 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
         solved = console.solve(scenario.problem, "smooth", reach=scenario.target_radius())
         solution = replace(solved, scenario=from_anywhere(reference))
         console.say(f"wrote {save_load.save(solution, folder / 'solution.npz')}")
+        tube, remark = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)
+        if remark:
+            console.say(remark)
         if solution.cost_to_go is not None:
-            drawn = plot_policy(
-                solution, folder / "policy.png", world=scenario.scene.world, radius=scenario.robot.radius
-            )
-            console.say(f"wrote {drawn}")
+            world, radius = scenario.scene.world, scenario.robot.radius
+            console.say(f"wrote {plot_policy(solution, folder / 'policy.png', world=world, radius=radius, tube=tube)}")
         if not solution.success:
             failures.append(f"{reference}: the plan did not converge ({solution.status.name})")
         runs = {
-            "undisturbed": _execute(scenario, solution, folder / "undisturbed.npz", seed, disturbed=False),
-            "disturbed": _execute(scenario, solution, folder / "disturbed.npz", seed, disturbed=True),
+            "undisturbed": _execute(scenario, solution, folder / "undisturbed.npz", seed, ()),
+            "disturbed": _execute(scenario, solution, folder / "disturbed.npz", seed, scenario.disturbances, tube),
         }
         worst, unit = float(runs["undisturbed"].tracking_error.max()), runs["undisturbed"].tracking_unit
         if not worst <= scenario.tracking_bound:  # a diverged run is NaN
@@ -71,7 +75,7 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
         plan, reach = runs["undisturbed"].target, runs["undisturbed"].goal_radius
         misses += [f"{reference}: {line}" for line in plan.of_plan(reach)[1:]]
         if video:
-            _film(runs["disturbed"], solution, folder / "video.mp4", quick=quick)
+            _film(runs["disturbed"], folder / "video.mp4", quick=quick)
         rows += [_row(reference, name, solution, rollout) for name, rollout in runs.items()]
     console.say("\n" + "\n".join([TABLE, *rows]))
     for miss in misses:
@@ -90,20 +94,27 @@ def _can_film() -> bool:
     return True
 
 
-def _execute(scenario: Scenario, solution: Solution, path: Path, seed: int, *, disturbed: bool) -> Rollout:
-    """One closed-loop run, saved and summed up in a line."""
-    disturbances = scenario.disturbances if disturbed else ()
+def _execute(
+    scenario: Scenario,
+    solution: Solution,
+    path: Path,
+    seed: int,
+    disturbances: Sequence[Disturbance],
+    tube: Tube | None = None,
+) -> Rollout:
+    """One closed-loop run with the tube that was predicted, saved and summed up in a line."""
     with console.progress("simulating", "step") as progress:
         rollout = simulate(
             scenario.plant(), solution, disturbances=disturbances, seed=seed, progress=progress,
             **scenario.near_enough(),
         )  # fmt: skip
     console.say(rollout.summary())
+    rollout = rollout if tube is None else tube.added_to(rollout)
     console.say(f"wrote {save_load.save(rollout, path)}")
     return rollout
 
 
-def _film(rollout: Rollout, solution: Solution, path: Path, *, quick: bool) -> None:
+def _film(rollout: Rollout, path: Path, *, quick: bool) -> None:
     """With the calibrated panes from which the robot's position can be measured."""
     from lqrsim.view import cameras
     from lqrsim.view.render import render
@@ -111,7 +122,7 @@ def _film(rollout: Rollout, solution: Solution, path: Path, *, quick: bool) -> N
     insets = cameras.measuring(rollout)
     quality, fps = ("draft", 5) if quick else ("standard", 30)
     with console.progress("rendering", "frame") as progress:
-        render(rollout, path, insets=insets, solution=solution, quality=quality, fps=fps, progress=progress)
+        render(rollout, path, insets=insets, quality=quality, fps=fps, progress=progress)
     console.say(f"wrote {path}")
 
 

@@ -65,7 +65,8 @@ class Solve:
     control_limits: Annotated[tuple[float, float] | None, optional("LOWEST HIGHEST")] = None
     """Plan with these limits of every control, in its unit. By default those of the actuators."""
     figure: Annotated[Path | None, optional("FILE")] = None
-    """Draw the policy, too, in FILE.png, .pdf or .svg: tube, cost-to-go along the plan, gains over time."""
+    """Draw the policy, too, in FILE.png, .pdf or .svg: the tube in which it keeps the robot under the scenario's
+    disturbances, cost-to-go along the plan, gains over time."""
 
     def run(self) -> int:
         """Carry the command out; its exit code."""
@@ -101,10 +102,14 @@ class Solve:
         solution = replace(solved, scenario=from_anywhere(self.scenario))
         console.say(f"wrote {save_load.save(solution, folder / 'solution.npz')}")
         if self.figure is not None:
+            from lqrsim.simulation.tube_under import tube_under
             from lqrsim.view.policy_plot import plot_policy
 
+            tube, remark = tube_under(problem, solution, scenario.plant(), scenario.disturbances)
+            if remark:
+                console.say(remark)
             world, radius = scenario.scene.world, scenario.robot.radius
-            console.say(f"wrote {plot_policy(solution, self.figure, world=world, radius=radius)}")
+            console.say(f"wrote {plot_policy(solution, self.figure, world=world, radius=radius, tube=tube)}")
         return 0 if solution.success else 1
 
 
@@ -112,8 +117,9 @@ class Solve:
 class Simulate:
     """Execute a policy in MuJoCo, in closed loop.
 
-    Writes the runs to rollout.npz. Prints where the plan ends, a line for each trial, and how many reached the goal.
-    Without a disturbance it is the plain closed loop. The same seed gives the same bits on equal processors.
+    Writes the runs to rollout.npz, with the tube in which they are predicted to be under their disturbances, for
+    pictures. Prints where the plan ends, a line for each trial, and how many reached the goal. Without a disturbance it
+    is the plain closed loop. The same seed gives the same bits on equal processors.
 
       lqrsim simulate SOLUTION.npz --force-noise 0.1 --push 0.2 0 0 3.0 --trials 10
       lqrsim simulate SOLUTION.npz --disturbances severe --out runs/severe
@@ -166,6 +172,7 @@ class Simulate:
         from lqrsim.results import save_load
         from lqrsim.scenarios.references import resolve
         from lqrsim.simulation.closed_loop import simulate
+        from lqrsim.simulation.tube_under import tube_under
         from lqrsim.stress.sweeps import sweep
         from lqrsim.stress.trials import controller_by_name
 
@@ -183,12 +190,13 @@ class Simulate:
             solution = solution.open_loop()
         law = controller_by_name(self.controller, scenario, solution, self.stated)
         named = [one.scaled(self.strength) for name in self.disturbances for one in sweep(name, scenario)]
+        disturbances, plant = [*named, *self._single_disturbances()], scenario.plant()
         with console.progress("simulating", "step") as progress:
             rollout = simulate(
-                scenario.plant(),
+                plant,
                 solution,
                 controller=law,
-                disturbances=[*named, *self._single_disturbances()],
+                disturbances=disturbances,
                 seed=self.seed,
                 trials=self.trials,
                 first_trial=self.first_trial,
@@ -196,6 +204,10 @@ class Simulate:
                 **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             )
         console.say(rollout.summary())
+        tube, remark = tube_under(scenario.problem, solution, plant, disturbances, law)
+        if remark:
+            console.say(remark)
+        rollout = rollout if tube is None else tube.added_to(rollout)
         console.say(f"wrote {save_load.save(rollout, folder / 'rollout.npz')}")
         console.say(rollout.tally())
         return 0

@@ -41,9 +41,10 @@ class Render:
     title: Annotated[tuple[str, ...], optional("TEXT ...")] = ()
     """Of each run. By default the robot and the scene."""
     overlays: tuple[Overlay, ...] = OVERLAYS
-    """What is drawn over the scene. `tube` needs --solution."""
+    """What is drawn over the scene. tube: where the run was predicted to be under its disturbances, 2 sigma, if it was.
+    cost_tube: where the total cost is near its least, whatever disturbs; it needs --solution, and to be asked for."""
     solution: Annotated[tuple[Path, ...], optional("SOLUTION ...")] = ()
-    """Whose run it is, one for all or one each: adds the tube in which the policy expects the robot."""
+    """Whose run it is, one for all or one each, for cost_tube."""
     quality: Quality = "standard"
     """Size, smooth edges, shadows, and how much a video is compressed: 640 x 360, 1280 x 720 or 1920 x 1080."""
     size: Annotated[tuple[int, int] | None, optional("WIDTH HEIGHT")] = None
@@ -74,6 +75,9 @@ class Render:
             raise InputError(f"--time, --every: got them for {out.name}, want --out FILE.png: they are of stills")
         console.check_output("--out", out.parent, out.name)
         runs = [save_load.load_rollout(path) for path in self.rollouts]
+        if self.overlays != OVERLAYS and "tube" in self.overlays:
+            for path in (path for path, run in zip(self.rollouts, runs, strict=True) if run.tube is None):
+                console.say(f"no tube in {path}: none was predicted for it")
         solutions = [save_load.load_solution(path) for path in self.solution]
         one_trial = len(self.trial) == 1
         options = {

@@ -4,7 +4,7 @@ LQG-MP (van den Berg, Abbeel and Goldberg 2011): with the linear model about the
 are jointly Gaussian, and known before any run; `loop_moments.py` has the recursion.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,6 +20,7 @@ from lqrsim.errors import Array, InputError, check_kind
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 
@@ -55,6 +56,19 @@ class Tube:
         """(T+1, 2 or 3, 2 or 3)."""
         place = list(self.state_coordinates.position)
         return self.covariance[:, place][:, :, place]
+
+    def added_to(self, rollout: Rollout) -> Rollout:
+        """The rollout with the covariance of the position and the chance of collision, for its figures and videos.
+
+        Raises:
+          InputError: it is a run of another plan, or of a robot without a position.
+        """
+        check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
+        if not self.state_coordinates.position:
+            raise InputError("Tube: state_coordinates.position: got none, want the 2 or 3 states that are the position")
+        if not np.array_equal(rollout.plan.states, self.plan.states):
+            raise InputError("rollout: got one of another plan than that of the tube, want a run of the tube's plan")
+        return replace(rollout, tube=self.position_covariance, collision_chance=self.step_chance)
 
 
 def predict_tube(

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from lqrsim.errors import (
     Array,
     InputError,
+    check_array,
     check_items,
     check_kind,
     check_number,
@@ -56,6 +57,9 @@ class Rollout:
       failed_at: (K,) seconds to the knot at which the controller failed; infinite where it did not. From there on, too.
       reasons: (K) why it failed, or what of its filter diverged; empty where neither was so.
       frame_times: (F,) seconds; frames: (K, F, nq) MuJoCo's qpos then, for drawing.
+      tube: (T+1, p, p) covariance of the position about the plan that was predicted for the controller and the
+        disturbances, in m^2; p is 2 or 3, as the position has it. None where nobody predicted it; see `predict_tube`.
+      collision_chance: (T+1,) the predicted chance of being in collision at each knot, or None.
       disturbances: one description each. seed, first_trial: what the draws came from.
       versions: of lqrsim and the libraries that the bits depend on, and the processor.
     """
@@ -91,6 +95,8 @@ class Rollout:
     seed: int
     first_trial: int = 0
     versions: Mapping[str, str] = field(default_factory=dict)
+    tube: Array | None = None
+    collision_chance: Array | None = None
 
     def __post_init__(self) -> None:
         check_kind("Rollout: plan", self.plan, Trajectory, "a Trajectory")
@@ -111,6 +117,7 @@ class Rollout:
         if not all(isinstance(one, str) for item in given.items() for one in item):
             raise InputError(f"Rollout: versions: got {excerpt(given)}, want a dictionary of name: version")
         self._check_shapes()
+        self._check_prediction()
 
     def _check_shapes(self) -> None:
         """Raises InputError for arrays that do not fit together."""
@@ -140,6 +147,29 @@ class Rollout:
         if self.goal is not None:
             object.__setattr__(self, "goal", shaped("Rollout: goal", self.goal, (n,)))
         _ = self.target  # which refuses what is no goal
+
+    def _check_prediction(self) -> None:
+        """Raises InputError unless what was predicted is covariances of the position, and chances."""
+        steps, size = self.plan.steps, len(self.state_coordinates.position)
+        if self.tube is not None:
+            if not size:
+                raise InputError("Rollout: tube: got one of a robot without a position, want None")
+            tube = check_array("Rollout: tube", self.tube, (steps + 1, size, size))
+            scale = np.abs(tube).max(axis=(1, 2), keepdims=True)
+            relative = tube / np.where(scale > 0, scale, 1.0)
+            # What is summed up in another order differs in the last digits.
+            skewed = np.abs(relative - relative.transpose(0, 2, 1)).max(axis=(1, 2)) > 1e-9
+            negative = np.linalg.eigvalsh(relative)[:, 0] < -1e-9
+            for wrong, want in ((skewed, "a symmetric matrix"), (negative, "no negative variance")):
+                if wrong.any():
+                    at = int(np.argmax(wrong))
+                    raise InputError(f"Rollout: tube: got {excerpt(tube[at].tolist())} at knot {at}, want {want}")
+            object.__setattr__(self, "tube", tube)
+        if self.collision_chance is not None:
+            chance = check_array("Rollout: collision_chance", self.collision_chance, (steps + 1,))
+            if not ((chance >= 0) & (chance <= 1)).all():
+                raise InputError(f"Rollout: collision_chance: got {excerpt(chance.tolist())}, want chances from 0 to 1")
+            object.__setattr__(self, "collision_chance", chance)
 
     def _check_endings(self, trials: int) -> None:
         """Raises InputError unless what ended trials has its time within the run, and its words."""

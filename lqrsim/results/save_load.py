@@ -50,7 +50,7 @@ _ROLLOUT_ARRAYS = {  # of the same names in a Rollout
     "torques": "K T 3", "displaced": "K obstacles 3", "clearance": "K T+1", "contacts": "K",
     "collided_at": "K", "diverged_at": "K", "failed_at": "K", "frame_times": "F", "frames": "K F nq",
 }  # fmt: skip
-_ROLLOUT_OPTIONAL: tuple[dict[str, str], ...] = ({"goal": "n"},)
+_ROLLOUT_OPTIONAL: tuple[dict[str, str], ...] = ({"goal": "n"}, {"tube": "T+1 p p"}, {"collision_chance": "T+1"})
 _POLICY_ARRAYS = {  # of each kind; of the same names in the classes
     "affine": {"gain": "T m n", "offset": "T m", "nominal": "T n"},
     "output feedback": OUTPUT_FEEDBACK,
@@ -151,6 +151,7 @@ def _check(kind: str, headers: Mapping[str, Header], meta: dict[str, Any]) -> No
     sizes = {"n": len(meta["states"]["names"]), "m": len(meta["controls"]["names"])}
     if kind == "rollout":
         wanted, groups = _PLAN | _ROLLOUT_ARRAYS, _ROLLOUT_OPTIONAL
+        sizes["p"] = len(meta["states"]["position"])
     elif kind == "policy":
         wanted, groups = _POLICY_ARRAYS[meta["kind"]], ()
         if (meta["measured"] is None) != (meta["kind"] == "affine"):
@@ -280,8 +281,8 @@ def _solution(arrays: Arrays, meta: dict[str, Any]) -> Solution:
 def _rollout_parts(rollout: Rollout) -> tuple[Arrays, dict[str, Any]]:
     arrays: dict[str, npt.NDArray[Any]] = {name: getattr(rollout, name) for name in _ROLLOUT_ARRAYS}
     arrays |= {"trajectory.states": rollout.plan.states, "trajectory.controls": rollout.plan.controls}
-    if rollout.goal is not None:
-        arrays["goal"] = rollout.goal
+    for group in _ROLLOUT_OPTIONAL:
+        arrays |= {name: getattr(rollout, name) for name in group if getattr(rollout, name) is not None}
     texts = {name: getattr(rollout, name) for name in _ROLLOUT_TEXTS}
     texts |= {
         "versions": dict(rollout.versions), "dt": rollout.plan.dt,
@@ -296,7 +297,7 @@ def _rollout(arrays: Arrays, meta: dict[str, Any]) -> Rollout:
         raise InputError("frame_times: got times that are not in order, want each after the one before")
     return Rollout(
         **{name: arrays[name] for name in _ROLLOUT_ARRAYS},
-        goal=arrays.get("goal"),
+        **{name: arrays.get(name) for group in _ROLLOUT_OPTIONAL for name in group},
         plan=Trajectory(arrays["trajectory.states"], arrays["trajectory.controls"], float(meta["dt"])),
         state_coordinates=_coordinates(meta["states"]),
         control_coordinates=_coordinates(meta["controls"]),

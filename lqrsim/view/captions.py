@@ -103,7 +103,13 @@ class Legend:
     """
 
     def __init__(self, overlays: Sequence[Overlays], scale: Scale, size: tuple[int, int], *, over: bool) -> None:
-        entries: dict[str, text_tiles.Colour | None] = dict(entry for one in overlays for entry in one.legend_entries())
+        named = dict(entry for one in overlays for entry in one.legend_entries())
+        # What holds of one run's tube and more of another's is said once, with more.
+        entries: dict[str, text_tiles.Colour | None] = {
+            text: colour
+            for text, colour in named.items()
+            if not any(other != text and other.startswith(text) for other in named)
+        }
         if "trace" in overlays[0].show:
             full = f"{1e3 * scale.error:g} mm" if scale.error < 1 else f"{scale.error:g} m"
             entries[f"driven, tracking error 0 to {full}"] = None

@@ -2,9 +2,11 @@
 
 from typing import Literal, get_args
 
-Overlay = Literal["plan", "ghost", "trace", "forces", "measured", "tube", "caption"]
+Overlay = Literal["plan", "ghost", "trace", "forces", "measured", "tube", "cost_tube", "caption"]
 Quality = Literal["draft", "standard", "publication"]
 
-OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
+ALL_OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
+# Two tubes about one plan hide each other: that of the cost is for those who ask for it.
+OVERLAYS: tuple[Overlay, ...] = tuple(name for name in ALL_OVERLAYS if name != "cost_tube")
 CALIBRATED = ("top", "side")
 VIEWS = ("overview", "chase", *CALIBRATED)

@@ -12,7 +12,7 @@ from lqrsim.errors import Array, InputError
 from lqrsim.results.solution import Solution
 from lqrsim.view import text_tiles
 from lqrsim.view.decorative_geoms import PLAN_RGB, decorate
-from lqrsim.view.ellipsoids import COST_ABOVE_LEAST, SIGMAS, ellipsoids
+from lqrsim.view.ellipsoids import OF_COST, Ellipsoids
 from lqrsim.view.options import Overlay
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.text_tiles import Colour
@@ -20,10 +20,13 @@ from lqrsim.view.text_tiles import Colour
 # As PLAN_RGB, no colours of the error map, and none of the robots.
 FORCE = (0.0, 0.50, 0.36)
 MEASURED = (0.10, 0.10, 0.12)
-TUBE = (0.47, 0.30, 0.78)
+TUBE = (0.0, 0.70, 0.72)
+COST_TUBE = (0.47, 0.30, 0.78)
+OPACITY = {True: 0.2, False: 0.08}  # of tubes: flat on a floor, with the lines above; and around the lines
+SLIM = 0.65  # width of lines in a tube, in those of others: it is often hardly wider than they are
 SEGMENTS = 120  # a line is drawn with no more than this many
 DOTS = 30  # measured states that are shown, the last ones
-ELLIPSOIDS = 24
+MOST_ELLIPSOIDS = 120
 END_ON = 0.9  # cosine of the angle to the line of sight
 LIFT = 0.006  # metres between the floor and the lines on it
 
@@ -51,11 +54,11 @@ class Overlays:
     """Those of one trial.
 
     Args:
-      solution: of which the run is, for the tube.
-      show: which; those of which there is nothing to show are left out, as the tube without a solution.
+      solution: of which the run is, for the tube of its cost.
+      show: which; those of which there is nothing to show are left out, as the tube where none was predicted.
 
     Raises:
-      InputError: the solution is not that of the run, or has no total cost.
+      InputError: the solution is not that of the run, has no total cost, or is missing.
     """
 
     def __init__(
@@ -73,7 +76,10 @@ class Overlays:
             self.show.discard("measured")
         if scale.force < 1e-6:
             self.show.discard("forces")
-        self.tube = _tube(recorded, solution) if "tube" in self.show and solution is not None else None
+        self.tube = _predicted(recorded) if "tube" in self.show else None
+        self.cost_tube = _of_cost(recorded, solution) if "cost_tube" in self.show else None
+        if self.tube is not None:
+            self.width *= SLIM
 
     def legend_entries(self) -> list[tuple[str, Colour]]:
         """What the colours mean, but for those of the trace."""
@@ -84,16 +90,19 @@ class Overlays:
         }
         found = [entry for overlay, entry in entries.items() if overlay in self.show]
         if self.tube is not None:
-            found.append((f"{SIGMAS:g} sigma: total cost ≤ least + {COST_ABOVE_LEAST:g}", TUBE))
+            found.append((self.tube.label, TUBE))
+        if self.cost_tube is not None:
+            found.append((OF_COST, COST_TUBE))
         return found
 
     def draw(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
         """Appends the geoms of a moment to the scene; `data` is posed as it was then."""
         pen, recorded = _Pen(scene, flat=self.recorded.planar), self.recorded
         lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
-        if self.tube is not None:
-            for centre, sizes, rotation in zip(*self.tube, strict=True):
-                pen.add(Geom.mjGEOM_ELLIPSOID, centre + 0.5 * lift, sizes, (*TUBE, 0.14), rotation)
+        for tube, colour, height in ((self.cost_tube, COST_TUBE, 0.3), (self.tube, TUBE, 0.6)):
+            for centre, sizes, rotation in zip(*tube.in_world, strict=True) if tube is not None else ():
+                rgba = (*colour, OPACITY[recorded.planar])
+                pen.add(Geom.mjGEOM_ELLIPSOID, centre + height * lift, sizes, rgba, rotation)
         if "trace" in self.show:
             done = int(np.searchsorted(self.knots, time, side="right"))
             points = np.vstack([self.trace[:done], recorded.driven(time)])
@@ -163,20 +172,49 @@ class _Pen:
             self.add(Geom.mjGEOM_BOX, centres[number], size, colours[number], rotations[number])
 
 
-def _tube(recorded: RecordedTrial, solution: Solution) -> tuple[Array, Array, Array]:
-    """Centres (k, 3), half axes (k, 3) and rotations (k, 3, 3) of the ellipsoids along the plan."""
-    if not np.array_equal(solution.trajectory.states, recorded.rollout.plan.states):
+@dataclass(frozen=True)
+class _Tube:
+    """Ellipsoids in the world.
+
+    Attributes:
+      knots: (k,) of the plan, where they are. label: what the legend says of it.
+      in_world: centres (k, 3), half axes (k, 3) and rotations (k, 3, 3).
+    """
+
+    knots: npt.NDArray[np.int64]
+    in_world: tuple[Array, Array, Array]
+    label: str
+
+
+def _predicted(recorded: RecordedTrial) -> _Tube | None:
+    """The tube that was predicted for the run, if it was, and has any width."""
+    run = recorded.rollout
+    if run.tube is None or run.tube.max() < 1e-12:
+        return None
+    return _tube(recorded, Ellipsoids.predicted(run.plan.states[:, list(run.state_coordinates.position)], run.tube))
+
+
+def _of_cost(recorded: RecordedTrial, solution: Solution | None) -> _Tube:
+    """Where the solution's total cost is near its least."""
+    run = recorded.rollout
+    if solution is None:
+        raise InputError("solution: got None with the overlay cost_tube, want the Solution that was executed")
+    if not np.array_equal(solution.trajectory.states, run.plan.states):
         raise InputError("solution: got one with another plan than that of the run, want the one that was executed")
-    knots = np.unique(np.linspace(0, recorded.rollout.plan.steps, ELLIPSOIDS).astype(np.int64))
-    space = recorded.rollout.state_coordinates
+    return _tube(recorded, Ellipsoids.of_cost(solution, run.state_coordinates.position))
+
+
+def _tube(recorded: RecordedTrial, ellipsoids: Ellipsoids) -> _Tube:
+    space, knots = recorded.rollout.state_coordinates, ellipsoids.spread(MOST_ELLIPSOIDS)
     size, count = len(space.position), len(knots)
-    places, lengths, turns = ellipsoids(solution, space.position, knots)
+    lengths, turns = (part[knots] for part in ellipsoids.axes())
     half_axes, rotations = np.full((count, 3), 0.1 * LIFT), np.zeros((count, 3, 3))
-    half_axes[:, :size] = lengths
+    half_axes[:, :size] = np.maximum(lengths, 0.1 * LIFT)  # one without width cannot be drawn
     rotations[:, list(space.world_axes), :size] = turns
     if size == 2:  # what is flat is thin across
         rotations[:, :, 2] = np.cross(rotations[:, :, 0], rotations[:, :, 1])
-    return space.in_world(places, height=recorded.floor), half_axes, rotations
+    places = space.in_world(ellipsoids.centres[knots], height=recorded.floor)
+    return _Tube(knots, (places, half_axes, rotations), ellipsoids.label)
 
 
 def _round_up(value: float) -> float:

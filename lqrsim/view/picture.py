@@ -14,7 +14,7 @@ from lqrsim.view import gl, marker
 from lqrsim.view.camera_views import CameraView, camera_view, leaves_room_for_captions
 from lqrsim.view.captions import Caption, Legend
 from lqrsim.view.layout import Box, side_by_side, split_into_panes
-from lqrsim.view.options import OVERLAYS, Overlay, Quality
+from lqrsim.view.options import ALL_OVERLAYS, OVERLAYS, Overlay, Quality
 from lqrsim.view.overlays import Overlays, common_scale
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.scene_renderer import SceneRenderer, open_renderer
@@ -71,9 +71,9 @@ class PictureOptions:
         check_text("camera", self.camera, "the name of a camera")
         wanted = f"a tuple of the names of cameras, {MOST_INSETS} at most"
         insets = check_items("insets", self.insets, str, wanted, at_most=100)
-        overlays = check_items("overlays", self.overlays, object, f"a tuple of: {', '.join(OVERLAYS)}", at_most=100)
+        overlays = check_items("overlays", self.overlays, object, f"a tuple of: {', '.join(ALL_OVERLAYS)}", at_most=100)
         for overlay in overlays:
-            check_name("overlays", overlay, OVERLAYS)
+            check_name("overlays", overlay, ALL_OVERLAYS)
         titles = check_items("titles", self.titles, str, "a tuple of texts, one a run", at_most=MOST_RUNS)
         for title in titles:
             check_text("titles", title, "a title", at_most=100, empty=True)

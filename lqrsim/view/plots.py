@@ -1,11 +1,12 @@
-"""The figure of a run: path, tracking error, controls, and how the solver got there."""
+"""The figure of a run: path and tube, tracking error, controls, and how the solver got there."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
@@ -14,14 +15,20 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenes.world import World
-from lqrsim.view import obstacle_plots, style
+from lqrsim.view import obstacle_plots, prediction_plots, style
+from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.style import LIMIT, PLAN, RUNS
+
+AREA = "area: "  # before what the legend says of a tube
 
 
 def plot_run(
     solution: Solution, rollouts: Mapping[str, Rollout], path: str | os.PathLike[str], *, world: World, trial: int = 0
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution and of runs of its policy; returns its path.
+
+    Runs whose tube was predicted have it about the plan, 2 standard deviations wide, as far as that is not too wide to
+    be shown, and below it their chance of collision step by step.
 
     Args:
       rollouts: by what the legend calls them, for example `{"undisturbed": ..., "disturbed": ...}`; at most four.
@@ -35,7 +42,13 @@ def plot_run(
     with style.figure(path, size=(11, 7.5)) as figure:
         strips = len(solution.policy.control_coordinates)
         in_space = len(solution.policy.state_coordinates.position) == 3
-        left = figure.add_gridspec(1, 1, left=0.05 if in_space else 0.075, right=0.455, bottom=0.13, top=0.95)[0]
+        chances = [
+            (run.times, run.collision_chance, color)
+            for run, color in zip(rollouts.values(), RUNS, strict=False)
+            if run.collision_chance is not None and run.collision_chance.any()
+        ]
+        bottom = 0.335 if chances else 0.13
+        left = figure.add_gridspec(1, 1, left=0.05 if in_space else 0.075, right=0.455, bottom=bottom, top=0.95)[0]
         right = figure.add_gridspec(
             3, 1, left=0.57, right=0.92, bottom=0.13, top=0.95, hspace=0.42, height_ratios=(1, 0.7 + 0.3 * strips, 1)
         )
@@ -46,11 +59,18 @@ def plot_run(
         else:
             path_axes = figure.add_subplot(left)
             _path_in_plane(path_axes, solution, rollouts, world, trial)
+        if chances:
+            below = figure.add_gridspec(1, 1, left=0.085, right=0.455, bottom=0.13, top=0.23)[0]
+            prediction_plots.draw_chances(figure.add_subplot(below), chances)
         _tracking_error(figure.add_subplot(right[0]), rollouts, trial)
         rows = right[1].subgridspec(strips, 1, hspace=0.18)
         _controls([figure.add_subplot(row) for row in rows], solution.trajectory, rollouts, trial)
         _cost(figure.add_subplot(right[2]), solution)
-        figure.legend(*path_axes.get_legend_handles_labels(), loc="lower center", ncols=len(RUNS) + 3)
+        handles = dict(zip(*reversed(path_axes.get_legend_handles_labels()), strict=True))
+        tubes = {label: handles.pop(label) for label in list(handles) if label.startswith(AREA)}
+        figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=len(RUNS) + 3)
+        if tubes:
+            figure.legend(tubes.values(), tubes.keys(), loc="lower center", bbox_to_anchor=(0.5, 0.028), ncols=2)
     return Path(path)
 
 
@@ -82,6 +102,17 @@ def _paths(solution: Solution, rollouts: Mapping[str, Rollout], trial: int) -> l
     return [(name, color, line, states[:, position]) for name, color, line, states in (*driven, planned)]
 
 
+def _tubes(rollouts: Mapping[str, Rollout]) -> Iterator[tuple[Ellipsoids, dict[str, str]]]:
+    """Those that were predicted and have any width, with their label and colours."""
+    for (name, run), color in zip(rollouts.items(), RUNS, strict=False):
+        if run.tube is not None and run.tube.any():
+            plan = run.plan.states[:, list(run.state_coordinates.position)]
+            ellipsoids = Ellipsoids.predicted(plan, run.tube)
+            red, green, blue = to_rgb(color)
+            paler = to_hex((0.4 * red + 0.6, 0.4 * green + 0.6, 0.4 * blue + 0.6))
+            yield ellipsoids, {"label": f"{AREA}{name}, {ellipsoids.label}", "face": paler, "edge": color}
+
+
 def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
     paths, radius = _paths(solution, rollouts, trial), next(iter(rollouts.values())).radius
     places = np.vstack([points for *_, points in paths])
@@ -90,6 +121,8 @@ def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
     obstacle_plots.draw_in_plane(
         axes, flat, *obstacle_plots.bounds(places, flat, 1.5 * radius), radius, plane=space.plane
     )
+    for ellipsoids, looks in _tubes(rollouts):
+        prediction_plots.draw_tube(axes, ellipsoids, **looks)
     for name, color, line, points in paths:
         axes.plot(*points.T, line, color=color, label=name)
     plan = paths[-1][-1]
@@ -103,6 +136,8 @@ def _path_in_space(axes: Axes3D, solution: Solution, rollouts: Mapping[str, Roll
     obstacle_plots.draw_in_space(
         axes, world, *obstacle_plots.bounds(np.vstack([points for *_, points in paths]), world)
     )
+    for ellipsoids, looks in _tubes(rollouts):
+        prediction_plots.draw_tube_in_space(axes, ellipsoids, **looks)
     for name, color, line, points in paths:
         axes.plot(*points.T, line, color=color, label=name)
     plan = paths[-1][-1]

@@ -1,4 +1,4 @@
-"""The figure of a policy: the tube in which it expects the robot, cost-to-go along the plan, gains over time."""
+"""The figure of a policy: a tube about its plan, cost-to-go along the plan, gains over time."""
 
 import os
 from itertools import product
@@ -6,33 +6,39 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
+from lqrsim.control.tubes import Tube
 from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.scenes.world import World
-from lqrsim.view import obstacle_plots, style
-from lqrsim.view.ellipsoids import COST_ABOVE_LEAST, SIGMAS, outlines
+from lqrsim.view import obstacle_plots, prediction_plots, style
+from lqrsim.view.ellipsoids import OF_COST, Ellipsoids
 from lqrsim.view.style import PLAN, RUNS
 
-TUBE, OUTLINE = "#d5c8ec", "#7a4dc7"
-OUTLINES = 24  # ellipses whose outlines are drawn
+# Face and edge, as in videos.
+TUBE = {"face": "#8ad7d5", "edge": "#008f91"}
+COST_TUBE = {"face": "#d5c8ec", "edge": "#7a4dc7"}
 LINES = ("-", "--", "-.", ":")
 
 
-def plot_policy(solution: Solution, path: str | os.PathLike[str], *, world: World, radius: float) -> Path:
+def plot_policy(
+    solution: Solution, path: str | os.PathLike[str], *, world: World, radius: float, tube: Tube | None = None
+) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution's policy; returns its path.
 
-    The tube is that of the positions whose total cost is near its least, for a robot in space from above and from the
-    side. Solutions of `ilqr` have none: there the plan is alone.
+    With a tube it shows where runs are predicted to be, 2 standard deviations about the plan, as far as that is not too
+    wide to be shown, and the chance of collision step by step. Without, it shows the positions whose total cost is near
+    its least, which says nothing of disturbances; solutions of `ilqr` have no total cost, there the plan is alone. A
+    robot in space is seen from above and from the side.
 
     Args:
       world: the obstacles, as the scene has them. radius: of the robot, in metres.
+      tube: what `predict_tube` says of the solution and what runs it.
 
     Raises:
-      InputError: the solution has no policy or no position, or the file cannot be written.
+      InputError: the solution has no policy or no position, the tube is of another plan, or the file cannot be written.
     """
     check_kind("solution", solution, Solution, "a Solution")
     check_kind("world", world, World, "a World, such as scene.world")
@@ -43,12 +49,15 @@ def plot_policy(solution: Solution, path: str | os.PathLike[str], *, world: Worl
         )
     if not solution.policy.state_coordinates.position:
         raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
+    check_kind("tube", tube, (Tube, type(None)), "a Tube, such as predict_tube(...) returns, or None")
+    if tube is not None and not np.array_equal(tube.plan.states, solution.trajectory.states):
+        raise InputError("tube: got one of another plan, want that of the solution")
     with style.figure(path, size=(11, 7.5)) as figure:
-        draw(figure, solution, world, radius)
+        draw(figure, solution, world, radius, tube)
     return Path(path)
 
 
-def draw(figure: Figure, solution: Solution, world: World, radius: float) -> None:
+def draw(figure: Figure, solution: Solution, world: World, radius: float, tube: Tube | None = None) -> None:
     """Draws it all."""
     policy = solution.policy
     grid = figure.add_gridspec(1, 2, left=0.07, right=0.97, bottom=0.12, top=0.95, wspace=0.2, width_ratios=(1, 1.1))
@@ -56,21 +65,28 @@ def draw(figure: Figure, solution: Solution, world: World, radius: float) -> Non
     places = grid[0].subgridspec(len(planes), 1, hspace=0.25)
     paths = [figure.add_subplot(place) for place in places]
     for axes, plane in zip(paths, planes, strict=True):
-        _tube(axes, solution, world, radius, plane)
+        _tube(axes, solution, world, radius, plane, tube)
     figure.legend(*paths[0].get_legend_handles_labels(), loc="lower center", ncols=4)
     strips = list(
         product(dict.fromkeys(policy.control_coordinates.units), dict.fromkeys(policy.state_coordinates.units))
     )
-    rows = grid[1].subgridspec(2, 1, hspace=0.3, height_ratios=(1, 0.3 + 0.55 * len(strips)))
+    chances = [] if tube is None or not tube.step_chance.any() else [0.6]
+    ratios = (1, *chances, 0.3 + 0.55 * len(strips))
+    rows = grid[1].subgridspec(len(ratios), 1, hspace=0.42 if chances else 0.3, height_ratios=ratios)
     _cost(figure.add_subplot(rows[0]), solution)
-    of_gains = rows[1].subgridspec(len(strips), 1, hspace=0.18)
+    if tube is not None and chances:
+        axes = figure.add_subplot(rows[1])
+        prediction_plots.draw_chances(axes, [(tube.plan.times, tube.step_chance, TUBE["edge"])])
+        axes.set_title(f"predicted chance of collision ({tube.collision_chance:.2g} in all)")
+    of_gains = rows[len(ratios) - 1].subgridspec(len(strips), 1, hspace=0.18)
     _gains([figure.add_subplot(row) for row in of_gains], strips, policy, solution.trajectory.times)
 
 
-def _tube(axes: Axes, solution: Solution, world: World, radius: float, plane: tuple[int, int]) -> None:
+def _tube(
+    axes: Axes, solution: Solution, world: World, radius: float, plane: tuple[int, int], tube: Tube | None
+) -> None:
     """The tube, the plan and the obstacles, as seen along the axis that is not of the plane."""
     position = solution.policy.state_coordinates.position
-    states = [position[axis] for axis in plane]
     plan = solution.trajectory.states[:, list(position)]
     if len(position) == 2:
         space = solution.policy.state_coordinates
@@ -78,21 +94,19 @@ def _tube(axes: Axes, solution: Solution, world: World, radius: float, plane: tu
         obstacle_plots.draw_in_plane(
             axes, flat, *obstacle_plots.bounds(plan, flat, 1.5 * radius), radius, plane=space.plane
         )
-        axes.set_title("tube (pale: closer than the robot's radius)")
+        axes.set_title("tube (grey: closer than the robot's radius)")
     else:
         obstacle_plots.draw_projected(axes, world, *obstacle_plots.bounds(plan, world, 1.5 * radius), *plane)
         axes.set_title(f"tube, from {'above' if plane == (0, 1) else 'the side'}")
-    if solution.cost_to_come is not None:
-        steps = solution.trajectory.steps
-        every = outlines(solution, states, np.arange(steps + 1))
-        some = every[np.unique(np.linspace(0, steps, OUTLINES).astype(int))]
-        label = f"{SIGMAS:g} sigma: total cost at most {COST_ABOVE_LEAST:g} above its least"
-        axes.add_collection(PolyCollection(list(every), facecolors=TUBE, edgecolors="none", zorder=1.5, label=label))
-        axes.add_collection(
-            PolyCollection(list(some), facecolors="none", edgecolors=OUTLINE, linewidths=0.6, zorder=2.5)
-        )
+    onto = np.eye(len(position))[list(plane)]
+    if tube is not None:
+        ellipsoids = Ellipsoids.predicted(plan, tube.position_covariance)
+        prediction_plots.draw_tube(axes, ellipsoids.seen_in(onto), ellipsoids.label, **TUBE)
+    elif solution.cost_to_come is not None:
+        ellipses = Ellipsoids.of_cost(solution, position).seen_in(onto)
+        prediction_plots.draw_tube(axes, ellipses, OF_COST, **COST_TUBE)
     path = plan[:, list(plane)]
-    axes.plot(*path.T, "--", color=PLAN, zorder=3, label="planned")
+    axes.plot(*path.T, "--", color=PLAN, linewidth=1.4 if tube is None else 0.9, zorder=3, label="planned")
     axes.plot(*path[0], "o", color=PLAN, markersize=6, zorder=3, label="start")
     axes.plot(*path[-1], "*", color=PLAN, markersize=10, zorder=3, label="end of the plan")
 

@@ -56,9 +56,11 @@ def render(
         trace: what was driven so far, coloured by tracking error;
         forces: what pushes the robot, wind too, as an arrow: the mean over the last fifth of a second;
         measured: the last states that the policy was shown, where they differ from the true ones;
-        tube: ellipsoids in which the total cost is near its least: where the policy expects the robot;
+        tube: where the run was predicted to be under its disturbances, 2 standard deviations about the plan, as far as
+          that is not too wide to be shown; where there is a `rollout.tube`;
+        cost_tube: ellipsoids in which the total cost is near its least, whatever disturbs; only where it is asked for;
         caption: time, tracking error, clearance, what disturbs, and a legend.
-      solution: of which the run is, for the tube; one for all, or one each.
+      solution: of which the run is, for cost_tube; one for all, or one each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and how much the video is compressed.
       size: width and height in pixels, both even; that of the quality by default, and half of it for a GIF, but
         not less than 480 x 270.
