@@ -294,6 +294,16 @@ def test_a_live_run_is_what_simulate_does(quadrotor: ls.Scenario, quadrotor_solu
     assert [line.split(",")[0] for line in lines] == ["run 0: reached", "run 1: reached"]
 
 
+def test_a_live_run_takes_a_controller(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    tolerate = {"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s": 0.2}
+    law = ls.Feedback(ls.track(quadrotor.problem, quadrotor_solution, tolerate=tolerate))
+    noise, plant = [ForceNoise(0.1)], quadrotor.plant()
+    wanted = ls.simulate(plant, quadrotor_solution, controller=law, disturbances=noise, seed=3)
+    screen = Recorder(150, **viewer.arguments_for_plant(plant, quadrotor_solution))
+    live(quadrotor, quadrotor_solution, screen, controller=law, disturbances=noise, seed=3)
+    np.testing.assert_array_equal(screen.shown, wanted.frames[0][1:])
+
+
 @pytest.mark.parametrize("key", PUSHES)
 def test_a_push_is_felt_and_overcome(key: str, quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """0.3 m/s at 3 s: a decimetre off, in the direction of the key, and back within 3 cm at the end, at 5 s."""

@@ -28,7 +28,7 @@ def draw_together(config: Settings, result: Result) -> None:
             draw_success(axes, robot["together"])
             axes.set_title(NAMES[name], pad=50)
         both[0].set_ylabel("trials that reached their goal (%)")
-        drawn.legend(*both[0].get_legend_handles_labels(), loc="upper center", ncols=4, handlelength=3)
+        drawn.legend(*both[0].get_legend_handles_labels(), loc="upper center", ncols=len(POLICIES), handlelength=3)
         drawn.set_layout_engine("tight", rect=(0, 0, 1, 0.93), w_pad=3)
 
 
@@ -40,9 +40,10 @@ def draw_success(axes: Axes, cells: Sequence[dict[str, Any]]) -> None:
         value, low, high = 100 * np.array([cell["band"] for cell in mine]).T
         axes.fill_between(strengths, low, high, color=COLOURS[number], alpha=0.15, linewidth=0)
         # Curves may lie on each other: those below are wider, and their markers larger.
+        thin = min(number, 3)
         axes.plot(
             strengths, value, linestyle=LINES[number], color=COLOURS[number], marker=MARKERS[number],
-            markersize=8 - 1.2 * number, linewidth=2.4 - 0.4 * number, markerfacecolor="white", label=WORDS[policy],
+            markersize=8 - 1.2 * thin, linewidth=2.4 - 0.4 * thin, markerfacecolor="white", label=WORDS[policy],
             clip_on=False, zorder=3,
         )  # fmt: skip
     for name, strength in PRESETS.items():

@@ -33,8 +33,7 @@ class Stress:
     smooth. offset_free: the same, and estimates the state and what disturbs it. All meet the same numbers. By default
     the first four; ilqr is left out where the scenario has constraints, which it cannot keep."""
     stated: Annotated[str | None, optional("NAME")] = None
-    """Disturbances that track and offset_free are made for, named as above; they are told no more of what they meet. By
-    default moderate."""
+    """Disturbances that track and offset_free are made for, named as above, at all strengths. By default moderate."""
     trials: int = 200
     """Of each sweep, strength and policy."""
     seed: int = 0
