@@ -100,7 +100,9 @@ class Overlays:
         pen, recorded = _Pen(scene, flat=self.recorded.planar), self.recorded
         lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
         for tube, colour, height in ((self.cost_tube, COST_TUBE, 0.3), (self.tube, TUBE, 0.6)):
-            for centre, sizes, rotation in zip(*tube.in_world, strict=True) if tube is not None else ():
+            if tube is None:
+                continue
+            for centre, sizes, rotation in zip(*tube.in_world, strict=True):
                 pen.add(Geom.mjGEOM_ELLIPSOID, centre + height * lift, sizes, (*colour, tube.opacity), rotation)
         if "trace" in self.show:
             done = int(np.searchsorted(self.knots, time, side="right"))
