@@ -22,6 +22,7 @@ from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.simulation.outcome_table import OUTCOMES, Outcomes, outcomes
 from lqrsim.simulation.plant import Plant
+from lqrsim.simulation.tube_under import tube_under
 from lqrsim.stress import trials
 from lqrsim.stress.campaign import Campaign, run_campaign
 from lqrsim.stress.results import Results, differences, replay
@@ -142,6 +143,23 @@ def test_an_arm_that_is_stuck_on_a_post_has_collided_with_it(arm: Plant, swing: 
         assert rollout.states[0, -1, 0] > np.pi / 2
         assert rollout.contacts[0] == 0
     assert not arm.enclosed
+
+
+def test_no_tube_is_predicted_of_where_a_robot_without_a_position_is(arm: Plant, swing: ls.Solution) -> None:
+    problem = ls.Problem(
+        dynamics=arm.robot.dynamics, dt=0.05, steps=40, initial=ls.FixedState((0.0, 0.0)),
+        stage_cost=ls.ControlCost((1.0,)), final_cost=ls.QuadraticCost((1.0, 1.0), about=(1.0, 0.0)),
+    )  # fmt: skip
+    assert tube_under(problem, swing, arm, [ls.ControlNoise(0.1)]) == (
+        None,
+        "no predicted tube: the robot has no position",
+    )
+    tube = ls.predict_tube(problem, swing, ls.Uncertainty(control=0.1))
+    run = ls.simulate(arm, swing)
+    with pytest.raises(ls.InputError, match=r"state_coordinates\.position: got none"):
+        tube.added_to(run)
+    with pytest.raises(ls.InputError, match="tube: got one of a robot without a position"):
+        replace(run, tube=np.zeros((41, 2, 2)))
 
 
 def test_contacts_that_are_only_felt_change_no_bit_and_miss_none(arm: Plant, swing: ls.Solution) -> None:

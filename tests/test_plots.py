@@ -57,6 +57,29 @@ def test_errors_that_differ_by_decades_get_a_logarithmic_axis(
     assert "the plan (mm)" in texts(path)
 
 
+@pytest.mark.parametrize("robot", ["drive", "flight"])
+def test_a_predicted_tube_is_drawn_with_its_chance_of_collision(
+    robot: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    names = {"drive": ("differential_drive", "drive_solution"), "flight": ("quadrotor", "quadrotor_solution")}
+    scenario, solution = (request.getfixturevalue(name) for name in names[robot])
+    runs = request.getfixturevalue(f"{robot}_runs")
+    noise = [ls.ControlNoise(0.05)] if robot == "drive" else [ls.ForceNoise(0.1)]
+    tube = ls.predict_tube(scenario.problem, solution, ls.uncertainty_of(scenario.plant(), noise))
+    with_tube = runs | {"with noise": tube.added_to(runs["with noise"])}
+    without, found = (
+        texts(plot_run(solution, shown, tmp_path / "figure.svg", world=scenario.scene.world))
+        for shown in (runs, with_tube)
+    )
+    assert set(found) - set(without) >= {
+        "area: with noise, predicted: 2 sigma, 95 % in each direction",
+        "predicted chance of being in collision",
+        "chance",
+    }
+    # No chance is to be seen of the drive, whose tube stays away from the pillars.
+    assert ("below 1e-06 throughout" in found) == (robot == "drive") == (tube.step_chance.max() < 1e-6)
+
+
 @pytest.mark.parametrize("suffix", [".png", ".pdf", ".svg"])
 def test_same_runs_give_the_same_bytes(
     suffix: str,

@@ -15,6 +15,7 @@ from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.obstacle_plots import draw_projected
 from lqrsim.view.policy_plot import draw, strength
+from lqrsim.view.prediction_plots import draw_tube
 
 
 def drawn(solution: ls.Solution, scenario: ls.Scenario, tube: Tube | None = None) -> Figure:
@@ -132,6 +133,13 @@ def test_a_tube_ends_where_it_would_hide_the_picture(drive_solution: ls.Solution
     assert len(tube.centres) == np.count_nonzero(2 * std <= largest)
     assert 2 < len(tube.centres) < 20
     assert tube.label.endswith(f"drawn up to {largest:.2g} m")
+    # One that is too wide from the first knot on leaves the plan alone.
+    nothing = Ellipsoids.predicted(places, np.tile(1e6 * np.eye(2), (151, 1, 1)))
+    assert nothing.outlines().shape == (0, 48, 2)
+    assert len(nothing.spread(10)) == 0
+    axes = Figure().add_subplot()
+    draw_tube(axes, nothing, nothing.label, face="b", edge="k")
+    assert not [path for one in axes.collections for path in one.get_paths()]
     assert Ellipsoids.predicted(places, np.zeros((151, 2, 2))).label == "predicted: 2 sigma, 95 % in each direction"
 
 

@@ -14,6 +14,7 @@ from PIL import Image, ImageSequence
 
 import lqrsim as ls
 from lqrsim.view import gl, video_metadata
+from lqrsim.view.captions import Legend
 from lqrsim.view.options import ALL_OVERLAYS, Overlay
 from lqrsim.view.overlays import COST_TUBE, TUBE, Overlays, Scale
 from lqrsim.view.picture import PictureOptions, open_picture
@@ -306,6 +307,26 @@ def test_half_axes_of_a_tube_in_pixels(flight: ls.Rollout, tmp_path: Path) -> No
         want = np.ptp(places[:, axis])
         assert want > 40
         assert found.max() - found.min() + 1 == pytest.approx(want, abs=3)  # pixels
+
+
+def test_what_legends_say_of_tubes_is_said_once(drive: ls.Rollout) -> None:
+    """Of a tube that is drawn as a whole and one that ends, the legend has the one that says more."""
+    recordings = [
+        RecordedTrial(dataclasses.replace(drive, tube=std**2 * np.tile(np.eye(2), (len(drive.times), 1, 1))), 0)
+        for std in (0.05, 5.0)
+    ]
+    # All of the second is too wide; its first knots are not.
+    narrow, wide = recordings
+    assert wide.rollout.tube is not None
+    wide.rollout.tube.setflags(write=True)
+    wide.rollout.tube[:50] = 0.01 * np.eye(2)
+    overlays = [Overlays(one, None, ("tube",), Scale(1.0, 1.0)) for one in (narrow, wide)]
+    said = [text for one in overlays for text, _ in one.legend_entries()]
+    assert said[1].startswith(f"{said[0]}; drawn up to ")
+    both, second = (Legend(shown, Scale(1.0, 1.0), (640, 360), over=False) for shown in (overlays, overlays[1:]))
+    assert both.tile is not None
+    assert second.tile is not None
+    np.testing.assert_array_equal(both.tile, second.tile)
 
 
 @draws

@@ -22,11 +22,11 @@ FORCE = (0.0, 0.50, 0.36)
 MEASURED = (0.10, 0.10, 0.12)
 TUBE = (0.0, 0.70, 0.72)
 COST_TUBE = (0.47, 0.30, 0.78)
-OPACITY = {True: 0.2, False: 0.08}  # of tubes: flat on a floor, with the lines above; and around the lines
+OPACITY = {True: 0.43, False: 0.2}  # of all of a tube: flat on a floor, with the lines above; and around the lines
 SLIM = 0.65  # width of lines in a tube, in those of others: it is often hardly wider than they are
 SEGMENTS = 120  # a line is drawn with no more than this many
 DOTS = 30  # measured states that are shown, the last ones
-MOST_ELLIPSOIDS = 120
+MOST_ELLIPSOIDS = 80  # more take too long to draw
 END_ON = 0.9  # cosine of the angle to the line of sight
 LIFT = 0.006  # metres between the floor and the lines on it
 
@@ -100,9 +100,10 @@ class Overlays:
         pen, recorded = _Pen(scene, flat=self.recorded.planar), self.recorded
         lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
         for tube, colour, height in ((self.cost_tube, COST_TUBE, 0.3), (self.tube, TUBE, 0.6)):
-            for centre, sizes, rotation in zip(*tube.in_world, strict=True) if tube is not None else ():
-                rgba = (*colour, OPACITY[recorded.planar])
-                pen.add(Geom.mjGEOM_ELLIPSOID, centre + height * lift, sizes, rgba, rotation)
+            if tube is None:
+                continue
+            for centre, sizes, rotation in zip(*tube.in_world, strict=True):
+                pen.add(Geom.mjGEOM_ELLIPSOID, centre + height * lift, sizes, (*colour, tube.opacity), rotation)
         if "trace" in self.show:
             done = int(np.searchsorted(self.knots, time, side="right"))
             points = np.vstack([self.trace[:done], recorded.driven(time)])
@@ -177,13 +178,14 @@ class _Tube:
     """Ellipsoids in the world.
 
     Attributes:
-      knots: (k,) of the plan, where they are. label: what the legend says of it.
+      knots: (k,) of the plan, where they are. label: what the legend says of it. opacity: of each.
       in_world: centres (k, 3), half axes (k, 3) and rotations (k, 3, 3).
     """
 
     knots: npt.NDArray[np.int64]
     in_world: tuple[Array, Array, Array]
     label: str
+    opacity: float
 
 
 def _predicted(recorded: RecordedTrial) -> _Tube | None:
@@ -214,7 +216,11 @@ def _tube(recorded: RecordedTrial, ellipsoids: Ellipsoids) -> _Tube:
     if size == 2:  # what is flat is thin across
         rotations[:, :, 2] = np.cross(rotations[:, :, 0], rotations[:, :, 1])
     places = space.in_world(ellipsoids.centres[knots], height=recorded.floor)
-    return _Tube(knots, (places, half_axes, rotations), ellipsoids.label)
+    apart = np.linalg.norm(np.diff(places, axis=0), axis=1).sum() / max(count - 1, 1)
+    overlap = 2 * float(lengths.mean()) / apart if apart > 0 else 1.0
+    # With too few to overlap much, more of it would show as stripes on the lines within.
+    opacity = 1 - (1 - OPACITY[recorded.planar]) ** (1 / np.clip(overlap, 1.6, 10.0))
+    return _Tube(knots, (places, half_axes, rotations), ellipsoids.label, float(opacity))
 
 
 def _round_up(value: float) -> float:

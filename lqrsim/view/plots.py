@@ -47,10 +47,11 @@ def plot_run(
             for run, color in zip(rollouts.values(), RUNS, strict=False)
             if run.collision_chance is not None and run.collision_chance.any()
         ]
-        bottom = 0.335 if chances else 0.13
-        left = figure.add_gridspec(1, 1, left=0.05 if in_space else 0.075, right=0.455, bottom=bottom, top=0.95)[0]
+        low = 0.13 if len(list(_tubes(rollouts))) <= 2 else 0.155  # above the legend, which has two tubes a row
+        under = low + 0.205 if chances else low
+        left = figure.add_gridspec(1, 1, left=0.05 if in_space else 0.075, right=0.455, bottom=under, top=0.95)[0]
         right = figure.add_gridspec(
-            3, 1, left=0.57, right=0.92, bottom=0.13, top=0.95, hspace=0.42, height_ratios=(1, 0.7 + 0.3 * strips, 1)
+            3, 1, left=0.57, right=0.92, bottom=low, top=0.95, hspace=0.42, height_ratios=(1, 0.7 + 0.3 * strips, 1)
         )
         if in_space:
             path_axes = figure.add_subplot(left, projection="3d")
@@ -60,7 +61,7 @@ def plot_run(
             path_axes = figure.add_subplot(left)
             _path_in_plane(path_axes, solution, rollouts, world, trial)
         if chances:
-            below = figure.add_gridspec(1, 1, left=0.085, right=0.455, bottom=0.13, top=0.23)[0]
+            below = figure.add_gridspec(1, 1, left=0.085, right=0.455, bottom=low, top=low + 0.1)[0]
             prediction_plots.draw_chances(figure.add_subplot(below), chances)
         _tracking_error(figure.add_subplot(right[0]), rollouts, trial)
         rows = right[1].subgridspec(strips, 1, hspace=0.18)

@@ -21,7 +21,7 @@ def draw_tube(axes: Axes, ellipses: Ellipsoids, label: str, *, face: str, edge: 
     """Ellipses as one area, and the outlines of some of them, unless these would be beads on a string."""
     every = ellipses.outlines()
     axes.add_collection(PolyCollection(list(every), facecolors=face, edgecolors="none", zorder=1.5, label=label))
-    chosen = np.unique(np.linspace(0, len(every) - 1, OUTLINES).astype(int))
+    chosen = np.unique(np.linspace(0, len(every) - 1, OUTLINES).astype(int)) if len(every) else np.arange(0)
     apart = np.linalg.norm(np.diff(ellipses.centres[chosen], axis=0), axis=1)
     if len(chosen) < 2 or ellipses.axes()[0][chosen].mean() > BEADS * apart.mean():
         some = PolyCollection(list(every[chosen]), facecolors="none", edgecolors=edge, linewidths=0.6, zorder=2.5)
@@ -38,7 +38,7 @@ def draw_tube_in_space(axes: Axes3D, ellipsoids: Ellipsoids, label: str, *, face
     flat = ellipsoids.seen_in(onto)
     around_centres = flat.outlines()[chosen] - flat.centres[chosen, None, :]
     discs = ellipsoids.centres[chosen, None, :] + around_centres @ onto
-    axes.add_collection3d(Poly3DCollection(list(discs), facecolors=to_rgba(edge, 0.2), edgecolors="none"))
+    axes.add_collection3d(Poly3DCollection(list(discs), facecolors=to_rgba(edge, 0.15), edgecolors="none"))
     axes.plot([], [], [], color=face, linewidth=7, label=label)  # as the legend shows it
 
 
