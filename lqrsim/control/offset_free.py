@@ -29,6 +29,7 @@ from lqrsim.results.hashing import sha256
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.solution import Solution
 
+MEMORY = 5.0  # s
 INEXACT = 0.02  # how far a control is off from its command, at least, relative to the tolerated effort
 
 
@@ -47,7 +48,7 @@ class OffsetFree(Controller):
       tolerate, effort, at_end: as in `track`.
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
         SymPy symbols, as in `Dynamics`, that does not depend on u.
-      memory: in s, by default the plan's horizon.
+      memory: in s, by default 5 s, or the plan's horizon where that is shorter.
       record: whether to keep what the filter makes of the last run, for holding it against `filter`: see there.
 
     Attributes:
@@ -79,7 +80,8 @@ class OffsetFree(Controller):
         check_plan("OffsetFree", problem, solution)
         check_kind("OffsetFree: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
         plan = solution.trajectory
-        memory = plan.horizon if memory is None else check_number("OffsetFree: memory", memory, above=0.0)
+        memory = min(plan.horizon, MEMORY) if memory is None else memory
+        memory = check_number("OffsetFree: memory", memory, above=0.0)
         self.problem, self.solution, self.uncertainty = problem, solution, uncertainty
         self.record = check_flag("OffsetFree: record", record)
         self.estimates: Array | None = None

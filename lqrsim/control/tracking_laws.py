@@ -6,7 +6,8 @@ minimises the deviation: with z = (e, a, d) as in `plan_model.py` and u the devi
     sum_t  e' Q e + (u + M_t d)' R (u + M_t d)  +  e_T' Q_T e_T.
 
 M_t d is what of the unknowns' effect on the next state the controls can undo: a control that only does that costs
-nothing, or a steady disturbance would leave a steady error.
+nothing, or a steady disturbance would leave a steady error. For the same reason a law takes it that what disturbs the
+robot now will go on as it is: one that counts on a wind to abate gives way to one that does not.
 """
 
 from dataclasses import dataclass
@@ -64,16 +65,16 @@ def tracking_laws(model: PlanModel, weights: Weights) -> tuple[Array, Array]:
     n, m, steps = model.n, model.m, model.plan.steps
     own = n + model.lagging  # what the controls can do something about
     F, G, c = model.F[:, :own, :own], model.G[:, :own], model.c[:, :own]
-    E, transition = model.F[:, :own, own:], model.transition
+    E = model.F[:, :own, own:]
     Q, R = np.zeros((own, own)), np.diag(weights.control)
     Q[range(n), range(n)] = weights.state
     undo = R @ _undoing(model, weights)
     gain, offset = np.empty((steps, m, model.size)), np.empty((steps, m))
     # The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a); what d alone costs changes no law.
-    S, D, s = np.zeros((own, own)), np.zeros((own, len(transition))), np.zeros(own)
+    S, D, s = np.zeros((own, own)), np.zeros((own, E.shape[2])), np.zeros(own)
     S[range(n), range(n)] = weights.end
     for t in range(steps - 1, -1, -1):
-        SF, ahead = S @ F[t], S @ E[t] + D @ transition
+        SF, ahead = S @ F[t], S @ E[t] + D
         slope = S @ c[t] + s
         to_control = G[t].T
         right = np.concatenate([to_control @ SF, to_control @ ahead + undo[t], (to_control @ slope)[:, None]], axis=1)

@@ -28,7 +28,7 @@ from lqrsim.results.coordinates import Coordinates
 # A number for all, one for each, or by name or by unit: {"m": 0.05, "m/s": 0.2}, {"x": 0.05}.
 PerEntry = float | Sequence[float] | Mapping[str, float]
 
-MEAN = 0.2  # standard deviation of the mean of what varies, for a filter, relative to its own
+MEAN = 0.5  # standard deviation of the mean of what varies, for a filter, relative to its own
 GAIN, OFFSET = "gain of ", "offset of "  # before the name of a control
 
 

@@ -1,0 +1,1 @@
+"""What `robust_policies.py` is made of: a module a question."""

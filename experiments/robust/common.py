@@ -1,0 +1,88 @@
+"""Plans, laws and trials that all questions share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from paper.common import Settings, fixed
+from tqdm import tqdm
+
+import lqrsim as ls
+from lqrsim.control.controllers import Controller
+from lqrsim.stress.statistics import rate
+
+Reached = npt.NDArray[np.bool_]
+PRESETS = ("light", "moderate", "severe")
+# The chance of collision that a safe plan is asked for; under severe turbulence few plans have less.
+ASKED = {"light": 1e-3, "moderate": 1e-2, "severe": 0.2}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(Settings):
+    trials: int = 100
+    """Of each query, preset and policy."""
+    queries: int = 20
+    """Of the quadrotor: a start and a goal each."""
+    alone: int = 100
+    """Trials of each strength of one disturbance alone."""
+    plans: int = 10
+    """Whose predicted chance of collision is held against splitting."""
+    particles: int = 500
+    """Of splitting."""
+    worlds: int = 100
+    """Random ones, each with a safe plan."""
+    world_trials: int = 2000
+    """In each of them."""
+    seed: int = 0
+    """Of the disturbances, as in stress_test.py."""
+
+
+def few(config: Config) -> Config:
+    """What `--quick` comes to."""
+    return replace(
+        config, trials=min(config.trials, 10), queries=min(config.queries, 1), alone=min(config.alone, 6),
+        plans=min(config.plans, 1), particles=min(config.particles, 20), worlds=min(config.worlds, 1),
+        world_trials=min(config.world_trials, 50),
+    )  # fmt: skip
+
+
+def reach_exactly(problem: ls.Problem) -> ls.Problem:
+    """From exactly the wished start to exactly the wished place."""
+    goal = problem.goal
+    assert goal is not None
+    space = problem.dynamics.state_coordinates
+    place = ls.GoalState(goal[list(space.position)], states=[space.names[i] for i in space.position])
+    return replace(fixed(problem), constraints=[*problem.constraints, place])
+
+
+def reached(
+    plant: ls.Plant, solution: ls.Solution, controller: Controller | None, disturbances: Sequence[ls.Disturbance],
+    *, trials: int, seed: int, first: int = 0,
+) -> Reached:  # fmt: skip
+    """Which trials reach the goal."""
+    rollout = run(plant, solution, controller, disturbances, trials=trials, seed=seed, first=first)
+    return np.array(ls.outcomes(rollout).outcome) == "reached"
+
+
+def run(
+    plant: ls.Plant, solution: ls.Solution, controller: Controller | None, disturbances: Sequence[ls.Disturbance],
+    *, trials: int, seed: int, first: int = 0,
+) -> ls.Rollout:  # fmt: skip
+    """The trials."""
+    return ls.simulate(
+        plant, solution, controller=controller, disturbances=disturbances, trials=trials, seed=seed, first_trial=first,
+        frames=False, contacts=False,
+    )  # fmt: skip
+
+
+def share(successes: Reached) -> list[float]:
+    """The share with its exact interval, in percent."""
+    one = rate(int(successes.sum()), len(successes))
+    return [100 * one.value, 100 * one.low, 100 * one.high]
+
+
+def progress(sequence: Sequence[Any], name: str) -> Any:
+    """The same, with a bar if it takes long."""
+    return tqdm(sequence, desc=name, leave=False, delay=2.0, disable=None)

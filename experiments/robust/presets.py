@@ -1,0 +1,119 @@
+"""How often the quadrotor reaches its goal under all disturbances at once: policies and plans, and RotorPy's law."""
+
+from typing import Any
+
+import numpy as np
+from paper.common import between, table
+from peers import RotorPy, Unavailable
+from peers.rotorpy import BEST_AT_LIGHT, BEST_AT_MODERATE
+
+import lqrsim as ls
+from lqrsim.control.controllers import Controller
+from lqrsim.stress.statistics import compare
+from robust.common import ASKED, PRESETS, Config, Reached, progress, reach_exactly, reached, share
+
+OWN, PLAN, SAFE = "smoother's policy", "default plan", "safe plan"
+ROTORPY = "RotorPy's SE(3), safe plan"
+BEST = f"offset free, {SAFE}"
+
+
+def measure(config: Config) -> dict[str, Any]:
+    found: dict[str, dict[str, list[Reached]]] = {preset: {} for preset in PRESETS}
+    costs: dict[str, list[list[float]]] = {preset: [] for preset in PRESETS}
+    missing = ""
+    for query in progress(range(config.queries), "quadrotor, presets"):
+        scenario = ls.scenarios.quadrotor(query)
+        plant, plan = scenario.plant(), ls.smooth(scenario.problem)
+        for preset in PRESETS:
+            disturbances = ls.preset(preset, plant)
+            stated = ls.uncertainty_of(plant, disturbances)
+            safe = ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=ASKED[preset])
+            costs[preset].append([plan.cost, safe.solution.cost, safe.tube.collision_chance])
+            flown = laws(scenario, plan, safe, stated, preset)
+            try:
+                gains = BEST_AT_LIGHT if preset == "light" else BEST_AT_MODERATE
+                quadrotor = ls.Quadrotor()
+                peer = RotorPy(quadrotor, safe.solution, gains, feed_drag=preset != "light")
+                flown[ROTORPY] = safe.solution, peer
+            except Unavailable as error:
+                missing = str(error)
+            for name, (solution, law) in flown.items():
+                ended = reached(
+                    plant, solution, law, disturbances, trials=config.trials, seed=config.seed,
+                    first=query * config.trials,
+                )  # fmt: skip
+                found[preset].setdefault(name, []).append(ended)
+    return {
+        "presets": {preset: of_preset(rows, costs[preset]) for preset, rows in found.items()},
+        "trials": config.trials, "queries": config.queries, "missing": missing,
+    }  # fmt: skip
+
+
+def laws(
+    scenario: ls.Scenario, plan: ls.Solution, safe: ls.SafePlan, stated: ls.Uncertainty, preset: str
+) -> dict[str, tuple[ls.Solution, Controller | None]]:
+    """Name -> plan and what flies it."""
+    problem = scenario.problem
+    flown: dict[str, tuple[ls.Solution, Controller | None]] = {
+        OWN: (plan, None),
+        f"track, {PLAN}": (plan, ls.Feedback(ls.track(problem, plan, uncertainty=stated))),
+        f"offset free, {PLAN}": (plan, ls.OffsetFree(problem, plan, stated)),
+        f"track, {SAFE}": (safe.solution, ls.Feedback(ls.track(safe.problem, safe.solution, uncertainty=stated))),
+        BEST: (safe.solution, safe.controller),
+    }
+    if preset == "light":
+        blind = ls.OffsetFree(safe.problem, safe.solution, stated, sensors=("x", "y", "z"))
+        flown[f"positions only, {SAFE}"] = safe.solution, blind
+    return flown
+
+
+def of_preset(rows: dict[str, list[Reached]], costs: list[list[float]]) -> dict[str, Any]:
+    together = {name: np.concatenate(parts) for name, parts in rows.items()}
+    result: dict[str, Any] = {
+        "reached": {name: share(ended) for name, ended in together.items()},
+        "worst": {name: min(100 * float(part.mean()) for part in parts) for name, parts in rows.items()},
+        "costs": costs,
+    }
+    if ROTORPY in together:
+        pairs = compare(together[BEST], together[ROTORPY])
+        result["against"] = {
+            "only_ours": pairs.only_first, "only_theirs": pairs.only_second, "p_value": pairs.p_value,
+        }  # fmt: skip
+    return result
+
+
+def report(found: dict[str, Any]) -> list[str]:
+    names = list(dict.fromkeys(name for one in found["presets"].values() for name in one["reached"]))
+    rows = []
+    for name in names:
+        cells = []
+        for one in found["presets"].values():
+            told = one["reached"].get(name)
+            cells += ["-", "-"] if told is None else [between(told, ".1f"), f"{one['worst'][name]:.0f}"]
+        rows.append([name, *cells])
+    head = ["reached (%)", *(cell for preset in found["presets"] for cell in (preset, "worst query"))]
+    lines = [
+        f"{found['queries']} queries of the quadrotor, {found['trials']} trials each, the same for all policies. A safe"
+        " plan begins and ends where it should, exactly, and is asked for a chance of collision of "
+        + ", ".join(f"{chance:g} ({preset})" for preset, chance in ASKED.items())
+        + ". Laws are made for the preset that they meet. In brackets exact intervals of 95 %.",
+        table(head, rows),
+    ]
+    told = []
+    for preset, one in found["presets"].items():
+        costs = np.array(one["costs"])
+        more = 100 * np.median(costs[:, 1] / costs[:, 0] - 1)
+        told.append(f"{preset}: {more:+.0f} %")
+    lines.append(f"A safe plan's cost against that of the default plan, in the median: {', '.join(told)}.")
+    against = [
+        f"{preset}: only ours {one['against']['only_ours']}, only theirs {one['against']['only_theirs']}"
+        f" (p = {one['against']['p_value']:.1g})"
+        for preset, one in found["presets"].items()
+        if "against" in one
+    ]
+    peers = f"not flown: {found['missing']}" if not against else "; ".join(against)
+    lines.append(
+        "RotorPy's law has the gains that a search found best, at light for light, at moderate for the others"
+        f" (`experiments/rotorpy_gains.py`). Trials that only one reaches, McNemar's exact test: {peers}."
+    )
+    return lines
