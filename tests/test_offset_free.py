@@ -59,7 +59,7 @@ def test_what_is_late_is_taken_in_where_it_belongs(latency: int, delay: int) -> 
     true = np.concatenate([states, np.zeros((steps + 1, 2, 1))], axis=2)
     for step in range(latency, steps - delay):
         t = step + delay
-        wanted = true[t] @ law.gain[t].T + law.offset[t]
+        wanted: Array = true[t] @ law.gain[t].T + law.offset[t]
         np.testing.assert_allclose(commands[step], wanted, rtol=0, atol=1e-9 * (1 + np.abs(wanted).max()))
     # A law that is told nothing of it does something else.
     unaware = replace(uncertainty, latency=0, delay=0)
@@ -79,7 +79,7 @@ def test_lost_measurements_are_predicted() -> None:
     states, _ = run(system, law, [dropouts], off=0.3 * np.random.default_rng(0).normal(size=(20, 2)))
     assert law.estimates is not None
     assert law.innovations is not None
-    lost = np.isnan(law.innovations[:-1]).any(axis=2)
+    lost = np.any(np.isnan(law.innovations[:-1]), axis=2)
     assert 0.3 < lost.mean() < 0.7
     came_first = ~lost[0]
     assert 0 < came_first.sum() < 20
@@ -116,7 +116,7 @@ def test_nothing_winds_up_at_the_limits() -> None:
 @pytest.fixture(scope="module")
 def standing(quadrotor: ls.Scenario) -> ls.Solution:
     """Twenty seconds of hovering in the middle of the cage."""
-    return track(quadrotor.robot, np.zeros(12), np.full((600, 4), quadrotor.robot.hover_force), 1 / 30)
+    return track(quadrotor.robot, np.zeros(12), np.full((600, 4), ls.Quadrotor().hover_force), 1 / 30)
 
 
 @pytest.mark.parametrize(
