@@ -73,7 +73,7 @@ def test_lost_measurements_are_predicted() -> None:
     """Half of them get lost, in bursts: without noise the estimate stays that of the true state, to 1e-9."""
     steps = 40
     system = double_integrator(start=[1.0, 0.0], controls=np.cos(np.arange(steps) / 4)[:, None])
-    uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.3, loss=0.5)
+    uncertainty = ls.Uncertainty(start=0.3, loss=0.5)
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
     dropouts = ls.MeasurementDropouts(GilbertElliott(0.3, 0.3)).start(plant_of(), system.plan, generators(20))
     states, _ = run(system, law, [dropouts], off=0.3 * np.random.default_rng(0).normal(size=(20, 2)))
@@ -88,7 +88,8 @@ def test_lost_measurements_are_predicted() -> None:
     # Until the first measurement comes, the plan's first state is shown: it is not taken for one.
     first = np.argmin(lost, axis=0)
     for k in np.flatnonzero(~came_first):
-        np.testing.assert_allclose(law.estimates[: first[k], k, -1], 0.0, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(law.estimates[0, k], system.plan.states[0], rtol=0, atol=1e-12)
+        assert np.isnan(law.innovations[: first[k], k]).all()
 
 
 def test_nothing_winds_up_at_the_limits() -> None:

@@ -94,7 +94,7 @@ def test_the_chance_of_collision_beside_a_plane_is_that_of_monte_carlo() -> None
     """
     steps, keep, paths = 60, 0.9, 200_000
     wall = ls.World([ls.Obstacle("wall", "plane", np.array([0.0, -0.2, 0.0]), _facing_y(), np.zeros(3))])
-    surroundings = Surroundings(((wall.seen_by("xy", None), 0.0),), (0, 1), 0.0)
+    surroundings = _among(wall, radius=0.0, std=0.0)
     std = 0.1
     covariance = np.tile(np.diag([0.05, std]) ** 2, (steps + 1, 1, 1))
     each, total = collision_chance(np.zeros((steps + 1, 2)), covariance, keep * covariance[1:], surroundings)
@@ -110,6 +110,15 @@ def test_the_chance_of_collision_beside_a_plane_is_that_of_monte_carlo() -> None
     assert hit.mean() < total < 1.35 * hit.mean()
 
 
+def _among(world: ls.World, *, radius: float, std: float) -> Surroundings:
+    """What a robot in the plane of that radius sees."""
+    system = linear(
+        np.zeros((2, 2)), np.eye(2), np.eye(2), steps=2, position=("s0", "s1"),
+        costs=(ls.ObstacleCost(world, radius=radius, sharpness=10.0),),
+    )  # fmt: skip
+    return Surroundings.of(system.problem, std)
+
+
 def _facing_y() -> Array:
     """The rotation of a plane whose normal, its z axis, is along y."""
     return np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
@@ -121,7 +130,7 @@ def test_two_obstacles_and_one_that_is_displaced() -> None:
         ls.Obstacle(f"ball {i}", "sphere", np.array([x, 0.0, 0.0]), np.eye(3), np.array([0.5, 0, 0]))
         for i, x in enumerate((-1.0, 1.2))
     ]
-    surroundings = Surroundings(((ls.World(balls).seen_by("xy", None), 0.2),), (0, 1), 0.04)
+    surroundings = _among(ls.World(balls), radius=0.2, std=0.04)
     covariance = np.tile(np.diag([0.03, 0.3]) ** 2, (1, 1, 1))
     each, total = collision_chance(np.zeros((1, 2)), covariance, np.zeros((0, 2, 2)), surroundings)
     expected = norm.cdf(-0.3 / 0.05) + norm.cdf(-0.5 / 0.05)
