@@ -267,7 +267,8 @@ def test_effects_are_those_of_finite_differences(quadrotor: ls.Scenario) -> None
     """Of the quadrotor's wind, force, torque, mass, gains and offsets on the next state: 1e-6."""
     rng = np.random.default_rng(0)
     dynamics, dt = quadrotor.robot.dynamics, quadrotor.problem.dt
-    controls, states = rng.uniform(0.8, 1.6, size=(3, 4)), [0.2 * rng.normal(size=12)]
+    controls = rng.uniform(0.8, 1.6, size=(3, 4))
+    states: list[Any] = [0.2 * rng.normal(size=12)]
     for control in controls:
         states.append(dynamics.step(states[-1], control, dt))
     plan = ls.Trajectory(np.array(states), controls, dt)
