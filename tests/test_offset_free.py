@@ -148,6 +148,20 @@ def test_steady_disturbances_leave_no_error(
     assert error[300:].max() < 0.01
 
 
+def test_after_the_horizon_the_last_laws_stay_in_force() -> None:
+    """For as long again as the plan is: a start that is off is forgotten, and a push is held."""
+    system = double_integrator(controls=np.zeros((30, 1)))
+    uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.3, measurement=0.01, latency=1)
+    law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
+    control, x = law.start(2), np.array([[0.3, -0.2], [-0.1, 0.4]])
+    late = x
+    for t in range(90):
+        shown, late = late, x
+        x = x @ system.A.T + control(t, shown) @ system.B.T + 0.3 * system.E[:, 0]
+    assert np.abs(x).max() < 0.01
+    assert law.lost() == {}
+
+
 # Filters that diverge.
 
 
