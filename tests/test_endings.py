@@ -1,5 +1,6 @@
 """How a trial ends: one answer everywhere, judged by the goal, for robots with a position and without one."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -455,6 +456,40 @@ def test_at_strength_0_there_is_one_run_and_no_interval(rough: Results) -> None:
     assert "[" not in calm
     assert "[" in windy
     assert "smooth: the plan ends 0.0654 m from the goal" in rough.summary()
+
+
+# Filters that diverge.
+
+
+def test_a_campaign_says_whose_filter_diverged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the table, the summary and a replay, as of errors; whatever the batch."""
+    scenario = ls.scenarios.quadrotor()
+    tolerate = {"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}
+    # Estimates of drag that are negative make its predictions explode.
+    wrong = ls.Uncertainty(unknowns=[ls.Unknown("drag", 60.0)], measurement=0.02, start=0.01)
+
+    def controller(own: trials.Trials, policy: str) -> Controller:
+        return ls.OffsetFree(scenario.problem, own.solutions[policy], wrong, tolerate=tolerate)
+
+    monkeypatch.setattr(trials.Trials, "_controller", controller)
+    noise = (ls.MeasurementNoise(0.02), ls.ForceNoise(1.0))
+    campaign = replace(ROUGH, sweeps={"noise": noise}, strengths=(1.0,), trials=12)
+    files = []
+    for batch in (12, 5):
+        results = run_campaign(campaign, tmp_path / str(batch), workers=0, batch=batch)
+        files.append([path.read_bytes() for path in sorted((tmp_path / str(batch) / "shards").iterdir())])
+    assert files[0] == files[1]
+    cell = results.cells[0]
+    diverged = np.flatnonzero(results.outcomes(cell).outcome == "diverged")
+    assert 0 < len(diverged) < 12
+    reasons = results.reasons(cell)
+    assert sorted(reasons) == diverged.tolist()
+    assert all(re.fullmatch(r"filter at .* s: the estimate of \w+ is .*", reason) for reason in reasons.values())
+    assert " trials came to nothing: filter at " in results.summary()
+    trial = int(diverged[0])
+    again = replay(results, cell, trial)
+    assert again.reasons == (reasons[trial],)
+    assert differences(results, cell, trial, again) == []
 
 
 # Controllers that fail.

@@ -91,6 +91,7 @@ class Truth:
 
     def __init__(self, law: ls.OffsetFree, system: Linear, trials: int, rng: np.random.Generator) -> None:
         self.system, self.rng, self.uncertainty = system, rng, law.model.uncertainty
+        self.inexact = np.asarray(self.uncertainty.control)
         self.x = system.plan.states[0] + NOISE["start"] * rng.normal(size=(trials, 2))
         self.reached = np.tile(system.plan.controls[0], (trials, 1))
         self.unknowns: list[Array] = []
@@ -106,7 +107,7 @@ class Truth:
         return np.concatenate([self.x, *([self.reached] if lags else []), *self.unknowns], axis=1)
 
     def step(self, commands: Array) -> None:
-        rng, commands = self.rng, commands + NOISE["control"] * self.rng.normal(size=commands.shape)
+        rng, commands = self.rng, commands + self.inexact * self.rng.normal(size=commands.shape)
         push, offset = np.zeros((len(commands), 1)), np.zeros((len(commands), 1))
         for i, one in enumerate(self.uncertainty.unknowns):
             state, step = self.unknowns[i], DT / one.time_constant if one.time_constant else np.inf

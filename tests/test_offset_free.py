@@ -59,7 +59,7 @@ def test_what_is_late_is_taken_in_where_it_belongs(latency: int, delay: int) -> 
     true = np.concatenate([states, np.zeros((steps + 1, 2, 1))], axis=2)
     for step in range(latency, steps - delay):
         t = step + delay
-        wanted = true[t] @ law.gain[t].T + law.offset[t]
+        wanted: Array = true[t] @ law.gain[t].T + law.offset[t]
         np.testing.assert_allclose(commands[step], wanted, rtol=0, atol=1e-9 * (1 + np.abs(wanted).max()))
     # A law that is told nothing of it does something else.
     unaware = replace(uncertainty, latency=0, delay=0)
@@ -73,13 +73,13 @@ def test_lost_measurements_are_predicted() -> None:
     """Half of them get lost, in bursts: without noise the estimate stays that of the true state, to 1e-9."""
     steps = 40
     system = double_integrator(start=[1.0, 0.0], controls=np.cos(np.arange(steps) / 4)[:, None])
-    uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.3, loss=0.5)
+    uncertainty = ls.Uncertainty(start=0.3, loss=0.5)
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
     dropouts = ls.MeasurementDropouts(GilbertElliott(0.3, 0.3)).start(plant_of(), system.plan, generators(20))
     states, _ = run(system, law, [dropouts], off=0.3 * np.random.default_rng(0).normal(size=(20, 2)))
     assert law.estimates is not None
     assert law.innovations is not None
-    lost = np.isnan(law.innovations[:-1]).any(axis=2)
+    lost = np.any(np.isnan(law.innovations[:-1]), axis=2)
     assert 0.3 < lost.mean() < 0.7
     came_first = ~lost[0]
     assert 0 < came_first.sum() < 20
@@ -88,7 +88,8 @@ def test_lost_measurements_are_predicted() -> None:
     # Until the first measurement comes, the plan's first state is shown: it is not taken for one.
     first = np.argmin(lost, axis=0)
     for k in np.flatnonzero(~came_first):
-        np.testing.assert_allclose(law.estimates[: first[k], k, -1], 0.0, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(law.estimates[0, k], system.plan.states[0], rtol=0, atol=1e-12)
+        assert np.isnan(law.innovations[: first[k], k]).all()
 
 
 def test_nothing_winds_up_at_the_limits() -> None:
@@ -116,7 +117,7 @@ def test_nothing_winds_up_at_the_limits() -> None:
 @pytest.fixture(scope="module")
 def standing(quadrotor: ls.Scenario) -> ls.Solution:
     """Twenty seconds of hovering in the middle of the cage."""
-    return track(quadrotor.robot, np.zeros(12), np.full((600, 4), quadrotor.robot.hover_force), 1 / 30)
+    return track(quadrotor.robot, np.zeros(12), np.full((600, 4), ls.Quadrotor().hover_force), 1 / 30)
 
 
 @pytest.mark.parametrize(
@@ -145,6 +146,20 @@ def test_steady_disturbances_leave_no_error(
     error = rollout.tracking_error[0]
     assert error.max() > 0.005  # it is a disturbance
     assert error[300:].max() < 0.01
+
+
+def test_after_the_horizon_the_last_laws_stay_in_force() -> None:
+    """For as long again as the plan is: a start that is off is forgotten, and a push is held."""
+    system = double_integrator(controls=np.zeros((30, 1)))
+    uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.3, measurement=0.01, latency=1)
+    law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
+    control, x = law.start(2), np.array([[0.3, -0.2], [-0.1, 0.4]])
+    late = x
+    for t in range(90):
+        shown, late = late, x
+        x = x @ system.A.T + control(t, shown) @ system.B.T + 0.3 * system.E[:, 0]
+    assert np.abs(x).max() < 0.01
+    assert law.lost() == {}
 
 
 # Filters that diverge.

@@ -144,7 +144,7 @@ def test_on_the_quadrotor_they_are_close(quadrotor: ls.Scenario, quadrotor_solut
     assert rollout.outcome == ("reached",)
     apart = np.abs(commands - rollout.commanded[0])
 
-    assert apart.mean() < 0.02 * quadrotor.robot.max_force
+    assert apart.mean() < 0.02 * ls.Quadrotor().max_force
 
 
 # Files.

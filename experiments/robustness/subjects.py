@@ -15,6 +15,7 @@ from typing import Any
 
 import lqrsim as ls
 from lqrsim.stress.trial_tables import Damaged
+from robustness.of_policies import policies
 from robustness.of_problems import problems, results, solving
 from robustness.of_runs import campaigns, pictures, running
 from robustness.place import Place
@@ -78,7 +79,7 @@ def subjects(folder: Path) -> dict[str, Subject]:
     logging.getLogger("lqrsim").setLevel(logging.ERROR)
     place = Place(folder)
     found: dict[str, Subject] = {}
-    for make in (problems, solving, results, running, campaigns, pictures):
+    for make in (problems, solving, results, policies, running, campaigns, pictures):
         for name, (arguments, *weight) in make(place).items():
             owner, _, method = name.partition(".")
             if "call" in arguments:

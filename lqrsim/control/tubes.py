@@ -16,7 +16,7 @@ from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.tracking_laws import check_plan
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import Array, InputError, check_kind
+from lqrsim.errors import Array, InputError, check_kind, check_number, shaped
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.policy import AffinePolicy
@@ -38,6 +38,9 @@ class Tube:
       saturation: share of the commands that are beyond the limits, (T, m).
       step_chance: the chance of being in collision at each knot, (T+1,); bounded by the sum over obstacles.
       collision_chance: of colliding at all.
+
+    Raises:
+      InputError: arrays that do not fit together.
     """
 
     plan: Trajectory
@@ -50,6 +53,20 @@ class Tube:
     saturation: Array
     step_chance: Array
     collision_chance: float
+
+    def __post_init__(self) -> None:
+        plan = check_kind("Tube: plan", self.plan, Trajectory, "a Trajectory")
+        check_kind("Tube: state_coordinates", self.state_coordinates, Coordinates, "Coordinates")
+        n, m, knots = len(self.state_coordinates), plan.controls.shape[-1], len(plan.states)
+        shapes: dict[str, tuple[int, ...]] = {
+            "mean": (knots, n), "covariance": (knots, n, n), "estimate_covariance": (knots, n, n),
+            "command": (knots - 1, m), "saturation": (knots - 1, m), "step_chance": (knots,),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            if name != "estimate_covariance" or self.estimate_covariance is not None:
+                object.__setattr__(self, name, shaped(f"Tube: {name}", getattr(self, name), shape))
+        chance = check_number("Tube: collision_chance", self.collision_chance, at_least=0.0, at_most=1.0)
+        object.__setattr__(self, "collision_chance", chance)
 
     @cached_property
     def position_covariance(self) -> Array:

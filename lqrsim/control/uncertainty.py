@@ -66,9 +66,7 @@ class Unknown:
             check_number(f"Unknown: of: {name}", share)
         object.__setattr__(self, "std", check_number("Unknown: std", self.std, at_least=0.0))
         object.__setattr__(self, "drift", check_number("Unknown: drift", self.drift, at_least=0.0))
-        if self.time_constant != np.inf:
-            constant = check_number("Unknown: time_constant", self.time_constant, at_least=0.0)
-            object.__setattr__(self, "time_constant", constant)
+        object.__setattr__(self, "time_constant", _seconds("Unknown: time_constant", self.time_constant, at_least=0.0))
         check_count("Unknown: order", self.order, at_most=2)
         if self.order == 2 and not 0 < self.time_constant < np.inf:
             raise InputError(f"Unknown: order: got 2 with a time constant of {self.time_constant:g} s, want 1")
@@ -159,7 +157,12 @@ class Uncertainty:
         Args:
           memory: seconds in which a constant may wander by its standard deviation.
           share: of what varies, the standard deviation of its mean, relative to its own.
+
+        Raises:
+          InputError: a number is out of range.
         """
+        memory = _seconds("memory", memory, above=0.0)
+        share = check_number("share", share, at_least=0.0)
         constants: dict[tuple[tuple[str, float], ...], list[Unknown]] = {}
         for one in self.unknowns:
             constants.setdefault(tuple(sorted(one.shares.items())), []).append(one)
@@ -181,6 +184,11 @@ def possible_unknowns(dynamics: Dynamics) -> list[str]:
     controls = dynamics.control_coordinates.names
     own = dynamics.disturbed.parameters
     return [*own, *(GAIN + name for name in controls), *(OFFSET + name for name in controls)]
+
+
+def _seconds(field: str, value: float, **bounds: float) -> float:
+    """A time that may be infinite."""
+    return value if isinstance(value, float) and value == np.inf else check_number(field, value, **bounds)
 
 
 def per_entry(field: str, numbers: PerEntry, space: Coordinates, *, above: float | None = None) -> Array:

@@ -1,0 +1,35 @@
+"""What laws, filters and tubes are given: see `subjects.py`."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+import lqrsim as ls
+from robustness.place import Place
+
+
+def policies(place: Place) -> dict[str, tuple[Any, ...]]:
+    unknown = ls.Unknown("gain of left", 0.05)
+    uncertainty = ls.Uncertainty(unknowns=[unknown], start=0.01, measurement=0.01, control=0.01)
+    common = {"problem": place.problem, "solution": place.solution, "uncertainty": uncertainty}
+    chosen = {"tolerate": {"m": 0.05, "rad": 0.1}, "effort": 0.1, "at_end": 0.2}
+    law = ls.OffsetFree(**common, **chosen)
+    policy, tube = law.policy, ls.predict_tube(**common, controller=law)
+    saved = ls.save(policy, place.folder / "policy.npz")
+
+    def fields(one: Any) -> dict[str, Any]:
+        return {field.name: getattr(one, field.name) for field in dataclasses.fields(one) if field.init}
+
+    return {
+        "Unknown": (fields(unknown),),
+        "Uncertainty": (fields(uncertainty),),
+        "Uncertainty.steady": ({"self": uncertainty, "memory": 5.0, "share": 0.2},),
+        "track": (common | chosen, 0.5),
+        "OffsetFree": (common | chosen | {"sensors": ("x", "y"), "memory": 5.0, "record": False}, 0.5),
+        "predict_tube": (common | {"controller": law}, 0.5),
+        "Tube": (fields(tube),),
+        "OutputFeedbackPolicy": (fields(policy),),
+        "OutputFeedbackPolicy.step": ({"self": policy, "z": policy.start(), "measurement": np.zeros(3), "t": 0.3},),
+        "load_policy": ({"path": saved},),
+    }
