@@ -46,8 +46,11 @@ def drawn(structure: int, seed: int, *, unstable: bool, steps: int = 8) -> tuple
 class Oracle:
     """The run that follows from commands (T, m), stated as absolute numbers, and its cost as a sum of squares."""
 
-    def __init__(self, system: Linear, uncertainty: ls.Uncertainty, weights: Weights) -> None:
+    def __init__(
+        self, system: Linear, uncertainty: ls.Uncertainty, weights: Weights, *, persistent: bool = False
+    ) -> None:
         self.system, self.weights = system, weights
+        self.persistent = persistent  # whether what disturbs the robot goes on as it is
         m = system.B.shape[1]
         self.lag = uncertainty.lag
         step = DT / self.lag if self.lag else np.inf
@@ -102,7 +105,7 @@ class Oracle:
                 reached = command + self.left * (reached - command)
             x = system.A @ x + system.B @ applied + self.push(d, t)
             place = 0
-            for move, _, _ in self.unknowns:
+            for move, _, _ in () if self.persistent else self.unknowns:
                 d[place : place + len(move)] = move @ d[place : place + len(move)]
                 place += len(move)
         return np.concatenate([*found, np.sqrt(weights.end) * (x - plan.states[-1])])
@@ -125,7 +128,7 @@ def test_laws_are_dense_least_squares_of_the_same_cost(structure: int, seed: int
     model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
     weights = Weights(rng.uniform(0.5, 4, n), rng.uniform(0.5, 4, m), rng.uniform(1, 20, n))
     gain, offset = tracking_laws(model, weights)
-    oracle = Oracle(system, uncertainty, weights)
+    oracle = Oracle(system, uncertainty, weights, persistent=True)
     e, a, d = rng.normal(size=n), rng.normal(size=m), rng.normal(size=oracle.states_of_unknowns)
     commands = oracle.best(e, a, d)
     # The law in closed loop, on the oracle's run: knot by knot, the rest of the commands changes nothing of the past.
@@ -134,6 +137,7 @@ def test_laws_are_dense_least_squares_of_the_same_cost(structure: int, seed: int
         u = gain[t] @ z + offset[t]
         np.testing.assert_allclose(system.plan.controls[t] + u, commands[t], rtol=0, atol=1e-6 * (1 + np.abs(u).max()))
         z = model.F[t] @ z + model.G[t] @ u + model.c[t]
+        z[n + model.lagging :] = d
 
 
 @hypothesis.given(st.integers(0, len(STRUCTURES) - 1), st.integers(0, 10**6), st.booleans())

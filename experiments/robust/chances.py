@@ -20,7 +20,7 @@ def measure(config: Config) -> dict[str, Any]:
         score = ls.TrialScore(plant, safe.solution, disturbances, controller=safe.controller)
         row: dict[str, Any] = {"query": query, "asked": asked, "predicted": safe.tube.collision_chance}
         try:
-            found = ls.split(score, score.size, particles=config.particles, repetitions=8, moves=3, seed=config.seed)
+            found = ls.split(score, score.size, particles=config.particles, repetitions=6, moves=3, seed=config.seed)
             row |= {"measured": interval(found.probability), "simulations": found.simulations}
         except ls.NoFailure:
             row |= {"measured": None, "simulations": score.simulations}

@@ -29,11 +29,11 @@ class Config(Settings):
     """Trials of each strength of one disturbance alone."""
     plans: int = 10
     """Whose predicted chance of collision is held against splitting."""
-    particles: int = 500
+    particles: int = 300
     """Of splitting."""
     worlds: int = 100
     """Random ones, each with a safe plan."""
-    world_trials: int = 2000
+    world_trials: int = 1000
     """In each of them."""
     seed: int = 0
     """Of the disturbances, as in stress_test.py."""

@@ -21,6 +21,7 @@ def measure(config: Config) -> dict[str, Any]:
         plant, plan = scenario.plant(), ls.smooth(scenario.problem)
         stated = ls.uncertainty_of(plant, ls.preset("moderate", plant))
         safe = ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=ASKED["moderate"])
+        flown = ("smoother", plan, None), ("offset free", safe.solution, safe.controller)
         winds = rng.normal(size=(DIRECTIONS, 3))
         cases = {f"wind of {SPEED:g} m/s": [[ls.MeanWind(SPEED * one / np.linalg.norm(one))] for one in winds]}
         cases |= {f"mass times {factor:g}": [[ls.MassMismatch(factor=factor)]] for factor in MASSES}

@@ -1,4 +1,4 @@
-"""Safe plans in random worlds: whether those that are asked for a chance of collision of 1e-3 keep it, and their cost."""
+"""Safe plans in random worlds: whether those asked for a chance of collision of 1e-3 keep it, and what they cost."""
 
 import tempfile
 from pathlib import Path
