@@ -67,10 +67,8 @@ def laws(
     }
     if preset == "light":
         for name, sensors in POSES.items():
-            flown[f"{name}, {SAFE}"] = (
-                safe.solution,
-                ls.OffsetFree(safe.problem, safe.solution, stated, sensors=sensors),
-            )
+            law = ls.OffsetFree(safe.problem, safe.solution, stated, sensors=sensors)
+            flown[f"{name}, {SAFE}"] = safe.solution, law
     return flown
 
 

@@ -27,10 +27,7 @@ def measure(config: Config) -> dict[str, Any]:
         cases |= {f"mass times {factor:g}": [[ls.MassMismatch(factor=factor)]] for factor in MASSES}
         for name, several in cases.items():
             for disturbances in several:
-                for policy, solution, law in (
-                    ("smoother", plan, None),
-                    ("offset free", safe.solution, safe.controller),
-                ):
+                for policy, solution, law in flown:
                     ended = reached(plant, solution, law, disturbances, trials=1, seed=config.seed)
                     found.setdefault(f"{name}: {policy}", []).append(bool(ended[0]))
     return {"reached": {name: share(np.array(ended)) for name, ended in found.items()}, "hover": hover(config)}
