@@ -47,6 +47,7 @@ class Ipopt:
         compile: bool = False,
     ) -> None:
         margins = [one.margin for one in problem.constraints if isinstance(one, ls.Clearance)]
+        margins = [margin for margin in margins if isinstance(margin, float)]
         if len(problem.constraints) > 1 or len(margins) < len(problem.constraints):
             raise NotImplementedError(f"the constraints {problem.constraints}")
         clearance = margins[0] if margins else None

@@ -31,5 +31,26 @@ def policies(place: Place) -> dict[str, tuple[Any, ...]]:
         "Tube": (fields(tube),),
         "OutputFeedbackPolicy": (fields(policy),),
         "OutputFeedbackPolicy.step": ({"self": policy, "z": policy.start(), "measurement": np.zeros(3), "t": 0.3},),
+        "smooth_chance_constrained": (
+            {
+                "problem": place.problem,
+                "uncertainty": uncertainty,
+                "chance": 0.01,
+                "controller": lambda problem, solution: solution.policy,
+                "rounds": 1,
+            },
+            0.1,
+        ),
+        "SafePlan": (
+            {
+                "problem": place.problem,
+                "solution": place.solution,
+                "controller": law,
+                "tube": tube,
+                "asked": 0.01,
+                "rounds": ((0.0, 0.1, 30.0, 0.001),),
+            },
+        ),
+        "Tube.added_to": ({"self": tube, "rollout": place.rollout},),
         "load_policy": ({"path": saved},),
     }

@@ -60,6 +60,8 @@ def _one(problem: ls.Problem, constraint: ls.Constraint) -> Kept:
     if isinstance(constraint, ls.Clearance):
         space = dynamics.state_coordinates
         obstacles = constraint.world.seen_by(space.plane, space.offset).obstacles
+        if isinstance(constraint.margin, np.ndarray):
+            raise NotImplementedError("a clearance with a margin for each knot")
         function = partial(_spare, obstacles, list(space.position), constraint.radius + constraint.margin)
         return Kept(function, np.tile(changeable[:, None], (1, len(obstacles))), False)
     if isinstance(constraint, ls.GoalState):

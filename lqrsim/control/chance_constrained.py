@@ -16,7 +16,16 @@ from lqrsim.control.controllers import Controller, Feedback
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty
-from lqrsim.errors import Array, InputError, check_count, check_function, check_kind, check_number
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_function,
+    check_items,
+    check_kind,
+    check_number,
+)
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
@@ -45,6 +54,16 @@ class SafePlan:
     tube: Tube
     asked: float
     rounds: tuple[tuple[float, float, float, float], ...]
+
+    def __post_init__(self) -> None:
+        for name, kind in (
+            ("problem", Problem), ("solution", Solution), ("controller", Controller), ("tube", Tube)
+        ):  # fmt: skip
+            check_kind(f"SafePlan: {name}", getattr(self, name), kind, f"a {kind.__name__}")
+        object.__setattr__(self, "asked", check_number("SafePlan: asked", self.asked, above=0.0, below=1.0))
+        rounds = check_items("SafePlan: rounds", self.rounds, tuple, "a tuple of four numbers each")
+        each = tuple(tuple(check_array("SafePlan: rounds", one, (4,)).tolist()) for one in rounds)
+        object.__setattr__(self, "rounds", each)
 
     @property
     def success(self) -> bool:

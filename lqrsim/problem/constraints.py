@@ -81,6 +81,7 @@ class Constraint(abc.ABC):
 
     def ahead(self, steps: int) -> "Constraint":
         """What is left of it after so many steps: itself, unless it says something else of each."""
+        check_count("steps", steps, at_least=0)
         return self
 
 
@@ -114,6 +115,7 @@ class Clearance(Constraint):
                 raise InputError("Clearance: margin: got no numbers, want one, or one for each knot")
 
     def ahead(self, steps: int) -> "Clearance":
+        steps = check_count("steps", steps, at_least=0)
         if not isinstance(self.margin, np.ndarray):
             return self
         return Clearance(self.world, radius=self.radius, margin=self.margin[min(steps, len(self.margin) - 1) :])
