@@ -6,7 +6,8 @@
 Closed loop: the policy, the demo's noise, what is recorded and the table of outcomes, without contacts of obstacles, as
 a stress test runs them. Raw: `mujoco.batch` steps the same model through the same states, with the controls and forces
 of a closed loop before, all given ahead, in as many calls as there are control periods. In turns, in one process;
-medians.
+medians. The same with a Kalman filter in the loop, `OffsetFree`; and how long that and `track` take to be made, with
+tolerances that are given and with those that are chosen.
 """
 
 import json
@@ -29,6 +30,8 @@ from lqrsim.simulation.outcome_table import outcomes
 from lqrsim.versions import versions
 
 LEAST = 0.85  # of raw, one thread
+LEAST_WITH_FILTER = 0.8  # with `OffsetFree`
+SOON = {"track": 5.0, "OffsetFree": 20.0}  # ms to make, with given tolerances, 12 states and 150 steps
 TWICE = 1.7  # two threads against one
 MOST = 1.3  # 10,000 trials against raw, two threads
 MEMORY = 2.0  # GB
@@ -59,12 +62,17 @@ class Contest:
         self.plant = self.scenario.plant()
         self.solution = ls.smooth(self.scenario.problem)
         self.seed = seed
+        self.stated = ls.uncertainty_of(self.plant, self.scenario.disturbances)
+        self.law = ls.OffsetFree(self.scenario.problem, self.solution, self.stated)
 
-    def closed_loop(self, count: int, threads: int, first: int = 0) -> ls.Rollout:
+    def closed_loop(
+        self, count: int, threads: int, first: int = 0, controller: ls.Controller | None = None
+    ) -> ls.Rollout:
         """A batch of trials, as a stress test runs it."""
         rollout = ls.simulate(
             self.plant,
             self.solution,
+            controller=controller,
             disturbances=self.scenario.disturbances,
             seed=self.seed,
             trials=count,
@@ -107,6 +115,7 @@ def main(config: Config) -> dict[str, Any]:
         contest = Contest(name, config.seed)
         result["robots"][name] = {str(count): throughput(contest, count, threads, rounds) for count in counts}
     contest = Contest("quadrotor", config.seed)
+    result["making"] = making(contest, rounds)
     result["many"] = many(contest, trials, counts[0], threads[-1], rounds)
     return result
 
@@ -118,15 +127,37 @@ def throughput(contest: Contest, count: int, threads: tuple[int, ...], rounds: i
     for number in threads:
         contestants[f"raw, {number}"] = timed(contest.raw(rollout, number))
         contestants[f"closed loop, {number}"] = timed(lambda number=number: contest.closed_loop(count, number))
+    contest.closed_loop(count, 1, controller=contest.law)
+    contestants["with a filter, 1"] = timed(lambda: contest.closed_loop(count, 1, controller=contest.law))
     turns = take_turns(contestants, [None], rounds, f"{contest.scenario.name}, {count}")
     seconds = {who: taken[0] for who, taken in turns.items()}
     steps = rollout.plan.steps * contest.plant.substeps(rollout.plan.dt)
     share = [raw / loop for raw, loop in zip(seconds["raw, 1"], seconds["closed loop, 1"], strict=True)]
-    found: dict[str, Any] = {"seconds": seconds, "steps": steps, "share": median(share)}
+    filtered = [raw / loop for raw, loop in zip(seconds["raw, 1"], seconds["with a filter, 1"], strict=True)]
+    found: dict[str, Any] = {
+        "seconds": seconds, "steps": steps, "share": median(share), "share with a filter": median(filtered),
+    }  # fmt: skip
     if len(threads) > 1:
         pairs = zip(seconds["closed loop, 1"], seconds["closed loop, 2"], strict=True)
         found["two threads"] = median(one / two for one, two in pairs)
     return found
+
+
+def making(contest: Contest, rounds: int) -> dict[str, float]:
+    """Milliseconds, medians."""
+    problem, solution = contest.scenario.problem, contest.solution
+    stated = ls.uncertainty_of(contest.plant, ls.preset("light", contest.plant))
+    tolerate = {"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}
+    contestants = {
+        "track": timed(lambda: ls.track(problem, solution, tolerate=tolerate)),
+        "OffsetFree": timed(lambda: ls.OffsetFree(problem, solution, stated, tolerate=tolerate)),
+        "track, tolerances chosen": timed(lambda: ls.track(problem, solution, uncertainty=stated)),
+        "OffsetFree, tolerances chosen": timed(lambda: ls.OffsetFree(problem, solution, stated)),
+    }
+    for make in contestants.values():
+        make(None)  # compile
+    turns = take_turns(contestants, [None], 5 * rounds, "laws")
+    return {who: 1e3 * median(taken[0]) for who, taken in turns.items()}
 
 
 def timed(run: Callable[[], object]) -> Callable[[None], float]:
@@ -180,7 +211,10 @@ def report(result: dict[str, Any]) -> str:
             each = [1e6 * median(found["seconds"][f"{who}, 1"]) / steps for who in ("raw", "closed loop")]
             twice = f"{found['two threads']:>10.2f}" if "two threads" in found else f"{'-':>10}"
             rows.append(f"{name:<20} {count:>8} {each[0]:>12.2f} {each[1]:>12.2f} {found['share']:>7.3f} {twice}")
+            with_filter = found["share with a filter"]
+            rows.append(f"  with a Kalman filter in the loop {with_filter:.3f}")
             if int(count) >= FULL:
+                rows.append(f"  {judge(with_filter >= LEAST_WITH_FILTER, f'that share >= {LEAST_WITH_FILTER:g}')}")
                 rows.append(f"  {judge(found['share'] >= LEAST, f'a share >= {LEAST:g}')}")
                 if "two threads" in found:
                     rows.append(f"  {judge(found['two threads'] >= TWICE, f'two threads >= {TWICE:g}')}")
@@ -190,6 +224,11 @@ def report(result: dict[str, Any]) -> str:
         f"{found['trials']} trials of the quadrotor, {found['threads']} threads: {loop:.1f} s, raw {raw:.1f} s, ratio"
         f" {found['ratio']:.3f}  {judge(found['ratio'] <= MOST, f'<= {MOST:g}')}",
         f"memory at most {found['memory']:.2f} GB  {judge(found['memory'] < MEMORY, f'< {MEMORY:g}')}",
+    ]
+    rows += [
+        f"{name} takes {took:.1f} ms to make"
+        + (f"  {judge(took <= SOON[name], f'<= {SOON[name]:g}')}" if name in SOON else "")
+        for name, took in result["making"].items()
     ]
     return "\n".join(rows)
 

@@ -8,6 +8,7 @@ presets  How often the quadrotor reaches its goal under the presets: 20 queries,
 alone    How strong one disturbance alone must be for half of the trials to fail.
 steady   A steady wind, a wrong mass: whether it gets there, and what error stays when it hovers.
 drive    The differential drive under all disturbances at once.
+filter   Whether the filter knows how wrong it is.
 chances  The predicted chance of collision against what splitting measures.
 worlds   Whether safe plans in random worlds keep the chance that they were asked for, and what they cost.
 """
@@ -17,14 +18,15 @@ from types import ModuleType
 from typing import Any, Literal
 
 from paper.common import Result, Statement, opening, run
-from robust import alone, chances, common, drive, presets, steady, worlds
+from robust import alone, chances, common, consistency, drive, presets, steady, worlds
 
-Section = Literal["presets", "alone", "steady", "drive", "chances", "worlds"]
+Section = Literal["presets", "alone", "steady", "drive", "filter", "chances", "worlds"]
 SECTIONS: dict[Section, tuple[ModuleType, str]] = {
     "presets": (presets, "All disturbances of a preset"),
     "alone": (alone, "One disturbance alone"),
     "steady": (steady, "Steady disturbances"),
     "drive": (drive, "The differential drive"),
+    "filter": (consistency, "Consistency of the filter"),
     "chances": (chances, "Predicted chances of collision"),
     "worlds": (worlds, "Safe plans in random worlds"),
 }
