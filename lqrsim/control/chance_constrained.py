@@ -199,7 +199,7 @@ class _Search:
             if low is None or self.impossible - low < 0.05 * self.impossible:
                 return None
             return (low + self.impossible) / 2
-        wanted = float(-ndtri(self.asked)) if first else self._needed(plan)
+        wanted = max(float(-ndtri(self.asked)), 0.5) if first else self._needed(plan)
         if np.isfinite(self.enough) and not self.too_few < wanted < self.enough:
             wanted = (self.too_few + self.enough) / 2
         elif not np.isfinite(self.enough) and wanted <= self.too_few:
