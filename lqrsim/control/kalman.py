@@ -24,14 +24,19 @@ class KalmanFilter(NamedTuple):
     innovation: Array
 
 
-def kalman_filter(model: PlanModel) -> KalmanFilter:
-    """The filter of a plan's model."""
+def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
+    """The filter of a plan's model.
+
+    Args:
+      known: covariance (Z, Z) after the measurement of the first knot, if that is taken in already: the gain there
+        is zero. By default the model's start, before it.
+    """
     knots, size, measured, n = model.plan.steps + 1, model.size, model.sensor.size, model.n
     gain = np.empty((knots, size, measured))
     predicted, corrected = np.empty((knots, size, size)), np.empty((knots, size, size))
     innovation = np.empty((knots, measured, measured))
     F, H, noise, fresh = model.F, model.H, model.measurement_noise, model.process_noise
-    P = model.start
+    P = model.start if known is None else known
     for t in range(knots):
         predicted[t] = P
         seen = P[:, :n] @ H[t].T  # of z with what is measured
@@ -39,6 +44,8 @@ def kalman_filter(model: PlanModel) -> KalmanFilter:
         S = 0.5 * (S + S.T)
         S[np.diag_indices(measured)] += TINY * S.diagonal().max() + 1e-30
         K = np.linalg.solve(S, seen.T).T
+        if t == 0 and known is not None:
+            K = np.zeros_like(K)
         P = P - K @ seen.T
         P = 0.5 * (P + P.T)
         gain[t], corrected[t], innovation[t] = K, P, S

@@ -4,6 +4,8 @@ A Kalman filter estimates the state, what the actuators have reached, and what d
 follows all of it.
 """
 
+import copy
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -11,16 +13,17 @@ import numpy as np
 
 from lqrsim.codegen.jit import in_c_order
 from lqrsim.control.collision_chance import Surroundings
-from lqrsim.control.controllers import Control, Controller
+from lqrsim.control.controllers import Control, Controller, SolvingAgain
 from lqrsim.control.kalman import check_observable, kalman_filter
 from lqrsim.control.loop_moments import Loop
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.policy_of_filter import policy_of
+from lqrsim.control.replanned import Replanned
 from lqrsim.control.sensors import Sensors, sensor_of
 from lqrsim.control.tolerances import Prediction, choose_tolerances, with_filter
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of, tracking_laws
 from lqrsim.control.uncertainty import PerEntry, Uncertainty, per_entry
-from lqrsim.errors import Array, check_flag, check_kind, check_number
+from lqrsim.errors import Array, InputError, check_flag, check_kind, check_number
 from lqrsim.kernels.estimation import FAR
 from lqrsim.kernels.records import Limits, Policy
 from lqrsim.problem.problem import Problem
@@ -28,6 +31,7 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Trajectory
 
 MEMORY = 5.0  # s
 INEXACT = 0.02  # how far a control is off from its command, at least, relative to the tolerated effort
@@ -50,6 +54,10 @@ class OffsetFree(Controller):
         SymPy symbols, as in `Dynamics`, that does not depend on u.
       memory: in s, by default 5 s, or the plan's horizon where that is shorter.
       record: whether to keep what the filter makes of the last run, for holding it against `filter`: see there.
+      replan_every: seconds, rounded to control periods, after which each trial is solved again, and so on: for what is
+        left of the horizon, from its estimated state, with the unknown parameters as they are estimated; by default
+        never. Where a solve does not succeed, the law before goes on. Costs that depend on the step's number are not
+        supported then.
 
     Attributes:
       model, filter: the linear model about the plan, with z = (state, what the actuators have reached, unknowns), and
@@ -58,10 +66,15 @@ class OffsetFree(Controller):
         its knot: NaN where none was taken in, which is so of the last knot, and of as many more as measurements are
         late. Their errors have the covariances `filter.corrected`. Else None.
       innovations: likewise what measurements differed by from what was expected, (T+1, K, Y), of the covariances
-        `filter.innovation`; NaN where a measurement got lost, too.
+        `filter.innovation`; NaN where a measurement got lost, too. Both covariances are of the first plan: with
+        `replan_every` they are those of a run up to its first solve.
+      plans: with `record` and `replan_every`, the new plans of each trial of the last run, by the step that they begin
+        at. Else empty.
+      solved, kept: as of `Replanning`, of the last run.
 
     Raises:
-      InputError: something does not fit the system; or an unknown changes nothing of what is measured.
+      InputError: something does not fit the system; an unknown changes nothing of what is measured; or `replan_every`
+        is shorter than a control period, or comes with latency, a delay or a plan of another horizon than the problem.
     """
 
     def __init__(
@@ -76,6 +89,7 @@ class OffsetFree(Controller):
         sensors: Sensors = None,
         memory: float | None = None,
         record: bool = False,
+        replan_every: float | None = None,
     ) -> None:
         check_plan("OffsetFree", problem, solution)
         check_kind("OffsetFree: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
@@ -86,17 +100,43 @@ class OffsetFree(Controller):
         self.record = check_flag("OffsetFree: record", record)
         self.estimates: Array | None = None
         self.innovations: Array | None = None
+        self.plans: list[dict[int, Trajectory]] = []
         self._lost: Mapping[int, str] = {}
+        self._again = None if replan_every is None else self._solving_again(replan_every)
         sensor = sensor_of(sensors, problem.dynamics.state_coordinates)
         efforts = effort_of(effort, problem.dynamics)
         self.model = PlanModel.of(problem.dynamics, plan, for_filter(uncertainty, memory, efforts, problem), sensor)
         check_observable("OffsetFree", self.model)
         self.filter = kalman_filter(self.model)
         self.weights = self._weights(tolerate, efforts, at_end)
+        self._make_law(np.zeros(len(self.model.transition)))
+
+    def _make_law(self, granted: Array) -> None:
+        """About the model's plan, which takes states (D,) of the unknowns for granted."""
+        plan = self.model.plan
         self.gain, offset = tracking_laws(self.model, self.weights)
         # In what the filter estimates, and not in deviations from the plan.
-        self.nominal = self._nominal()
+        self.nominal = np.concatenate([plan.states, self.model.reached, np.tile(granted, (plan.steps + 1, 1))], axis=1)
         self.offset = plan.controls + offset - np.einsum("tij,tj->ti", self.gain, self.nominal[:-1])
+
+    def about(self, solution: Solution, model: PlanModel, corrected: Array, granted: Array) -> "OffsetFree":
+        """The same about another plan, which begins with a measurement that is taken in already.
+
+        Args:
+          model: of its plan, with the dynamics that it is of. corrected: covariance of the estimate's error there,
+            (Z, Z). granted: states of the unknowns that it takes for granted, (D,).
+        """
+        law = copy.copy(self)
+        law.solution, law.model, law.filter = solution, model, kalman_filter(model, corrected)
+        law._make_law(granted)
+        return law
+
+    def _solving_again(self, every: float) -> SolvingAgain:
+        late = self.uncertainty.latency, self.uncertainty.delay
+        if any(late):
+            got = f"{every:g} with a latency of {late[0]} and a delay of {late[1]} periods"
+            raise InputError(f"OffsetFree: replan_every: got {got}, want None, or an uncertainty without both")
+        return SolvingAgain("OffsetFree", self.problem, self.solution, every, "replan_every")
 
     def _weights(self, tolerate: PerEntry | None, effort: Array, at_end: float) -> Weights:
         """Of the tolerances, or of those that are chosen."""
@@ -111,25 +151,43 @@ class OffsetFree(Controller):
 
         return choose_tolerances(self.model, predicted, effort, at_end).weights
 
-    def _nominal(self) -> Array:
-        """What an undisturbed run has of what is estimated, (T+1, Z)."""
-        model, plan = self.model, self.solution.trajectory
-        unknowns = np.zeros((plan.steps + 1, len(model.transition)))
-        return np.concatenate([plan.states, model.reached, unknowns], axis=1)
-
     def start(self, trials: int) -> Control:
         self.estimates = self.innovations = None
         run = _Run(self, trials)
         if self.record:
             self.estimates, self.innovations = run.estimated, run.surprises
+        if self._again is not None:
+            run = Replanned(self._again, [run.of_trial(k) for k in range(trials)])
+        self.plans = run.plans if self.record and isinstance(run, Replanned) else []
         self._lost = run.lost
         return run.control
 
     def lost(self) -> Mapping[int, str]:
         return self._lost
 
+    @property
+    def solved(self) -> int:
+        return 0 if self._again is None else self._again.solved
+
+    @property
+    def kept(self) -> Counter[str]:
+        return Counter() if self._again is None else self._again.kept
+
+    def summary(self) -> str:
+        return "" if self._again is None else self._again.summary()
+
+    def _check_one_plan(self, what: str) -> None:
+        """Raise InputError if there will be others: no matrices are known of these ahead of time."""
+        if self._again is not None:
+            raise InputError(f"OffsetFree: {what}: got a law with replan_every={self._again.every:g}, want one without")
+
     def loop(self) -> Loop:
-        """The closed loop about the plan, as matrices, with the uncertainty as it was stated."""
+        """The closed loop about the plan, as matrices, with the uncertainty as it was stated.
+
+        Raises:
+          InputError: with `replan_every`, for then there are other plans.
+        """
+        self._check_one_plan("loop")
         truth = replace(self.model, uncertainty=self.uncertainty.as_steady)
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self.nominal[:-1])
@@ -137,7 +195,12 @@ class OffsetFree(Controller):
 
     @property
     def policy(self) -> OutputFeedbackPolicy:
-        """The same for a robot, with NumPy alone: predictions are linear about the plan. `save` writes it to a file."""
+        """The same for a robot, with NumPy alone: predictions are linear about the plan. `save` writes it to a file.
+
+        Raises:
+          InputError: with `replan_every`: NumPy alone solves nothing.
+        """
+        self._check_one_plan("policy")
         return policy_of(self)
 
     @property
@@ -146,7 +209,8 @@ class OffsetFree(Controller):
         parts = (self.gain, self.offset, self.nominal, self.filter.gain, model.output, model.transition, limits)
         numbers = np.array([model.plan.dt, self.uncertainty.lag, self.uncertainty.latency, self.uncertainty.delay])
         sources = model.dynamics.source, model.dynamics.data, model.sensor.source, model.sensor.data
-        return sha256(*parts, numbers, *sources)[:16]
+        again = () if self._again is None else (f"{self.problem.digest} {self._again.periods}", self.filter.corrected)
+        return sha256(*parts, numbers, *sources, *again)[:16]
 
     @property
     def spaces(self) -> tuple[Coordinates, Coordinates]:
@@ -161,7 +225,8 @@ class _Run:
     """
 
     def __init__(self, law: OffsetFree, trials: int) -> None:
-        self.law, self.trials, self.model = law, trials, law.model
+        self.law, self.first = law, 0  # the law in force, and the step that its plan begins at
+        self.trials, self.model = trials, law.model  # which predicts, whatever the law's plan takes for granted
         self.estimates = np.tile(law.nominal[0], (trials, 1))  # of the knot that the newest measurement is of
         # What is shown until the first measurement comes, if that gets lost, is where the plan begins.
         self.last = np.tile(law.solution.trajectory.states[0], (trials, 1))
@@ -179,28 +244,45 @@ class _Run:
             for i in range(self.delay)
         ]
 
+    def of_trial(self, k: int) -> "_Run":
+        """One of its trials alone, which has not begun yet; what is recorded of it is a view of this one's."""
+        one = _Run(self.law, 1)
+        one.estimated, one.surprises = self.estimated[:, k : k + 1], self.surprises[:, k : k + 1]
+        return one
+
     def control(self, step: int, shown: Array) -> Array:
-        law, core, steps = self.law, self.model.core, self.model.plan.steps
-        if step >= self.latency:  # before, there is nothing new
-            if step > self.latency:
-                self._predict(self.estimates, self.commands.pop(0))
-            knot = min(step - self.latency, steps)  # after the horizon the last gain stays in force
-            lost = (shown == self.last).all(axis=1).astype(np.float64)
-            self.last[:] = shown
-            core.correct(
-                self.trials, in_c_order(shown), lost, in_c_order(self.model.plan.states[knot]), law.filter.gain[knot],
-                self.model.sensor.data, self.estimates, self.differences,
-            )  # fmt: skip
-            if law.record and step - self.latency <= steps:
-                self.estimated[knot], self.surprises[knot] = self.estimates, self.differences
+        self.take_in(step, shown)
+        return self.command(step)
+
+    def take_in(self, step: int, shown: Array) -> None:
+        """What is shown at a step, after the period before."""
+        if step < self.latency:  # there is nothing new
+            return
+        law, core = self.law, self.model.core
+        if step > self.latency:
+            self._predict(self.estimates, self.commands.pop(0))
+        # After the horizon the last gain stays in force.
+        knot = min(step - self.first - self.latency, law.model.plan.steps)
+        lost = (shown == self.last).all(axis=1).astype(np.float64)
+        self.last[:] = shown
+        core.correct(
+            self.trials, in_c_order(shown), lost, in_c_order(law.model.plan.states[knot]), law.filter.gain[knot],
+            self.model.sensor.data, self.estimates, self.differences,
+        )  # fmt: skip
+        at = step - self.latency
+        if at < len(self.estimated):  # which is empty if nothing is recorded
+            self.estimated[at], self.surprises[at] = self.estimates, self.differences
+
+    def command(self, step: int) -> Array:
+        law, core = self.law, self.model.core
         ahead = self.estimates
         if self.commands:
             ahead = ahead.copy()
             for command in self.commands:
                 self._predict(ahead, command)
-        t = min(step + self.delay, steps - 1)
+        t = min(step - self.first + self.delay, law.model.plan.steps - 1)
         out = np.empty((self.trials, self.model.m))
-        near = in_c_order(self.model.plan.states[t])
+        near = in_c_order(law.model.plan.states[t])
         core.command(self.trials, ahead, near, Policy(law.gain[t], law.offset[t]), self.limits, out)
         self.commands.append(out.copy())
         self._look_for_lost(ahead)

@@ -1,0 +1,83 @@
+"""Output feedback that plans again as it goes, with what it has estimated in the model.
+
+At each of these steps, and for each trial, what is left of the horizon is solved from the estimated state, with the
+unknown parameters at their estimated values, and the law and the filter are made anew about that plan. The estimates go
+on as they are; the law acts on what they differ by from what the new plan takes for granted. As for the law, what
+disturbs the robot now will go on as it is, gusts too. Gains and offsets of the controls are no parameters of the model,
+so that they stay with the law, and so does the lag of the actuators. A solve takes no time in the simulation.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lqrsim.control.controllers import SolvingAgain
+from lqrsim.control.plan_model import PlanModel
+from lqrsim.errors import Array, InputError
+from lqrsim.results.solution_parts import Trajectory
+
+if TYPE_CHECKING:
+    from lqrsim.control.offset_free import _Run
+
+
+class Replanned:
+    """A run whose trials have a law each.
+
+    Attributes:
+      plans: of each trial, by the step that they begin at; without the first. lost: the trials whose estimates are
+        beyond all that a robot can be -> why, in a line.
+    """
+
+    def __init__(self, again: SolvingAgain, runs: Sequence["_Run"]) -> None:
+        again.start()
+        self._again, self._runs = again, runs
+        self.plans: list[dict[int, Trajectory]] = [{} for _ in runs]
+        self.lost: dict[int, str] = {}
+
+    def control(self, step: int, shown: Array) -> Array:
+        commands: list[Array] = []
+        for k, run in enumerate(self._runs):
+            run.take_in(step, shown[k : k + 1])
+            if self._again.due(step) and step < run.law.problem.steps and not run.lost:
+                self._replan(run, step, self.plans[k])
+            commands.append(run.command(step))
+            if run.lost:
+                self.lost.setdefault(k, run.lost[0])
+        return np.concatenate(commands)
+
+    def _replan(self, run: "_Run", step: int, plans: dict[int, Trajectory]) -> None:
+        """The law from now on is about a new plan, if there is one."""
+        law, model, z = run.law, run.model, run.estimates[0]
+        n, done = model.n, step - run.first
+        granted = np.where(in_parameters(model), z[n + model.lagging :], 0.0)
+        changes = model.output[: len(model.parameters)] @ granted
+        values = {
+            name: float(model.dynamics.parameters[name] + change)
+            for name, change in zip(model.parameters, changes, strict=True)
+        }
+        try:
+            dynamics = model.dynamics.with_parameters(**values)
+            problem = replace(law.problem, dynamics=dynamics)
+        except InputError as error:  # an estimate is not finite
+            self._again.keep(str(error))
+            return
+        # By that model the actuators have no lag, and no gains and offsets.
+        gain, reached = law.gain[done:], law.nominal[done:-1, n : n + model.lagging]
+        rest = np.concatenate([reached, np.tile(granted, (len(gain), 1))], axis=1)
+        offset = law.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], rest)
+        here = dynamics.state_coordinates.nearest(z[:n], law.nominal[done, :n])
+        solution = self._again.solve(problem, step, here, gain[:, :, :n], offset)
+        if solution is None:
+            return
+        plans[step] = solution.trajectory
+        about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
+        run.law, run.first = law.about(solution, about, law.filter.corrected[done], granted), step
+
+
+def in_parameters(model: PlanModel) -> Array:
+    """Which of the unknowns' states do nothing but change parameters of the dynamics, (D,)."""
+    moved = (model.output != 0).any(axis=0)
+    beyond = (model.output[len(model.parameters) :] != 0).any(axis=0)
+    return moved & ~beyond

@@ -1,0 +1,279 @@
+"""Output feedback that plans again: what its plans take for granted, how the estimates go on, bits, what fails."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from linear_plans import DT, Linear, double_integrator, linear
+
+import lqrsim as ls
+from lqrsim.errors import Array
+
+PUSH = ls.Unknown("d0", 0.5)
+TOLERATE = {"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}
+STEPS, AGAIN = 30, 10
+
+
+def rocking() -> Linear:
+    """A double integrator with a plan that is no optimum."""
+    return double_integrator(start=[1.0, 0.0], controls=np.cos(np.arange(STEPS) / 4)[:, None])
+
+
+def stated(*unknowns: ls.Unknown, lag: float = 0.0, latency: int = 0, delay: int = 0) -> ls.Uncertainty:
+    return ls.Uncertainty(
+        unknowns=unknowns, start=0.3, measurement=0.1, control=0.2, lag=lag, latency=latency, delay=delay
+    )
+
+
+def replanned(system: Linear, uncertainty: ls.Uncertainty, every: float | None = AGAIN * DT) -> ls.OffsetFree:
+    return ls.OffsetFree(
+        system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True, replan_every=every
+    )
+
+
+def run(system: Linear, law: ls.OffsetFree, *, push: float = 0.0, bias: float = 0.0) -> tuple[Array, Array]:
+    """What a trial is shown (T, n), with noise, and its commands (T, m), of a linear system in NumPy."""
+    rng, control = np.random.default_rng(0), law.start(1)
+    x, shown, commands = system.plan.states[0] + [0.2, -0.1], [], []
+    for t in range(system.plan.steps):
+        shown.append(x + 0.1 * rng.normal(size=len(x)))
+        commands.append(control(t, shown[-1][None])[0])
+        x = system.A @ x + system.B @ (commands[-1] + bias) + push * system.E[:, 0]
+    return np.array(shown), np.array(commands)
+
+
+def optimal_controls(system: Linear, x: Array, push: float, steps: int) -> Array:
+    """Minimises 1/2 sum u^2 + 1/2 |x_T|^2 for a constant push, by least squares."""
+    onto, free = np.zeros((2, 0)), x
+    for _ in range(steps):
+        onto = np.concatenate([system.A @ onto, system.B], axis=1)
+        free = system.A @ free + push * system.E[:, 0]
+    stacked = np.concatenate([np.eye(steps), onto])
+    return np.linalg.lstsq(stacked, np.concatenate([np.zeros(steps), -free]))[0]
+
+
+def recorded(law: ls.OffsetFree) -> Array:
+    assert law.estimates is not None
+    return law.estimates[:, 0]
+
+
+# What a plan takes for granted.
+
+
+def test_new_plans_are_optimal_for_what_is_estimated() -> None:
+    """By least squares, to 1e-5; and each begins with what is commanded there, for there is nothing to correct."""
+    system = rocking()
+    law = replanned(system, stated(PUSH))
+    _, commands = run(system, law, push=0.4)
+    assert (law.solved, law.kept) == (2, {})
+    assert law.summary() == "solved again 2 times"
+    assert list(law.plans[0]) == [AGAIN, 2 * AGAIN]
+    for step, plan in law.plans[0].items():
+        z = recorded(law)[step]
+        assert abs(z[2]) > 0.1  # it matters
+        wanted = optimal_controls(system, z[:2], z[2], STEPS - step)
+        np.testing.assert_allclose(plan.controls[:, 0], wanted, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(commands[step], plan.controls[0], rtol=0, atol=1e-9)
+
+
+def test_so_they_are_for_a_parameter_that_has_a_value() -> None:
+    """The control pushes by a third more than it was planned with."""
+    system = rocking()
+    law = replanned(system, stated(ls.Unknown("b10", 0.3)))
+    _, commands = run(replace(system, inputs=system.inputs * 4 / 3), law)
+    assert (law.solved, law.kept) == (2, {})
+    for step, plan in law.plans[0].items():
+        z = recorded(law)[step]
+        assert abs(z[2]) > 0.03  # it matters
+        true = replace(system, inputs=system.inputs * (1 + z[2]))
+        np.testing.assert_allclose(
+            plan.controls[:, 0], optimal_controls(true, z[:2], 0.0, STEPS - step), rtol=0, atol=1e-5
+        )
+        np.testing.assert_allclose(commands[step], plan.controls[0], rtol=0, atol=1e-9)
+
+
+def test_what_is_no_parameter_stays_with_the_law() -> None:
+    """An offset of the control: the plan knows nothing of it, and the law takes it off the command, to 1e-5."""
+    system = rocking()
+    law = replanned(system, stated(ls.Unknown("offset of u0", 0.5)))
+    _, commands = run(system, law, bias=0.4)
+    assert law.solved == 2
+    for step, plan in law.plans[0].items():
+        z = recorded(law)[step]
+        assert abs(z[2]) > 0.1
+        wanted = optimal_controls(system, z[:2], 0.0, STEPS - step)
+        np.testing.assert_allclose(plan.controls[:, 0], wanted, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(commands[step], plan.controls[0] - z[2], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.2])
+def test_estimates_go_on(lag: float) -> None:
+    """Of a linear system one filter does for all plans: its recursion in NumPy, over both solves, to 1e-6."""
+    system = rocking()
+    law = replanned(system, stated(PUSH, lag=lag))
+    shown, commands = run(system, law, push=0.4)
+    assert law.solved == 2
+    left = np.exp(-DT / lag) if lag else 0.0
+    mean = lag / DT * (1 - left)
+    z = law.nominal[0].copy()
+    for t in range(STEPS):
+        z = z + law.filter.gain[t] @ (shown[t] - z[:2])
+        np.testing.assert_allclose(recorded(law)[t], z, rtol=0, atol=1e-6)
+        reached = z[2:-1] if lag else commands[t]
+        applied = commands[t] + mean * (reached - commands[t])
+        after = commands[t] + left * (reached - commands[t])
+        x = system.A @ z[:2] + system.B @ applied + system.E[:, 0] * z[-1]
+        z = np.concatenate([x, after if lag else [], z[-1:]])
+
+
+# A quadrotor in a steady wind.
+
+WIND = ls.MeanWind((3.0, 0.0, 0.0))
+
+
+def flight(steps: int = 150) -> ls.Problem:
+    """A metre to where it is to hover."""
+    robot, weight = ls.Quadrotor(), np.repeat((50.0, 10.0, 1.0, 1.0), 3)
+    return ls.Problem(
+        # So that with and without a wind the same is compiled.
+        dynamics=robot.dynamics.disturbed, dt=1 / 30, steps=steps, initial=ls.FixedState(np.eye(12)[0]),
+        stage_cost=ls.QuadraticCost(weight, about=np.zeros(12))
+        + ls.ControlCost(np.ones(4), about=np.full(4, robot.hover_force)),
+        final_cost=ls.QuadraticCost(10 * weight, about=np.zeros(12)),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def flown() -> tuple[ls.Solution, ls.OffsetFree]:
+    """Its plan without a wind, and what flies it."""
+    problem = flight()
+    solution = ls.smooth(problem)
+    assert solution.success
+    measured = {"m": 5e-3, "m/s": 5e-2, "rad": 5e-3, "rad/s": 5e-3}
+    unknowns = [ls.Unknown(f"wind_{axis}", 1.5) for axis in "xyz"]
+    uncertainty = ls.Uncertainty(unknowns=unknowns, start=0.01, measurement=measured)
+    law = ls.OffsetFree(problem, solution, uncertainty, tolerate=TOLERATE, record=True, replan_every=1.0)
+    return solution, law
+
+
+def thrust(controls: Array, states: Array) -> npt.NDArray[np.float64]:
+    """Of a plan, in the world's axes: (T, 3)."""
+    turned = ls.rotations.quaternion(states[:-1, 6:9])
+    w, x, y, z = turned.T
+    upward = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    return controls.sum(axis=1)[:, None] * upward
+
+
+def test_in_a_steady_wind_the_new_plan_leans_into_it(
+    quadrotor: ls.Scenario, flown: tuple[ls.Solution, ls.OffsetFree]
+) -> None:
+    """Where its plan hovers, by atan(drag * wind / weight), within what the estimate is off."""
+    solution, law = flown
+    rollout = ls.simulate(quadrotor.plant(), solution, controller=law, disturbances=[WIND], frames=False)
+    assert rollout.outcome == ("reached",)
+    assert (law.solved, law.kept) == (4, {})
+    assert list(law.plans[0]) == [30, 60, 90, 120]
+    robot, plan = ls.Quadrotor(), law.plans[0][30]
+    estimated = recorded(law)[30, 12:]
+    np.testing.assert_allclose(estimated, [3.0, 0.0, 0.0], rtol=0, atol=0.02)
+    # It is a plan of the model with this wind: Newton's law, over each period, to second order.
+    velocity = plan.states[:, 3:6]
+    mean = (velocity[1:] + velocity[:-1]) / 2
+    force = thrust(plan.controls, plan.states) - robot.drag * (mean - [3.0, 0.0, 0.0])
+    force[:, 2] -= robot.mass * robot.gravity
+    turning = np.abs(np.diff(plan.states[:, 6:9], axis=0)).max(axis=1)  # the thrust's direction changes on the way
+    off = np.abs(robot.mass * np.diff(velocity, axis=0) * 30 - force).max(axis=1)
+    assert (off < 0.01 + robot.mass * robot.gravity * turning).all()
+    # Here it is as good as at rest, so that all that is left is what holds against weight and wind.
+    middle = slice(80, 104)
+    changes = robot.drag * np.abs(mean) + robot.mass * np.abs(np.diff(velocity, axis=0) * 30)
+    assert changes[middle].max() < 0.003  # N
+    weight, drag = robot.mass * robot.gravity, robot.drag * 3.0
+    tilt, leans = np.arctan(drag / weight), thrust(plan.controls, plan.states)[middle]
+    tolerance = 0.003 / weight + turning[middle].max() + 0.02 / 3.0 * tilt
+    assert tolerance < 0.025 * tilt
+    np.testing.assert_allclose(np.arctan2(-leans[:, 0], leans[:, 2]), tilt, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(np.linalg.norm(leans, axis=1), np.hypot(drag, weight), rtol=0, atol=0.005)
+    # The first plan does not.
+    first = thrust(solution.trajectory.controls, solution.trajectory.states)[30:][middle]
+    assert np.abs(np.arctan2(-first[:, 0], first[:, 2])).max() < 0.05 * tilt
+
+
+def test_each_trial_gets_what_it_gets_alone(quadrotor: ls.Scenario, flown: tuple[ls.Solution, ls.OffsetFree]) -> None:
+    solution, law = flown
+    noise = [WIND, ls.MeasurementNoise(0.003), ls.ForceNoise(0.05)]
+    plant = quadrotor.plant()
+    together = ls.simulate(plant, solution, controller=law, disturbances=noise, trials=3, frames=False)
+    assert law.solved == 12
+    plans, estimates = law.plans, law.estimates
+    alone = ls.simulate(plant, solution, controller=law, disturbances=noise, first_trial=2, frames=False)
+    assert law.solved == 4
+    np.testing.assert_array_equal(alone.states[0], together.states[2])
+    np.testing.assert_array_equal(alone.commanded[0], together.commanded[2])
+    np.testing.assert_array_equal(law.plans[0][60].controls, plans[2][60].controls)
+    assert estimates is not None
+    np.testing.assert_array_equal(recorded(law), estimates[:, 2])
+    assert not np.array_equal(together.states[0], together.states[2])
+
+
+# What fails, and what does not fit.
+
+
+def test_where_no_solve_succeeds_the_law_goes_on() -> None:
+    """Within an obstacle no problem may begin: bit by bit the law that never solves again."""
+    ball = ls.World([ls.Obstacle("ball", "sphere", np.zeros(3), np.eye(3), np.array([1.0, 0.0, 0.0]))])
+    system = linear(
+        np.zeros((2, 2)), np.eye(2), np.eye(2), controls=np.zeros((STEPS, 2)), start=[2.0, 0.0], position=("s0", "s1"),
+        costs=(ls.ObstacleCost(ball, radius=0.1, sharpness=10.0, weight=1.0),),
+    )  # fmt: skip
+    commands: list[list[Array]] = []
+    for every in (AGAIN * DT, None):
+        law = replanned(system, stated(PUSH), every)
+        control, rng = law.start(2), np.random.default_rng(0)
+        shown = np.array([[0.5, 0.0], [0.0, 0.6]]) + 0.01 * rng.normal(size=(STEPS + 5, 2, 2))
+        commands.append([control(t, shown[t]) for t in range(STEPS + 5)])
+        assert law.plans == ([{}, {}] if every else [])
+        assert law.solved == 0
+        if every:
+            assert law.kept.total() == 4
+            assert all(reason.startswith("initial: got a start at (") for reason in law.kept)
+            assert all("inside obstacle 'ball'" in reason for reason in law.kept)
+            assert law.summary().startswith("solved again 0 times, kept the law before 4 times: 1 times initial: got")
+        else:
+            assert (law.kept, law.summary()) == ({}, "")
+    np.testing.assert_array_equal(commands[0], commands[1])
+
+
+@pytest.mark.parametrize(
+    ("options", "every", "says"),
+    [
+        ({"latency": 2}, 1.0, "replan_every: got 1 with a latency of 2 and a delay of 0 periods, want None, or"),
+        ({"delay": 1}, 1.0, "replan_every: got 1 with a latency of 0 and a delay of 1 periods, want None, or"),
+        ({}, 0.05, "OffsetFree: replan_every: got 0.05, want a finite number >= 0.0999"),
+        ({}, "often", "OffsetFree: replan_every: got 'often', want"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_a_line(options: dict, every: float, says: str) -> None:
+    with pytest.raises(ls.InputError) as caught:
+        replanned(rocking(), stated(PUSH, **options), every)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_plan_of_another_horizon_is_refused() -> None:
+    system = rocking()
+    shorter = replace(system, problem=replace(system.problem, steps=20))
+    with pytest.raises(ls.InputError, match=r"OffsetFree: solution: got 30 steps of 0\.1 s, want the problem's: 20"):
+        replanned(shorter, stated(PUSH))
+    assert replanned(shorter, stated(PUSH), None).gain.shape[0] == 30
+
+
+def test_what_is_of_one_plan_is_refused_and_the_digest_is_another() -> None:
+    system, uncertainty = rocking(), stated(PUSH)
+    law = replanned(system, uncertainty)
+    with pytest.raises(ls.InputError, match="OffsetFree: policy: got a law with replan_every=1, want one without"):
+        _ = law.policy
+    with pytest.raises(ls.InputError, match="OffsetFree: loop: got a law with replan_every=1, want one without"):
+        ls.predict_tube(system.problem, system.solution, uncertainty, law)
+    assert len({replanned(system, uncertainty, every).digest for every in (None, 0.5, 1.0)}) == 3
