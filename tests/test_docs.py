@@ -48,6 +48,11 @@ def test_a_robot_scene_cost_and_disturbance_of_ones_own(
     expected = 0.2 * np.maximum(windy.states[:, :-1, 0], 0)
     np.testing.assert_allclose(windy.forces[..., 0], expected, rtol=0, atol=1e-15)
     assert windy.tracking_error.max() > 0.01
+    # Told of the wind, it keeps nearer to the plan in the same gusts.
+    assert {one.name for one in names["stated"].unknowns} == {"wind_x", "wind_y"}
+    assert "wind_z" in names["stated"].left_out[0]
+    loose = ls.simulate(names["plant"], solution, disturbances=names["gusts"], trials=3)
+    assert (names["held"].tracking_error.max(axis=1) < loose.tracking_error.max(axis=1)).all()
     # Its own cost acts: the plan keeps the speed limit better than one without it.
     speeds = np.linalg.norm(solution.trajectory.states[:, 2:], axis=1)
     assert speeds.max() < 1.05
@@ -98,6 +103,18 @@ def test_forms_starts_and_endings() -> None:
     np.testing.assert_allclose(names["least"], names["solution"].cost, rtol=1e-3)
     assert "pass of iteration" in names["safe"].detail
     assert names["control"].shape == (2,)
+
+
+def test_robust_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_page("robust_policies.md")
+    tubes, run = names["tubes"], names["run"]
+    assert tubes["offset_free"].collision_chance < tubes["track"].collision_chance < tubes["smooth"].collision_chance
+    assert names["shown"].tube.shape == (names["problem"].steps + 1, 3, 3)
+    # The recursion of the file gives what the filter gave in the simulation, shown the same.
+    np.testing.assert_allclose(names["control"], run.commanded[0, 0], rtol=0, atol=1e-9)
+    with pytest.raises(ls.InputError, match=r"wind_z.*wind_x"):
+        ls.Uncertainty(unknowns=[ls.Unknown("wind_z", std=1.0)]).check(names["mass"])
 
 
 def presets() -> str:

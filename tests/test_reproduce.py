@@ -19,6 +19,8 @@ from lqrsim.cli import main
 from lqrsim.commands import reproduce
 from lqrsim.reports.paper import results_page
 
+pytestmark = pytest.mark.timeout(900)  # all scripts are run, each in a process of its own
+
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "experiments"
 
