@@ -1,7 +1,7 @@
 """How strong a disturbance alone must be for half of the trials to fail: the smoother's policy, and OffsetFree.
 
 OffsetFree is told of the disturbance, at the strength that it has: how large the noise is, how late a measurement, how
-slow the motors. Both robots; the quadrotor's OffsetFree flies the safe plan of the preset 'moderate'.
+slow the motors. It flies the safe plan of the preset 'moderate'.
 """
 
 from typing import Any
@@ -19,7 +19,7 @@ LATE = (ls.ControlDelay(1), ls.MeasurementLatency(1))
 
 
 def measure(config: Config) -> dict[str, Any]:
-    names = [*NAMES][-1:] if config.quick else NAMES
+    names = [*NAMES][-1:]  # of the drive nothing is left to be gained: `drive.py` has all at once
     return {name: of_robot(config, ls.scenarios.get(name)) for name in names}
 
 
