@@ -43,6 +43,8 @@ class Config:
     """Of each point of the search."""
     search_seed: int = 1
     """Of the search's disturbances."""
+    quick: bool = False
+    """Few trials, for a first look."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,8 @@ def ranked(bench: Bench, tunings: Iterable[Tuning], config: Config) -> list[Tuni
 def main(config: Config) -> dict[str, dict[str, int]]:
     """Successes by law and preset."""
     bench = Bench()
+    if config.quick:
+        config = replace(config, trials=min(config.trials, 4), search_trials=min(config.search_trials, 2))
     if config.search:
         search(bench, config)
     laws = {

@@ -119,7 +119,7 @@ class OffsetFree(Controller):
         self.nominal = np.concatenate([plan.states, self.model.reached, np.tile(granted, (plan.steps + 1, 1))], axis=1)
         self.offset = plan.controls + offset - np.einsum("tij,tj->ti", self.gain, self.nominal[:-1])
 
-    def about(self, solution: Solution, model: PlanModel, corrected: Array, granted: Array) -> "OffsetFree":
+    def _about(self, solution: Solution, model: PlanModel, corrected: Array, granted: Array) -> "OffsetFree":
         """The same about another plan, which begins with a measurement that is taken in already.
 
         Args:

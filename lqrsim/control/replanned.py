@@ -73,7 +73,7 @@ class Replanned:
             return
         plans[step] = solution.trajectory
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
-        run.law, run.first = law.about(solution, about, law.filter.corrected[done], granted), step
+        run.law, run.first = law._about(solution, about, law.filter.corrected[done], granted), step
 
 
 def in_parameters(model: PlanModel) -> Array:
