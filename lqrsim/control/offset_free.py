@@ -1,4 +1,4 @@
-"""Output feedback that leaves no steady error.
+"""Output feedback that, by the linear model, leaves no steady error.
 
 A Kalman filter estimates the state, what the actuators have reached, and what disturbs the robot; a tracking law
 follows all of it.

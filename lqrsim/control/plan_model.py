@@ -25,7 +25,7 @@ from lqrsim.kernels.records import Predictor
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.solution_parts import Trajectory
 
-STEP = 1e-5  # of a parameter for differences, relative to its standard deviation where that is larger than to 1
+STEP = 1e-5  # of a parameter for differences, relative to its value where that is larger than 1
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # that a deviation may 
 # What a tube of twice the width of the narrowest counts for as a chance of failing: little, so that it decides where
 # the plan is clear of everything, or collides whatever the law.
 NARROW = 0.02
-# What the square of the share of commands beyond the limits adds to the chance of failing. Measured: of the quadrotor's
-# flights through the cage under the presets, about so many fail besides those that are predicted to.
+# What the square of the share of commands beyond the limits adds to the chance of failing: a choice of ours, of the
+# order of what fails of the quadrotor's flights through the cage besides what is predicted to.
 FRAGILE = 3.0
 
 

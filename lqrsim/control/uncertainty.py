@@ -151,8 +151,8 @@ class Uncertainty:
     def steady(self, memory: float, share: float = MEAN) -> "Uncertainty":
         """The same for a filter: what varies may have a mean that is not zero, and what is constant may change.
 
-        That is what leaves no steady error: a filter that believes in a constant stops listening, and one that believes
-        in a wind that always comes back to zero is always a little wrong about one that does not.
+        By the linear model, that leaves no steady error: a filter that believes in a constant stops listening, and one
+        that believes in a wind that always comes back to zero is always a little wrong about one that does not.
 
         Args:
           memory: seconds in which a constant may wander by its standard deviation.
