@@ -172,6 +172,12 @@ def test_without_unknowns_they_are_those_of_a_plain_riccati_recursion() -> None:
         np.testing.assert_allclose(policy(plan.states[t], t * DT), plan.controls[t], rtol=0, atol=1e-12)
 
 
+def test_at_the_end_only_the_position_is_tolerated_less() -> None:
+    drive = ls.DifferentialDrive().dynamics
+    weights = Weights.of({"m": 0.05, "rad": 0.2}, np.ones(2), drive, at_end=0.1)
+    np.testing.assert_allclose(weights.end, [1 / 0.005**2, 1 / 0.005**2, 1 / 0.2**2], rtol=1e-12)
+
+
 def test_they_keep_to_a_plan_that_a_cost_was_indifferent_to() -> None:
     """About a plan of the linear-quadratic solver: pushed off, the law is back while the plan's own drifts away."""
     system = linear([[0, 1], [0, 0]], [[0], [1]], [[0], [1]], start=[1.0, 0.0], controls=np.zeros((60, 1)))
@@ -192,7 +198,7 @@ def test_drakes_finite_horizon_regulator_has_the_same_gains() -> None:
         pytest.skip("Drake is not installed")
     drake = importlib.import_module("peers.drake")
     system, _ = drawn(0, 3, unstable=True)
-    policy = ls.track(system.problem, system.solution, tolerate=0.5, effort=2.0)
+    policy = ls.track(system.problem, system.solution, tolerate=0.5, effort=2.0, at_end=0.2)
     n, m = system.B.shape
     steps = np.ones((len(policy.gain), 1, 1))
     found, _ = drake.finite_horizon_gains(

@@ -35,7 +35,7 @@ def track(
         the ratios to one another and to `effort` matter. By default those under which the robot is least likely to fail
         under the uncertainty; see `tolerances.py`.
       effort: what may be added to each control to get back; by default a quarter of its range.
-      at_end: the tolerances at the plan's end, relative to those before.
+      at_end: the tolerances of the position at the plan's end, relative to before; of all states where there is none.
       uncertainty: what runs will meet, as `uncertainty_of` makes it; only for choosing tolerances.
 
     Raises:

@@ -22,7 +22,9 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
 
 CONTROL_SHARE = 0.25  # of the range between its limits that a control may be changed by, by default
-AT_END = 0.2  # the tolerances at the plan's end, relative to those before
+# The tolerances of the position at the plan's end, relative to those before. Whether a goal is reached depends on the
+# position alone; controls that also bring the velocity to rest there have less left for it.
+AT_END = 0.1
 
 
 @dataclass(frozen=True)
@@ -41,11 +43,17 @@ class Weights:
     def of(cls, tolerate: PerEntry, effort: Array, dynamics: Dynamics, *, at_end: float = AT_END) -> "Weights":
         """Of tolerances in the states' units and efforts (m,) in the controls'.
 
+        Args:
+          at_end: of the position, relative to before; of all states where there is none.
+
         Raises:
           InputError: a name or unit that there is not, or a tolerance that is not positive.
         """
-        state = per_entry("tolerate", tolerate, dynamics.state_coordinates, above=0.0)
-        return cls(state**-2.0, effort**-2.0, (check_number("at_end", at_end, above=0.0) * state) ** -2.0)
+        space = dynamics.state_coordinates
+        state = per_entry("tolerate", tolerate, space, above=0.0)
+        end, last = state.copy(), list(space.position) or slice(None)
+        end[last] *= check_number("at_end", at_end, above=0.0)
+        return cls(state**-2.0, effort**-2.0, end**-2.0)
 
 
 def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
