@@ -54,6 +54,7 @@ from .results.value_functions import Quadratic as Quadratic
 from .results.value_functions import TotalCost as TotalCost
 from .robots.base import Robot as Robot
 from .robots.differential_drive import DifferentialDrive as DifferentialDrive
+from .robots.mjcf import MjcfRobot as MjcfRobot
 from .robots.quadrotor import Quadrotor as Quadrotor
 from .scenarios.packaged import Scenario as Scenario
 from .scenes.scene import Scene as Scene

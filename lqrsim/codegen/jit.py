@@ -148,14 +148,15 @@ def _vocabulary() -> dict[str, Any]:
 
     import numba
 
-    from lqrsim.codegen import pointers
+    from lqrsim.codegen import foreign, pointers
 
     jit: Any = numba.njit
     inner = jit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
     inlined = jit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_options())
     names = {**vars(math), "__name__": __name__, "inner": inner, "inlined": inlined}
     names |= {name: record for name, record in vars(records).items() if inspect.isclass(record)}
-    return names | {name: getattr(pointers, name) for name in ("stack", "pointer", "invoke", "invoke_writing")}
+    names |= {name: getattr(pointers, name) for name in ("stack", "pointer", "invoke", "invoke_writing")}
+    return names | {name: getattr(foreign, name) for name in ("at", "call", "call_with_two", "claim", "release")}
 
 
 def in_c_order(array: Array) -> Array:
@@ -333,12 +334,12 @@ def _machine() -> str:
     """What compiled code depends on besides its source: the compiler, the processor, and how pointers are compiled."""
     from numba.core import registry
 
-    from lqrsim.codegen import pointers
+    from lqrsim.codegen import foreign, pointers
 
     target: Any = registry.cpu_target
     parts = [version("numba"), version("llvmlite"), platform.python_version(), *_FAST]
     parts.append(repr(target.target_context.codegen().magic_tuple()))
-    texts = (Path(str(module.__file__)).read_text(encoding="utf-8") for module in (pointers, records))
+    texts = (Path(str(module.__file__)).read_text(encoding="utf-8") for module in (pointers, foreign, records))
     return "\n".join([*parts, *texts])
 
 

@@ -208,7 +208,8 @@ class OffsetFree(Controller):
         model, limits = self.model, np.array(_limits(self))
         parts = (self.gain, self.offset, self.nominal, self.filter.gain, model.output, model.transition, limits)
         numbers = np.array([model.plan.dt, self.uncertainty.lag, self.uncertainty.latency, self.uncertainty.delay])
-        sources = model.dynamics.source, model.dynamics.data, model.sensor.source, model.sensor.data
+        moved = model.dynamics.fixed or np.array(list(model.dynamics.parameters.values()), dtype=np.float64)
+        sources = model.dynamics.source, moved, model.sensor.source, model.sensor.data
         again = () if self._again is None else (f"{self.problem.digest} {self._again.periods}", self.filter.corrected)
         return sha256(*parts, numbers, *sources, *again)[:16]
 

@@ -50,6 +50,31 @@ def invoke_writing(address, x, u, data, first, second) -> None:
     """Call the user's function at an address that writes to two arrays, which it gets as they are."""
 
 
+# Memory and functions of a C library; see `codegen/foreign.py`.
+
+
+def at(address):
+    """The float64 numbers at an address."""
+    return np.empty(0)
+
+
+def call(function, first, second) -> None:
+    """Call the C function at an address with two pointers."""
+
+
+def call_with_two(function, first, second, third: int, fourth: int) -> None:
+    """Call the C function at an address with two pointers and two ints."""
+
+
+def claim(flags, index) -> int:
+    """Set a flag that threads share; 1 if it was this thread that did, else 0."""
+    return 1
+
+
+def release(flags, index) -> None:
+    """Set it back."""
+
+
 def rate(x, u, p, out) -> None:
     """Write xdot = f(x, u), (N,)."""
 

@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -75,6 +75,11 @@ class Dynamics:
       InputError: a name does not exist, a parameter is not finite, or the level does not fit the function. What f
         returns is looked at when it is first needed.
     """
+
+    # Whether they are given as where a control period leads, and not as a rate; see `robots/mjcf_dynamics.py`.
+    discrete: ClassVar[bool] = False
+    # What defines them besides their source and parameters, as a hash; none for functions.
+    fixed: str = ""
 
     def __init__(
         self,
@@ -236,6 +241,9 @@ class Dynamics:
                 symbolic.write_chain(n, slopes),
             ]
         )
+
+    def check_period(self, dt: float) -> None:
+        """Raises InputError if they cannot be stepped by `dt` seconds; they always can, but where MuJoCo steps them."""
 
     def rate(self, state: npt.ArrayLike, control: npt.ArrayLike) -> Array:
         """`xdot` (n,) at one state (n,) and control (m,), in plain Python."""

@@ -75,6 +75,7 @@ class Problem:
         object.__setattr__(self, "steps", check_count("steps", self.steps))
         if not isinstance(self.dynamics, Dynamics):
             raise InputError(f"dynamics: got {excerpt(self.dynamics)}, want Dynamics(...), such as robot.dynamics")
+        self.dynamics.check_period(self.dt)
         check_memory("steps", self.steps, self.bytes_per_step)
         costs = {name: terms_of(getattr(self, name), name) for name in ("stage_cost", "final_cost")}
         if isinstance(self.initial, FixedState):
@@ -175,6 +176,8 @@ class Problem:
         """Hash of everything that defines the problem: structure and numbers."""
         parts: list[str | Array] = [f"{self.dynamics.source} {self.dt!r} {self.steps}", repr(self.dynamics.parameters)]
         parts.append(repr((self.control_coordinates.low, self.control_coordinates.high)))
+        if self.dynamics.fixed:
+            parts.append(self.dynamics.fixed)
         functions = [*self.dynamics.functions]
         if isinstance(self.initial, FixedState):
             parts.append(np.asarray(self.initial.state))

@@ -13,7 +13,8 @@ from lqrsim.robots.base import Robot
 def _registry() -> dict[str, type[Robot]]:
     modules = [importlib.import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__)]
     classes = [item for module in modules for item in vars(module).values() if inspect.isclass(item)]
-    return {robot.name: robot for robot in classes if issubclass(robot, Robot) and not inspect.isabstract(robot)}
+    robots = [item for item in classes if issubclass(item, Robot) and not inspect.isabstract(item)]
+    return {robot.name: robot for robot in robots if hasattr(robot, "name")}  # the rest are made of a file
 
 
 def names() -> list[str]:

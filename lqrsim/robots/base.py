@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
@@ -26,11 +26,11 @@ class Robot(abc.ABC):
       radius: of its collision circle (seen from above) or ball (the rest), in metres.
     """
 
-    name: ClassVar[str]
-    body: ClassVar[str]
-    joints: ClassVar[tuple[str, ...]]
-    actuators: ClassVar[tuple[str, ...]]
-    wheels: ClassVar[tuple[str, ...]] = ()
+    name: str
+    body: str
+    joints: tuple[str, ...]
+    actuators: tuple[str, ...]
+    wheels: tuple[str, ...] = ()
     drag: float = 0.0
     radius: float
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,11 +24,11 @@ class DifferentialDrive(Robot):
     max_speed: float = 0.5  # m/s, of a wheel's rim, either way
     wheel_radius: float = 0.036  # m; the height of the axle
 
-    name: ClassVar[str] = "differential_drive"
-    body: ClassVar[str] = "create"
-    joints: ClassVar[tuple[str, ...]] = ("create_base", "create_wheel_left", "create_wheel_right")
-    actuators: ClassVar[tuple[str, ...]] = ("create_wheel_left", "create_wheel_right")
-    wheels: ClassVar[tuple[str, ...]] = ("create_tread_left", "create_tread_right")
+    name = "differential_drive"
+    body = "create"
+    joints = ("create_base", "create_wheel_left", "create_wheel_right")
+    actuators = ("create_wheel_left", "create_wheel_right")
+    wheels = ("create_tread_left", "create_tread_right")
 
     def __post_init__(self) -> None:
         self._check(above_zero=("axle_length", "radius", "max_speed", "wheel_radius"))

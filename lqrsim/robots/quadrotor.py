@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,10 +29,10 @@ class Quadrotor(Robot):
     max_force: float = 3.71  # N, of a rotor; the least is 0
     radius: float = 0.3  # m, of the collision sphere
 
-    name: ClassVar[str] = "quadrotor"
-    body: ClassVar[str] = "quadrotor"
-    joints: ClassVar[tuple[str, ...]] = ("quadrotor_x", "quadrotor_y", "quadrotor_z", "quadrotor_rotation")
-    actuators: ClassVar[tuple[str, ...]] = (
+    name = "quadrotor"
+    body = "quadrotor"
+    joints = ("quadrotor_x", "quadrotor_y", "quadrotor_z", "quadrotor_rotation")
+    actuators = (
         "quadrotor_rotor_1",
         "quadrotor_rotor_2",
         "quadrotor_rotor_3",

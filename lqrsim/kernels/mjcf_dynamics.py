@@ -1,0 +1,247 @@
+"""Dynamics that are MuJoCo's own control period: `mj_step` and its parts, called at their addresses.
+
+States are tangent coordinates: for each degree of freedom a position (of a ball or free joint's rotation three numbers
+of a rotation vector), then the velocities, then the actuators' own states. `p` has the wrench on the robot's body, then
+addresses and sizes, at the places named below; `scenes/mjcf_physics.py` writes it. Several threads may be here at once:
+each takes a slot, two `MjData` that are its own for as long as it needs them.
+"""
+
+from math import atan2, cos, nan, pi, sqrt
+
+from lqrsim.kernels.declarations import M, N, W, at, call, call_with_two, claim, release, stack
+from lqrsim.kernels.rotation_ratios import sine_ratio
+
+# Where p has what. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: who has which
+# slot, where their numbers are, how many. MODEL: MuJoCo's. STEP, FORWARD, INTEGRATE: the addresses of mj_step,
+# mj_forwardSkip and the integrator; the last is 0 where parts of a step cannot be had on their own. TIMESTEP: of the
+# physics, in s. NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those
+# is that the controls are for; TABLE: the joints' kind and places in qpos and qvel, three numbers each.
+WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
+TIMESTEP, NV, NA, JOINTS, ACTUATORS, TABLE = 13, 14, 15, 16, 17, 18
+
+# What a slot has of each of its two MjData: addresses.
+SLOT, DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, SIZE = 16, 0, 1, 2, 3, 4, 5, 6, 7, 8
+
+FREE, BALL = 0, 1  # MuJoCo's kinds of joints that have a rotation
+LARGEST = 1e10  # MuJoCo's mjMAXVAL: what is beyond is no state of anything
+
+
+def advance(x, u, p, h, out):
+    """Write the state after `h` seconds, (N,): a whole number of physics steps; NaN where it leaves all numbers."""
+    substeps = steps_in(x, u, p, h)
+    if substeps < 1:
+        for i in range(N):
+            out[i] = nan
+        return
+    slot = take_slot(p)
+    one = at(p[SLOTS] + 8 * SLOT * slot)
+    write_to(x, u, p, one, 1)
+    for _ in range(substeps):
+        call(p[STEP], p[MODEL], one[DATA])
+    read_from(x, p, one, out)
+    release(p[FLAGS], slot)
+
+
+def step_jacobian(x, u, p, h, fx, fu, out, jacobian):
+    """Write the step as above and its Jacobian `[A B]` (N, W), by central differences over the whole of it.
+
+    `fx` and `fu` are not used. What a perturbed velocity or control does not change of the first physics step, the
+    stage of positions, is kept. MuJoCo's solver starts at the solution of the step that is not perturbed, so that both
+    end equally near to their own: its tolerance is not divided by the difference.
+    """
+    substeps = steps_in(x, u, p, h)
+    if substeps < 1:
+        for i in range(N):
+            out[i] = nan
+            for j in range(W):
+                jacobian[i, j] = nan
+        return
+    slot = take_slot(p)
+    address = p[SLOTS] + 8 * SLOT * slot
+    one, two = at(address), at(address + 8 * SIZE)
+    z, v, warm, ahead, behind = stack(N), stack(M), stack(N), stack(N), stack(N)
+    for i in range(N):
+        z[i] = x[i]
+    for i in range(M):
+        v[i] = u[i]
+    nv = int(p[NV])
+    write_to(x, u, p, one, 1)
+    call_with_two(p[FORWARD], p[MODEL], one[DATA], 0, 1)
+    accelerations = at(one[QACC])
+    for i in range(nv):
+        warm[i] = accelerations[i]
+    write_to(x, u, p, two, 1)
+    for _ in range(substeps):
+        call(p[STEP], p[MODEL], two[DATA])
+    read_from(x, p, two, out)
+    for k in range(W):
+        # Controls first: of the first stages, they leave that of the velocities, too.
+        j = k + N if k < M else k - M
+        size = x[j] if j < N else u[j - N]
+        difference = 1e-6 * max(1.0, abs(size))
+        for side in range(2):
+            moved = size + difference if side == 0 else size - difference
+            if j < N:
+                z[j] = moved
+            else:
+                v[j - N] = moved
+            after = ahead if side == 0 else behind
+            kept = 0 if j < nv else 1 if j < N else 2
+            if kept > 0 and p[INTEGRATE] != 0:
+                step_from(z, v, p, one, two, warm, kept)
+                first = 1
+            else:
+                write_to(z, v, p, two, 1)
+                start_from(p, two, warm)
+                first = 0
+            for _ in range(substeps - first):
+                call(p[STEP], p[MODEL], two[DATA])
+            read_from(out, p, two, after)
+            if j < N:
+                z[j] = x[j]
+            else:
+                v[j - N] = u[j - N]
+        for i in range(N):
+            jacobian[i, j] = (ahead[i] - behind[i]) / (2 * difference)
+    release(p[FLAGS], slot)
+
+
+def steps_in(x, u, p, h):
+    """How many steps of the physics there are in `h` seconds; 0 if MuJoCo cannot go there: back, or from NaN."""
+    for i in range(N):
+        if not abs(x[i]) < LARGEST:
+            return 0
+    for i in range(M):
+        if not abs(u[i]) < LARGEST:
+            return 0
+    return int(h / p[TIMESTEP] + 0.5) if h > 0 else 0
+
+
+def take_slot(p):
+    """A slot that no other thread has."""
+    slot, count = 0, int(p[COUNT])
+    while claim(p[FLAGS], slot) == 0:
+        slot = (slot + 1) % count
+    return slot
+
+
+def write_to(x, u, p, one, anew):
+    """Write a state and a control into an MjData; with `anew` its solver begins without a guess."""
+    nv = int(p[NV])
+    qpos, qvel, act, ctrl = at(one[QPOS]), at(one[QVEL]), at(one[ACT]), at(one[CTRL])
+    for k in range(int(p[JOINTS])):
+        kind, q, d = int(p[TABLE + 3 * k]), int(p[TABLE + 3 * k + 1]), int(p[TABLE + 3 * k + 2])
+        if kind == FREE:
+            for i in range(3):
+                qpos[q + i] = x[d + i]
+            write_quaternion(x, d + 3, qpos, q + 3)
+        elif kind == BALL:
+            write_quaternion(x, d, qpos, q)
+        else:
+            qpos[q] = x[d]
+    for i in range(nv):
+        qvel[i] = x[nv + i]
+    for i in range(int(p[NA])):
+        act[i] = x[2 * nv + i]
+    listed = int(p[ACTUATORS])
+    for i in range(M):
+        ctrl[int(p[listed + i])] = u[i]
+    if anew == 1:
+        warm, push = at(one[WARM]), at(one[PUSH])
+        for i in range(nv):
+            warm[i] = 0.0
+        for i in range(6):
+            push[i] = p[WRENCH + i]
+
+
+def start_from(p, one, guess):
+    """Have the solver of the next step begin at these accelerations."""
+    warm = at(one[WARM])
+    for i in range(int(p[NV])):
+        warm[i] = guess[i]
+
+
+def step_from(z, v, p, one, two, guess, kept):
+    """A step of the physics with the stages kept that `one` has, and that the state and control share; to `two`."""
+    write_to(z, v, p, one, 0)
+    start_from(p, one, guess)
+    call_with_two(p[FORWARD], p[MODEL], one[DATA], kept, 1)
+    call(p[INTEGRATE], p[MODEL], one[DATA])
+    nv = int(p[NV])
+    write_to(z, v, p, two, 1)
+    for k in range(int(p[JOINTS])):
+        kind, q = int(p[TABLE + 3 * k]), int(p[TABLE + 3 * k + 1])
+        copy_between(one[QPOS], two[QPOS], q, 7 if kind == FREE else 4 if kind == BALL else 1)
+    copy_between(one[QVEL], two[QVEL], 0, nv)
+    copy_between(one[WARM], two[WARM], 0, nv)
+    copy_between(one[ACT], two[ACT], 0, int(p[NA]))
+
+
+def copy_between(source, target, first, count):
+    """Copy numbers from one address to another."""
+    there, here = at(source), at(target)
+    for i in range(first, first + count):
+        here[i] = there[i]
+
+
+def read_from(near, p, one, out):
+    """Write the state of an MjData, rotations by the vectors nearest to those of `near`; NaN if it is none."""
+    nv, na = int(p[NV]), int(p[NA])
+    qpos, qvel, act = at(one[QPOS]), at(one[QVEL]), at(one[ACT])
+    for k in range(int(p[JOINTS])):
+        kind, q, d = int(p[TABLE + 3 * k]), int(p[TABLE + 3 * k + 1]), int(p[TABLE + 3 * k + 2])
+        if kind == FREE:
+            for i in range(3):
+                out[d + i] = qpos[q + i]
+            rotation_vector_near(qpos, q + 3, near, d + 3, out)
+        elif kind == BALL:
+            rotation_vector_near(qpos, q, near, d, out)
+        else:
+            out[d] = qpos[q]
+    for i in range(nv):
+        out[nv + i] = qvel[i]
+    for i in range(na):
+        out[2 * nv + i] = act[i]
+    good = True
+    for i in range(N):
+        good = good and abs(out[i]) < LARGEST
+    if not good:
+        for i in range(N):
+            out[i] = nan
+
+
+def write_quaternion(x, first, qpos, q):
+    """Write the quaternion of the rotation vector that begins at x[first]."""
+    square = 0.0
+    for i in range(3):
+        square += x[first + i] * x[first + i]
+    ratio = 0.5 * sine_ratio(0.25 * square)
+    qpos[q] = cos(0.5 * sqrt(square))
+    for i in range(3):
+        qpos[q + 1 + i] = ratio * x[first + i]
+
+
+def rotation_vector_near(qpos, q, near, first, out):
+    """Write the rotation vector of a quaternion to out[first], of all those the one nearest to that of `near`."""
+    sine, along, length = 0.0, 0.0, 0.0
+    for i in range(3):
+        sine += qpos[q + 1 + i] * qpos[q + 1 + i]
+        along += qpos[q + 1 + i] * near[first + i]
+        length += near[first + i] * near[first + i]
+    sine = sqrt(sine)
+    if sine < 1e-150:
+        # No turn, or whole ones, which have any axis: that of `near`.
+        turns = 2 * pi * nearest_whole(sqrt(length) / (2 * pi))
+        scale = turns / sqrt(length) if turns > 0 else 0.0
+        for i in range(3):
+            out[first + i] = scale * near[first + i]
+        return
+    angle = 2 * atan2(sine, qpos[q])
+    angle += 2 * pi * nearest_whole((along / sine - angle) / (2 * pi))
+    for i in range(3):
+        out[first + i] = angle / sine * qpos[q + 1 + i]
+
+
+def nearest_whole(number):
+    """The nearest whole number."""
+    return float(int(number + 0.5)) if number >= 0 else -float(int(0.5 - number))

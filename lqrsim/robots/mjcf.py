@@ -1,0 +1,194 @@
+"""A robot from any MJCF: its dynamics are MuJoCo's own steps, and nothing is derived by hand."""
+
+import os
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim import rotations
+from lqrsim.errors import Array, InputError, check_flag, check_name, check_number, excerpt, vectors_of
+from lqrsim.problem.constraints import StateBounds
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.robots.base import Robot
+from lqrsim.robots.mjcf_dynamics import MjcfDynamics
+from lqrsim.scenes import mjcf_joints
+from lqrsim.scenes.scene import Scene, load_scene, scene_from_xml
+
+_AXES = "xyz"
+_WIDTH = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # in qpos and in qvel
+
+
+class MjcfRobot(Robot):
+    """All that moves in an MJCF, as one robot.
+
+    A cart-pole, from hanging to standing:
+
+        robot = ls.MjcfRobot("cartpole.xml")
+        problem = ls.Problem(
+            dynamics=robot.dynamics, dt=0.02, steps=150, initial=ls.FixedState(robot.at(pole=np.pi)),
+            stage_cost=ls.ControlCost([0.1]), final_cost=ls.QuadraticCost(np.full(4, 100.0), about=robot.at()),
+        )
+        solution = ls.smooth(problem)
+        rollout = ls.simulate(ls.Plant(robot, robot.scene), solution)
+
+    The states are the positions of the joints in MuJoCo's order, then their velocities, then the states of actuators.
+    Slides and hinges have the joint's name and `<name>_velocity`; ball joints `<name>_rx` to `_rz`, a rotation vector,
+    and `<name>_wx` to `_wz` in body axes; free joints `<name>_x` to `_z` and `<name>_vx` to `_vz`, too, without the
+    `<name>_` where the joint has no name. A hinge without limits is an angle. The controls are MuJoCo's `ctrl`, by the
+    actuators' names, limited by their ctrlrange. What has no name in the MJCF gets one, as `unnamed_joint_0`.
+
+    Obstacles, geoms that are fixed to the world, do not collide in the plan's physics: costs and constraints keep clear
+    of them. Level planes do collide, if `floors`. All other contacts are MuJoCo's.
+
+    Args:
+      file: the name of a packaged scene, the path of an MJCF, or a Scene.
+      body: the name of the one that is pushed by disturbances, and whose place is the robot's; by default the first
+        that moves and has mass.
+      position: the 2 or 3 states that are the body's place in the world, in metres; by default those of which MuJoCo's
+        kinematics says so. () for none.
+      radius: of a ball about the body's origin that has in it all that may collide; by default the least that is sure.
+      floors: whether level planes are for standing on.
+
+    Attributes:
+      scene: what it moves in. dynamics: MuJoCo's steps.
+
+    Raises:
+      InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
+        describe: equality constraints, delays, plugins with states.
+    """
+
+    def __init__(
+        self,
+        file: str | os.PathLike[str] | Scene,
+        *,
+        body: str | None = None,
+        position: Sequence[str] | None = None,
+        radius: float | None = None,
+        floors: bool = True,
+    ) -> None:
+        scene = file if isinstance(file, Scene) else load_scene(file)
+        self.scene = scene_from_xml(mjcf_joints.named(scene.xml), scene.name)
+        self.name = self.scene.name
+        model, who = self.scene.model, f"MjcfRobot {self.name}"
+        number = mjcf_joints.body_of(model, body, who)
+        self._joints, actuators = mjcf_joints.joints_of(model), mjcf_joints.actuators_of(model)
+        self.body = model.body(number).name
+        self.joints = tuple(one.name for one in self._joints)
+        self.actuators = tuple(one.name for one in actuators)
+        self._activations = int(model.na)
+        names, units = zip(*self._states(), strict=True)
+        turned = {"free": 3, "ball": 0}  # where among a joint's coordinates a rotation vector begins
+        place, plane = self._position(position, names, mjcf_joints.position_of(model, number), who)
+        states = Coordinates(
+            names=names, units=units, position=place, plane=plane,
+            rotation_vectors=tuple(one.dof + turned[one.kind] for one in self._joints if one.kind in turned),
+            angles=tuple(one.dof for one in self._joints if one.kind == "hinge" and one.limits is None),
+        )  # fmt: skip
+        self._dynamics = MjcfDynamics(
+            self.scene.xml, who, body=number, floors=check_flag(f"{who}: floors", floors), states=states,
+            controls=Coordinates(
+                names=self.actuators or ("none",), units=tuple(one.unit for one in actuators) or ("",),
+                low=tuple(one.low for one in actuators), high=tuple(one.high for one in actuators),
+            ),
+            actuators=tuple(one.number for one in actuators),
+        )  # fmt: skip
+        reach = mjcf_joints.reach_of(model, number) if radius is None else radius
+        self.radius = check_number(f"{who}: radius", reach, at_least=0.0)
+
+    def _states(self) -> Iterator[tuple[str, str]]:
+        """Names and units: positions, velocities, states of actuators."""
+        turned = [("rx", "rad"), ("ry", "rad"), ("rz", "rad")], [("wx", "rad/s"), ("wy", "rad/s"), ("wz", "rad/s")]
+        moved = [(axis, "m") for axis in _AXES], [(f"v{axis}", "m/s") for axis in _AXES]
+        for side in (0, 1):
+            for one in self._joints:
+                own = "" if one.kind == "free" and one.name.startswith(mjcf_joints.UNNAMED) else one.name
+                if one.kind in ("free", "ball"):
+                    entries = [*(moved[side] if one.kind == "free" else []), *turned[side]]
+                    yield from ((f"{own}_{name}" if own else name, unit) for name, unit in entries)
+                else:
+                    unit = "m" if one.kind == "slide" else "rad"
+                    yield (own, unit) if side == 0 else (f"{own}_velocity", f"{unit}/s")
+        for number in range(self._activations):
+            yield f"activation_{number}", ""
+
+    def _position(
+        self, asked: Sequence[str] | None, names: tuple[str, ...], axes: dict[int, int], who: str
+    ) -> tuple[tuple[int, ...], str]:
+        """Which states are the position, and in which plane."""
+        if asked is None:
+            found = sorted(axes, key=lambda dof: axes[dof])
+            if len({axes[dof] for dof in found}) < len(found) or len(found) == 1:
+                return (), ""
+        else:
+            found = [names.index(check_name(f"{who}: position", name, names)) for name in asked]
+        plane = "".join(_AXES[axes[dof]] for dof in found if dof in axes)
+        if found and (len(plane) != len(found) or len(set(plane)) < len(plane)):
+            told = ", ".join(names[dof] for dof in axes) or "none"
+            raise InputError(
+                f"{who}: position: got {excerpt(tuple(asked or ()))}, want some that say where the body is: {told}"
+            )
+        return tuple(found), plane if len(found) == 2 else ""
+
+    @property
+    def dynamics(self) -> MjcfDynamics:
+        return self._dynamics
+
+    @property
+    def joint_limits(self) -> StateBounds:
+        """The joints' ranges as constraints for a problem; in MuJoCo they are springs that push back.
+
+        Raises:
+          InputError: no joint has any.
+        """
+        names = self.dynamics.state_coordinates.names
+        limited = {names[one.dof]: one.limits for one in self._joints if one.limits is not None}
+        return StateBounds(
+            {name: low for name, (low, _) in limited.items()}, {name: high for name, (_, high) in limited.items()}
+        )
+
+    def at(self, keyframe: str | None = None, /, **values: float) -> Array:
+        """A state (n,): at rest as the MJCF has it, or in one of its keyframes, but for the states that are named.
+
+        Raises:
+          InputError: no such keyframe or state.
+        """
+        model, who = self.scene.model, f"MjcfRobot {self.name}"
+        state = np.zeros(len(self.dynamics.state_coordinates))
+        if keyframe is None:
+            qpos, qvel, act = model.qpos0.copy(), np.zeros(model.nv), np.zeros(model.na)
+        else:
+            qpos, qvel, act = mjcf_joints.keyframe(model, keyframe, who)
+        state[: 2 * model.nv] = self.state(qpos, qvel)[: 2 * model.nv]
+        state[2 * model.nv :] = act
+        names = self.dynamics.state_coordinates.names
+        for name, value in values.items():
+            state[names.index(check_name(f"{who}: state", name, names))] = check_number(f"{who}: {name}", value)
+        return state
+
+    def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
+        model = self.scene.model
+        qpos, qvel = vectors_of("qpos", qpos, model.nq), vectors_of("qvel", qvel, model.nv)
+        parts = []
+        for one in self._joints:
+            own = qpos[..., one.qpos : one.qpos + _WIDTH[one.kind][0]]
+            if one.kind in ("free", "ball"):
+                parts += [own[..., :3]] if one.kind == "free" else []
+                parts.append(rotations.rotation_vector(own[..., -4:]))
+            else:
+                parts.append(own)
+        state = np.concatenate([*parts, qvel], axis=-1)
+        return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
+
+    def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
+        model = self.scene.model
+        state = vectors_of("state", state, len(self.dynamics.state_coordinates))
+        parts = []
+        for one in self._joints:
+            own = state[..., one.dof : one.dof + _WIDTH[one.kind][1]]
+            if one.kind in ("free", "ball"):
+                parts += [own[..., :3]] if one.kind == "free" else []
+                parts.append(rotations.quaternion(own[..., -3:]))
+            else:
+                parts.append(own)
+        return np.concatenate(parts, axis=-1), state[..., model.nv : 2 * model.nv].copy()

@@ -1,0 +1,137 @@
+"""Dynamics that are MuJoCo's: where a control period leads, by its own steps."""
+
+import copy
+from functools import cache, cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen.jit import Core
+from lqrsim.codegen.kernel_source import source_of
+from lqrsim.errors import Array, InputError, check_name, check_number
+from lqrsim.kernels import mjcf_dynamics, rotation_ratios
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.hashing import sha256
+from lqrsim.scenes.mjcf_physics import MjcfPhysics
+
+# What may push the robot's body, in the world's axes: names that `uncertainty_of` knows.
+WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
+
+
+class MjcfDynamics(Dynamics):
+    """`x' = g(x, u)`, by MuJoCo's steps of a whole control period; `MjcfRobot` makes it.
+
+    The state is the position of each joint, in MuJoCo's order of degrees of freedom and with rotations of ball and free
+    joints as rotation vectors; then the velocities; then the states of actuators that have some. The control is
+    MuJoCo's `ctrl`. Derivatives are central differences over the control period. There is no rate: solvers in
+    continuous time do not take them, nor those that need an inverse.
+
+    Attributes:
+      physics: MuJoCo's model, and memory for each thread.
+    """
+
+    discrete: ClassVar[bool] = True
+
+    def __init__(
+        self, xml: str, name: str, *, body: int, floors: bool, states: Coordinates, controls: Coordinates,
+        actuators: tuple[int, ...],
+    ) -> None:  # fmt: skip
+        self._name = name
+        self._stated: dict[str, Any] = {"body": body, "floors": floors, "actuators": actuators}
+        self._xml, self.fixed = xml, sha256(xml, repr(self._stated))
+        self.functions, self.level = (), "compiled"
+        self.parameters: dict[str, float] = {}
+        self.disturbances = dict.fromkeys(WRENCH, 0.0)
+        self.state_coordinates, self.control_coordinates = states, controls
+        self.physics = MjcfPhysics(xml, name, **self._stated)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without MuJoCo's memory, which another process makes anew."""
+        return {name: value for name, value in vars(self).items() if name not in ("physics", "disturbed")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.physics = MjcfPhysics(self._xml, self._name, **self._stated)
+
+    def __copy__(self) -> "MjcfDynamics":
+        """With the same memory of MuJoCo's."""
+        other = object.__new__(type(self))
+        vars(other).update({name: value for name, value in vars(self).items() if name != "disturbed"})
+        return other
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @cached_property
+    def source(self) -> str:
+        return _source()
+
+    @property
+    def data(self) -> Array:
+        wrench = [self.parameters.get(name, self.disturbances[name]) for name in WRENCH]
+        return np.concatenate([wrench, self.physics.numbers])
+
+    def with_parameters(self, **values: float) -> "MjcfDynamics":
+        """The same, pushed otherwise: `dynamics.disturbed.with_parameters(force_x=1.0)`.
+
+        Raises:
+          InputError: there is no such parameter, or the value is not finite.
+        """
+        other = copy.copy(self)
+        other.parameters = dict(self.parameters)
+        for name, value in values.items():
+            other.parameters[check_name("parameters", name, self.parameters)] = check_number(name, value)
+        return other
+
+    def check_period(self, dt: float) -> None:
+        """Raises InputError unless `dt` seconds are a whole number of physics steps."""
+        timestep = float(self.physics.model.opt.timestep)
+        steps = dt / timestep
+        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
+            raise InputError(
+                f"dt: got {dt:g} s, want a multiple of the physics step of {self.name}, {timestep:g} s;"
+                f' or set <option timestep="{dt / max(round(steps), 1):.17g}"/> there'
+            )
+
+    def rate(self, state: npt.ArrayLike, control: npt.ArrayLike) -> Array:
+        raise InputError(f"{self.name}: got MuJoCo's steps, which have no rate, want `step`")
+
+    def rate_jacobian(self, state: npt.ArrayLike, control: npt.ArrayLike) -> tuple[Array, Array]:
+        raise InputError(f"{self.name}: got MuJoCo's steps, which have no rate, want `linearize`")
+
+    def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
+        """The state (n,) after `dt` seconds, control held; NaN where it leaves all numbers."""
+        x, u = self._check(state, control)
+        self.check_period(check_number("dt", dt))
+        out = np.empty(len(x))
+        self._core.advance(x, u, self.data, float(dt), out)
+        return out
+
+    def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
+        """A (n, n), B (n, m) and c (n,) of the step about a state and control: x' = A x + B u + c."""
+        x, u = self._check(state, control)
+        self.check_period(check_number("dt", dt))
+        n, m = len(x), len(u)
+        out, jacobian, unused = np.empty(n), np.empty((n, n + m)), np.empty((n, n))
+        self._core.step_jacobian(x, u, self.data, float(dt), unused, np.empty((n, m)), out, jacobian)
+        a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
+        return a, b, out - a @ x - b @ u
+
+    @property
+    def _core(self) -> Core:
+        return _core(len(self.state_coordinates), len(self.control_coordinates))
+
+
+@cache
+def _source() -> str:
+    names = {name: value for name, value in vars(mjcf_dynamics).items() if name.isupper() and len(name) > 1}
+    return source_of(mjcf_dynamics, **names)
+
+
+@cache
+def _core(n: int, m: int) -> Core:
+    sizes = {"N": n, "M": m, "W": n + m}
+    return Core(f"{source_of(rotation_ratios)}\n\n{_source()}", sizes, f"MuJoCo's steps ({n} states, {m} controls)")

@@ -1,0 +1,163 @@
+"""What the joints, actuators and keyframes of an MJCF are, as a robot's states and controls need it."""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from lqrsim.errors import Array, InputError, check_name
+
+_KINDS = {
+    mujoco.mjtJoint.mjJNT_FREE: "free", mujoco.mjtJoint.mjJNT_BALL: "ball", mujoco.mjtJoint.mjJNT_SLIDE: "slide",
+    mujoco.mjtJoint.mjJNT_HINGE: "hinge",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint.
+
+    Attributes:
+      name: its own. kind: free, ball, slide or hinge.
+      qpos, dof: where its numbers begin in qpos and qvel. limits: of a slide or hinge, in m or rad; None without.
+      rest: its numbers in qpos when nothing else is said.
+    """
+
+    name: str
+    kind: str
+    qpos: int
+    dof: int
+    limits: tuple[float, float] | None
+    rest: Array
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """An actuator: its name, MuJoCo's number, the unit of its control (or empty), and its limits."""
+
+    name: str
+    number: int
+    unit: str
+    low: float
+    high: float
+
+
+UNNAMED = "unnamed_"  # what begins the name of a body, joint or actuator that has none in the MJCF
+
+
+def named(xml: str) -> str:
+    """An MJCF in which every body, joint and actuator has a name: `unnamed_<kind>_<number>`, counted from 0."""
+    root = ElementTree.fromstring(xml)
+    taken = {element.get("name") for element in root.iter()}
+
+    def name(elements: list[ElementTree.Element], kind: str) -> None:
+        count = 0
+        for element in elements:
+            if element.get("name") is None:
+                while f"{UNNAMED}{kind}_{count}" in taken:
+                    count += 1
+                element.set("name", f"{UNNAMED}{kind}_{count}")
+                count += 1
+
+    for world in root.iter("worldbody"):
+        name(list(world.iter("body")), "body")
+        name([one for one in world.iter() if one.tag in ("joint", "freejoint")], "joint")
+    name([one for section in root.iter("actuator") for one in section], "actuator")
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def joints_of(model: mujoco.MjModel) -> tuple[Joint, ...]:
+    """All joints, in the order of their degrees of freedom."""
+    found = []
+    for number in range(model.njnt):
+        joint, limited = model.joint(number), bool(model.jnt_limited[number])
+        kind = _KINDS[mujoco.mjtJoint(model.jnt_type[number])]
+        first = int(model.jnt_qposadr[number])
+        rest = model.qpos0[first : first + {"free": 7, "ball": 4}.get(kind, 1)].copy()
+        low, high = model.jnt_range[number].tolist()
+        limits = (low, high) if limited and kind in ("slide", "hinge") else None
+        found.append(Joint(joint.name, kind, first, int(model.jnt_dofadr[number]), limits, rest))
+    return tuple(found)
+
+
+def actuators_of(model: mujoco.MjModel) -> tuple[Actuator, ...]:
+    """All actuators, in MuJoCo's order."""
+    found = []
+    for number in range(model.nu):
+        low, high = (
+            model.actuator_ctrlrange[number].tolist() if model.actuator_ctrllimited[number] else (-np.inf, np.inf)
+        )
+        found.append(Actuator(model.actuator(number).name, number, _unit(model, number), low, high))
+    return tuple(found)
+
+
+def _unit(model: mujoco.MjModel, number: int) -> str:
+    """The unit of a control: of plain motors and servos of joints; of the rest it depends on what they are for."""
+    transmission, kinds = model.actuator_trntype[number], mujoco.mjtJoint
+    gear, gain, bias = model.actuator_gear[number], model.actuator_gainprm[number], model.actuator_biasprm[number]
+    own = transmission in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    if not own or gear[0] != 1 or model.actuator_gaintype[number] != mujoco.mjtGain.mjGAIN_FIXED:
+        return ""
+    kind = model.jnt_type[model.actuator_trnid[number, 0]]
+    if kind not in (kinds.mjJNT_SLIDE, kinds.mjJNT_HINGE):
+        return ""
+    force, length = ("N", "m") if kind == kinds.mjJNT_SLIDE else ("N m", "rad")
+    if model.actuator_biastype[number] == mujoco.mjtBias.mjBIAS_NONE:
+        return force if gain[0] == 1 and model.actuator_dyntype[number] == mujoco.mjtDyn.mjDYN_NONE else ""
+    if gain[0] == -bias[1] and bias[0] == 0:
+        return length
+    return f"{length}/s" if bias[1] == 0 and gain[0] == -bias[2] else ""
+
+
+def body_of(model: mujoco.MjModel, name: str | None, what: str) -> int:
+    """The id of the body of that name; without one, of what moves first in the world. Raises InputError."""
+    if name is not None:
+        names = [model.body(number).name for number in range(1, model.nbody)]
+        return int(model.body(check_name(f"{what}: body", name, names)).id)
+    moving = [number for number in range(1, model.nbody) if model.body_jntnum[number] > 0]
+    if not moving:
+        raise InputError(f"{what}: got no joints, want a robot that moves: at least one <joint> or <freejoint/>")
+    # Several bodies may carry a slide each before there is any mass: the robot is the first that has some.
+    return next((number for number in moving if model.body_mass[number] > 0), moving[0])
+
+
+def keyframe(model: mujoco.MjModel, name: str, what: str) -> tuple[Array, Array, Array]:
+    """qpos, qvel and act of a keyframe. Raises InputError if there is none of that name."""
+    names = [model.key(number).name for number in range(model.nkey)]
+    number = names.index(check_name(f"{what}: keyframe", name, names))
+    return model.key_qpos[number].copy(), model.key_qvel[number].copy(), model.key_act[number].copy()
+
+
+def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:
+    """Which axis of the world (0 to 2) each degree of freedom is along which a body's origin is told by it alone.
+
+    Found by moving it: the origin must be where the free joint or the slides say, whatever the other joints do.
+    """
+    data, rng, joints = mujoco.MjData(model), np.random.default_rng(0), joints_of(model)
+    candidates = {
+        one.dof + i: one.qpos + i for one in joints if one.kind in ("free", "slide")
+        for i in range(3 if one.kind == "free" else 1)
+    }  # fmt: skip
+    errors = {(dof, axis): 0.0 for dof in candidates for axis in range(3)}
+    for _ in range(5):
+        data.qpos[:] = model.qpos0 + rng.normal(size=model.nq)
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        mujoco.mj_kinematics(model, data)
+        for dof, axis in errors:
+            off = abs(float(data.xpos[body][axis] - data.qpos[candidates[dof]]))
+            errors[dof, axis] = max(errors[dof, axis], off)
+    return {dof: axis for (dof, axis), error in errors.items() if error < 1e-9}
+
+
+def reach_of(model: mujoco.MjModel, body: int) -> float:
+    """How far from a body's origin what collides of it and of all it carries can be, at most, in metres."""
+    reach = 0.0
+    for geom in np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0)):
+        path = [int(model.geom_bodyid[geom])]
+        while path[-1] not in (0, body):
+            path.append(int(model.body_parentid[path[-1]]))
+        if path[-1] == body:
+            offsets = [model.geom_pos[geom], *(model.body_pos[one] for one in path[:-1])]
+            reach = max(reach, float(model.geom_rbound[geom] + sum(np.linalg.norm(one) for one in offsets)))
+    return reach

@@ -1,0 +1,134 @@
+"""MuJoCo's own steps as numbers that compiled code can work with: addresses, sizes, and memory for several threads."""
+
+import ctypes
+import platform
+from functools import cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from lqrsim.errors import Array, InputError
+from lqrsim.kernels import mjcf_dynamics as kernel
+from lqrsim.machine import processors
+from lqrsim.scenes.scene import model_from_xml, obstacle_geoms
+
+_CONVERGED = 1e-14  # the constraint solver's tolerance: what it leaves is divided by the difference of a derivative
+_PARTS = {
+    mujoco.mjtIntegrator.mjINT_EULER: "mj_Euler",
+    mujoco.mjtIntegrator.mjINT_IMPLICIT: "mj_implicit",
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: "mj_implicit",
+}
+
+
+class MjcfPhysics:
+    """What `kernels/mjcf_dynamics.py` needs of an MJCF.
+
+    The model is the MJCF's own, but that
+
+    - obstacles do not collide: they are for costs and constraints to keep clear of. Level planes do, if `floors`;
+    - controls are not cut off at their range, which would hide from a solver which way to go from there;
+    - the constraint solver ends nearer to its solution;
+    - what blows up is not reset.
+
+    Args:
+      xml: the MJCF as text. name: of it, for messages. body: id of the one that is pushed.
+      actuators: ids of those that the controls are for, in order.
+
+    Attributes:
+      model: MuJoCo's. numbers: what the kernel takes after the wrench.
+
+    Raises:
+      InputError: it has what a state of joints and actuators does not describe.
+    """
+
+    def __init__(self, xml: str, name: str, *, body: int, actuators: tuple[int, ...], floors: bool) -> None:
+        self.model = model_from_xml(xml, name)
+        _check(self.model, name)
+        _prepare(self.model, floors)
+        slots = 2 * processors()
+        self._data = [mujoco.MjData(self.model) for _ in range(2 * slots)]
+        for data in self._data:
+            # MuJoCo writes to a file and the console about the first of each: there are no first ones.
+            for warning in range(len(data.warning.number)):
+                data.warning.number[warning] = 1
+        self._flags = np.zeros(slots, dtype=np.int64)
+        self._table = np.array([self._addresses(data, body) for data in self._data], dtype=np.float64)
+        self.numbers = self._numbers(actuators)
+
+    def _addresses(self, data: mujoco.MjData, body: int) -> list[float]:
+        row = np.zeros(kernel.SIZE)
+        fields = {
+            kernel.QPOS: data.qpos, kernel.QVEL: data.qvel, kernel.ACT: data.act, kernel.CTRL: data.ctrl,
+            kernel.WARM: data.qacc_warmstart, kernel.QACC: data.qacc, kernel.PUSH: data.xfrc_applied[body],
+        }  # fmt: skip
+        for place, array in fields.items():
+            row[place] = array.ctypes.data
+        row[kernel.DATA] = data._address
+        return row.tolist()
+
+    def _numbers(self, actuators: tuple[int, ...]) -> Array:
+        model, functions = self.model, _functions()
+        joints = np.stack([model.jnt_type, model.jnt_qposadr, model.jnt_dofadr], axis=1).astype(np.float64)
+        part = _PARTS.get(mujoco.mjtIntegrator(model.opt.integrator))
+        numbers = np.zeros(kernel.TABLE)
+        numbers[kernel.FLAGS], numbers[kernel.SLOTS] = self._flags.ctypes.data, self._table.ctypes.data
+        numbers[kernel.COUNT], numbers[kernel.MODEL] = len(self._flags), model._address
+        numbers[kernel.STEP], numbers[kernel.FORWARD] = functions["mj_step"], functions["mj_forwardSkip"]
+        numbers[kernel.INTEGRATE] = functions[part] if part else 0
+        numbers[kernel.TIMESTEP], numbers[kernel.NV], numbers[kernel.NA] = model.opt.timestep, model.nv, model.na
+        numbers[kernel.JOINTS], numbers[kernel.ACTUATORS] = model.njnt, kernel.TABLE + joints.size
+        return np.concatenate([numbers, joints.ravel(), actuators])[kernel.WRENCH + 6 :]
+
+
+def _check(model: mujoco.MjModel, name: str) -> None:
+    """Raises InputError for what the states do not have, or that makes them depend on each other."""
+    refused = {
+        "actuators": (model.nu == 0, "got none", "at least one <actuator>"),
+        "equality": (
+            any(model.eq_active0),
+            "got constraints that make coordinates depend on each other",
+            'none, or active="false"',
+        ),
+        "plugins": (model.npluginstate > 0, "got some with states of their own", "none"),
+        "delays": (getattr(model, "nhistory", 0) > 0, "got actuators or sensors with a delay", "none"),
+    }
+    for what, (found, got, wanted) in refused.items():
+        if found:
+            raise InputError(f"{name}: {what}: {got}, want {wanted}")
+
+
+def _prepare(model: mujoco.MjModel, floors: bool) -> None:
+    for geom in obstacle_geoms(model):
+        level = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE and _is_level(model, geom)
+        if not (floors and level):
+            model.geom_contype[geom] = model.geom_conaffinity[geom] = 0
+            if ((model.pair_geom1 == geom) | (model.pair_geom2 == geom)).any():
+                raise InputError(f"geom {geom}: got an obstacle in a <contact><pair>, want contype and conaffinity")
+    option, flags = model.opt, mujoco.mjtDisableBit
+    option.disableflags |= int(flags.mjDSBL_CLAMPCTRL) | int(flags.mjDSBL_AUTORESET) | int(flags.mjDSBL_SENSOR)
+    option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    option.tolerance = min(option.tolerance, _CONVERGED)
+    if mujoco.__version__ == "4.0.0":
+        option.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # on sparse ones its Newton solver is wrong
+
+
+def _is_level(model: mujoco.MjModel, geom: int) -> bool:
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return abs(data.geom_xmat[geom][8]) > 1 - 1e-9
+
+
+@cache
+def _functions() -> dict[str, int]:
+    """The addresses of MuJoCo's functions, in the library that the bindings have loaded."""
+    folder = Path(mujoco.__file__).parent
+    patterns = {"Windows": "mujoco.dll", "Darwin": "libmujoco*.dylib"}
+    (library, *_) = sorted(folder.glob(patterns.get(platform.system(), "libmujoco.so*")))
+    loaded = ctypes.CDLL(str(library))
+    found = {}
+    for name in ("mj_step", "mj_forwardSkip", "mj_Euler", "mj_implicit"):
+        address = ctypes.cast(getattr(loaded, name), ctypes.c_void_p).value
+        assert address is not None
+        found[name] = address
+    return found
