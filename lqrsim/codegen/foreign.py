@@ -1,4 +1,4 @@
-"""Memory and functions of a C library, for compiled code: numbers as addresses, and flags that threads share.
+"""Memory and functions of a C library, for compiled code: numbers as addresses, and words that threads share.
 
 An address is kept in a float64, which has all integers up to 2^53, beyond any address of a process. Imported by
 compiled cores only.
@@ -35,6 +35,16 @@ def at(typingctx: Any, address: Any) -> Any:
     return Pointer(())(address), generate
 
 
+@intrinsic(prefer_literal=True)
+def rows_at(typingctx: Any, address: Any, width: Any) -> Any:
+    """The same as rows of a constant width."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _pointer(builder, args[0], ir.DoubleType())
+
+    return Pointer((width.literal_value,))(address, width), generate
+
+
 @intrinsic
 def call(typingctx: Any, function: Any, first: Any, second: Any) -> Any:
     """Call the C function at an address with two pointers."""
@@ -64,6 +74,17 @@ def call_with_two(typingctx: Any, function: Any, first: Any, second: Any, third:
 
 
 @intrinsic
+def call_alone(typingctx: Any, function: Any) -> Any:
+    """Call the C function at an address that takes nothing."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        builder.call(_pointer(builder, args[0], ir.FunctionType(_INT, [])), [])
+        return context.get_dummy_value()
+
+    return types.none(function), generate
+
+
+@intrinsic
 def claim(typingctx: Any, flags: Any, index: Any) -> Any:
     """Set a flag, an int64 at an address, from 0 to 1; 1 if it was this thread that did, else 0."""
 
@@ -76,11 +97,31 @@ def claim(typingctx: Any, flags: Any, index: Any) -> Any:
 
 
 @intrinsic
-def release(typingctx: Any, flags: Any, index: Any) -> Any:
-    """Set a flag back to 0."""
+def load(typingctx: Any, words: Any, index: Any) -> Any:
+    """One of the int64 at an address, which threads share."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store_atomic(ir.Constant(_WORD, 0), _word(builder, *args), "release", 8)
+        return builder.load_atomic(_word(builder, *args), "acquire", 8)
+
+    return types.int64(words, types.int64), generate
+
+
+@intrinsic
+def store(typingctx: Any, words: Any, index: Any, value: Any) -> Any:
+    """Write one of them; what was written before it is there for who then loads it."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        builder.store_atomic(args[2], _word(builder, *args[:2]), "release", 8)
         return context.get_dummy_value()
 
-    return types.none(flags, types.int64), generate
+    return types.none(words, types.int64, types.int64), generate
+
+
+@intrinsic
+def fetch_add(typingctx: Any, words: Any, index: Any, value: Any) -> Any:
+    """Add to one of them, and return what it was before."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.atomic_rmw("add", _word(builder, *args[:2]), args[2], "acq_rel")
+
+    return types.int64(words, types.int64, types.int64), generate

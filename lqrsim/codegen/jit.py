@@ -36,6 +36,9 @@ _FAST = ("contract", "reassoc", "nsz", "arcp")
 # The functions that take long to compile, which is worth a message.
 LONG = ("smoother", "ilqr")
 
+# What kernels may call of `foreign.py`.
+FOREIGN = ("at", "rows_at", "call", "call_alone", "call_with_two", "claim", "load", "store", "fetch_add")
+
 # Compilations in this process; what was loaded from disk does not count.
 compilations: list[str] = []
 compiling = threading.RLock()
@@ -156,7 +159,7 @@ def _vocabulary() -> dict[str, Any]:
     names = {**vars(math), "__name__": __name__, "inner": inner, "inlined": inlined}
     names |= {name: record for name, record in vars(records).items() if inspect.isclass(record)}
     names |= {name: getattr(pointers, name) for name in ("stack", "pointer", "invoke", "invoke_writing")}
-    return names | {name: getattr(foreign, name) for name in ("at", "call", "call_with_two", "claim", "release")}
+    return names | {name: getattr(foreign, name) for name in FOREIGN}
 
 
 def in_c_order(array: Array) -> Array:

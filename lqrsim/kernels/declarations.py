@@ -58,6 +58,11 @@ def at(address):
     return np.empty(0)
 
 
+def rows_at(address, width: int):
+    """The same as rows of a constant width."""
+    return np.empty((0, width))
+
+
 def call(function, first, second) -> None:
     """Call the C function at an address with two pointers."""
 
@@ -66,13 +71,27 @@ def call_with_two(function, first, second, third: int, fourth: int) -> None:
     """Call the C function at an address with two pointers and two ints."""
 
 
+def call_alone(function) -> None:
+    """Call the C function at an address that takes nothing."""
+
+
 def claim(flags, index) -> int:
-    """Set a flag that threads share; 1 if it was this thread that did, else 0."""
+    """Set a flag, one of the int64 at an address, from 0 to 1; 1 if it was this thread that did, else 0."""
     return 1
 
 
-def release(flags, index) -> None:
-    """Set it back."""
+def load(words, index) -> int:
+    """One of the int64 at an address, which threads share."""
+    return 0
+
+
+def store(words, index, value: int) -> None:
+    """Write one of them; what was written before it is there for who then loads it."""
+
+
+def fetch_add(words, index, value: int) -> int:
+    """Add to one of them, and return what it was before."""
+    return 0
 
 
 def rate(x, u, p, out) -> None:

@@ -8,19 +8,40 @@ each takes a slot, two `MjData` that are its own for as long as it needs them.
 
 from math import atan2, cos, nan, pi, sqrt
 
-from lqrsim.kernels.declarations import M, N, W, at, call, call_with_two, claim, release, stack
+from lqrsim.kernels.declarations import (
+    M,
+    N,
+    W,
+    at,
+    call,
+    call_alone,
+    call_with_two,
+    claim,
+    fetch_add,
+    load,
+    rows_at,
+    stack,
+    store,
+)
 from lqrsim.kernels.rotation_ratios import sine_ratio
 
 # Where p has what. WRENCH: force and torque on the body, world axes, 6 numbers. FLAGS, SLOTS, COUNT: who has which
 # slot, where their numbers are, how many. MODEL: MuJoCo's. STEP, FORWARD, INTEGRATE: the addresses of mj_step,
 # mj_forwardSkip and the integrator; the last is 0 where parts of a step cannot be had on their own. TIMESTEP: of the
 # physics, in s. NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those
-# is that the controls are for; TABLE: the joints' kind and places in qpos and qvel, three numbers each.
+# is that the controls are for. TEAM, JOB: where threads that help find what to do, 0 without any; YIELD: the address of
+# what lets others run. TABLE: the joints' kind and places in qpos and qvel, three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
-TIMESTEP, NV, NA, JOINTS, ACTUATORS, TABLE = 13, 14, 15, 16, 17, 18
+TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, TABLE = 13, 14, 15, 16, 17, 18, 19, 20, 21
 
 # What a slot has of each of its two MjData: addresses.
 SLOT, DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, SIZE = 16, 0, 1, 2, 3, 4, 5, 6, 7, 8
+
+# The words that a team shares: whether somebody has it, the next column to do with the number of the job above it, how
+# many are done, whether to stop, how many helpers there are.
+BUSY, TICKET, DONE, STOP, HELPERS = 0, 1, 2, 3, 4
+JOBS = 65536  # the ticket is JOBS * job + column
+PATIENT = 2000  # looks at the ticket before a helper lets others run
 
 FREE, BALL = 0, 1  # MuJoCo's kinds of joints that have a rotation
 LARGEST = 1e10  # MuJoCo's mjMAXVAL: what is beyond is no state of anything
@@ -34,20 +55,16 @@ def advance(x, u, p, h, out):
             out[i] = nan
         return
     slot = take_slot(p)
-    one = at(p[SLOTS] + 8 * SLOT * slot)
-    write_to(x, u, p, one, 1)
-    for _ in range(substeps):
-        call(p[STEP], p[MODEL], one[DATA])
-    read_from(x, p, one, out)
-    release(p[FLAGS], slot)
+    two = at(p[SLOTS] + 8 * SLOT * slot + 8 * SIZE)
+    run(x, u, p, p, substeps, two, out)
+    store(p[FLAGS], slot, 0)
 
 
 def step_jacobian(x, u, p, h, fx, fu, out, jacobian):
     """Write the step as above and its Jacobian `[A B]` (N, W), by central differences over the whole of it.
 
-    `fx` and `fu` are not used. What a perturbed velocity or control does not change of the first physics step, the
-    stage of positions, is kept. MuJoCo's solver starts at the solution of the step that is not perturbed, so that both
-    end equally near to their own: its tolerance is not divided by the difference.
+    `fx` and `fu` are not used. If there are helpers and nobody has them, they do columns, too; which thread did one
+    makes no difference to the last bit.
     """
     substeps = steps_in(x, u, p, h)
     if substeps < 1:
@@ -56,54 +73,135 @@ def step_jacobian(x, u, p, h, fx, fu, out, jacobian):
             for j in range(W):
                 jacobian[i, j] = nan
         return
-    slot = take_slot(p)
-    address = p[SLOTS] + 8 * SLOT * slot
-    one, two = at(address), at(address + 8 * SIZE)
-    z, v, warm, ahead, behind = stack(N), stack(M), stack(N), stack(N), stack(N)
+    team, slot = p[TEAM], take_slot(p)
+    together = team != 0 and load(team, HELPERS) > 0 and claim(team, BUSY) == 1
+    if together:
+        job = at(p[JOB])
+        job[0] = substeps
+        for i in range(N):
+            job[1 + i] = x[i]
+        for i in range(M):
+            job[1 + N + i] = u[i]
+        for i in range(6):
+            job[1 + W + i] = p[WRENCH + i]
+        store(team, DONE, 0)
+        store(team, TICKET, JOBS * (load(team, TICKET) // JOBS + 1))
+    address, warm = p[SLOTS] + 8 * SLOT * slot, stack(N)
+    run(x, u, p, p, substeps, at(address + 8 * SIZE), out)
+    linearize_here(x, u, p, p, address, warm)
+    if not together:
+        for k in range(W):
+            column(k, x, u, p, p, substeps, address, warm, jacobian)
+        store(p[FLAGS], slot, 0)
+        return
+    columns = job_columns(p)
+    k = fetch_add(team, TICKET, 1) % JOBS
+    while k < W:
+        column(k, x, u, p, p, substeps, address, warm, columns)
+        fetch_add(team, DONE, 1)
+        k = fetch_add(team, TICKET, 1) % JOBS
+    patience = 0
+    while load(team, DONE) < W:  # a helper has still something to do, if it gets to run
+        patience += 1
+        if patience > PATIENT and p[YIELD] != 0:
+            call_alone(p[YIELD])
+    for i in range(N):
+        for j in range(W):
+            jacobian[i, j] = columns[i, j]
+    store(team, BUSY, 0)
+    store(p[FLAGS], slot, 0)
+
+
+def help_out(p):
+    """Do columns of what others linearise about, until told to stop.
+
+    A column is taken first and its job looked at then: as long as it is not done, nobody writes another job.
+    """
+    team, slot, known, patience = p[TEAM], take_slot(p), -1, 0
+    address, warm, job, columns = p[SLOTS] + 8 * SLOT * slot, stack(N), at(p[JOB]), job_columns(p)
+    x, u, wrench = stack(N), stack(M), stack(6)
+    while load(team, STOP) == 0:
+        if load(team, TICKET) % JOBS >= W:
+            patience += 1
+            if patience > PATIENT and p[YIELD] != 0:
+                call_alone(p[YIELD])
+            continue
+        patience, ticket = 0, fetch_add(team, TICKET, 1)
+        if ticket % JOBS >= W:
+            continue
+        if ticket // JOBS != known:
+            known = ticket // JOBS
+            for i in range(N):
+                x[i] = job[1 + i]
+            for i in range(M):
+                u[i] = job[1 + N + i]
+            for i in range(6):
+                wrench[i] = job[1 + W + i]
+            linearize_here(x, u, p, wrench, address, warm)
+        column(ticket % JOBS, x, u, p, wrench, int(job[0]), address, warm, columns)
+        fetch_add(team, DONE, 1)
+    store(p[FLAGS], slot, 0)
+
+
+def job_columns(p):
+    """Where the columns of a job go: rows of W numbers."""
+    return rows_at(p[JOB] + 8 * (1 + W + 6), W)
+
+
+def run(x, u, p, wrench, substeps, two, out):
+    """Write where so many physics steps lead."""
+    write_to(x, u, p, two)
+    begin(p, wrench, two)
+    for _ in range(substeps):
+        call(p[STEP], p[MODEL], two[DATA])
+    read_from(x, p, two, out)
+
+
+def linearize_here(x, u, p, wrench, address, warm):
+    """Have the first MjData of a slot at the state that columns differ from, and write MuJoCo's accelerations there."""
+    one = at(address)
+    write_to(x, u, p, one)
+    begin(p, wrench, one)
+    call_with_two(p[FORWARD], p[MODEL], one[DATA], 0, 1)
+    accelerations = at(one[QACC])
+    for i in range(int(p[NV])):
+        warm[i] = accelerations[i]
+
+
+def column(k, x, u, p, wrench, substeps, address, warm, jacobian):
+    """Write a column of the Jacobian: the k-th, of the controls first, which leave the stage of velocities as it is.
+
+    What a perturbed velocity or control does not change of the first physics step, the stage of positions, is kept.
+    MuJoCo's solver starts at the solution of the step that is not perturbed, so that both sides end equally near to
+    their own: its tolerance is not divided by the difference.
+    """
+    one, two, nv = at(address), at(address + 8 * SIZE), int(p[NV])
+    z, v, ahead, behind = stack(N), stack(M), stack(N), stack(N)
     for i in range(N):
         z[i] = x[i]
     for i in range(M):
         v[i] = u[i]
-    nv = int(p[NV])
-    write_to(x, u, p, one, 1)
-    call_with_two(p[FORWARD], p[MODEL], one[DATA], 0, 1)
-    accelerations = at(one[QACC])
-    for i in range(nv):
-        warm[i] = accelerations[i]
-    write_to(x, u, p, two, 1)
-    for _ in range(substeps):
-        call(p[STEP], p[MODEL], two[DATA])
-    read_from(x, p, two, out)
-    for k in range(W):
-        # Controls first: of the first stages, they leave that of the velocities, too.
-        j = k + N if k < M else k - M
-        size = x[j] if j < N else u[j - N]
-        difference = 1e-6 * max(1.0, abs(size))
-        for side in range(2):
-            moved = size + difference if side == 0 else size - difference
-            if j < N:
-                z[j] = moved
-            else:
-                v[j - N] = moved
-            after = ahead if side == 0 else behind
-            kept = 0 if j < nv else 1 if j < N else 2
-            if kept > 0 and p[INTEGRATE] != 0:
-                step_from(z, v, p, one, two, warm, kept)
-                first = 1
-            else:
-                write_to(z, v, p, two, 1)
-                start_from(p, two, warm)
-                first = 0
-            for _ in range(substeps - first):
-                call(p[STEP], p[MODEL], two[DATA])
-            read_from(out, p, two, after)
-            if j < N:
-                z[j] = x[j]
-            else:
-                v[j - N] = u[j - N]
-        for i in range(N):
-            jacobian[i, j] = (ahead[i] - behind[i]) / (2 * difference)
-    release(p[FLAGS], slot)
+    j = k + N if k < M else k - M
+    size = x[j] if j < N else u[j - N]
+    difference = 1e-6 * max(1.0, abs(size))
+    kept = 0 if j < nv or p[INTEGRATE] == 0 else 1 if j < N else 2
+    for side in range(2):
+        moved = size + difference if side == 0 else size - difference
+        if j < N:
+            z[j] = moved
+        else:
+            v[j - N] = moved
+        begin(p, wrench, two)
+        if kept > 0:
+            step_from(z, v, p, one, two, warm, kept)
+        else:
+            write_to(z, v, p, two)
+            start_from(p, two, warm)
+        for _ in range(substeps - 1 if kept > 0 else substeps):
+            call(p[STEP], p[MODEL], two[DATA])
+        read_from(x, p, two, ahead if side == 0 else behind)
+    for i in range(N):
+        jacobian[i, j] = (ahead[i] - behind[i]) / (2 * difference)
 
 
 def steps_in(x, u, p, h):
@@ -125,8 +223,8 @@ def take_slot(p):
     return slot
 
 
-def write_to(x, u, p, one, anew):
-    """Write a state and a control into an MjData; with `anew` its solver begins without a guess."""
+def write_to(x, u, p, one):
+    """Write a state and a control into an MjData."""
     nv = int(p[NV])
     qpos, qvel, act, ctrl = at(one[QPOS]), at(one[QVEL]), at(one[ACT]), at(one[CTRL])
     for k in range(int(p[JOINTS])):
@@ -146,12 +244,15 @@ def write_to(x, u, p, one, anew):
     listed = int(p[ACTUATORS])
     for i in range(M):
         ctrl[int(p[listed + i])] = u[i]
-    if anew == 1:
-        warm, push = at(one[WARM]), at(one[PUSH])
-        for i in range(nv):
-            warm[i] = 0.0
-        for i in range(6):
-            push[i] = p[WRENCH + i]
+
+
+def begin(p, wrench, one):
+    """Have the next step of an MjData depend on nothing that was before; and push the body."""
+    warm, push = at(one[WARM]), at(one[PUSH])
+    for i in range(int(p[NV])):
+        warm[i] = 0.0
+    for i in range(6):
+        push[i] = wrench[WRENCH + i]
 
 
 def start_from(p, one, guess):
@@ -163,12 +264,12 @@ def start_from(p, one, guess):
 
 def step_from(z, v, p, one, two, guess, kept):
     """A step of the physics with the stages kept that `one` has, and that the state and control share; to `two`."""
-    write_to(z, v, p, one, 0)
+    write_to(z, v, p, one)
     start_from(p, one, guess)
     call_with_two(p[FORWARD], p[MODEL], one[DATA], kept, 1)
     call(p[INTEGRATE], p[MODEL], one[DATA])
     nv = int(p[NV])
-    write_to(z, v, p, two, 1)
+    write_to(z, v, p, two)
     for k in range(int(p[JOINTS])):
         kind, q = int(p[TABLE + 3 * k]), int(p[TABLE + 3 * k + 1])
         copy_between(one[QPOS], two[QPOS], q, 7 if kind == FREE else 4 if kind == BALL else 1)

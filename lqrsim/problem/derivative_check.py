@@ -35,19 +35,18 @@ def check_functions(problem: Problem, x: Array, u: Array) -> None:
 def check_start(problem: Problem, x: Array, u: Array) -> None:
     """Raises InputError if the dynamics or a cost is not finite at a state (n,) and control (m,)."""
     where = f"at the start, x = {brief(x)}, u = {brief(u)}"
-    names = problem.dynamics.state_coordinates.names
+    dynamics, names = problem.dynamics, problem.dynamics.state_coordinates.names
+    called = dynamics.name if dynamics.discrete else f"{dynamics.name}(x, u, p)"
     with np.errstate(all="ignore"):
-        for i, rate in enumerate(problem.dynamics.rate(x, u)):
-            if not np.isfinite(rate):
-                raise InputError(
-                    f"{problem.dynamics.name}(x, u, p): got {rate:g} as entry {i} ({names[i]}) {where},"
-                    " want a finite number"
-                )
-        columns = names, problem.dynamics.control_coordinates.names
-        for what, slopes, column in zip(("df/dx", "df/du"), problem.dynamics.rate_jacobian(x, u), columns, strict=True):
+        for i, moved in enumerate(dynamics.step(x, u, problem.dt) if dynamics.discrete else dynamics.rate(x, u)):
+            if not np.isfinite(moved):
+                raise InputError(f"{called}: got {moved:g} as entry {i} ({names[i]}) {where}, want a finite number")
+        columns = names, dynamics.control_coordinates.names
+        slopes_of = dynamics.linearize(x, u, problem.dt)[:2] if dynamics.discrete else dynamics.rate_jacobian(x, u)
+        for what, slopes, column in zip(("df/dx", "df/du"), slopes_of, columns, strict=True):
             for i, j in np.argwhere(~np.isfinite(slopes)):
                 raise InputError(
-                    f"{problem.dynamics.name}(x, u, p): got {slopes[i, j]:g} in {what}, row {names[i]}, column"
+                    f"{called}: got {slopes[i, j]:g} in {what}, row {names[i]}, column"
                     f" {column[j]}, {where}, want finite derivatives"
                 )
         for cost, term in _terms(problem):
@@ -218,6 +217,8 @@ def _derivatives(subject: Problem | Dynamics, points: Sequence[tuple[Array, Arra
 def _of_dynamics(dynamics: Dynamics, points: Sequence[tuple[Array, Array]]) -> Iterator[_Derivative]:
     states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     n = len(states)
+    if dynamics.discrete:
+        return  # what is stated are central differences
     for x, u in points:
         fx, fu = dynamics.rate_jacobian(x, u)
         joint, noise = _differences(lambda z: dynamics.rate(z[:n], z[n:]), np.concatenate([x, u]))

@@ -1,5 +1,6 @@
 """The dynamics of a system, stated as a function: of symbols, of arrays for numba, or of NumPy arrays."""
 
+import contextlib
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -244,6 +245,10 @@ class Dynamics:
 
     def check_period(self, dt: float) -> None:
         """Raises InputError if they cannot be stepped by `dt` seconds; they always can, but where MuJoCo steps them."""
+
+    def solving(self, threads: int) -> contextlib.AbstractContextManager[None]:
+        """What lasts while a solver is at work that may use so many threads for one trajectory."""
+        return contextlib.nullcontext()
 
     def rate(self, state: npt.ArrayLike, control: npt.ArrayLike) -> Array:
         """`xdot` (n,) at one state (n,) and control (m,), in plain Python."""

@@ -1,6 +1,9 @@
 """Dynamics that are MuJoCo's: where a control period leads, by its own steps."""
 
+import contextlib
 import copy
+import threading
+from collections.abc import Iterator
 from functools import cache, cached_property
 from typing import Any, ClassVar
 
@@ -10,14 +13,18 @@ import numpy.typing as npt
 from lqrsim.codegen.jit import Core
 from lqrsim.codegen.kernel_source import source_of
 from lqrsim.errors import Array, InputError, check_name, check_number
-from lqrsim.kernels import mjcf_dynamics, rotation_ratios
+from lqrsim.kernels import mjcf_dynamics as kernel
+from lqrsim.kernels import rotation_ratios
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 from lqrsim.scenes.mjcf_physics import MjcfPhysics
+from lqrsim.scenes.scene import unlogged
 
 # What may push the robot's body, in the world's axes: names that `uncertainty_of` knows.
 WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
+
+_forming = threading.Lock()  # of teams
 
 
 class MjcfDynamics(Dynamics):
@@ -120,6 +127,27 @@ class MjcfDynamics(Dynamics):
         a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
         return a, b, out - a @ x - b @ u
 
+    @contextlib.contextmanager
+    def solving(self, threads: int) -> Iterator[None]:
+        """While it lasts, so many threads linearise together, and MuJoCo says nothing of what statuses tell."""
+        team, helpers = self.physics.team, list[threading.Thread]()
+        with unlogged():
+            with _forming:
+                if team[kernel.HELPERS] == 0:
+                    numbers, help_out = self.data, self._core.help_out
+                    helpers += [threading.Thread(target=help_out, args=(numbers,)) for _ in range(threads - 1)]
+                    team[kernel.HELPERS] = len(helpers)
+            for helper in helpers:
+                helper.start()
+            try:
+                yield
+            finally:
+                if helpers:
+                    team[kernel.STOP] = 1
+                    for helper in helpers:
+                        helper.join()
+                    team[kernel.STOP] = team[kernel.HELPERS] = 0
+
     @property
     def _core(self) -> Core:
         return _core(len(self.state_coordinates), len(self.control_coordinates))
@@ -127,8 +155,8 @@ class MjcfDynamics(Dynamics):
 
 @cache
 def _source() -> str:
-    names = {name: value for name, value in vars(mjcf_dynamics).items() if name.isupper() and len(name) > 1}
-    return source_of(mjcf_dynamics, **names)
+    names = {name: value for name, value in vars(kernel).items() if name.isupper() and len(name) > 1}
+    return source_of(kernel, **names)
 
 
 @cache

@@ -151,9 +151,14 @@ def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:
 
 
 def reach_of(model: mujoco.MjModel, body: int) -> float:
-    """How far from a body's origin what collides of it and of all it carries can be, at most, in metres."""
+    """How far from a body's origin what collides of it and of all it carries can be, at most, in metres.
+
+    What is only drawn counts where nothing collides.
+    """
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    collides &= model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
     reach = 0.0
-    for geom in np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0)):
+    for geom in np.flatnonzero(collides) if collides.any() else range(model.ngeom):
         path = [int(model.geom_bodyid[geom])]
         while path[-1] not in (0, body):
             path.append(int(model.body_parentid[path[-1]]))

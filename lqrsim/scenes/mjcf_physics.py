@@ -36,7 +36,7 @@ class MjcfPhysics:
       actuators: ids of those that the controls are for, in order.
 
     Attributes:
-      model: MuJoCo's. numbers: what the kernel takes after the wrench.
+      model: MuJoCo's. numbers: what the kernel takes after the wrench. team: the words that its threads share.
 
     Raises:
       InputError: it has what a state of joints and actuators does not describe.
@@ -53,6 +53,10 @@ class MjcfPhysics:
             for warning in range(len(data.warning.number)):
                 data.warning.number[warning] = 1
         self._flags = np.zeros(slots, dtype=np.int64)
+        self.team = np.zeros(8, dtype=np.int64)
+        n, m = 2 * self.model.nv + self.model.na, len(actuators)
+        self.team[kernel.TICKET] = n + m  # a job without columns left
+        self._job = np.zeros(1 + n + m + 6 + n * (n + m))
         self._table = np.array([self._addresses(data, body) for data in self._data], dtype=np.float64)
         self.numbers = self._numbers(actuators)
 
@@ -78,6 +82,8 @@ class MjcfPhysics:
         numbers[kernel.INTEGRATE] = functions[part] if part else 0
         numbers[kernel.TIMESTEP], numbers[kernel.NV], numbers[kernel.NA] = model.opt.timestep, model.nv, model.na
         numbers[kernel.JOINTS], numbers[kernel.ACTUATORS] = model.njnt, kernel.TABLE + joints.size
+        numbers[kernel.TEAM], numbers[kernel.JOB] = self.team.ctypes.data, self._job.ctypes.data
+        numbers[kernel.YIELD] = _yield()
         return np.concatenate([numbers, joints.ravel(), actuators])[kernel.WRENCH + 6 :]
 
 
@@ -117,6 +123,14 @@ def _is_level(model: mujoco.MjModel, geom: int) -> bool:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return abs(data.geom_xmat[geom][8]) > 1 - 1e-9
+
+
+@cache
+def _yield() -> int:
+    """The address of what lets other threads run; 0 where there is none."""
+    if platform.system() == "Windows":
+        return 0
+    return ctypes.cast(ctypes.CDLL(None).sched_yield, ctypes.c_void_p).value or 0
 
 
 @cache

@@ -14,6 +14,7 @@ contype or conaffinity is not zero. So
 import contextlib
 import os
 import re
+import threading
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
@@ -128,16 +129,29 @@ def scene_from_xml(xml: str, name: str) -> Scene:
     return Scene(name, xml, model, World(_obstacles(model, name)))
 
 
+_quiet, _count, _before = threading.Lock(), 0, None
+
+
 @contextlib.contextmanager
 def unlogged() -> Iterator[None]:
-    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder about what is told or recorded otherwise."""
-    before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-    quiet.logto_file = quiet.logto_console = False
-    quiet.set()
+    """Keeps MuJoCo from writing MUJOCO_LOG.TXT and to the console about what is told or recorded otherwise.
+
+    Several threads may be in it: the last to leave puts back what was there before the first.
+    """
+    global _count, _before
+    with _quiet:
+        if _count == 0:
+            _before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+            quiet.logto_file = quiet.logto_console = False
+            quiet.set()
+        _count += 1
     try:
         yield
     finally:
-        before.set()
+        with _quiet:
+            _count -= 1
+            if _count == 0 and _before is not None:
+                _before.set()
 
 
 def free_name(name: str, taken: Collection[str]) -> str:

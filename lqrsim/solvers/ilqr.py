@@ -22,6 +22,7 @@ from lqrsim.solvers.common import (
     check_callback,
     check_outcome,
     check_problem,
+    check_threads,
     iterate,
     list_of,
     solve_all,
@@ -62,7 +63,8 @@ def ilqr(
     )
     check_callback(callback)
     _check(problem, settings)
-    return _solve(problem, settings, each=True, callback=callback)
+    with problem.dynamics.solving(check_threads(None)):
+        return _solve(problem, settings, each=True, callback=callback)
 
 
 def ilqr_many(

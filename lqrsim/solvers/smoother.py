@@ -160,11 +160,12 @@ def _solve(
     for attempt in attempts:
         attempt.stop = stop
     search = Search([name for name, _ in given], attempts, each=each, callback=callback)
-    search.run(threads)
-    default = settings.start is None and settings.starts is None and settings.safeguard
-    if default and not stop.due and search.poor(problem):
-        search.widen(problem, settings, start, stop, threads)
-    chosen, found = search.best
+    with problem.dynamics.solving(threads if len(attempts) == 1 else 1):
+        search.run(threads)
+        default = settings.start is None and settings.starts is None and settings.safeguard
+        if default and not stop.due and search.poor(problem):
+            search.widen(problem, settings, start, stop, threads)
+        chosen, found = search.best
     assert found.certificate is not None
     solution = assemble(
         problem, solver="smooth", options=settings.options(chosen.initial_guess), status=found.status,
