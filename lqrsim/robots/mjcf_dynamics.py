@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.jit import Core
+from lqrsim.codegen.jit import Core, in_c_order
 from lqrsim.codegen.kernel_source import source_of
 from lqrsim.errors import Array, InputError, check_name, check_number
 from lqrsim.kernels import mjcf_dynamics as kernel
@@ -114,7 +114,7 @@ class MjcfDynamics(Dynamics):
         x, u = self._check(state, control)
         self.check_period(check_number("dt", dt))
         out = np.empty(len(x))
-        self._core.advance(x, u, self.data, float(dt), out)
+        self._core.advance(in_c_order(x), in_c_order(u), self.data, float(dt), out)
         return out
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
@@ -123,7 +123,9 @@ class MjcfDynamics(Dynamics):
         self.check_period(check_number("dt", dt))
         n, m = len(x), len(u)
         out, jacobian, unused = np.empty(n), np.empty((n, n + m)), np.empty((n, n))
-        self._core.step_jacobian(x, u, self.data, float(dt), unused, np.empty((n, m)), out, jacobian)
+        self._core.step_jacobian(
+            in_c_order(x), in_c_order(u), self.data, float(dt), unused, np.empty((n, m)), out, jacobian
+        )
         a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
         return a, b, out - a @ x - b @ u
 

@@ -60,7 +60,7 @@ class Attempt:
         self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, stop: Stop
     ) -> None:
         self.problem, self.settings, self.stop = problem, settings, stop
-        if settings.first_pass == "backward" and initial_guess.gain.any():
+        if settings.first_pass == "backward" and (initial_guess.gain.any() or problem.dynamics.discrete):
             initial_guess = initial_guess.rolled_out(problem, start)
         self.initial_guess = initial_guess
         self.work = Workspace(problem, settings, initial_guess, start)

@@ -164,6 +164,8 @@ def smooth_continuous(
         )
     if problem.constraints:
         raise InputError("constraints: got some, want none in continuous time; smooth keeps them")
+    if problem.dynamics.discrete:
+        raise InputError(f"dynamics: got {problem.dynamics.name}, whose steps have no rate, want `smooth` for it")
     limits = _Limits(
         check_number("tolerance", tolerance, above=0.0),
         check_number("gap_tolerance", gap_tolerance, above=0.0),

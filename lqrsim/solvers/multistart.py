@@ -28,6 +28,10 @@ SHARES = (0.0, 0.1, 0.4, 0.7)  # of the obstacle costs, in the first iterations
 PULL = 0.1  # of the path, relative to the curvature of an obstacle's cost where it is touched
 RING, STEP, WIDEST = 0.3, 0.2, 0.6  # how far paths bend, relative to the distance from start to goal
 HALVE, CHOOSE = 3, 4  # the iterations after which half of the starts are left, and one
+# Where nothing that the controls do at rest leads anywhere, as for what swims: how often they sway along the plan, and
+# how far, of what they may.
+SWAYS, SWAY = (1, 2, 4, 8), 0.3
+IDLE = 1e-6  # how far controls may be from the nominal ones to be none, relative to these and at least 1
 # Where what these lead to is poor: how much heavier obstacles and goal are made to find another way.
 BOLD = (10.0, 100.0)
 
@@ -70,6 +74,17 @@ def bold(problem: Problem, times: float) -> Problem:
     stage = [heavier(cost) if isinstance(cost, ObstacleCost) else cost for cost in terms_of(problem.stage_cost)]
     final = [heavier(cost) for cost in terms_of(problem.final_cost)]
     return dataclasses.replace(problem, stage_cost=CostSum(tuple(stage)), final_cost=CostSum(tuple(final)))
+
+
+def swayed(problem: Problem, cycles: int) -> Array:
+    """Controls (T, m) that sway about the nominal ones so often, each a while after the one before it."""
+    space, nominal = problem.control_coordinates, problem.nominal_control
+    actuators = problem.dynamics.control_coordinates
+    low, high = np.maximum(space.low, actuators.low), np.minimum(space.high, actuators.high)
+    room = np.minimum(high - nominal, nominal - low)
+    far = SWAY * np.where(np.isfinite(room), np.maximum(room, 0.0), 1.0)
+    times = np.arange(problem.steps)[:, None] / problem.steps
+    return nominal + far * np.sin(2 * np.pi * (cycles * times - np.arange(len(nominal)) / 4))
 
 
 def check_starts(problem: Problem, count: int | None) -> None:
@@ -165,7 +180,7 @@ class Search:
         """
         position = list(problem.dynamics.state_coordinates.position)
         if _pull(problem) == 0 or problem.goal is None:
-            return False
+            return self._idle(problem)
         (attempt, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
         if not found.success:
             return attempt.iterations_left(found.iterations) > 0
@@ -175,8 +190,25 @@ class Search:
         clearance = clearance_of(problem, found.states)
         return clearance is not None and not clearance.min() >= -0.5 * radius
 
+    def _idle(self, problem: Problem) -> bool:
+        """Whether what was found is to do nothing: at rest no control helps by itself, and some may together."""
+        found, nominal = self.best[1], problem.nominal_control
+        off = np.abs(found.controls - nominal).max()
+        return found.success and found.cost > 0 and off <= IDLE * max(1.0, np.abs(nominal).max())
+
     def widen(self, problem: Problem, settings: SmootherSettings, start: Array, stop: Stop, threads: int) -> None:
         """Look for another way round: of bold plans, go on from the best by steps that lower the true cost alone."""
+        if _pull(problem) == 0:
+            controls = [swayed(problem, cycles) for cycles in SWAYS]
+            attempts = [Attempt(problem, settings, resolve(one, problem), start, stop) for one in controls]
+            named = dict(zip(map(id, attempts), SWAYS, strict=True))
+            chosen = choose(attempts, self._advance, threads)[0]
+            self._named.append((f"controls that sway {named[id(chosen)]} times", chosen))
+            found, best = finish(chosen, each=self._each, callback=self._callback), self.best[1]
+            # Even one that is not at its end is better than to do nothing.
+            better = found.violation <= best.violation and found.cost < best.cost
+            self._finished.insert(0 if better else len(self._finished), (chosen, found))
+            return
         for times in BOLD:
             harder = bold(problem, times)
             attempts = [

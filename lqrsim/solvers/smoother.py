@@ -54,7 +54,8 @@ def smooth(
       problem: with an initial cost, the paper's soft start, or a `FixedState`, which only the dual form takes.
       form: "dual" has the cost-to-come by its moments and needs no inverse dynamics; "primal" is the paper's.
       first_pass: "forward" or "backward"; each iteration ends with a backward pass, so the latter is one pass more.
-        From controls it runs the dynamics backwards in time, from the minimiser of the final cost.
+        From controls it runs the dynamics backwards in time, from the minimiser of the final cost; those of an MJCF,
+        which cannot, it runs forwards.
       safeguard: where the method fails, go on from the best plan so far by steps that lower its cost; see
         `kernels/damped_iterations.py`. Where it converges, the safeguard changes nothing, to the last bit.
       stop: "optimal" (change of cost, gap and first-order optimality all within tolerance) or "cost", the paper's
@@ -181,6 +182,8 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
     check_problem(problem)
     several = settings.start is None and len(problem.obstacle_costs) > 0
     check_attempts(problem, settings.starts or (STARTS if several else 1))
+    if settings.form == "primal" and problem.dynamics.discrete:
+        raise InputError(f"form: got 'primal' for {problem.dynamics.name}, whose steps have no inverse, want 'dual'")
     if settings.form == "primal" and isinstance(problem.initial, FixedState):
         raise InputError(
             "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start):"
