@@ -23,6 +23,7 @@ class Robot(abc.ABC):
       actuators: its actuators in the MJCF, in the order of `actuation`.
       wheels: the geoms in the MJCF that are the treads of its wheels, each on a body of its own; none by default.
       drag: linear, against its velocity through the air, in N s/m; wind acts through it. None by default.
+      activations: how many of its states are those of MuJoCo's actuators, `act`: the last ones. None by default.
       radius: of its collision circle (seen from above) or ball (the rest), in metres.
     """
 
@@ -32,6 +33,7 @@ class Robot(abc.ABC):
     actuators: tuple[str, ...]
     wheels: tuple[str, ...] = ()
     drag: float = 0.0
+    activations: int = 0
     radius: float
 
     @property
@@ -43,7 +45,7 @@ class Robot(abc.ABC):
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
         """The analytic state (..., n) of MuJoCo's `qpos` (..., nq), `qvel` (..., nv).
 
-        Angles come out in the representative nearest to `near` (..., n), if given.
+        Angles come out in the representative nearest to `near` (..., n), if given. Without the `activations`.
         """
 
     @abc.abstractmethod

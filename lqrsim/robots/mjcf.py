@@ -76,7 +76,7 @@ class MjcfRobot(Robot):
         self.body = model.body(number).name
         self.joints = tuple(one.name for one in self._joints)
         self.actuators = tuple(one.name for one in actuators)
-        self._activations = int(model.na)
+        self.activations = int(model.na)
         names, units = zip(*self._states(), strict=True)
         turned = {"free": 3, "ball": 0}  # where among a joint's coordinates a rotation vector begins
         place, plane = self._position(position, names, mjcf_joints.position_of(model, number), who)
@@ -109,7 +109,7 @@ class MjcfRobot(Robot):
                 else:
                     unit = "m" if one.kind == "slide" else "rad"
                     yield (own, unit) if side == 0 else (f"{own}_velocity", f"{unit}/s")
-        for number in range(self._activations):
+        for number in range(self.activations):
             yield f"activation_{number}", ""
 
     def _position(
@@ -124,10 +124,8 @@ class MjcfRobot(Robot):
             found = [names.index(check_name(f"{who}: position", name, names)) for name in asked]
         plane = "".join(_AXES[axes[dof]] for dof in found if dof in axes)
         if found and (len(plane) != len(found) or len(set(plane)) < len(plane)):
-            told = ", ".join(names[dof] for dof in axes) or "none"
-            raise InputError(
-                f"{who}: position: got {excerpt(tuple(asked or ()))}, want some that say where the body is: {told}"
-            )
+            got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes) or "none"
+            raise InputError(f"{who}: position: got {got}, want 2 or 3 that say where the body is, of: {told}")
         return tuple(found), plane if len(found) == 2 else ""
 
     @property
@@ -178,7 +176,12 @@ class MjcfRobot(Robot):
             else:
                 parts.append(own)
         state = np.concatenate([*parts, qvel], axis=-1)
-        return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
+        if near is None:
+            return state
+        near = vectors_of("near", near, len(self.dynamics.state_coordinates))
+        unknown = np.zeros((*state.shape[:-1], self.activations))
+        whole = self.dynamics.state_coordinates.nearest(np.concatenate([state, unknown], axis=-1), near)
+        return whole[..., : 2 * model.nv]
 
     def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
         model = self.scene.model

@@ -114,7 +114,8 @@ class MjcfDynamics(Dynamics):
         x, u = self._check(state, control)
         self.check_period(check_number("dt", dt))
         out = np.empty(len(x))
-        self._core.advance(in_c_order(x), in_c_order(u), self.data, float(dt), out)
+        with unlogged():
+            self._core.advance(in_c_order(x), in_c_order(u), self.data, float(dt), out)
         return out
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:

@@ -13,6 +13,8 @@ _KINDS = {
     mujoco.mjtJoint.mjJNT_HINGE: "hinge",
 }  # fmt: skip
 
+_OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+
 
 @dataclass(frozen=True)
 class Joint:
@@ -94,17 +96,19 @@ def actuators_of(model: mujoco.MjModel) -> tuple[Actuator, ...]:
 
 def _unit(model: mujoco.MjModel, number: int) -> str:
     """The unit of a control: of plain motors and servos of joints; of the rest it depends on what they are for."""
-    transmission, kinds = model.actuator_trntype[number], mujoco.mjtJoint
+    joint = int(model.actuator_trnid[number, 0])
     gear, gain, bias = model.actuator_gear[number], model.actuator_gainprm[number], model.actuator_biasprm[number]
-    own = transmission in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    if not own or gear[0] != 1 or model.actuator_gaintype[number] != mujoco.mjtGain.mjGAIN_FIXED:
+    if mujoco.mjtTrn(model.actuator_trntype[number]) not in _OF_JOINTS or gear[0] != 1:
         return ""
-    kind = model.jnt_type[model.actuator_trnid[number, 0]]
-    if kind not in (kinds.mjJNT_SLIDE, kinds.mjJNT_HINGE):
+    if mujoco.mjtGain(model.actuator_gaintype[number]) != mujoco.mjtGain.mjGAIN_FIXED:
         return ""
-    force, length = ("N", "m") if kind == kinds.mjJNT_SLIDE else ("N m", "rad")
-    if model.actuator_biastype[number] == mujoco.mjtBias.mjBIAS_NONE:
-        return force if gain[0] == 1 and model.actuator_dyntype[number] == mujoco.mjtDyn.mjDYN_NONE else ""
+    kind = _KINDS[mujoco.mjtJoint(model.jnt_type[joint])]
+    if kind not in ("slide", "hinge"):
+        return ""
+    force, length = ("N", "m") if kind == "slide" else ("N m", "rad")
+    plain = mujoco.mjtDyn(model.actuator_dyntype[number]) == mujoco.mjtDyn.mjDYN_NONE
+    if mujoco.mjtBias(model.actuator_biastype[number]) == mujoco.mjtBias.mjBIAS_NONE:
+        return force if gain[0] == 1 and plain else ""
     if gain[0] == -bias[1] and bias[0] == 0:
         return length
     return f"{length}/s" if bias[1] == 0 and gain[0] == -bias[2] else ""

@@ -72,6 +72,7 @@ class Physics:
         self.drawn_parts = self.parts // self._every
         self._qpos, self._qvel = self.simulations.bind("qpos"), self.simulations.bind("qvel")
         self._ctrl, self._wrench = self.simulations.bind("ctrl"), self.simulations.bind("xfrc_applied")
+        self._act = self.simulations.bind("act") if plant.robot.activations else np.zeros((trials, 0))
         self._in_qpos, self._in_qvel, self._in_ctrl = (_span(one) for one in (plant.qpos, plant.qvel, plant.ctrl))
         self.unstable = np.zeros(trials, dtype=bool)
         self.solid = np.zeros(trials, dtype=bool)
@@ -82,6 +83,7 @@ class Physics:
         """Put the robots where analytic states (K, n) say."""
         qpos, qvel = self.plant.robot.configuration(states)
         self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel] = qpos, qvel
+        self._act[:] = states[:, states.shape[1] - self._act.shape[1] :]
 
     def prepare(self, *, altered: bool) -> None:
         """Have obstacles without effect; and what follows from fields that were `altered` worked out."""
@@ -114,7 +116,7 @@ class Physics:
 
     def state(self) -> Array:
         """The analytic states (K, n), angles in any representative."""
-        return self.plant.robot.state(self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel])
+        return self.plant.state(self._qpos[:, self._in_qpos], self._qvel[:, self._in_qvel], self._act)
 
     def touching_now(self) -> npt.NDArray[np.bool_]:
         """Who touches which obstacle now, (K, obstacles); of no use to simulations that go on."""

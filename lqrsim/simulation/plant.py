@@ -91,6 +91,11 @@ class Plant:
         """Whether the robot touches nothing at a clearance above 0: all of it that collides is within its radius."""
         return not self.obstacles or (len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9))
 
+    def state(self, qpos: Array, qvel: Array, act: Array, near: Array | None = None) -> Array:
+        """The analytic state (..., n) of the robot's `qpos`, `qvel` and the actuators' `act`; see `Robot.state`."""
+        state = self.robot.state(qpos, qvel, near=near)
+        return np.concatenate([state, act], axis=-1) if self.robot.activations else state
+
     def clearance(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
         """Signed distance to the nearest obstacle minus the robot's radius in metres, (...), at states (..., n).
 

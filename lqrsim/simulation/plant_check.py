@@ -205,10 +205,12 @@ def _sample(
     robot = plant.robot
     mujoco.mj_resetData(plant.model, data)
     data.qpos[plant.qpos], data.qvel[plant.qvel] = robot.configuration(state)
+    if robot.activations:
+        data.act[:] = state[len(state) - robot.activations :]
     data.ctrl[plant.ctrl] = robot.actuation(control)
     for _ in range(waiting):
         mujoco.mj_step(plant.model, data)
-    before = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=state)
+    before = plant.state(data.qpos[plant.qpos], data.qvel[plant.qvel], data.act, near=state)
     touched: set[tuple[str, str]] = set()
     for _ in range(plant.substeps(period)):
         mujoco.mj_step(plant.model, data)
@@ -220,7 +222,7 @@ def _sample(
             " want a smaller timestep, other states (around, spread) or other controls"
         )
     predicted = robot.dynamics.step(before, control, period)
-    simulated = robot.state(data.qpos[plant.qpos], data.qvel[plant.qvel], near=predicted)
+    simulated = plant.state(data.qpos[plant.qpos], data.qvel[plant.qvel], data.act, near=predicted)
     return _Sample(before, control, simulated, predicted), touched
 
 

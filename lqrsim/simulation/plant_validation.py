@@ -69,7 +69,7 @@ def check_maps(plant: "Plant") -> None:
         ("configuration: qpos", qpos, len(plant.qpos), joints),
         ("configuration: qvel", qvel, len(plant.qvel), joints),
         ("actuation", np.asarray(robot.actuation(np.zeros(m))), len(plant.ctrl), actuators),
-        ("state", np.asarray(robot.state(qpos, qvel)), n, "its dynamics"),
+        ("state", np.asarray(robot.state(qpos, qvel)), n - robot.activations, "its dynamics"),
     ):
         if got.shape != (want,):
             raise InputError(f"robot {robot.name}: {what}: got shape {got.shape}, want ({want},) for {of}")

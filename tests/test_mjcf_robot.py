@@ -1,0 +1,325 @@
+"""A robot of any MJCF: MuJoCo's own steps, the derivatives of these, and what states and controls are called."""
+
+import pickle
+import threading
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import mjcf_files
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lqrsim as ls
+from lqrsim.errors import Array, InputError
+from lqrsim.kernels import mjcf_dynamics as kernel
+from lqrsim.scenes.scene import scene_from_xml
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+@cache
+def robot_of(kind: str, seed: int, integrator: str | None = None) -> tuple[ls.MjcfRobot, mjcf_files.Drawn]:
+    drawn = mjcf_files.draw(kind, seed, integrator)
+    return ls.MjcfRobot(scene_from_xml(drawn.xml, kind)), drawn
+
+
+def near_rest(robot: ls.MjcfRobot, seed: int, size: float = 0.4) -> tuple[Array, Array]:
+    rng = np.random.default_rng(seed)
+    n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
+    return robot.at() + size * rng.normal(size=n), rng.normal(size=m)
+
+
+def stepped(robot: ls.MjcfRobot, state: Array, control: Array, substeps: int, *, near: Array) -> Array:
+    """By MuJoCo's bindings, from `mj_resetData`, with the model that the dynamics are of."""
+    model, n = robot.dynamics.physics.model, len(state)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = robot.configuration(state)
+    data.act[:] = state[n - model.na :]
+    data.ctrl[:] = control
+    for _ in range(substeps):
+        mujoco.mj_step(model, data)
+    after = np.concatenate([robot.state(data.qpos, data.qvel), data.act])
+    return robot.dynamics.state_coordinates.nearest(after, near)
+
+
+@pytest.mark.parametrize("kind", mjcf_files.KINDS)
+@settings(max_examples=15, deadline=None)
+@given(seed=SEEDS)
+def test_a_control_period_is_that_many_steps_of_mujoco(kind: str, seed: int) -> None:
+    robot, drawn = robot_of(kind, seed)
+    state, control = near_rest(robot, seed)
+    found = robot.dynamics.step(state, control, 0.005 * drawn.substeps)
+    # To rounding: the maps between rotation vectors and quaternions differ in the last bits.
+    expected = stepped(robot, state, control, drawn.substeps, near=state)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", mjcf_files.KINDS)
+@settings(max_examples=10, deadline=None)
+@given(seed=SEEDS)
+def test_its_derivatives_are_those_of_the_steps(kind: str, seed: int) -> None:
+    """Against central differences of MuJoCo's own steps, ten times wider: the two differ by curvature and rounding.
+
+    At contacts and limits the width of the differences shows, for these forces have kinks.
+    """
+    robot, drawn = robot_of(kind, seed)
+    state, control = near_rest(robot, seed, 0.1 if kind == "cart" else 0.4)
+    if kind == "box":
+        state[2] += 3.0
+    dt, n = 0.005 * drawn.substeps, len(state)
+    A, B, c = robot.dynamics.linearize(state, control, dt)
+    joint, columns = np.concatenate([state, control]), []
+    for move in 1e-5 * np.eye(len(joint)):
+        ahead, behind = joint + move, joint - move
+        sides = [stepped(robot, one[:n], one[n:], drawn.substeps, near=state) for one in (ahead, behind)]
+        columns.append((sides[0] - sides[1]) / 2e-5)
+    expected = np.stack(columns, axis=1)
+    size = 1 + np.abs(expected).max()
+    np.testing.assert_allclose(np.concatenate([A, B], axis=1), expected, rtol=0, atol=1e-6 * size)
+    np.testing.assert_allclose(A @ state + B @ control + c, robot.dynamics.step(state, control, dt), atol=1e-9)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast"])
+@pytest.mark.parametrize(("kind", "seed"), [("cart", 3), ("wheel", 4)])
+def test_they_are_what_mjd_transition_fd_finds(kind: str, seed: int, integrator: str) -> None:
+    robot, _ = robot_of(kind, seed, integrator)
+    state, control = near_rest(robot, seed, 0.1)
+    model, n, m = robot.dynamics.physics.model, len(state), len(control)
+    data, A, B = mujoco.MjData(model), np.zeros((n, n)), np.zeros((n, m))
+    data.qpos[:], data.qvel[:] = robot.configuration(state)
+    data.act[:], data.ctrl[:] = state[n - model.na :], control
+    mujoco.mjd_transitionFD(model, data, 1e-6, 1, A, B, None, None)
+    found = robot.dynamics.linearize(state, control, 0.005)
+    np.testing.assert_allclose(found[0], A, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found[1], B, rtol=0, atol=1e-7)
+
+
+def test_a_resting_box_is_linearised_through_its_contacts() -> None:
+    """The floor's force is stiff: a millimetre deeper is pushed out by what MuJoCo's own differences say."""
+    robot, _ = robot_of("box", 1, "Euler")
+    state = robot.at()
+    for _ in range(300):
+        state = robot.dynamics.step(state, np.zeros(2), 0.005)
+    assert robot.dynamics.physics.model.opt.tolerance <= 1e-12
+    model, data = robot.dynamics.physics.model, mujoco.MjData(robot.dynamics.physics.model)
+    A, B = np.zeros((12, 12)), np.zeros((12, 2))
+    data.qpos[:], data.qvel[:] = robot.configuration(state)
+    mujoco.mj_forward(model, data)
+    assert data.ncon >= 3
+    mujoco.mjd_transitionFD(model, data, 1e-6, 1, A, B, None, None)
+    found, _, _ = robot.dynamics.linearize(state, np.zeros(2), 0.005)
+    # Its rotations are of the body, ours entries of a rotation vector, which are the same at no rotation at all.
+    assert np.abs(state[3:6]).max() < 1e-6
+    np.testing.assert_allclose(found, A, rtol=0, atol=1e-4 * np.abs(A).max())
+
+
+@pytest.mark.parametrize("kind", mjcf_files.KINDS)
+def test_helpers_change_no_bit(kind: str) -> None:
+    robot, drawn = robot_of(kind, 11)
+    dynamics, dt = robot.dynamics, 0.005 * drawn.substeps
+    points = [near_rest(robot, seed) for seed in range(20)]
+    alone = [dynamics.linearize(*point, dt) for point in points]
+    with dynamics.solving(3):
+        assert dynamics.physics.team[kernel.HELPERS] == 2
+        together = [dynamics.linearize(*point, dt) for point in points]
+    assert not dynamics.physics.team.any() or dynamics.physics.team[kernel.HELPERS] == 0
+    for one, other in zip(alone, together, strict=True):
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_threads_do_not_disturb_each_other() -> None:
+    robot, drawn = robot_of("arm", 5)
+    points = [near_rest(robot, seed) for seed in range(40)]
+    expected = [robot.dynamics.step(*point, 0.005 * drawn.substeps) for point in points]
+    found: dict[int, list[Array]] = {}
+
+    def work(which: int) -> None:
+        found[which] = [robot.dynamics.step(*point, 0.005 * drawn.substeps) for point in points]
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 8
+    for one in found.values():
+        np.testing.assert_array_equal(one, expected)
+
+
+@pytest.mark.parametrize("kind", mjcf_files.KINDS)
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS)
+def test_states_and_mujocos_numbers_are_the_same_place(kind: str, seed: int) -> None:
+    robot, _ = robot_of(kind, 0)
+    rng, nv = np.random.default_rng(seed), robot.scene.model.nv
+    states = robot.at() + rng.normal(size=(4, len(robot.dynamics.state_coordinates)))
+    qpos, qvel = robot.configuration(states)
+    back = robot.state(qpos, qvel, near=states)
+    np.testing.assert_allclose(back, states[:, : 2 * nv], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(robot.state(qpos[0], qvel[0], near=states[0]), back[0], rtol=0, atol=0)
+
+
+def test_what_is_not_finite_comes_back_as_nan_and_nothing_is_logged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    robot, _ = robot_of("cart", 3, "Euler")
+    dynamics, state = robot.dynamics, robot.at()
+    assert np.isnan(dynamics.step(np.where(np.arange(4) == 2, 1e11, state), np.zeros(1), 0.005)).all()
+    # Large enough to blow up within the period.
+    assert np.isnan(dynamics.step(state + 9e9, np.full(1, 9e9), 0.02)).all()
+    np.testing.assert_array_equal(dynamics.step(state, np.zeros(1), 0.005), dynamics.step(state, np.zeros(1), 0.005))
+    assert capfd.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_names_units_limits_and_what_wraps() -> None:
+    cart, _ = robot_of("cart", 0)
+    space, controls = cart.dynamics.state_coordinates, cart.dynamics.control_coordinates
+    assert space.names == ("slider", "pole", "slider_velocity", "pole_velocity")
+    assert space.units == ("m", "rad", "m/s", "rad/s")
+    assert space.angles == (1,)
+    assert (controls.names, controls.low, controls.high) == (("push",), (-1.0,), (1.0,))
+    arm, _ = robot_of("arm", 0)
+    space = arm.dynamics.state_coordinates
+    assert space.names[:4] == ("shoulder_rx", "shoulder_ry", "shoulder_rz", "elbow")
+    assert space.names[4:] == ("shoulder_wx", "shoulder_wy", "shoulder_wz", "elbow_velocity")
+    assert (space.rotation_vectors, space.angles) == ((0,), (3,))
+    assert arm.dynamics.control_coordinates.units == ("rad", "rad/s")
+    box, _ = robot_of("box", 0)
+    space = box.dynamics.state_coordinates
+    assert space.names == ("x", "y", "z", "rx", "ry", "rz", "vx", "vy", "vz", "wx", "wy", "wz")
+    assert (space.position, space.rotation_vectors, space.plane) == ((0, 1, 2), (3,), "xyz")
+    assert box.dynamics.control_coordinates.names == ("unnamed_actuator_0", "unnamed_actuator_1")
+    wheel, _ = robot_of("wheel", 0)
+    assert wheel.dynamics.state_coordinates.names == ("axle", "axle_velocity", "activation_0")
+
+
+def test_states_by_name_and_keyframe() -> None:
+    xml = mjcf_files.draw("cart", 1).xml.replace(
+        "</mujoco>", '<keyframe><key name="tilted" qpos="0.1 0.5" qvel="1 2"/></keyframe></mujoco>'
+    )
+    robot = ls.MjcfRobot(scene_from_xml(xml, "cart"))
+    np.testing.assert_array_equal(robot.at(), np.zeros(4))
+    np.testing.assert_array_equal(robot.at(pole=np.pi, slider_velocity=2.0), [0, np.pi, 2, 0])
+    np.testing.assert_array_equal(robot.at("tilted"), [0.1, 0.5, 1, 2])
+    np.testing.assert_array_equal(robot.at("tilted", slider=0.0), [0, 0.5, 1, 2])
+    with pytest.raises(InputError, match=r"keyframe: got 'up', want one of: tilted"):
+        robot.at("up")
+    with pytest.raises(InputError, match=r"state: got 'hinge', want one of: slider, pole"):
+        robot.at(hinge=1.0)
+
+
+def test_joint_limits_are_bounds() -> None:
+    robot, _ = robot_of("cart", 0)
+    bounds = robot.joint_limits
+    assert (bounds.low, bounds.high) == ({"slider": -0.3}, {"slider": 0.3})
+    with pytest.raises(InputError, match="got no bounds"):
+        _ = robot_of("wheel", 0)[0].joint_limits
+
+
+def test_a_wrench_on_the_body_is_a_disturbance() -> None:
+    robot, _ = robot_of("box", 2, "Euler")
+    state = robot.at(z=3.0)
+    pushed = robot.dynamics.disturbed.with_parameters(force_x=2.0, torque_z=0.1)
+    mass = float(robot.scene.model.body_mass[1])
+    spin = float(robot.scene.model.body_inertia[1, 2])
+    after = pushed.step(state, np.zeros(2), 0.005)
+    np.testing.assert_allclose(after[6], 0.005 * 2.0 / mass, rtol=1e-9)
+    np.testing.assert_allclose(after[11], 0.005 * 0.1 / spin, rtol=1e-9)
+    np.testing.assert_array_equal(
+        robot.dynamics.disturbed.step(state, np.zeros(2), 0.005), robot.dynamics.step(state, np.zeros(2), 0.005)
+    )
+
+
+def test_it_is_pickled_with_its_model() -> None:
+    robot, _ = robot_of("cart", 4, "Euler")
+    again = pickle.loads(pickle.dumps(robot))
+    state, control = near_rest(robot, 0)
+    np.testing.assert_array_equal(again.dynamics.step(state, control, 0.01), robot.dynamics.step(state, control, 0.01))
+
+
+def swing(robot: ls.MjcfRobot, **options: Any) -> ls.Problem:
+    return ls.Problem(
+        dynamics=robot.dynamics, dt=0.02, steps=60, initial=ls.FixedState(robot.at(pole=2.5)),
+        stage_cost=ls.ControlCost([0.1]), final_cost=ls.QuadraticCost(np.full(4, 50.0), about=robot.at(pole=np.pi)),
+        **options,
+    )  # fmt: skip
+
+
+def test_a_plan_of_the_smoother_is_what_mujoco_does() -> None:
+    """One hanging pole, brought to rest: solved, optimal by differences of its cost, and run in the same MJCF."""
+    robot, _ = robot_of("cart", 4, "implicitfast")
+    problem = swing(robot)
+    solution = ls.smooth(problem)
+    assert solution.success, solution
+    assert solution.certificate.optimality < 1e-3
+    rollout = ls.simulate(ls.Plant(robot, robot.scene), solution)
+    # Not to the bit: the plan's solver of constraints ends nearer to its solution.
+    np.testing.assert_allclose(rollout.states[0], solution.trajectory.states, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(ls.ilqr(problem).cost, solution.cost, rtol=1e-3)
+    pickled = pickle.loads(pickle.dumps(problem))
+    assert pickled.digest == problem.digest
+    np.testing.assert_array_equal(ls.smooth(pickled, threads=1).trajectory.states, solution.trajectory.states)
+
+
+def test_laws_that_track_and_estimate_take_it() -> None:
+    robot, _ = robot_of("cart", 4, "implicitfast")
+    problem = swing(robot)
+    solution, plant = ls.smooth(problem), ls.Plant(robot, robot.scene)
+    noise = [ls.MeasurementNoise(0.002)]
+    law = ls.track(problem, solution, tolerate={"m": 0.05, "rad": 0.05, "m/s": 0.5, "rad/s": 0.5}, effort=0.5)
+    estimating = ls.OffsetFree(
+        problem, solution, ls.uncertainty_of(plant, noise), effort=0.5,
+        tolerate={"m": 0.05, "rad": 0.05, "m/s": 0.5, "rad/s": 0.5},
+    )  # fmt: skip
+    rollout = ls.simulate(plant, solution, controller=estimating, disturbances=noise, trials=5, seed=1)
+    off = np.abs(rollout.states - solution.trajectory.states)[..., :2].max()
+    assert off < 0.1
+    assert law.gain.shape == (60, 1, 4)
+
+
+BAD = {
+    "no actuators": ('<worldbody><body><joint/><geom size="0.1"/></body></worldbody>', "actuators: got none, want at"),
+    "nothing moves": ('<worldbody><geom size="0.1"/></worldbody>', "got no joints, want a robot that moves"),
+    "equality": (
+        '<worldbody><body name="a"><joint name="a"/><geom size="0.1"/></body><body name="b"><joint name="b"/>'
+        '<geom size="0.1"/></body></worldbody><equality><joint joint1="a" joint2="b"/></equality>'
+        '<actuator><motor joint="a"/></actuator>',
+        "equality: got constraints that make coordinates depend on each other, want none",
+    ),
+}
+
+
+@pytest.mark.parametrize("which", BAD)
+def test_what_states_do_not_describe_is_refused(which: str) -> None:
+    text, message = BAD[which]
+    with pytest.raises(InputError, match=message) as refused:
+        ls.MjcfRobot(scene_from_xml(f"<mujoco>{text}</mujoco>", "bad"))
+    assert "\n" not in str(refused.value)
+
+
+def test_bad_arguments_are_named() -> None:
+    scene = robot_of("cart", 0)[0].scene
+    robot = ls.MjcfRobot(scene)
+    cases: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"body": "hull"}, "body: got 'hull', want one of: cart, pole"),
+        ({"position": ("pole", "slider")}, "position: got .*, want 2 or 3 that say where the body is, of: slider"),
+        ({"position": ("nose",)}, "position: got 'nose'"),
+        ({"radius": -1.0}, "radius: got -1"),
+        ({"floors": 3}, "floors: got 3"),
+    )
+    for arguments, message in cases:
+        with pytest.raises(InputError, match=message):
+            ls.MjcfRobot(scene, **arguments)
+    with pytest.raises(InputError, match=r"dt: got 0.007 s, want a multiple of the physics step"):
+        robot.dynamics.step(robot.at(), np.zeros(1), 0.007)
+    with pytest.raises(InputError, match="no rate"):
+        robot.dynamics.rate(robot.at(), np.zeros(1))
+    with pytest.raises(InputError, match="steps have no inverse, want 'dual'"):
+        ls.smooth(swing(robot), form="primal")
