@@ -64,7 +64,7 @@ def bold(problem: Problem, times: float) -> Problem:
 
     def heavier(cost: Cost) -> Cost:
         if isinstance(cost, ObstacleCost):
-            return ObstacleCost(cost.world, radius=cost.radius, sharpness=cost.sharpness, weight=times * cost.weight)
+            return cost.weighing(times * cost.weight)
         return QuadraticCost(times * cost.weight, about=cost.about) if isinstance(cost, QuadraticCost) else cost
 
     stage = [heavier(cost) if isinstance(cost, ObstacleCost) else cost for cost in terms_of(problem.stage_cost)]
@@ -166,7 +166,7 @@ class Search:
         position = list(problem.dynamics.state_coordinates.position)
         if _pull(problem) == 0 or problem.goal is None:
             return False
-        (attempt, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
+        (attempt, found), radius = self.best, max(cost.largest for cost in problem.obstacle_costs)
         if not found.success:
             return attempt.iterations_left(found.iterations) > 0
         places = found.states[:, position]
