@@ -9,6 +9,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array, check_number
 
 if TYPE_CHECKING:
+    from lqrsim.problem.balls import Balls
     from lqrsim.problem.dynamics import Dynamics
 
 
@@ -24,6 +25,8 @@ class Robot(abc.ABC):
       wheels: the geoms in the MJCF that are the treads of its wheels, each on a body of its own; none by default.
       drag: linear, against its velocity through the air, in N s/m; wind acts through it. None by default.
       radius: of its collision circle (seen from above) or ball (the rest), in metres.
+      balls: what collides, in place of that: of a robot that is more than one ball, or that has no position. None by
+        default.
     """
 
     name: ClassVar[str]
@@ -33,6 +36,7 @@ class Robot(abc.ABC):
     wheels: ClassVar[tuple[str, ...]] = ()
     drag: float = 0.0
     radius: float
+    balls: "Balls | None" = None
 
     @property
     @abc.abstractmethod

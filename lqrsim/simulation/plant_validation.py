@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_kind, check_number, excerpt
+from lqrsim.problem.balls import Balls
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene
@@ -23,10 +24,11 @@ MIXED = 10  # of so many controls at most, all corners of their limits are looke
 def check_names(robot: Robot, scene: Scene) -> None:
     """Raises InputError unless the robot's body, joints, actuators and wheels are in the scene by their names.
 
-    Its radius and its drag must be numbers that are not negative.
+    Its radius and its drag must be numbers that are not negative, and its balls Balls.
     """
     check_number(f"robot {robot.name}: radius", getattr(robot, "radius", None), at_least=0.0)
     check_number(f"robot {robot.name}: drag", robot.drag, at_least=0.0)
+    check_kind(f"robot {robot.name}: balls", robot.balls, (Balls, type(None)), "Balls(places, radii), or None")
     model = scene.model
     wanted = {
         "body": ("body", [robot.body], model.nbody),
@@ -76,6 +78,8 @@ def check_maps(plant: "Plant") -> None:
     _check_limits(plant)
     if robot.dynamics.state_coordinates.position:
         _check_position(plant)
+    if robot.balls is not None:
+        _check_sites(plant, robot.balls)
 
 
 def _check_limits(plant: "Plant") -> None:
@@ -149,6 +153,39 @@ def _check_position(plant: "Plant") -> None:
             f"{who}: got {_point(place)} m in {_of(space)}, where MuJoCo has the origin of body {robot.body!r} at"
             f" {_point(there)} m; want configuration() to put it there (slides count from the body's pos in the MJCF)"
         )
+
+
+def _check_sites(plant: "Plant", balls: Balls) -> None:
+    """Raises InputError unless each ball that names a site or a geom has its middle where MuJoCo has that."""
+    robot, model, data = plant.robot, plant.model, mujoco.MjData(plant.model)
+    who, n = f"robot {robot.name}: balls", len(robot.dynamics.state_coordinates)
+    kinds = {"site": (model.site, model.nsite), "geom": (model.geom, model.ngeom)}
+    numbers = {
+        kind: {get(number).name: number for number in range(count) if get(number).name}
+        for kind, (get, count) in kinds.items()
+    }
+    names = [*numbers["site"], *numbers["geom"]]
+    for site in filter(None, balls.sites):
+        if site not in names:
+            has = ", ".join(names) or "none"
+            raise InputError(f"{who}: sites: got {excerpt(site)}, want a site or a geom of the MJCF; it has: {has}")
+    rng = np.random.default_rng(0)
+    for state in (np.zeros(n), 0.1 + 0.01 * np.arange(n), *rng.uniform(-1.0, 1.0, (3, n))):
+        data.qpos[plant.qpos] = robot.configuration(state)[0]
+        mujoco.mj_kinematics(model, data)
+        for name, site, said in zip(balls.names, balls.sites, balls.centres(robot.dynamics, state), strict=True):
+            if site is None:
+                continue
+            kind = "site" if site in numbers["site"] else "geom"
+            there = (data.site_xpos if kind == "site" else data.geom_xpos)[numbers[kind][site]]
+            off = there - said
+            if plant.places is not None and plant.places.in_plane and robot.dynamics.state_coordinates.from_above:
+                off[2] = 0.0  # it has no certain height
+            if not np.abs(off).max() <= OFF:
+                raise InputError(
+                    f"{who}: got {name!r} at {_point(said)} m in the state {_point(state)}, where MuJoCo has {kind}"
+                    f" {site!r} at {_point(there)} m; want them in the same place"
+                )
 
 
 def _remedy(plant: "Plant", names: list[str], moves: Array) -> str:

@@ -52,12 +52,13 @@ class PlanarArm(ls.Robot):
             controls=dict.fromkeys(self.actuators, "N m"),
             parameters={"length": LENGTH, "damping": DAMPING, "inertia": INERTIA},
             angles=self.joints,
-            control_limits=(-3.0, 3.0),
+            control_limits=(-0.6, 0.6),
         )
 
     @cached_property
     def balls(self):
-        return ls.Balls(places, 3 * LINK.radii)
+        sites = [None] * (LINK.count - 1)
+        return ls.Balls(places, 3 * LINK.radii, sites=[*sites, "end 0", *sites, "end 1", *sites, "end 2"])
 
     def state(self, qpos, qvel, near=None):
         state = np.concatenate([qpos, qvel], axis=-1)
@@ -84,7 +85,7 @@ class PlanarArm(ls.Robot):
             hinge = f'<joint name="{joint}" axis="0 0 1" damping="{DAMPING}" armature="{INERTIA}"/>'
             bodies += f'<body name="{body}" pos="{place}">{hinge}{link.format(i)}{site.format(i, LENGTH)}'
         motors = "".join(
-            f'<motor name="{joint}" joint="{joint}" ctrllimited="true" ctrlrange="-3 3"/>'
+            f'<motor name="{joint}" joint="{joint}" ctrllimited="true" ctrlrange="-0.6 0.6"/>'
             for joint in ("shoulder", "elbow", "wrist")
         )
         return f"""
