@@ -10,12 +10,14 @@ import numpy.typing as npt
 
 from lqrsim.codegen import distances, symbolic
 from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order
-from lqrsim.codegen.kernel_source import source_of
+from lqrsim.codegen.kernel_source import check_source, source_of
 from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
 from lqrsim.errors import (
     Array,
     InputError,
     check_array,
+    check_count,
+    check_flag,
     check_function,
     check_items,
     check_kind,
@@ -48,6 +50,16 @@ class Places:
     depends_on: tuple[int, ...]
     in_plane: bool = False
     functions: tuple[UserFunction, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_source("Places", self.source, {"places": 3, "places_jacobian": 4})
+        object.__setattr__(self, "data", check_array("Places: data", self.data, (None,), infinite=True))
+        given = check_items("Places: depends_on", self.depends_on, (int, np.integer), "a tuple of indices of states")
+        indices = tuple(check_count("Places: depends_on", i, at_least=0) for i in given)
+        object.__setattr__(self, "depends_on", indices)
+        object.__setattr__(self, "in_plane", check_flag("Places: in_plane", self.in_plane))
+        functions = check_items("Places: functions", self.functions, UserFunction, "a tuple of UserFunction")
+        object.__setattr__(self, "functions", functions)
 
     @property
     def numbers(self) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
-from lqrsim.codegen.kernel_source import source_of
+from lqrsim.codegen.kernel_source import check_source, source_of
 from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
 from lqrsim.errors import (
     Array,
@@ -30,7 +30,6 @@ from lqrsim.errors import (
 )
 from lqrsim.kernels import ball_clearance, clearance, state_bound
 from lqrsim.problem.balls import Balls, bind_outline, check_outline
-from lqrsim.problem.costs import check_source
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
 

@@ -4,8 +4,6 @@ To add a kind of cost, subclass `Cost` and write `bind`; or state it as a formul
 """
 
 import abc
-import ast
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
-from lqrsim.codegen.kernel_source import source_of
+from lqrsim.codegen.kernel_source import check_source, source_of
 from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
 from lqrsim.errors import (
     Array,
@@ -24,7 +22,6 @@ from lqrsim.errors import (
     check_flag,
     check_function,
     check_items,
-    check_kind,
     check_name,
     check_number,
     check_weight,
@@ -349,40 +346,6 @@ class FunctionCost(Cost):
             uses_control=any(axis >= n for axis in axes),
             functions=functions,
         )
-
-
-def check_source(field: str, source: object, functions: Mapping[str, int]) -> None:
-    """Raises InputError unless it is source text that defines these functions, of so many arguments, and can compile.
-
-    What there is besides Python's own arithmetic is named without its module: cos, not math.cos or np.cos.
-    """
-    wanted = " and ".join(f"{name}(...)" for name in functions)
-    check_kind(f"{field}: source", source, str, f"text that defines {wanted}")
-    wrong = _wrong(str(source), tuple(functions.items()))
-    if wrong:
-        raise InputError(f"{field}: source: {wrong}")
-
-
-@functools.lru_cache(maxsize=256)  # a problem that is stated again and again has the same sources
-def _wrong(source: str, functions: tuple[tuple[str, int], ...]) -> str:
-    """What is wrong with a source; see `check_source`."""
-    try:
-        tree = ast.parse(source)
-    except Exception as error:  # SyntaxError, or what nesting, null characters and the like lead to
-        return f"got {excerpt(source)}, which is no Python ({error}), want functions"
-    defined = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
-    for name, count in functions:
-        found = defined.get(name)
-        if found is None:
-            return f"got {excerpt(source)}, want it to define {name}(...)"
-        if len(found.args.args) != count:
-            return f"got {name} of {len(found.args.args)} arguments, want {count}"
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            return f"got an import in line {node.lineno}, want none: sqrt, exp, cos and the like are at hand"
-        if isinstance(node, ast.Attribute):
-            return f"got {ast.unparse(node)} in line {node.lineno}, want {node.attr}: modules are not at hand"
-    return ""
 
 
 def _check_size(field: str, weight: Array, want: int, what: str) -> None:

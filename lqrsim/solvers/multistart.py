@@ -130,11 +130,9 @@ def bends(way: Array, count: int, *, ring: float | None = None, unit: str = "m")
         ]
     if len(way) > 3:
         aside = np.linalg.qr(np.column_stack([ahead, np.eye(len(way))[:, np.argsort(np.abs(ahead))[:-1]]]))[0][:, 1:]
+        far = ring * distance
         named = [
-            (
-                f"{ring * distance:.3g} {unit} aside, direction {sign}{side + 1}",
-                factor * ring * distance * aside[:, side],
-            )
+            (f"{far:.3g} {unit} aside, direction {sign}{side + 1}", factor * far * aside[:, side])
             for side in range(len(way) - 1)
             for sign, factor in (("", 1), ("-", -1))
         ]
