@@ -57,9 +57,9 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
     @property
     def _fewest(self) -> float:
         """Balls that keep to the tolerance."""
-        sunk = max(self.radius - self.tolerance, 0.0)  # how far from the axis the balls must still reach
-        widest = 2 * math.sqrt((self.radius - sunk) * (self.radius + sunk))
-        return math.ceil(self.length / widest * (1 - 1e-12)) + 1 if self.length else 1
+        sunk = min(self.tolerance, self.radius)
+        widest = 2 * math.sqrt(sunk) * math.sqrt(2 * self.radius - sunk)  # between two balls
+        return self.length / widest * (1 - 1e-12) // 1 + 2 if self.length else 1
 
     @property
     def count(self) -> int:
@@ -91,5 +91,10 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
             given = f"{excerpt(start)} and {excerpt(end)}"
             raise InputError(f"between: got {given}, want two points of 2 or 3 coordinates")
         most = max(self.count - 1, 1)
-        # Products of whole numbers first, so that the ends are exactly what they are.
-        return [[((most - k) * a + k * b) / most for a, b in zip(first, last, strict=True)] for k in range(self.count)]
+        try:
+            return [
+                [((most - k) * a + k * b) / most for a, b in zip(first, last, strict=True)] for k in range(self.count)
+            ]
+        except Exception as error:  # whatever is no number
+            given = f"{excerpt(start)} and {excerpt(end)}"
+            raise InputError(f"between: got {given} ({type(error).__name__}), want points of expressions") from None

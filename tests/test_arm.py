@@ -10,6 +10,7 @@ import pytest
 from planar_arm import LINK, PlanarArm
 
 import lqrsim as ls
+from lqrsim.control.collision_chance import Surroundings
 from lqrsim.errors import Array
 from lqrsim.results.goal import OF_RANGE
 from lqrsim.simulation.tube_under import tube_under
@@ -119,6 +120,39 @@ def test_obstacles_elsewhere(plant: ls.Plant, plan: ls.Solution) -> None:
         np.testing.assert_allclose(rollout.clearance[k, ::30], wanted, rtol=0, atol=1e-9)
 
 
+def test_clearances_that_chances_of_collision_are_of(plant: ls.Plant, plan: ls.Solution) -> None:
+    """The nearest ball's to each obstacle, and its slope; with a position, those of a radius are the same."""
+    stated, balls = problem(plant, plant.world), plant.robot.balls
+    surroundings, dynamics = Surroundings.of(stated, 0.02), plant.robot.dynamics
+    states = plan.trajectory.states[5:110:15]
+    clearance, slope, variance = surroundings.clearances(states)
+
+    def nearest(state: Array) -> Array:
+        centres = balls.centres(dynamics, state)
+        away = np.array([plant.world.distances(centre) for centre in centres]) - balls.radii[:, None]
+        return away.min(axis=0)
+
+    np.testing.assert_allclose(clearance, [nearest(state) for state in states], rtol=0, atol=1e-12)
+    assert surroundings.position == (0, 1, 2)
+    for state, own in zip(states, slope, strict=True):
+        moves = 1e-7 * np.eye(6)[:3]
+        wanted = np.stack([(nearest(state + move) - nearest(state - move)) / 2e-7 for move in moves], axis=1)
+        np.testing.assert_allclose(own, wanted, rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(variance, 0.02**2)
+
+
+def test_the_chance_of_collision_is_about_how_often_it_collides(plant: ls.Plant, plan: ls.Solution) -> None:
+    """Of obstacles that are elsewhere by so much that some runs collide."""
+    noise = [ls.DisplacedObstacles(0.06)]
+    stated = problem(plant, plant.world)
+    tube = ls.predict_tube(stated, plan, ls.uncertainty_of(plant, noise))
+    run = ls.simulate(plant, plan, disturbances=noise, trials=200, frames=False, contacts=False)
+    rate, std = run.collided.mean(), np.sqrt(run.collided.mean() * (1 - run.collided.mean()) / run.trials)
+    assert 0.02 < rate < 0.6
+    # The clearance is taken to be linear, and a collision counted when it begins: both err to the safe side here.
+    assert rate - 3 * std < tube.collision_chance < 2.5 * (rate + 3 * std)
+
+
 def test_no_tube_of_a_robot_without_a_position(plant: ls.Plant, plan: ls.Solution) -> None:
     tube, why = tube_under(problem(plant, plant.world), plan, plant, [ls.ControlNoise(0.1)])
     assert tube is None
@@ -145,8 +179,8 @@ def mirrored(x, p):
 @pytest.mark.parametrize(
     ("balls", "said"),
     [
-        (ls.Balls(mirrored, [0.03], sites=["end 0"], names=["elbow"]), "got 'elbow' at .* has site 'end 0' at"),
-        (ls.Balls(mirrored, [0.03], sites=["link 0"]), "has geom 'link 0' at"),
+        (ls.Balls(mirrored, [0.03], sites=["end 0"], names=["elbow"]), "got 'elbow' at .* has 'end 0' at"),
+        (ls.Balls(mirrored, [0.03], sites=["link 0"]), "has 'link 0' at"),
         (ls.Balls(mirrored, [0.03], sites=["end 9"]), "got 'end 9', want a site or a geom of the MJCF; it has: end 0"),
         ([0.03], "balls: got .*, want Balls"),
     ],

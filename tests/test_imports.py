@@ -38,7 +38,7 @@ FLOORS_WITHIN = {
     "kernels": (("declarations",), ("linear_algebra", "rotation_ratios", "runge_kutta", "signed_distance")),
     "scenes": (("world",),),
     "results": (
-        ("schema", "hashing", "coordinates", "solution_parts", "trial_outcome", "value_functions"),
+        ("schema", "hashing", "ball_record", "coordinates", "solution_parts", "trial_outcome", "value_functions"),
         ("archive", "goal", "policy"),
         ("solution",),
         ("rollout",),

@@ -272,6 +272,9 @@ def results(place: Place) -> dict[str, tuple[Any, ...]]:
             name: ({field.name: getattr(one, field.name) for field in dataclasses.fields(one) if field.init},)
             for name, one in built.items()
         },
+        "Rollout.places": ({"self": rollout, "trial": 0},),
+        "Rollout.in_world": ({"self": rollout, "places": np.zeros((4, 2)), "height": 0.1},),
+        "Rollout.of_world": ({"self": rollout, "points": np.zeros((4, 3))},),
         "AffinePolicy.control": ({"self": policy, "state": np.zeros(3), "step": 0},),
         "AffinePolicy.__call__": ({"self": policy, "state": np.zeros(3), "t": 0.3, "interpolate": True},),
         "Quadratic.__add__": ({"self": go, "other": go},),

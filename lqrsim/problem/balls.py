@@ -24,6 +24,7 @@ from lqrsim.errors import (
     check_name,
     check_number,
     excerpt,
+    vectors_of,
 )
 from lqrsim.kernels import ball_places, function_places, linear_algebra, place_differences, rotation_ratios
 from lqrsim.problem.dynamics import Dynamics
@@ -259,6 +260,8 @@ class Balls:
 
         Of places in a plane that is seen from above, the height is 0.
         """
+        check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
+        states = vectors_of("states", states, len(dynamics.state_coordinates))
         places = self.bind(dynamics)
         found = evaluate(places, len(self), states)
         return dynamics.state_coordinates.in_world(found[..., :2]) if places.in_plane else found
@@ -300,16 +303,29 @@ def evaluate(places: Places, count: int, states: npt.ArrayLike) -> Array:
     given = np.asarray(states, dtype=np.float64)
     flat = in_c_order(given.reshape(-1, given.shape[-1]))
     out = np.empty((len(flat), 3 * count))
+    _call(places, "places_of", flat, out)
+    return out.reshape(*given.shape[:-1], count, 3)
+
+
+def evaluate_slopes(places: Places, count: int, states: Array) -> tuple[Array, Array]:
+    """Where so many balls are (K, count, 3), and the derivatives in the states (K, count, 3, n), at states (K, n)."""
+    flat = in_c_order(states)
+    out, slopes = np.empty((len(flat), 3 * count)), np.zeros((len(flat), 3 * count, flat.shape[1]))
+    _call(places, "slopes_of", flat, out, slopes)
+    return out.reshape(-1, count, 3), slopes.reshape(len(flat), count, 3, -1)
+
+
+def _call(places: Places, name: str, states: Array, *outputs: Array) -> None:
+    """Call a function of `kernels/ball_places.py`; what a user's function raises comes through."""
     with compiling:
-        core = _core(places.source, flat.shape[1])
+        core = _core(places.source, states.shape[1])
         data = np.array([*(address_of(function) for function in places.functions), *places.data], dtype=np.float64)
-    core.places_of(len(flat), flat, data, out)
+    getattr(core, name)(len(states), states, data, *outputs)
     for function in places.functions:
         if function.raised is not None:
             error = function.raised
             function.forget()
             raise error
-    return out.reshape(*given.shape[:-1], count, 3)
 
 
 def clearances(balls: Balls, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> Array:

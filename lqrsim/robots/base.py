@@ -26,7 +26,7 @@ class Robot(abc.ABC):
       drag: linear, against its velocity through the air, in N s/m; wind acts through it. None by default.
       radius: of its collision circle (seen from above) or ball (the rest), in metres.
       balls: what collides, in place of that: of a robot that is more than one ball, or that has no position. None by
-        default.
+        default. The radius is then how large pictures take the robot to be, and near what goal it has arrived.
     """
 
     name: ClassVar[str]

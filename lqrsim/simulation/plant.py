@@ -11,6 +11,7 @@ from mujoco import batch
 from lqrsim.codegen import distances
 from lqrsim.errors import Array, InputError, check_kind, check_number, shaped, vectors_of
 from lqrsim.problem.balls import evaluate
+from lqrsim.results.ball_record import BallRecord
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
 from lqrsim.scenes.world import World
@@ -143,6 +144,21 @@ class Plant:
             self.world, middles.reshape(trials, -1, size), self.across(displaced)
         )
         return (found.reshape(middles.shape[:-1]) - self.radii).min(axis=-1)
+
+    def record_of_balls(self, planned: Array, driven: Array) -> BallRecord | None:
+        """Where its balls are along a plan (T+1, n) and in runs (K, T+1, n), for pictures; None if it has none."""
+        if self.balls is None:
+            return None
+        dynamics, anchors = self.robot.dynamics, np.full((len(self.balls), 4), np.nan)
+        places = np.full((*driven.shape[:2], len(self.balls), 3), np.nan)
+        known = np.isfinite(driven).all(axis=2)
+        places[known] = self.balls.centres(dynamics, driven[known])
+        for k, site in enumerate(self.balls.sites):
+            if site is not None:
+                anchors[k] = plant_validation.anchor_of(self.model, site)
+        return BallRecord(
+            driven=places, planned=self.balls.centres(dynamics, planned), radii=self.balls.radii, anchors=anchors
+        )
 
     def across(self, vectors: Array) -> Array:
         """Vectors (..., 3) along the axes that `world` has, of vectors along those of the scene."""

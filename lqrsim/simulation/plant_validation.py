@@ -155,36 +155,40 @@ def _check_position(plant: "Plant") -> None:
         )
 
 
+def anchor_of(model: mujoco.MjModel, site: str) -> Array:
+    """The body that a site, or a geom, of that name is on, by its number, and where it is in the axes of that, (4,)."""
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, site)
+    if number >= 0:
+        return np.array([model.site_bodyid[number], *model.site_pos[number]])
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, site)
+    return np.array([model.geom_bodyid[number], *model.geom_pos[number]])
+
+
 def _check_sites(plant: "Plant", balls: Balls) -> None:
     """Raises InputError unless each ball that names a site or a geom has its middle where MuJoCo has that."""
     robot, model, data = plant.robot, plant.model, mujoco.MjData(plant.model)
     who, n = f"robot {robot.name}: balls", len(robot.dynamics.state_coordinates)
-    kinds = {"site": (model.site, model.nsite), "geom": (model.geom, model.ngeom)}
-    numbers = {
-        kind: {get(number).name: number for number in range(count) if get(number).name}
-        for kind, (get, count) in kinds.items()
-    }
-    names = [*numbers["site"], *numbers["geom"]]
+    names = [model.site(number).name for number in range(model.nsite)]
+    names = list(filter(None, [*names, *(model.geom(number).name for number in range(model.ngeom))]))
     for site in filter(None, balls.sites):
         if site not in names:
             has = ", ".join(names) or "none"
             raise InputError(f"{who}: sites: got {excerpt(site)}, want a site or a geom of the MJCF; it has: {has}")
+    anchors = [(k, site, anchor_of(model, site)) for k, site in enumerate(balls.sites) if site is not None]
     rng = np.random.default_rng(0)
     for state in (np.zeros(n), 0.1 + 0.01 * np.arange(n), *rng.uniform(-1.0, 1.0, (3, n))):
         data.qpos[plant.qpos] = robot.configuration(state)[0]
         mujoco.mj_kinematics(model, data)
-        for name, site, said in zip(balls.names, balls.sites, balls.centres(robot.dynamics, state), strict=True):
-            if site is None:
-                continue
-            kind = "site" if site in numbers["site"] else "geom"
-            there = (data.site_xpos if kind == "site" else data.geom_xpos)[numbers[kind][site]]
-            off = there - said
+        centres = balls.centres(robot.dynamics, state) if anchors else ()
+        for k, site, (body, *place) in anchors:
+            there = data.xpos[int(body)] + data.xmat[int(body)].reshape(3, 3) @ place
+            off = there - centres[k]
             if plant.places is not None and plant.places.in_plane and robot.dynamics.state_coordinates.from_above:
                 off[2] = 0.0  # it has no certain height
             if not np.abs(off).max() <= OFF:
                 raise InputError(
-                    f"{who}: got {name!r} at {_point(said)} m in the state {_point(state)}, where MuJoCo has {kind}"
-                    f" {site!r} at {_point(there)} m; want them in the same place"
+                    f"{who}: got {balls.names[k]!r} at {_point(centres[k])} m in the state {_point(state)}, where"
+                    f" MuJoCo has {site!r} at {_point(there)} m; want them in the same place"
                 )
 
 

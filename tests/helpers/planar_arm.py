@@ -34,7 +34,7 @@ def places(x, p):
 class PlanarArm(ls.Robot):
     """Speeds are commanded: each joint follows its own, so that the dynamics are linear and the geometry is not."""
 
-    radius: float = RADIUS
+    radius: float = 0.3  # m, how large pictures take it to be
 
     name = "planar_arm"
     body = "upper"
