@@ -195,3 +195,62 @@ def test_what_it_sees_of_a_floor(tmp_path: Path) -> None:
     plant = ls.Plant(PlanarArm(), PlanarArm.scene(tmp_path, '<geom name="floor" type="plane" size="3 3 0.1"/>'))
     assert plant.world.names == ("floor",)
     np.testing.assert_allclose(plant.clearance(np.zeros((2, 6))), 0.07, rtol=0, atol=1e-12)
+
+
+class Long(ls.DifferentialDrive):
+    """A drive that pushes a bumper before it: two balls in the plane, turned by its heading."""
+
+    balls = ls.Balls(lambda x, p: [[x[0], x[1]], [x[0] + 0.25 * _cos(x[2]), x[1] + 0.25 * _sin(x[2])]], [0.17, 0.05])
+
+
+def _cos(angle):
+    from sympy import cos
+
+    return cos(angle)
+
+
+def _sin(angle):
+    from sympy import sin
+
+    return sin(angle)
+
+
+def test_balls_in_the_plane_of_a_position(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
+    """Seen from above, as the position is; the plan of a rounder robot hits something with the bumper."""
+    plant = ls.Plant(Long(), differential_drive.scene)
+    around = ls.Plant(ls.DifferentialDrive(), differential_drive.scene)
+    assert plant.world.names == around.world.names
+    rollout = ls.simulate(plant, drive_solution, trials=2, disturbances=[ls.ControlNoise(0.05)], contacts=False)
+    x, y, heading = rollout.states[0].T
+    front = np.stack([x + 0.25 * np.cos(heading), y + 0.25 * np.sin(heading)], axis=1)
+    flat = plant.world
+    wanted = np.minimum(flat.distance(np.stack([x, y], axis=1)) - 0.17, flat.distance(front) - 0.05)
+    np.testing.assert_allclose(rollout.clearance[0], wanted, rtol=0, atol=1e-12)
+    assert rollout.balls is not None
+    np.testing.assert_allclose(rollout.balls.driven[0, :, 1], np.column_stack([front, 0 * x]), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(rollout.places(0), rollout.states[0, :, :2])  # its position stands for it
+    collides = wanted < 0
+    assert rollout.collided[0] == (collides.any() or np.isfinite(rollout.collided_at[0]))
+    if collides.any():
+        assert rollout.collided_at[0] <= rollout.times[np.argmax(collides)]
+
+
+def rotors(x, p):
+    arms = [(0.2, 0, 0), (0, 0.2, 0), (-0.2, 0, 0), (0, -0.2, 0)]
+    return [[a + b for a, b in zip(x[:3], ls.rotations.rotate(x[6:9], arm), strict=True)] for arm in arms]
+
+
+def test_balls_in_space_that_turn_with_a_position(quadrotor: ls.Scenario) -> None:
+    """The derivatives of places by rotation vectors, and costs of them, against differences."""
+    balls = ls.Balls(rotors, [0.1] * 4)
+    problem = dataclasses.replace(
+        quadrotor.problem,
+        stage_cost=ls.ControlCost(np.ones(4)) + ls.ObstacleCost(quadrotor.scene.world, balls=balls),
+        constraints=[ls.Clearance(quadrotor.scene.world, balls=balls)],
+    )
+    names = quadrotor.problem.dynamics.state_coordinates.names
+    assert problem.terms("stage_cost")[1].nonconvex_in == (0, 1, 2, 6, 7, 8), names
+    checks = ls.check_derivatives(problem, samples=2)
+    assert all(check.good for check in checks), [str(check) for check in checks if not check.good]
+    assert any(check.what.startswith("gradient of stage_cost: ObstacleCost") for check in checks)
+    assert not any(check.what.startswith("Hessian of stage_cost: ObstacleCost") for check in checks)
