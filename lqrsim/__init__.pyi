@@ -3,6 +3,7 @@
 from . import robots as robots
 from . import rotations as rotations
 from . import scenarios as scenarios
+from .capsules import Capsule as Capsule
 from .control.chance_constrained import SafePlan as SafePlan
 from .control.chance_constrained import smooth_chance_constrained as smooth_chance_constrained
 from .control.controllers import Controller as Controller
@@ -15,6 +16,8 @@ from .control.tubes import predict_tube as predict_tube
 from .control.uncertainty import Uncertainty as Uncertainty
 from .control.uncertainty import Unknown as Unknown
 from .errors import InputError as InputError
+from .problem.balls import Balls as Balls
+from .problem.balls import Places as Places
 from .problem.constraints import Clearance as Clearance
 from .problem.constraints import Constraint as Constraint
 from .problem.constraints import ConstraintTerm as ConstraintTerm

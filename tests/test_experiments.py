@@ -276,3 +276,16 @@ class TestStressTest:
         assert stress.possible(ls.MassMismatch(0.1), (1.0, 2.0, 3.0, 4.0)) == [1.0, 2.0, 3.0]
         assert stress.possible(ls.MeasurementDropouts(0.5), (1.0, 2.0, 3.0)) == [1.0, 2.0]
         assert stress.possible(ls.MeasurementLatency(1), (1.0, 1.1, 2.0)) == [1.0, 2.0]
+
+
+def test_three_links_go_round_posts(tmp_path: Path) -> None:
+    script: Any = import_module("three_link_arm")
+    found = script.main(script.Config(quick=True, out=tmp_path))
+    assert found["status"] == "converged"
+    assert found["planned"] >= found["missed"] + 0.01
+    assert found["calm"] == "reached"
+    # MuJoCo's own distances, at each frame: undisturbed what was planned, within what the balls miss and a step moves.
+    assert found["planned"] - found["missed"] - 0.01 < found["calm clear"] < found["planned"] + 1e-4
+    assert found["noisy clear"] > 0
+    assert found["noisy reached"] >= 0.7 * found["trials"]
+    assert str(found["trials"]) in script.report(found)

@@ -15,7 +15,7 @@ PACKAGE = Path(lqrsim.__file__).parent
 FLOORS = (
     ("errors", "machine", "process", "versions"),
     ("kernels",),
-    ("rotations",),
+    ("rotations", "capsules"),
     ("scenes",),
     ("results",),
     ("codegen",),
@@ -38,7 +38,7 @@ FLOORS_WITHIN = {
     "kernels": (("declarations",), ("linear_algebra", "rotation_ratios", "runge_kutta", "signed_distance")),
     "scenes": (("world",),),
     "results": (
-        ("schema", "hashing", "coordinates", "solution_parts", "trial_outcome", "value_functions"),
+        ("schema", "hashing", "ball_record", "coordinates", "solution_parts", "trial_outcome", "value_functions"),
         ("archive", "goal", "policy"),
         ("solution",),
         ("rollout",),
@@ -49,7 +49,7 @@ FLOORS_WITHIN = {
         ("symbolic", "user_functions"),
         ("jit",),
     ),
-    "problem": (("dynamics", "linear_quadratic"), ("costs",), ("constraints",), ("problem",)),
+    "problem": (("dynamics", "linear_quadratic"), ("balls",), ("costs",), ("constraints",), ("problem",)),
     "solvers": (("compiled", "initial_guess"), ("common", "certify"), ("workspace",), ("attempt",)),
     "simulation": (("plant_validation", "plant"), ("physics",), ("disturbances",)),
 }

@@ -25,6 +25,14 @@ def slope(x: Any, u: Any, p: Any, gradient: Any, hessian: Any) -> None:
     gradient[0], gradient[2], hessian[0, 0], hessian[2, 2] = 2 * x[0], 0.2 * u[0], 2.0, 0.2
 
 
+def reach(x: Any, p: Any) -> list[list[Any]]:
+    return [[x[0], 0.0, 1.0]]
+
+
+def reach_slopes(x: Any, p: Any, slopes: Any) -> None:
+    slopes[0, 0, 0] = 1.0
+
+
 def check_functions(
     f: Any, jacobian: Any, function: Any, derivatives: Any, depends_on: Any, formula: Any, parameters: Any
 ) -> list[ls.DerivativeCheck]:
@@ -69,6 +77,8 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         high=(1.0,) * 3,
     )
     cost = ls.QuadraticCost([1.0, 1.0, 1.0], about=[0.0, 0.0, 0.0])
+    balls = ls.Balls(reach, [0.1], level="plain")
+    places = balls.bind(cart)
     at, there = {"state": [0.1, 0.2], "control": [0.3]}, {"vector": [0.1, 0.2, 9.0], "near": [0.0, 0.0, 0.0]}
     source = "def value(x, u, t, row, data):\n    return x[0]\n\n\ndef slope(x, u, t, row, data, gradient):\n    pass\n"
     known: dict[str, ls.Robot] = {
@@ -102,6 +112,16 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "QuadraticCost": ({"weight": [1.0, 2.0], "about": [0.0, 0.0]},),
         "ControlCost": ({"weight": [[1.0]], "about": [0.0]},),
         "ObstacleCost": ({"world": world, "radius": 0.2, "sharpness": 10.0, "weight": 1.0},),
+        "ObstacleCost of balls": ({"call": ls.ObstacleCost, "world": world, "balls": balls, "weight": 1.0},),
+        "ObstacleCost.weighing": ({"self": ls.ObstacleCost(world, radius=0.2), "weight": 2.0},),
+        "Balls": ({
+            "places": reach, "radii": [0.1], "names": ("hand",), "sites": ("tip",), "jacobian": reach_slopes,
+            "depends_on": ("x",), "level": "plain",
+        },),
+        "Balls.centres": ({"self": balls, "dynamics": cart, "states": [[0.1, 0.2]]},),
+        "Places": ({field.name: getattr(places, field.name) for field in dataclasses.fields(places)},),
+        "Capsule": ({"length": 0.4, "radius": 0.03, "tolerance": 0.002},),
+        "Capsule.between": ({"self": ls.Capsule(0.4, 0.1, 0.02), "start": (0, 0, 0), "end": [1.0, 2.0, 3.0]},),
         "SymbolicCost": ({"function": bowl, "parameters": {"a": 1.0}, "convex": True},),
         "FunctionCost": ({
             "function": bowl, "derivatives": slope, "depends_on": ("x", "force"), "parameters": {"a": 1.0},
@@ -117,9 +137,10 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         },
         "Term": ({field.name: getattr(term, field.name) for field in dataclasses.fields(term)},),
         "Clearance": ({"world": world, "radius": 0.2, "margin": 0.1},),
+        "Clearance of balls": ({"call": ls.Clearance, "world": world, "balls": balls, "margin": 0.1},),
         "ConstraintTerm": ({
             "source": source, "data": [1.0], "rows": 1, "describe": str, "uses_control": False, "equality": True,
-            "final_only": False,
+            "final_only": False, "balls": 0, "functions": (),
         },),
         "SymbolicConstraint": ({"function": bowl, "parameters": {"a": 1.0}, "equality": True, "at": "all"},),
         "Clearance.ahead": ({"self": ls.Clearance(world, radius=0.2, margin=np.linspace(0, 0.1, 5)), "steps": 2},),
@@ -251,6 +272,9 @@ def results(place: Place) -> dict[str, tuple[Any, ...]]:
             name: ({field.name: getattr(one, field.name) for field in dataclasses.fields(one) if field.init},)
             for name, one in built.items()
         },
+        "Rollout.places": ({"self": rollout, "trial": 0},),
+        "Rollout.in_world": ({"self": rollout, "places": np.zeros((4, 2)), "height": 0.1},),
+        "Rollout.of_world": ({"self": rollout, "points": np.zeros((4, 3))},),
         "AffinePolicy.control": ({"self": policy, "state": np.zeros(3), "step": 0},),
         "AffinePolicy.__call__": ({"self": policy, "state": np.zeros(3), "t": 0.3, "interpolate": True},),
         "Quadratic.__add__": ({"self": go, "other": go},),

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim import rotations
+from lqrsim import capsules, rotations
 from lqrsim.codegen import disk_cache
 from lqrsim.kernels import rotation_ratios
 
@@ -48,7 +48,13 @@ def fingerprint(function: Any) -> str | None:
 @functools.cache
 def _versions() -> tuple[str, ...]:
     installed = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES if name != "math")
-    return (sys.version, *installed, inspect.getsource(rotations), inspect.getsource(rotation_ratios))
+    return (
+        sys.version,
+        *installed,
+        inspect.getsource(capsules),
+        inspect.getsource(rotations),
+        inspect.getsource(rotation_ratios),
+    )
 
 
 def helpers(function: Any) -> list[Any]:

@@ -8,8 +8,11 @@ import ast
 import functools
 import importlib
 import inspect
+from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
+
+from lqrsim.errors import InputError, check_kind, excerpt
 
 
 def source_of(module: ModuleType, *functions: str, **constants: Any) -> str:
@@ -39,6 +42,40 @@ def _source(name: str, functions: tuple[str, ...], pairs: tuple[tuple[str, Any],
     if constants:
         nodes = [_Fill(constants).visit(node) for node in nodes]
     return "\n\n".join(ast.unparse(node) for node in nodes)
+
+
+def check_source(field: str, source: object, functions: Mapping[str, int]) -> None:
+    """Raises InputError unless it is source text that defines these functions, of so many arguments, and can compile.
+
+    What there is besides Python's own arithmetic is named without its module: cos, not math.cos or np.cos.
+    """
+    wanted = " and ".join(f"{name}(...)" for name in functions)
+    check_kind(f"{field}: source", source, str, f"text that defines {wanted}")
+    wrong = _wrong(str(source), tuple(functions.items()))
+    if wrong:
+        raise InputError(f"{field}: source: {wrong}")
+
+
+@functools.lru_cache(maxsize=256)  # a problem that is stated again and again has the same sources
+def _wrong(source: str, functions: tuple[tuple[str, int], ...]) -> str:
+    """What is wrong with a source; see `check_source`."""
+    try:
+        tree = ast.parse(source)
+    except Exception as error:  # SyntaxError, or what nesting, null characters and the like lead to
+        return f"got {excerpt(source)}, which is no Python ({error}), want functions"
+    defined = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    for name, count in functions:
+        found = defined.get(name)
+        if found is None:
+            return f"got {excerpt(source)}, want it to define {name}(...)"
+        if len(found.args.args) != count:
+            return f"got {name} of {len(found.args.args)} arguments, want {count}"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            return f"got an import in line {node.lineno}, want none: sqrt, exp, cos and the like are at hand"
+        if isinstance(node, ast.Attribute):
+            return f"got {ast.unparse(node)} in line {node.lineno}, want {node.attr}: modules are not at hand"
+    return ""
 
 
 class _Fill(ast.NodeTransformer):

@@ -68,14 +68,14 @@ def _writers() -> str:
     """The code that writes what is kept: with other code, something else may be right."""
     package = Path(__file__).parents[1]
     files = [package / "codegen" / "symbolic.py"]
-    files += [package / "problem" / f"{name}.py" for name in ("dynamics", "costs", "constraints")]
+    files += [package / "problem" / f"{name}.py" for name in ("dynamics", "costs", "constraints", "balls")]
     return "".join(file.read_text(encoding="utf-8") for file in files)
 
 
 def trace(
     function: Callable[..., Any],
     states: int,
-    controls: int,
+    controls: int | None,
     parameters: Sequence[str],
     *,
     constants: Mapping[str, float] | None = None,
@@ -83,6 +83,7 @@ def trace(
     """Call `function(x, u, p)` with symbols.
 
     Args:
+      controls: how many; None for a `function(x, p)`.
       constants: further attributes of p, which are numbers and not symbols.
 
     Returns:
@@ -94,23 +95,25 @@ def trace(
     import sympy
 
     x = [sympy.Symbol(f"x{i}", real=True) for i in range(states)]
-    u = [sympy.Symbol(f"u{i}", real=True) for i in range(controls)]
+    u = [sympy.Symbol(f"u{i}", real=True) for i in range(controls or 0)]
     p = Parameters(**{name: sympy.Symbol(f"p{i}", real=True) for i, name in enumerate(parameters)})
     for constant, value in (constants or {}).items():  # a whole number as one, so that x + 0 and 1 * x are x
         setattr(p, constant, sympy.Integer(int(value)) if float(value).is_integer() else sympy.Float(value))
-    name = getattr(function, "__qualname__", repr(function))
+    given = (tuple(x), p) if controls is None else (tuple(x), tuple(u), p)
+    of, counted = ("x", "") if controls is None else ("x, u", f" and {controls} in u")
+    called = f"{getattr(function, '__qualname__', repr(function))}({of}, p)"
     try:
-        returned = function(tuple(x), tuple(u), p)
+        returned = function(*given)
     except InputError as error:
-        raise InputError(f"{name}(x, u, p): {error}") from None
+        raise InputError(f"{called}: {error}") from None
     except Exception as error:  # whatever a user's function may raise becomes one line
         raise InputError(
-            f"{name}(x, u, p): got {type(error).__name__} ({error}) when called with symbols, {states} in x and"
-            f" {controls} in u, want plain arithmetic and functions of SymPy (from sympy import sin, Max, ...);"
+            f"{called}: got {type(error).__name__} ({error}) when called with symbols, {states} in x{counted},"
+            " want plain arithmetic and functions of SymPy (from sympy import sin, Max, ...);"
             " for NumPy's functions and for branches there is level='compiled' or 'plain'"
         ) from None
     if returned is None:
-        raise InputError(f"{name}(x, u, p): got None, want what it computes: is a return missing?")
+        raise InputError(f"{called}: got None, want what it computes: is a return missing?")
     if hasattr(returned, "tolist"):  # an array of NumPy's, or a matrix of SymPy's
         returned = [entry for row in returned.tolist() for entry in (row if isinstance(row, list) else [row])]
     listed = returned if isinstance(returned, (list, tuple)) else [returned]
@@ -119,21 +122,19 @@ def trace(
         try:
             expression = sympy.sympify(entry, strict=True)
         except sympy.SympifyError:
-            raise InputError(f"{name}(x, u, p): got {excerpt(entry)} as entry {i}, want an expression") from None
+            raise InputError(f"{called}: got {excerpt(entry)} as entry {i}, want an expression") from None
         if not isinstance(expression, sympy.Expr):
-            raise InputError(f"{name}(x, u, p): got {excerpt(entry)} as entry {i}, want an expression")
+            raise InputError(f"{called}: got {excerpt(entry)} as entry {i}, want an expression")
         known = {*x, *u, *vars(p).values()}
         strange = sorted(str(symbol) for symbol in expression.free_symbols - known)
         if strange:
-            raise InputError(f"{name}(x, u, p): got the unknown symbol {strange[0]} in entry {i}, want x, u and p only")
+            raise InputError(f"{called}: got the unknown symbol {strange[0]} in entry {i}, want {of} and p only")
         if expression.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo, sympy.I):
-            raise InputError(f"{name}(x, u, p): got {expression} as entry {i}, want a finite real expression")
+            raise InputError(f"{called}: got {expression} as entry {i}, want a finite real expression")
         for piecewise in expression.atoms(sympy.Piecewise):
             last: Any = piecewise.args[-1]
             if last[1] != sympy.true:
-                raise InputError(
-                    f"{name}(x, u, p): got {piecewise} in entry {i}, want its last case to be (expression, True)"
-                )
+                raise InputError(f"{called}: got {piecewise} in entry {i}, want its last case to be (expression, True)")
         expressions.append(expression)
     return expressions, x, u
 

@@ -62,7 +62,7 @@ class UserFunction:
     """One function, and how it is called.
 
     With `values`, `function(x, u, p)` returns that many numbers (one: the number itself); with `writes`,
-    `function(x, u, p, a, b)` writes to arrays of those two shapes, which are zero when it is called.
+    `function(x, u, p, a, b)` writes to arrays of those shapes, one or two, which are zero when it is called.
 
     Attributes:
       level: compiled or plain.
@@ -71,6 +71,8 @@ class UserFunction:
       held: once it has an address, what must be kept alive for that, and the address.
       stopped: set it to end the solves that call back, in whatever thread they are.
       entries: what each returned value is for, as messages name it; without, the value is returned bare.
+      columns: the values are returned as rows of so many, or, with 0, one after the other.
+      with_control: whether it is called with u at all; without, it is `function(x, p)`.
     """
 
     function: Callable[..., Any]
@@ -83,6 +85,8 @@ class UserFunction:
     writes: tuple[tuple[int, ...], ...] = ()
     entries: tuple[str, ...] = ()
     unused: tuple[tuple[int, str], ...] = ()
+    columns: int = 0
+    with_control: bool = True
     held: list[tuple[Any, int]] = field(default_factory=list, init=False, repr=False, compare=False)
     stopped: threading.Event = field(default_factory=threading.Event, init=False, repr=False, compare=False)
     _thread: threading.local = field(default_factory=threading.local, init=False, repr=False, compare=False)
@@ -95,7 +99,8 @@ class UserFunction:
     @property
     def name(self) -> str:
         """As messages have it."""
-        return f"{name_of(self.function)}(x, u, p{', ...' if self.writes else ''})"
+        of = "x, u, p" if self.with_control else "x, p"
+        return f"{name_of(self.function)}({of}{', ...' if self.writes else ''})"
 
     @cached_property
     def identity(self) -> str:
@@ -115,9 +120,11 @@ class UserFunction:
         written: list[Array] = [np.zeros(shape) for shape in self.writes]
         try:
             with np.errstate(all="ignore"):  # NaN and infinity are dealt with where they arrive
-                returned = plain(x.copy(), u.copy(), parameters_class(tuple(p))(*p.values()), *written)
+                given = (x.copy(), u.copy()) if self.with_control else (x.copy(),)
+                returned = plain(*given, parameters_class(tuple(p))(*p.values()), *written)
                 if self.writes and returned is not None:
-                    raise InputError(f"got {excerpt(returned)} returned, want it written to the last two arguments")
+                    last = "argument" if len(self.writes) == 1 else "two arguments"
+                    raise InputError(f"got {excerpt(returned)} returned, want it written to the last {last}")
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from None
         except Exception as error:  # whatever a user's function may raise becomes one line
@@ -134,11 +141,15 @@ class UserFunction:
             vector = np.array([float(entry) for entry in array.reshape(-1)])
         except (TypeError, ValueError):
             raise InputError(f"{self.name}: got {excerpt(returned)}, want {self._wanted()}") from None
+        if self.columns and array.shape != (wanted := (self.values // self.columns, self.columns)):
+            raise InputError(f"{self.name}: got shape {array.shape}, want {wanted}: {self._wanted()}")
         if len(vector) != self.values:
             raise InputError(f"{self.name}: got {len(vector)} entries, want {self._wanted()}")
         return vector
 
     def _wanted(self) -> str:
+        if self.columns:
+            return f"{self.columns} coordinates for each of {', '.join(self.entries)}"
         return f"{self.values}: one for each of {', '.join(self.entries)}" if self.entries else "one number"
 
     @cached_property
@@ -147,7 +158,7 @@ class UserFunction:
 
         `f(x, u, data, out)` or `f(x, u, data, a, b)`, all pointers to float64.
         """
-        count = 4 if self.values else 5
+        count = 3 + (len(self.writes) or 1)
         prototype = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * count)
         sizes = [int(np.prod(shape)) for shape in self.writes] or [self.values]
         end = self.offset + len(self.parameters)
@@ -161,16 +172,16 @@ class UserFunction:
                     raise self.raised
                 values = _view(data, end)[self.offset :]
                 p = parameters_class(self.parameters)(*values.tolist())
-                state, control = _view(x, self.states).copy(), _view(u, self.controls).copy()
+                given = (_view(x, self.states).copy(), _view(u, self.controls).copy())[: 1 + self.with_control]
                 with np.errstate(all="ignore"):
                     if self.writes:
                         # Not the memory itself, which is gone when this returns; the user's function may keep them.
                         written = [np.zeros(shape) for shape in self.writes]
-                        self.function(state, control, p, *written)
+                        self.function(*given, p, *written)
                         for array, values_written in zip(arrays, written, strict=True):
                             array[:] = values_written.reshape(-1)
                     else:
-                        arrays[0][:] = self._vector(self.function(state, control, p))
+                        arrays[0][:] = self._vector(self.function(*given, p))
             except BaseException as error:  # Ctrl-C, too: C code can not pass it on, so the solver asks for it
                 self._thread.raised = error
                 for array in arrays:
@@ -195,23 +206,34 @@ class UserFunction:
         lines = [f"x, u = readonly(carray(x, {self.states})), readonly(carray(u, {self.controls}))"]
         numbers = "".join(f"data[{self.offset + i}], " for i in range(len(self.parameters)))
         lines.append(f"p = Parameters({numbers})")
+        of = "x, u, p" if self.with_control else "x, p"
         if self.writes:
-            outputs = ("a", "b")
+            outputs = ("a", "b")[: len(self.writes)]
             lines += [f"{name} = carray({name}, {shape})" for name, shape in zip(outputs, self.writes, strict=True)]
             # A function that raises leaves NaN, which the solver sees, and not half of its numbers.
-            lines += ["try:", "    function(x, u, p, a, b)", "except Exception:", "    a[:] = nan", "    b[:] = nan"]
+            lines += ["try:", f"    function({of}, {', '.join(outputs)})", "except Exception:"]
+            lines += [f"    {name}[:] = nan" for name in outputs]
         else:
             outputs = ("out",)
-            lines += ["try:", "    returned = function(x, u, p)"]
-            copies = [f"out[{i}] = returned{f'[{i}]' if self.entries else ''}" for i in range(self.values)]
+            lines += ["try:", f"    returned = function({of})"]
+            copies = [f"out[{i}] = returned{self._entry(i)}" for i in range(self.values)]
             if self.entries:  # an array may have another length at another time
-                lines.append(f"    if len(returned) == {self.values}:")
+                rows = self.values // (self.columns or 1)
+                sizes = [f"len(returned) == {rows}"]
+                sizes += [f"len(returned[{k}]) == {self.columns}" for k in range(rows if self.columns else 0)]
+                lines.append(f"    if {' and '.join(sizes)}:")
                 copies = [f"    {line}" for line in copies]
             lines += [f"    {line}" for line in copies]
             lines += ["except Exception:", "    out[0] = nan"]
         body = "\n".join(f"    {line}" for line in lines)
         source = f"def adapter(x, u, data, {', '.join(outputs)}):\n{body}\n"
         return source, {"Parameters": parameters_class(self.parameters)}
+
+    def _entry(self, i: int) -> str:
+        """How the value of that number is taken out of what is returned."""
+        if self.columns:
+            return f"[{i // self.columns}][{i % self.columns}]"
+        return f"[{i}]" if self.entries else ""
 
 
 def plain_names(states: int, controls: int, functions: Sequence[UserFunction], parameters: Mapping[str, float]) -> dict:
@@ -222,7 +244,7 @@ def plain_names(states: int, controls: int, functions: Sequence[UserFunction], p
 
     def invoke(place: float, x: Array, u: Array, data: Array, *outputs: Array) -> None:
         for output, value in zip(outputs, functions[int(place)].call(x, u, parameters), strict=True):
-            output[:] = value
+            output[...] = value.reshape(output.shape)
 
     names: dict[str, Any] = {"N": states, "M": controls, "W": states + controls, "clear": linear_algebra.clear}
     names["ROW"] = declarations.ROW

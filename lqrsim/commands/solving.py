@@ -81,7 +81,9 @@ class Solve:
         console.check_output("--out", folder)
         problem = scenario.problem
         if self.clearance is not None:
-            kept = Clearance(scenario.scene.world, radius=scenario.robot.radius, margin=self.clearance)
+            balls = scenario.robot.balls
+            radius = scenario.robot.radius if balls is None else None
+            kept = Clearance(scenario.scene.world, radius=radius, balls=balls, margin=self.clearance)
             problem = replace(problem, constraints=[*problem.constraints, kept])
         if self.control_limits is not None:
             problem = replace(problem, control_limits=self.control_limits)

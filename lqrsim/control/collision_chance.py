@@ -13,7 +13,9 @@ from scipy.special import ndtr
 
 from lqrsim.codegen.distances import distances_with_normals
 from lqrsim.errors import Array
+from lqrsim.problem.balls import Places, bind_outline, evaluate_slopes
 from lqrsim.problem.constraints import Clearance
+from lqrsim.problem.costs import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.scenes.world import World
 
@@ -23,13 +25,16 @@ class Surroundings:
     """What a robot must not touch.
 
     Attributes:
-      worlds: with the radius to keep from each. seen: the worlds as the robot sees them.
-      position: which states are its place.
+      worlds: with what is to be kept from each: the costs and constraints that say so, each kind once.
+      seen: the worlds as the robot sees them. places: of those that are kept from balls, where these are.
+      place: which states are its position. position: these, or, with balls, all that move it.
       std: of where an obstacle is, in m.
     """
 
-    worlds: tuple[tuple[World, float], ...]
+    worlds: tuple[ObstacleCost | Clearance, ...]
     seen: tuple[World, ...]
+    places: tuple[Places | None, ...]
+    place: tuple[int, ...]
     position: tuple[int, ...]
     std: float
 
@@ -39,33 +44,59 @@ class Surroundings:
         space, worlds = problem.dynamics.state_coordinates, []
         clearances = [one for one in problem.constraints if isinstance(one, Clearance)]
         for one in (*problem.obstacle_costs, *clearances):
-            if not any(world is one.world and radius == one.radius for world, radius in worlds):
-                worlds.append((one.world, one.radius))
-        pairs = [(pair, pair[0].seen_by(space.plane, space.offset)) for pair in worlds]
-        pairs = [(pair, seen) for pair, seen in pairs if len(seen)]
-        return cls(tuple(pair for pair, _ in pairs), tuple(seen for _, seen in pairs), space.position, std)
+            kind = id(one.world), one.radius, id(one.balls)
+            if not any((id(other.world), other.radius, id(other.balls)) == kind for other in worlds):
+                worlds.append(one)
+        bound = [bind_outline("problem", one.balls, problem.dynamics, one.world) for one in worlds]
+        found = [(one, places, seen) for one, (places, seen) in zip(worlds, bound, strict=True) if len(seen)]
+        moving = space.position
+        if any(places is not None for _, places, _ in found):
+            own = [places.depends_on if places is not None else space.position for _, places, _ in found]
+            moving = tuple(sorted({i for indices in own for i in indices}))
+        kept, of_balls, seen = (tuple(part) for part in zip(*found, strict=True)) if found else ((), (), ())
+        return cls(kept, seen, of_balls, space.position, moving, std)
 
     def keep_away(self, margin: Array) -> list[Clearance]:
         """Constraints that keep a margin from each obstacle, (T+1, O)."""
         kept, first = [], 0
-        for (world, radius), seen in zip(self.worlds, self.seen, strict=True):
-            kept.append(Clearance(world, radius=radius, margin=margin[:, first : first + len(seen)]))
+        for one, seen in zip(self.worlds, self.seen, strict=True):
+            own = margin[:, first : first + len(seen)]
+            kept.append(Clearance(one.world, radius=one.radius, balls=one.balls, margin=own))
             first += len(seen)
         return kept
 
     def clearances(self, states: Array) -> tuple[Array, Array, Array]:
-        """At states (K, n): to each obstacle (K, O), in which direction that grows (K, O, p), and its variance (O,)."""
-        places = states[:, list(self.position)]
-        worlds = [(seen, radius) for (_, radius), seen in zip(self.worlds, self.seen, strict=True)]
-        parts = [(*distances_with_normals(world, places), radius, world) for world, radius in worlds]
-        if not parts:
+        """At states (K, n): to each obstacle (K, O), in which direction that grows (K, O, p), and its variance (O,).
+
+        Of balls it is the clearance of that which is nearest to the obstacle.
+        """
+        if not self.worlds:
             return np.zeros((len(states), 0)), np.zeros((len(states), 0, len(self.position))), np.zeros(0)
-        fixed = [[one.kind == "plane" for one in world.obstacles] for *_, world in parts]
+        pairs = zip(self.worlds, self.seen, self.places, strict=True)
+        parts = [self._of_one(one, seen, places, states) for one, seen, places in pairs]
+        fixed = [[one.kind == "plane" for one in seen.obstacles] for seen in self.seen]
         return (
-            np.concatenate([distances - radius for distances, _, radius, _ in parts], axis=1),
-            np.concatenate([normals for _, normals, *_ in parts], axis=1),
+            np.concatenate([clearance for clearance, _ in parts], axis=1),
+            np.concatenate([normals for _, normals in parts], axis=1),
             np.where(np.concatenate(fixed), 0.0, self.std**2),
         )
+
+    def _of_one(
+        self, one: ObstacleCost | Clearance, seen: World, places: Places | None, states: Array
+    ) -> tuple[Array, Array]:
+        if one.balls is None or places is None:
+            distances, across = distances_with_normals(seen, states[:, list(self.place)])
+            normals = np.zeros((*distances.shape, len(self.position)))
+            normals[..., [self.position.index(i) for i in self.place]] = across
+            return distances - (one.radius or 0.0), normals
+        count, knots = len(one.balls), np.arange(len(states))[:, None]
+        middles, slopes = evaluate_slopes(places, count, states)
+        distances, normals = distances_with_normals(seen, middles.reshape(-1, 3))
+        clearance = distances.reshape(len(states), count, -1) - one.balls.radii[:, None]
+        nearest, obstacle = clearance.argmin(axis=1), np.arange(len(seen))
+        normals = normals.reshape(len(states), count, -1, 3)[knots, nearest, obstacle]
+        moves = slopes[knots, nearest][..., list(self.position)]
+        return clearance[knots, nearest, obstacle], np.einsum("kod,kodi->koi", normals, moves)
 
     def spread(self, states: Array, covariance: Array) -> tuple[Array, Array]:
         """Clearances at mean states (T+1, n), and their standard deviations, both (T+1, O)."""

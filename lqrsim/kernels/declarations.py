@@ -131,6 +131,14 @@ def constraint_slope(x, u, t, row, data, gradient) -> None:
     """Add its gradient (W,)."""
 
 
+def places(x, data, out) -> None:
+    """Write where the balls of a robot are, three coordinates each, ball by ball."""
+
+
+def places_jacobian(x, data, out, slopes) -> None:
+    """Write these, and those of their derivatives in the states (..., N) that are not zero everywhere."""
+
+
 def initial_value(x, u, t, data) -> float:
     """The initial cost c_0(x)."""
     return 0.0

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
-from lqrsim.codegen.kernel_source import source_of
-from lqrsim.codegen.user_functions import check_signature, level_of, name_of
+from lqrsim.codegen.kernel_source import check_source, source_of
+from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
 from lqrsim.errors import (
     Array,
     InputError,
@@ -28,8 +28,8 @@ from lqrsim.errors import (
     excerpt,
     real,
 )
-from lqrsim.kernels import clearance, state_bound
-from lqrsim.problem.costs import check_source
+from lqrsim.kernels import ball_clearance, clearance, state_bound
+from lqrsim.problem.balls import Balls, bind_outline, check_outline
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
 
@@ -51,6 +51,10 @@ class ConstraintTerm:
       uses_control: whether they depend on u; if so, they do not act at the last step, which has none.
       equality: whether they are to be zero.
       final_only: whether they act at the last step alone.
+      balls: of how many balls the numbers are, whose places all of them share; mostly none. With it the source defines
+        `places` and `places_jacobian`, too, as `Places` has them, and `value` and `slope` get the places (3 balls,) and
+        their derivatives (3 balls, n) in place of x and u.
+      functions: what the source calls with `invoke`; their addresses come first in the data that it is given.
     """
 
     source: str
@@ -60,6 +64,8 @@ class ConstraintTerm:
     uses_control: bool = False
     equality: bool = False
     final_only: bool = False
+    balls: int = 0
+    functions: tuple[UserFunction, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", check_array("ConstraintTerm: data", self.data, (None,), infinite=True))
@@ -69,7 +75,11 @@ class ConstraintTerm:
             object.__setattr__(self, name, check_flag(f"ConstraintTerm: {name}", getattr(self, name)))
         if self.uses_control and self.final_only:
             raise InputError("ConstraintTerm: final_only: got True with uses_control, want one: the end has no control")
-        check_source("ConstraintTerm", self.source, {"value": 5, "slope": 6})
+        object.__setattr__(self, "balls", check_count("ConstraintTerm: balls", self.balls, at_least=0))
+        of_balls = {"places": 3, "places_jacobian": 4} if self.balls else {}
+        check_source("ConstraintTerm", self.source, {"value": 5, "slope": 6, **of_balls})
+        functions = check_items("ConstraintTerm: functions", self.functions, UserFunction, "a tuple of UserFunction")
+        object.__setattr__(self, "functions", functions)
 
 
 class Constraint(abc.ABC):
@@ -96,16 +106,23 @@ class Clearance(Constraint):
 
     Args:
       world: the obstacles; a robot in the plane sees them as for an ObstacleCost.
-      radius: of the robot, in metres.
+      radius, balls: of the robot, one of the two, as for an ObstacleCost.
       margin: what is to be left beyond that, in metres; a number, or one for each of the T + 1 knots, or (T + 1, O),
         one for each knot and obstacle, as the robot sees the world.
     """
 
-    def __init__(self, world: World, *, radius: float, margin: float | npt.ArrayLike = 0.0) -> None:
+    def __init__(
+        self,
+        world: World,
+        *,
+        radius: float | None = None,
+        balls: Balls | None = None,
+        margin: float | npt.ArrayLike = 0.0,
+    ) -> None:
         if not isinstance(world, World):
             raise InputError(f"Clearance: world: got {excerpt(world)}, want a World, such as scene.world")
-        self.world = world
-        self.radius = check_number("Clearance: radius", radius, at_least=0.0)
+        self.world, self.balls = world, balls
+        self.radius = check_outline("Clearance", radius, balls)
         given = real("Clearance: margin", margin)
         if given.ndim == 0:
             self.margin: float | Array = check_number("Clearance: margin", margin)
@@ -118,29 +135,36 @@ class Clearance(Constraint):
         steps = check_count("steps", steps, at_least=0)
         if not isinstance(self.margin, np.ndarray):
             return self
-        return Clearance(self.world, radius=self.radius, margin=self.margin[min(steps, len(self.margin) - 1) :])
+        left = self.margin[min(steps, len(self.margin) - 1) :]
+        return Clearance(self.world, radius=self.radius, balls=self.balls, margin=left)
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        space = dynamics.state_coordinates
-        position = space.position
-        if not position:
-            raise InputError("Clearance: got dynamics without a position, want Dynamics(..., position=(names))")
-        world = self.world.seen_by(space.plane, space.offset)
+        balls = self.balls
+        places, world = bind_outline("Clearance", balls, dynamics, self.world)
         margins = np.atleast_1d(self.margin).reshape(np.shape(self.margin)[0] if np.ndim(self.margin) else 1, -1)
         if margins.shape[1] not in (1, len(world)):
             want = f"{len(world)}, one an obstacle: {', '.join(world.names)}"
             raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
 
         def describe(row: int) -> str:
-            own = margins[:, row % margins.shape[1]]
+            ball, place = divmod(row, len(world))
+            own, who = margins[:, place % margins.shape[1]], "" if balls is None else f" of {balls.names[ball]!r}"
             low, high = f"{own.min():g}", f"{own.max():g}"
-            return f"a clearance of {low if low == high else f'{low} to {high}'} m to obstacle {world.names[row]!r}"
+            said = low if low == high else f"{low} to {high}"
+            return f"a clearance of {said} m{who} to obstacle {world.names[place]!r}"
 
+        if balls is None or places is None:
+            data = np.concatenate([margins.shape, (self.radius + margins).ravel(), world.table.ravel()])
+            source = source_of(clearance, AXES=dynamics.state_coordinates.position)
+            return ConstraintTerm(source, data, len(world), describe)
+        own = [*margins.shape, len(world), *balls.radii, *margins.ravel(), *world.table.ravel()]
         return ConstraintTerm(
-            source=source_of(clearance, AXES=position),
-            data=np.concatenate([margins.shape, (self.radius + margins).ravel(), world.table.ravel()]),
-            rows=len(world),
+            source=f"{places.source}\n\n{source_of(ball_clearance, AT=places.numbers, BALLS=len(balls))}",
+            data=np.concatenate([places.data, own]),
+            rows=len(balls) * len(world),
             describe=describe,
+            balls=len(balls),
+            functions=places.functions,
         )
 
 

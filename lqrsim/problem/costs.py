@@ -4,8 +4,6 @@ To add a kind of cost, subclass `Cost` and write `bind`; or state it as a formul
 """
 
 import abc
-import ast
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
-from lqrsim.codegen.kernel_source import source_of
+from lqrsim.codegen.kernel_source import check_source, source_of
 from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
 from lqrsim.errors import (
     Array,
@@ -24,13 +22,13 @@ from lqrsim.errors import (
     check_flag,
     check_function,
     check_items,
-    check_kind,
     check_name,
     check_number,
     check_weight,
     excerpt,
 )
-from lqrsim.kernels import cost_differences, function_cost, obstacle_cost, quadratic_cost
+from lqrsim.kernels import ball_cost, cost_differences, function_cost, obstacle_cost, quadratic_cost
+from lqrsim.problem.balls import Balls, Places, bind_outline, check_outline
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
 
@@ -51,6 +49,8 @@ class Term:
       factor: index in `data` of a number that the whole term is proportional to, for what may be eased in the first
         iterations; see `InitialPrior`. None where there is none.
       functions: what the source calls with `invoke`; their addresses come first in the data that it is given.
+      exact_hessian: whether the Hessian is all of it. Where a part is left out on purpose, `check_derivatives` does not
+        compare it with differences.
     """
 
     source: str
@@ -59,6 +59,7 @@ class Term:
     uses_control: bool = False
     factor: int | None = None
     functions: tuple[UserFunction, ...] = ()
+    exact_hessian: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", check_array("Term: data", self.data, (None,), infinite=True))
@@ -68,7 +69,8 @@ class Term:
             given = check_items("Term: nonconvex_in", self.nonconvex_in, (int, np.integer), wanted)
             entries = tuple(check_count("Term: nonconvex_in", i, at_least=0) for i in given)
             object.__setattr__(self, "nonconvex_in", entries)
-        object.__setattr__(self, "uses_control", check_flag("Term: uses_control", self.uses_control))
+        for name in ("uses_control", "exact_hessian"):
+            object.__setattr__(self, name, check_flag(f"Term: {name}", getattr(self, name)))
         if self.factor is not None:
             last = len(self.data) - 1
             object.__setattr__(self, "factor", check_count("Term: factor", self.factor, at_least=0, at_most=last))
@@ -154,27 +156,60 @@ class ObstacleCost(Cost):
     Paper: Sec. VI-A, with the sharpness made explicit. At t = 0, where the state is given, it does not act. A robot in
     the plane (two position coordinates) sees the world from above, or cut by its plane; see `World.seen_by`.
 
+    Of a robot of several balls it is the sum over these, too. The Hessian is then that in the balls' places, taken to
+    the states by the first derivatives of the places; their second derivatives are left out.
+
     Args:
-      world: the obstacles. radius: of the robot, in metres.
-      sharpness: in 1/m. weight: cost of touching one obstacle for one step.
+      world: the obstacles.
+      radius: of the robot at its position, in metres. balls: the robot in its place, as `robot.balls`; one of the two.
+      sharpness: in 1/m. weight: cost of touching one obstacle, with one ball, for one step.
     """
 
-    def __init__(self, world: World, *, radius: float, sharpness: float = 10.0, weight: float = 1.0) -> None:
+    def __init__(
+        self,
+        world: World,
+        *,
+        radius: float | None = None,
+        balls: Balls | None = None,
+        sharpness: float = 10.0,
+        weight: float = 1.0,
+    ) -> None:
         if not isinstance(world, World):
             raise InputError(f"ObstacleCost: world: got {excerpt(world)}, want a World, such as scene.world")
-        self.world = world
-        self.radius = check_number("ObstacleCost: radius", radius, at_least=0.0)
+        self.world, self.balls = world, balls
+        self.radius = check_outline("ObstacleCost", radius, balls)
         self.sharpness = check_number("ObstacleCost: sharpness", sharpness, above=0.0)
         self.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
 
+    @property
+    def largest(self) -> float:
+        """The radius of the robot, or of its largest ball, in metres."""
+        return float(self.balls.radii.max()) if self.balls is not None else self.radius or 0.0
+
+    def weighing(self, weight: float) -> "ObstacleCost":
+        """The same with another weight."""
+        return ObstacleCost(self.world, radius=self.radius, balls=self.balls, sharpness=self.sharpness, weight=weight)
+
     def bind(self, dynamics: Dynamics) -> Term:
-        space = dynamics.state_coordinates
-        position = space.position
-        if not position:
-            raise InputError("ObstacleCost: got dynamics without a position, want Dynamics(..., position=(names))")
-        world = self.world.seen_by(space.plane, space.offset)
+        places, world = bind_outline("ObstacleCost", self.balls, dynamics, self.world)
+        if self.balls is not None and places is not None:
+            return self._bind_balls(self.balls, places, world)
+        position = dynamics.state_coordinates.position
         data = np.concatenate([[self.radius, self.sharpness, self.weight, len(world)], world.table.ravel()])
         return Term(source_of(obstacle_cost, AXES=position), data, nonconvex_in=position, factor=2)
+
+    def _bind_balls(self, balls: Balls, places: Places, world: World) -> Term:
+        own = np.concatenate([[self.sharpness, self.weight, len(world)], balls.radii, world.table.ravel()])
+        count, axes = len(balls), places.depends_on
+        kernel = source_of(ball_cost, AT=places.numbers, BALLS=count, PLACES=3 * count, AXES=axes)
+        return Term(
+            f"{places.source}\n\n{kernel}",
+            np.concatenate([places.data, own]),
+            nonconvex_in=axes or None,
+            factor=len(places.data) + 1,
+            functions=places.functions,
+            exact_hessian=False,
+        )
 
 
 class SymbolicCost(Cost):
@@ -311,40 +346,6 @@ class FunctionCost(Cost):
             uses_control=any(axis >= n for axis in axes),
             functions=functions,
         )
-
-
-def check_source(field: str, source: object, functions: Mapping[str, int]) -> None:
-    """Raises InputError unless it is source text that defines these functions, of so many arguments, and can compile.
-
-    What there is besides Python's own arithmetic is named without its module: cos, not math.cos or np.cos.
-    """
-    wanted = " and ".join(f"{name}(...)" for name in functions)
-    check_kind(f"{field}: source", source, str, f"text that defines {wanted}")
-    wrong = _wrong(str(source), tuple(functions.items()))
-    if wrong:
-        raise InputError(f"{field}: source: {wrong}")
-
-
-@functools.lru_cache(maxsize=256)  # a problem that is stated again and again has the same sources
-def _wrong(source: str, functions: tuple[tuple[str, int], ...]) -> str:
-    """What is wrong with a source; see `check_source`."""
-    try:
-        tree = ast.parse(source)
-    except Exception as error:  # SyntaxError, or what nesting, null characters and the like lead to
-        return f"got {excerpt(source)}, which is no Python ({error}), want functions"
-    defined = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
-    for name, count in functions:
-        found = defined.get(name)
-        if found is None:
-            return f"got {excerpt(source)}, want it to define {name}(...)"
-        if len(found.args.args) != count:
-            return f"got {name} of {len(found.args.args)} arguments, want {count}"
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            return f"got an import in line {node.lineno}, want none: sqrt, exp, cos and the like are at hand"
-        if isinstance(node, ast.Attribute):
-            return f"got {ast.unparse(node)} in line {node.lineno}, want {node.attr}: modules are not at hand"
-    return ""
 
 
 def _check_size(field: str, weight: Array, want: int, what: str) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from lqrsim.codegen.user_functions import UserFunction, brief, plain_names
 from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, check_text, excerpt, real, shaped
+from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import Term, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import FixedState, Problem
@@ -16,14 +17,15 @@ from lqrsim.problem.problem import FixedState, Problem
 def functions_of(problem: Problem) -> list[UserFunction]:
     """The numba and plain Python functions of a problem."""
     terms = [term for name in ("initial", "stage_cost", "final_cost") for term in problem.terms(name)]
-    return [function for part in (problem.dynamics, *terms) for function in part.functions]
+    parts = (problem.dynamics, *terms, *problem.constraint_terms)
+    return [function for part in parts for function in part.functions]
 
 
 def check_functions(problem: Problem, x: Array, u: Array) -> None:
     """Call each numba and plain Python function once. Raises InputError if one does not return what it should."""
-    for part in (problem.dynamics, *(term for _, term in _terms(problem))):
+    for part in (problem.dynamics, *(term for _, term in _terms(problem)), *problem.constraint_terms):
         for function in part.functions:
-            parameters = dict(zip(function.parameters, part.data.tolist(), strict=True))
+            parameters = dict(zip(function.parameters, part.data.tolist(), strict=False))
             values = function.call(x, u, parameters)
             for i, name in function.unused:
                 z = np.concatenate([x, u])
@@ -71,12 +73,18 @@ def _terms(problem: Problem) -> Iterator[tuple[str, Term]]:
 def evaluate(term: Term, dynamics: Dynamics, x: Array, u: Array) -> tuple[float, Array, Array]:
     """A cost term in plain Python: its value, gradient (n+m,) and Hessian (n+m, n+m), before any projection."""
     n, m = len(x), len(u)
-    parameters = dict(zip(term.functions[0].parameters, term.data.tolist(), strict=True)) if term.functions else {}
-    names = plain_names(n, m, term.functions, parameters)
-    exec(compile(term.source, "<cost>", "exec"), names)
+    names, data = _run_plainly(term, n, m)
     gradient, hessian = np.zeros(n + m), np.zeros((n + m, n + m))
-    data = np.concatenate([np.arange(len(term.functions), dtype=np.float64), term.data])
     return float(names["derivatives"](x, u, 1, data, hessian, gradient)), gradient, hessian
+
+
+def _run_plainly(term: Term | ConstraintTerm, n: int, m: int) -> tuple[dict[str, Any], Array]:
+    """What a term's source defines, as plain Python, and the data that it is given."""
+    first = term.functions[:1]
+    parameters = dict(zip(first[0].parameters, term.data.tolist(), strict=False)) if first else {}
+    names = plain_names(n, m, term.functions, parameters)
+    exec(compile(term.source, "<term>", "exec"), names)
+    return names, np.concatenate([np.arange(len(term.functions), dtype=np.float64), term.data])
 
 
 def _constraints(
@@ -85,16 +93,25 @@ def _constraints(
     """The constraints' numbers in plain Python: what messages call each, its value and its slope (n+m,) at (x, u)."""
     n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
     for term in problem.constraint_terms:
-        names = plain_names(n, m, (), {})
-        exec(compile(term.source, "<constraint>", "exec"), names)
+        names, data = _run_plainly(term, n, m)
+
+        def given(x: Array, u: Array, term: ConstraintTerm = term, names: Any = names, data: Array = data) -> Any:
+            if not term.balls:
+                return x, u
+            at, moves = np.zeros(3 * term.balls), np.zeros((3 * term.balls, n))
+            names["places_jacobian"](x, data, at, moves)
+            return at, moves
+
         for row in range(term.rows):
 
-            def value(x: Array, u: Array, row: int = row, names: Any = names, data: Array = term.data) -> float:
-                return float(names["value"](x, u, 1, row, data))
+            def value(x: Array, u: Array, row: int = row, rest: Any = (given, names, data)) -> float:
+                given, names, data = rest
+                return float(names["value"](*given(x, u), 1, row, data))
 
-            def slope(x: Array, u: Array, row: int = row, names: Any = names, data: Array = term.data) -> Array:
+            def slope(x: Array, u: Array, row: int = row, rest: Any = (given, names, data)) -> Array:
+                given, names, data = rest
                 gradient = np.zeros(n + m)
-                names["slope"](x, u, 1, row, data, gradient)
+                names["slope"](*given(x, u), 1, row, data, gradient)
                 return gradient
 
             yield term.describe(row), value, slope
@@ -231,7 +248,7 @@ def _of_costs(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterat
     names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
     n = len(dynamics.state_coordinates)
     for cost, term in _terms(problem):
-        if len(term.functions) == 1:
+        if len(term.functions) == 1 and term.exact_hessian:
             continue  # without derivatives: what is stated are central differences
 
         def at(z: Array, term: Term = term) -> tuple[float, Array, Array]:
@@ -242,6 +259,8 @@ def _of_costs(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterat
             _, gradient, hessian = at(z)
             slope = _differences(lambda z, at=at: np.array([at(z)[0]]), z)
             yield _Derivative(f"gradient of {cost}", ("cost",), names, gradient[None], slope, x, u)
+            if not term.exact_hessian:
+                continue
             curvature = _differences(lambda z, at=at: at(z)[1], z)
             yield _Derivative(f"Hessian of {cost}", names, names, hessian, curvature, x, u)
 

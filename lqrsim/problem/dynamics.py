@@ -216,17 +216,17 @@ class Dynamics:
                 return source_of(function_dynamics)
             return f"{source_of(function_dynamics, 'rate')}\n\n{source_of(finite_differences)}"
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
-        details = ("dynamics", *names, *self._constants.items())
+        details = ("dynamics", *names, *self.constants.items())
         return symbolic.kept(self.f, details, lambda: {"source": self._trace()})["source"]
 
     @property
-    def _constants(self) -> dict[str, float]:
+    def constants(self) -> dict[str, float]:
         """The disturbances that are taken for granted."""
         return {name: value for name, value in self.disturbances.items() if name not in self.parameters}
 
     def _trace(self) -> str:
         n, m = len(self.state_coordinates), len(self.control_coordinates)
-        rates, x, u = symbolic.trace(self.f, n, m, list(self.parameters), constants=self._constants)
+        rates, x, u = symbolic.trace(self.f, n, m, list(self.parameters), constants=self.constants)
         if len(rates) != n:
             states = ", ".join(self.state_coordinates.names)
             raise InputError(f"{self.name}(x, u, p): got {len(rates)} entries, want {n}: one for each of {states}")

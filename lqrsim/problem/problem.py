@@ -18,6 +18,7 @@ from lqrsim.errors import (
     check_number,
     excerpt,
 )
+from lqrsim.problem.balls import evaluate
 from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, goals_of
 from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost, Term, terms_of
 from lqrsim.problem.dynamics import Dynamics
@@ -187,27 +188,34 @@ class Problem:
                 functions += term.functions
         for term in self.constraint_terms:
             parts += [term.source, term.data]
+            functions += term.functions
             if term.equality or term.final_only:
                 parts.append(repr((term.equality, term.final_only)))
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
 
     def _check_start_clear(self) -> None:
-        space = self.dynamics.state_coordinates
-        if self.start is None or not space.position:
+        """Raises InputError if the robot is in an obstacle where it starts."""
+        if self.start is None:
             return
+        space = self.dynamics.state_coordinates
         for cost in self.obstacle_costs:
-            world = cost.world.seen_by(space.plane, space.offset)
-            if not len(world):
-                continue
-            place = self.start[list(space.position)]
-            distances = world.distances(place) - cost.radius
-            if distances.min() < 0:
-                where = ", ".join(f"{value:g}" for value in place)
-                name = world.names[int(distances.argmin())]
-                raise InputError(
-                    f"initial: got a start at ({where}) m, {-distances.min():.3g} m inside obstacle {name!r},"
-                    f" want it clear of obstacles by the robot's radius of {cost.radius:g} m"
-                )
+            if cost.balls is None:
+                world, places = cost.world.seen_by(space.plane, space.offset), self.start[None, list(space.position)]
+                parts = [("a start", "the robot's radius", cost.radius)]
+            else:
+                bound = cost.balls.bind(self.dynamics)
+                world, places = bound.world_seen(cost.world, space), evaluate(bound, len(cost.balls), self.start)
+                balls = zip(cost.balls.names, cost.balls.radii, strict=True)
+                parts = [(f"a start with {name!r}", "its radius", radius) for name, radius in balls]
+            for place, (what, whose, radius) in zip(places, parts if len(world) else (), strict=False):
+                distances = world.distances(place) - radius
+                if distances.min() < 0:
+                    where = ", ".join(f"{value:g}" for value in place)
+                    name = world.names[int(distances.argmin())]
+                    raise InputError(
+                        f"initial: got {what} at ({where}) m, {-distances.min():.3g} m inside obstacle {name!r},"
+                        f" want it clear of obstacles by {whose} of {radius:g} m"
+                    )
 
 
 def _bound(cost: Cost, dynamics: Dynamics) -> Term:

@@ -11,6 +11,7 @@ from lqrsim.errors import (
     Array,
     InputError,
     check_array,
+    check_count,
     check_items,
     check_kind,
     check_number,
@@ -20,7 +21,9 @@ from lqrsim.errors import (
     excerpt,
     numbers_of,
     shaped,
+    vectors_of,
 )
+from lqrsim.results.ball_record import BallRecord
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.goal import Target, tracking_error, tracking_unit
 from lqrsim.results.solution_parts import Trajectory
@@ -60,6 +63,7 @@ class Rollout:
       tube: (T+1, p, p) covariance of the position about the plan that was predicted for the controller and the
         disturbances, in m^2; p is 2 or 3, as the position has it. None where nobody predicted it; see `predict_tube`.
       collision_chance: (T+1,) the predicted chance of being in collision at each knot, or None.
+      balls: where the robot's balls were, if it has any and was recorded for drawing; or None.
       disturbances: one description each. seed, first_trial: what the draws came from.
       versions: of lqrsim and the libraries that the bits depend on, and the processor.
     """
@@ -97,6 +101,7 @@ class Rollout:
     versions: Mapping[str, str] = field(default_factory=dict)
     tube: Array | None = None
     collision_chance: Array | None = None
+    balls: BallRecord | None = None
 
     def __post_init__(self) -> None:
         check_kind("Rollout: plan", self.plan, Trajectory, "a Trajectory")
@@ -118,6 +123,9 @@ class Rollout:
             raise InputError(f"Rollout: versions: got {excerpt(given)}, want a dictionary of name: version")
         self._check_shapes()
         self._check_prediction()
+        if self.balls is not None:
+            check_kind("Rollout: balls", self.balls, BallRecord, "a BallRecord, or None")
+            check_shape("Rollout: balls.driven", self.balls.driven, (self.trials, self.plan.steps + 1, None, 3))
 
     def _check_shapes(self) -> None:
         """Raises InputError for arrays that do not fit together."""
@@ -208,6 +216,38 @@ class Rollout:
     def target(self) -> Target:
         """What the trials were to reach."""
         return Target(self.state_coordinates, self.goal, self.plan.states)
+
+    @property
+    def plane(self) -> str:
+        """The axes of the world that `places` are along; of a robot without a position, of its last ball."""
+        return self.state_coordinates.plane or ("xyz" if self.balls is not None else "")
+
+    def places(self, trial: int) -> Array:
+        """Where the robot was in a trial, (T+1, 2 or 3): its position, or its last ball."""
+        if not check_count("trial", trial, at_least=0) < self.trials:
+            raise InputError(f"trial: got {trial}, want one of 0 to {self.trials - 1}")
+        if self.state_coordinates.position or self.balls is None:
+            return self.states[trial][:, list(self.state_coordinates.position)]
+        return self.balls.driven[trial, :, -1]
+
+    @property
+    def planned_places(self) -> Array:
+        """Where it should have been, (T+1, 2 or 3)."""
+        if self.state_coordinates.position or self.balls is None:
+            return self.plan.states[:, list(self.state_coordinates.position)]
+        return self.balls.planned[:, -1]
+
+    def in_world(self, places: npt.ArrayLike, *, height: float = 0.0) -> Array:
+        """Points (..., 3) in the world of places (..., 2 or 3); height in metres is that of those seen from above."""
+        space = self.state_coordinates
+        if space.position or self.balls is None:
+            return space.in_world(places, height=height)
+        return vectors_of("places", places, 3)
+
+    def of_world(self, points: npt.ArrayLike) -> Array:
+        """Places (..., 2 or 3) of points (..., 3) in the world."""
+        points = vectors_of("points", points, 3)
+        return self.state_coordinates.of_world(points) if self.state_coordinates.position else points
 
     @property
     def goal_distance(self) -> Array:

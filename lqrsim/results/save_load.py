@@ -17,6 +17,7 @@ from lqrsim.errors import InputError, check_array, check_kind, check_path, excer
 from lqrsim.results import schema
 from lqrsim.results.archive import Arrays, Header, opened, write
 from lqrsim.results.archive import replacing as replacing
+from lqrsim.results.ball_record import BallRecord
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.output_feedback import SHAPES as OUTPUT_FEEDBACK
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
@@ -50,7 +51,10 @@ _ROLLOUT_ARRAYS = {  # of the same names in a Rollout
     "torques": "K T 3", "displaced": "K obstacles 3", "clearance": "K T+1", "contacts": "K",
     "collided_at": "K", "diverged_at": "K", "failed_at": "K", "frame_times": "F", "frames": "K F nq",
 }  # fmt: skip
-_ROLLOUT_OPTIONAL: tuple[dict[str, str], ...] = ({"goal": "n"}, {"tube": "T+1 p p"}, {"collision_chance": "T+1"})
+_BALLS = {"balls.driven": "K T+1 B 3", "balls.planned": "T+1 B 3", "balls.radii": "B", "balls.anchors": "B 4"}
+_ROLLOUT_OPTIONAL: tuple[dict[str, str], ...] = (
+    {"goal": "n"}, {"tube": "T+1 p p"}, {"collision_chance": "T+1"}, _BALLS,
+)  # fmt: skip
 _POLICY_ARRAYS = {  # of each kind; of the same names in the classes
     "affine": {"gain": "T m n", "offset": "T m", "nominal": "T n"},
     "output feedback": OUTPUT_FEEDBACK,
@@ -281,8 +285,10 @@ def _solution(arrays: Arrays, meta: dict[str, Any]) -> Solution:
 def _rollout_parts(rollout: Rollout) -> tuple[Arrays, dict[str, Any]]:
     arrays: dict[str, npt.NDArray[Any]] = {name: getattr(rollout, name) for name in _ROLLOUT_ARRAYS}
     arrays |= {"trajectory.states": rollout.plan.states, "trajectory.controls": rollout.plan.controls}
-    for group in _ROLLOUT_OPTIONAL:
-        arrays |= {name: getattr(rollout, name) for name in group if getattr(rollout, name) is not None}
+    for name in (name for group in _ROLLOUT_OPTIONAL for name in group):
+        owner, _, part = name.rpartition(".")
+        found = getattr(getattr(rollout, owner), part, None) if owner else getattr(rollout, name)
+        arrays |= {} if found is None else {name: found}
     texts = {name: getattr(rollout, name) for name in _ROLLOUT_TEXTS}
     texts |= {
         "versions": dict(rollout.versions), "dt": rollout.plan.dt,
@@ -297,7 +303,8 @@ def _rollout(arrays: Arrays, meta: dict[str, Any]) -> Rollout:
         raise InputError("frame_times: got times that are not in order, want each after the one before")
     return Rollout(
         **{name: arrays[name] for name in _ROLLOUT_ARRAYS},
-        **{name: arrays.get(name) for group in _ROLLOUT_OPTIONAL for name in group},
+        **{name: arrays.get(name) for group in _ROLLOUT_OPTIONAL for name in group if "." not in name},
+        balls=BallRecord(**{name.split(".")[1]: arrays[name] for name in _BALLS}) if "balls.radii" in arrays else None,
         plan=Trajectory(arrays["trajectory.states"], arrays["trajectory.controls"], float(meta["dt"])),
         state_coordinates=_coordinates(meta["states"]),
         control_coordinates=_coordinates(meta["controls"]),

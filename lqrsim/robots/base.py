@@ -9,6 +9,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array, check_number
 
 if TYPE_CHECKING:
+    from lqrsim.problem.balls import Balls
     from lqrsim.problem.dynamics import Dynamics
 
 
@@ -25,6 +26,8 @@ class Robot(abc.ABC):
       drag: linear, against its velocity through the air, in N s/m; wind acts through it. None by default.
       activations: how many of its states are those of MuJoCo's actuators, `act`: the last ones. None by default.
       radius: of its collision circle (seen from above) or ball (the rest), in metres.
+      balls: what collides, in place of that: of a robot that is more than one ball, or that has no position. None by
+        default. The radius is then how large pictures take the robot to be, and near what goal it has arrived.
     """
 
     name: str
@@ -35,6 +38,7 @@ class Robot(abc.ABC):
     drag: float = 0.0
     activations: int = 0
     radius: float
+    balls: "Balls | None" = None
 
     @property
     @abc.abstractmethod

@@ -234,6 +234,7 @@ class Loop:
             seed=settings.seed,
             first_trial=settings.first_trial,
             versions=versions(),
+            balls=plant.record_of_balls(plan.states, records.states) if settings.frames else None,
         )
 
 

@@ -1,9 +1,9 @@
 """The one definition of a collision: the first moment at which a robot touches an obstacle, of each trial.
 
-It touches one where the signed distance of its position less its radius is negative, or where MuJoCo sees a contact of
-any of its geoms with one. Both are looked for in runs without obstacle contacts, so that they are the same to the bit
-whether an obstacle then stops the robot or not: at the knots, and between them at each part of the control period, as
-`Physics` has them; and between these along the straight line.
+It touches one where the signed distance of its position less its radius is negative, or that of one of its balls, or
+where MuJoCo sees a contact of any of its geoms with one. All of it is looked for in runs without obstacle contacts, so
+that it is the same to the bit whether an obstacle then stops the robot or not: at the knots, and between them at each
+part of the control period, as `Physics` has them; and between these along the straight line.
 """
 
 import numpy as np
@@ -34,8 +34,7 @@ class Collisions:
         self._moved = bool(displaced.any())
         self.at = np.full(len(states), np.inf)
         self.obstacles = [""] * len(states)
-        self._place = list(plant.robot.dynamics.state_coordinates.position)
-        self._last = states[:, self._place]
+        self._last = plant.middles(states)
         self.clearance = self._clear(self._last)
         for row in np.flatnonzero(self.clearance < 0):
             self._hit(int(row), 0.0, self._last[row])
@@ -53,7 +52,7 @@ class Collisions:
             for row in np.flatnonzero(open_ & touching.any(axis=1)) if len(touching) else ():
                 self.touch(int(row), start, touching[row])
             if len(self.plant.world):
-                self._search_line(step, part, parts, states[:, self._place], open_)
+                self._search_line(step, part, parts, self.plant.middles(states), open_)
         found = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
         # What is computed of a time in the period may be rounded to beyond its end.
         self.at[found] = np.minimum(self.at[found], (step + 1) * self.dt)
@@ -66,43 +65,48 @@ class Collisions:
 
     def relocate(self, states: Array) -> None:
         """The trials are elsewhere, as obstacles have stopped some of them."""
-        self._last = states[:, self._place]
+        self._last = self.plant.middles(states)
         self.clearance = self._clear(self._last)
 
     def _search_line(self, step: int, part: int, parts: int, there: Array, open_: npt.NDArray[np.bool_]) -> None:
-        """Look along the lines from the last places to these (K, 2 or 3)."""
+        """Look along the lines from where the balls were last to these places (K, B, 2 or 3)."""
         last, before = self._last, self.clearance
         self._last, self.clearance = there, self._clear(there)
-        length = np.linalg.norm(there - last, axis=1)
+        length = np.linalg.norm(there - last, axis=2).max(axis=1)  # of the ball that went furthest
         # No place of a line is nearer to an obstacle than its ends allow.
         rows = np.flatnonzero(open_ & np.isinf(self.at) & ~(before + self.clearance > length))
         rows = rows[np.isfinite(length[rows])]
         if not len(rows):
             return
-        finest = np.maximum(FINEST * self.plant.robot.radius, length[rows] / MOST)
+        finest = np.maximum(FINEST * float(self.plant.radii.min()), length[rows] / MOST)
         gone, clear = np.zeros(len(rows)), before[rows]
         looking = np.ones(len(rows), dtype=bool)
         while looking.any():
             gone = np.where(looking, np.minimum(gone + np.maximum(clear, finest), length[rows]), gone)
-            share = (gone / np.where(length[rows] > 0, length[rows], 1.0))[:, None]
+            share = (gone / np.where(length[rows] > 0, length[rows], 1.0))[:, None, None]
             at_end = gone >= length[rows]
-            places = np.where(at_end[:, None], there[rows], last[rows] + share * (there[rows] - last[rows]))
+            places = np.where(at_end[:, None, None], there[rows], last[rows] + share * (there[rows] - last[rows]))
             clear = self._clear(places, rows)
             for k in np.flatnonzero(looking & (clear < 0)):
-                self._hit(int(rows[k]), (step + (part + float(share[k, 0])) / parts) * self.dt, places[k])
+                self._hit(int(rows[k]), (step + (part + float(share[k, 0, 0])) / parts) * self.dt, places[k])
             looking &= (clear >= 0) & ~at_end
 
     def _clear(self, places: Array, rows: npt.NDArray[np.intp] | None = None) -> Array:
-        """Clearance (k,) at places (k, 2 or 3) of these trials."""
+        """Clearance (k,) with the balls of these trials at places (k, B, 2 or 3)."""
         if not self._moved:
             return self.plant.clearance_at(places)
-        return self.plant.clearance_at(places[:, None], self.displaced if rows is None else self.displaced[rows])[:, 0]
+        return self.plant.clearance_at(places, self.displaced if rows is None else self.displaced[rows])
 
-    def _hit(self, row: int, time: float, place: Array) -> None:
+    def _hit(self, row: int, time: float, places: Array) -> None:
+        """A collision with the obstacle that is nearest to the balls at these places (B, 2 or 3)."""
         self.at[row] = time
-        world, point = self.plant.world, np.zeros(3)
-        point[: len(place)] = place
-        there = (point - self.plant.across(self.displaced[row])).tolist()  # seen from where each obstacle is
-        table = world.table.ravel()
-        distances = [signed_distance(table, ROW * number, *seen) for number, seen in enumerate(there)]
-        self.obstacles[row] = world.names[int(np.argmin(distances))]
+        world, points = self.plant.world, np.zeros((len(places), 3))
+        points[:, : places.shape[1]] = places
+        table, away = world.table.ravel(), self.plant.across(self.displaced[row])
+        nearest = np.full(len(world), np.inf)
+        larger = self.plant.radii - self.plant.radii.min()  # what all have changes no order, except by rounding
+        for point, radius in zip(points, larger, strict=True):
+            there = (point - away).tolist()  # seen from where each obstacle is
+            found = [signed_distance(table, ROW * number, *seen) - radius for number, seen in enumerate(there)]
+            nearest = np.minimum(nearest, found)
+        self.obstacles[row] = world.names[int(np.argmin(nearest))]

@@ -10,6 +10,8 @@ from mujoco import batch
 
 from lqrsim.codegen import distances
 from lqrsim.errors import Array, InputError, check_kind, check_number, shaped, vectors_of
+from lqrsim.problem.balls import evaluate
+from lqrsim.results.ball_record import BallRecord
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
 from lqrsim.scenes.world import World
@@ -26,9 +28,10 @@ class Plant:
 
     Attributes:
       robot, scene: what it is made of.
-      world: the obstacles that bound the robot's position; none without one.
+      balls, places: the robot's balls, and where they are; None where it is one ball at its position.
+      world: the obstacles that bound the robot's position, or its balls; none without either.
       obstacles: names of what the robot can collide with: those; without a position all, but level planes if a free
-        joint, or a slide that is not level, lets the robot stand on them.
+        joint, or a slide that is not level, lets the robot stand on them. For balls in space it is the same.
       model: the compiled scene, with a contact sensor for each obstacle.
       body: id of the robot's body. qpos, qvel, ctrl: where its joints' and actuators' numbers are in MuJoCo's arrays.
       contact: where the contact sensors are in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
@@ -45,8 +48,14 @@ class Plant:
         plant_validation.check_names(robot, scene)
         space = robot.dynamics.state_coordinates
         self.robot, self.scene = robot, scene
-        self.world = scene.world.seen_by(space.plane, space.offset) if space.position else World()
-        self.obstacles = self.world.names if space.position else _in_the_way(robot, scene)
+        self.balls, self.places = robot.balls, None if robot.balls is None else robot.balls.bind(robot.dynamics)
+        self.world = World()
+        if self.places is not None and not self.places.in_plane:
+            near = _in_the_way(robot, scene)
+            self.world = World([one for one in scene.world.obstacles if one.name in near])
+        elif space.position:
+            self.world = scene.world.seen_by(space.plane, space.offset)
+        self.obstacles = self.world.names if space.position or self.places else _in_the_way(robot, scene)
         self.model = self._compile()
         joints = [self.model.joint(name) for name in robot.joints]
         self.body = int(self.model.body(robot.body).id)
@@ -88,7 +97,12 @@ class Plant:
 
     @cached_property
     def enclosed(self) -> bool:
-        """Whether the robot touches nothing at a clearance above 0: all of it that collides is within its radius."""
+        """Whether the robot touches nothing at a clearance above 0: all of it that collides is within its radius.
+
+        Of balls it is not known.
+        """
+        if self.balls is not None:
+            return not self.obstacles
         return not self.obstacles or (len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9))
 
     def state(self, qpos: Array, qvel: Array, act: Array, near: Array | None = None) -> Array:
@@ -98,6 +112,8 @@ class Plant:
 
     def clearance(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
         """Signed distance to the nearest obstacle minus the robot's radius in metres, (...), at states (..., n).
+
+        Of balls it is the least of theirs.
 
         Args:
           displaced: (K, obstacles, 3), by how much obstacles are elsewhere in each trial, along the world's axes;
@@ -109,20 +125,50 @@ class Plant:
             displaced = shaped("displaced", displaced, wanted)
             if displaced.any() and states.ndim != 3:
                 raise InputError(f"states: got shape {states.shape} beside displaced obstacles, want (K, k, n)")
-        return self.clearance_at(states[..., list(self.robot.dynamics.state_coordinates.position)], displaced)
+        return self.clearance_at(self.middles(states), displaced)
 
-    def clearance_at(self, position: Array, displaced: Array | None = None) -> Array:
-        """The same at positions (..., 2 or 3)."""
+    @property
+    def radii(self) -> Array:
+        """Of the robot's balls in metres, (B,); of the one that it is without any."""
+        return np.array([self.robot.radius]) if self.balls is None else self.balls.radii
+
+    def middles(self, states: Array) -> Array:
+        """Where the middles of its balls are, as the world is seen: (..., B, 2 or 3) at states (..., n)."""
+        if self.balls is None or self.places is None:
+            return states[..., None, list(self.robot.dynamics.state_coordinates.position)]
+        return evaluate(self.places, len(self.balls), states)
+
+    def clearance_at(self, middles: Array, displaced: Array | None = None) -> Array:
+        """The clearance (...) with the middles of its balls there, (..., B, 2 or 3)."""
         if not len(self.world):
-            return np.full(position.shape[:-1], np.inf)
+            return np.full(middles.shape[:-2], np.inf)
         if displaced is None or not displaced.any():
-            return distances.signed_distance(self.world, position) - self.robot.radius
-        return distances.signed_distance_displaced(self.world, position, self.across(displaced)) - self.robot.radius
+            return (distances.signed_distance(self.world, middles) - self.radii).min(axis=-1)
+        trials, size = len(middles), middles.shape[-1]
+        found = distances.signed_distance_displaced(
+            self.world, middles.reshape(trials, -1, size), self.across(displaced)
+        )
+        return (found.reshape(middles.shape[:-1]) - self.radii).min(axis=-1)
+
+    def record_of_balls(self, planned: Array, driven: Array) -> BallRecord | None:
+        """Where its balls are along a plan (T+1, n) and in runs (K, T+1, n), for pictures; None if it has none."""
+        if self.balls is None:
+            return None
+        dynamics, anchors = self.robot.dynamics, np.full((len(self.balls), 4), np.nan)
+        places = np.full((*driven.shape[:2], len(self.balls), 3), np.nan)
+        known = np.isfinite(driven).all(axis=2)
+        places[known] = self.balls.centres(dynamics, driven[known])
+        for k, site in enumerate(self.balls.sites):
+            if site is not None:
+                anchors[k] = plant_validation.anchor_of(self.model, site)
+        return BallRecord(
+            driven=places, planned=self.balls.centres(dynamics, planned), radii=self.balls.radii, anchors=anchors
+        )
 
     def across(self, vectors: Array) -> Array:
         """Vectors (..., 3) along the axes that `world` has, of vectors along those of the scene."""
         space = self.robot.dynamics.state_coordinates
-        if len(space.position) != 2:
+        if len(space.position) != 2 or (self.places is not None and not self.places.in_plane):
             return vectors
         seen = space.of_world(vectors)
         normal = np.cross(*np.eye(3)[list(space.world_axes)])

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_kind, check_number, excerpt
+from lqrsim.problem.balls import Balls
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene
@@ -23,10 +24,11 @@ MIXED = 10  # of so many controls at most, all corners of their limits are looke
 def check_names(robot: Robot, scene: Scene) -> None:
     """Raises InputError unless the robot's body, joints, actuators and wheels are in the scene by their names.
 
-    Its radius and its drag must be numbers that are not negative.
+    Its radius and its drag must be numbers that are not negative, and its balls Balls.
     """
     check_number(f"robot {robot.name}: radius", getattr(robot, "radius", None), at_least=0.0)
     check_number(f"robot {robot.name}: drag", robot.drag, at_least=0.0)
+    check_kind(f"robot {robot.name}: balls", robot.balls, (Balls, type(None)), "Balls(places, radii), or None")
     model = scene.model
     wanted = {
         "body": ("body", [robot.body], model.nbody),
@@ -76,6 +78,8 @@ def check_maps(plant: "Plant") -> None:
     _check_limits(plant)
     if robot.dynamics.state_coordinates.position:
         _check_position(plant)
+    if robot.balls is not None:
+        _check_sites(plant, robot.balls)
 
 
 def _check_limits(plant: "Plant") -> None:
@@ -149,6 +153,43 @@ def _check_position(plant: "Plant") -> None:
             f"{who}: got {_point(place)} m in {_of(space)}, where MuJoCo has the origin of body {robot.body!r} at"
             f" {_point(there)} m; want configuration() to put it there (slides count from the body's pos in the MJCF)"
         )
+
+
+def anchor_of(model: mujoco.MjModel, site: str) -> Array:
+    """The body that a site, or a geom, of that name is on, by its number, and where it is in the axes of that, (4,)."""
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, site)
+    if number >= 0:
+        return np.array([model.site_bodyid[number], *model.site_pos[number]])
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, site)
+    return np.array([model.geom_bodyid[number], *model.geom_pos[number]])
+
+
+def _check_sites(plant: "Plant", balls: Balls) -> None:
+    """Raises InputError unless each ball that names a site or a geom has its middle where MuJoCo has that."""
+    robot, model, data = plant.robot, plant.model, mujoco.MjData(plant.model)
+    who, n = f"robot {robot.name}: balls", len(robot.dynamics.state_coordinates)
+    names = [model.site(number).name for number in range(model.nsite)]
+    names = list(filter(None, [*names, *(model.geom(number).name for number in range(model.ngeom))]))
+    for site in filter(None, balls.sites):
+        if site not in names:
+            has = ", ".join(names) or "none"
+            raise InputError(f"{who}: sites: got {excerpt(site)}, want a site or a geom of the MJCF; it has: {has}")
+    anchors = [(k, site, anchor_of(model, site)) for k, site in enumerate(balls.sites) if site is not None]
+    rng = np.random.default_rng(0)
+    for state in (np.zeros(n), 0.1 + 0.01 * np.arange(n), *rng.uniform(-1.0, 1.0, (3, n))):
+        data.qpos[plant.qpos] = robot.configuration(state)[0]
+        mujoco.mj_kinematics(model, data)
+        centres = balls.centres(robot.dynamics, state) if anchors else ()
+        for k, site, (body, *place) in anchors:
+            there = data.xpos[int(body)] + data.xmat[int(body)].reshape(3, 3) @ place
+            off = there - centres[k]
+            if plant.places is not None and plant.places.in_plane and robot.dynamics.state_coordinates.from_above:
+                off[2] = 0.0  # it has no certain height
+            if not np.abs(off).max() <= OFF:
+                raise InputError(
+                    f"{who}: got {balls.names[k]!r} at {_point(centres[k])} m in the state {_point(state)}, where"
+                    f" MuJoCo has {site!r} at {_point(there)} m; want them in the same place"
+                )
 
 
 def _remedy(plant: "Plant", names: list[str], moves: Array) -> str:

@@ -4,7 +4,9 @@ import numpy as np
 
 from lqrsim.codegen import distances
 from lqrsim.errors import Array
+from lqrsim.problem.balls import clearances
 from lqrsim.problem.constraints import Clearance
+from lqrsim.problem.costs import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
@@ -69,19 +71,27 @@ def _radius(problem: Problem) -> float | None:
     goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
     if not position or (goal is not None and np.isnan(goal[position]).all()):
         return None
-    constraints = [constraint for constraint in problem.constraints if isinstance(constraint, Clearance)]
-    return max((one.radius for one in (*problem.obstacle_costs, *constraints)), default=0.0) or None
+    return max((one.radius or 0.0 for one in _kept_clear(problem)), default=0.0) or None
 
 
 def clearance_of(problem: Problem, states: Array) -> Array | None:
-    """Signed distance to the nearest obstacle minus the robot's radius, (T+1,); None without obstacles."""
+    """Signed distance to the nearest obstacle minus the robot's radius, (T+1,); None without obstacles.
+
+    Of a robot of several balls it is the least of theirs.
+    """
     space = problem.dynamics.state_coordinates
-    constraints = [constraint for constraint in problem.constraints if isinstance(constraint, Clearance)]
-    worlds = {(id(one.world), one.radius): one.world for one in (*problem.obstacle_costs, *constraints)}
     place = states[:, list(space.position)]
-    found = [
-        distances.signed_distance(world.seen_by(space.plane, space.offset), place) - radius
-        for (_, radius), world in worlds.items()
-        if len(world)
-    ]
+    worlds = {(id(one.world), one.radius, id(one.balls)): one for one in _kept_clear(problem) if len(one.world)}
+    found = []
+    for one in worlds.values():
+        if one.balls is not None:
+            found.append(clearances(one.balls, problem.dynamics, one.world, states).min(axis=1))
+        elif one.radius is not None:
+            seen = one.world.seen_by(space.plane, space.offset)
+            found.append(distances.signed_distance(seen, place) - one.radius)
     return np.min(found, axis=0) if found else None
+
+
+def _kept_clear(problem: Problem) -> tuple[ObstacleCost | Clearance, ...]:
+    """The costs and constraints that keep the robot clear of obstacles."""
+    return (*problem.obstacle_costs, *(one for one in problem.constraints if isinstance(one, Clearance)))

@@ -18,6 +18,7 @@ from lqrsim.codegen.kernel_source import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     augmented_lagrangian,
+    ball_constraint,
     certificate,
     control_limits,
     cost_to_come_dual,
@@ -44,8 +45,8 @@ from lqrsim.problem.problem import FixedState, Problem
 
 # The terms of a cost as far as they are structure: the source of each, and what it is not convex in (see `Term`).
 Structure = tuple[tuple[str, tuple[int, ...] | None], ...]
-# The constraints: the source of each, whether it uses the control, and whether it is an equality.
-Constraints = tuple[tuple[str, bool, bool], ...]
+# The constraints: the source of each, whether it uses the control, whether it is an equality, and of how many balls.
+Constraints = tuple[tuple[str, bool, bool, int], ...]
 
 _FIELDS = {"initial": "initial", "stage": "stage_cost", "final": "final_cost"}
 
@@ -64,7 +65,7 @@ def _structure(problem: Problem) -> tuple[Any, ...]:
     dynamics = problem.dynamics
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     costs = [(name, tuple((t.source, t.nonconvex_in) for t in problem.terms(field))) for name, field in _FIELDS.items()]
-    constraints = tuple((term.source, term.uses_control, term.equality) for term in problem.constraint_terms)
+    constraints = tuple((one.source, one.uses_control, one.equality, one.balls) for one in problem.constraint_terms)
     return n, m, dynamics.source, tuple(costs), constraints, f"{dynamics.name} ({n} states, {m} controls)"
 
 
@@ -107,12 +108,12 @@ def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> Model:
       multipliers: of each constraint, as `augmented_lagrangian.py` has them; by default none act.
     """
 
-    def numbers(part: Dynamics | Term) -> Array:
+    def numbers(part: Dynamics | Term | ConstraintTerm) -> Array:
         return np.array([*(address_of(function) for function in part.functions), *part.data], dtype=np.float64)
 
     data = {name: tuple(numbers(term) for term in problem.terms(field)) for name, field in _FIELDS.items()}
     multipliers = multipliers or [no_multipliers(problem, term) for term in problem.constraint_terms]
-    pairs = [(part.data.copy(), own) for part, own in zip(problem.constraint_terms, multipliers, strict=True)]
+    pairs = [(numbers(part), own) for part, own in zip(problem.constraint_terms, multipliers, strict=True)]
     data["stage"] += tuple(array for pair in pairs for array in pair)
     data["final"] += tuple(array for pair in pairs for array in pair)
     space = problem.control_coordinates
@@ -150,17 +151,37 @@ def _constraint_source(constraints: Constraints, terms: int) -> str:
     values = "def evaluate_constraints(steps, states, controls, data, values):\n    for t in range(steps + 1):\n"
     values += "        u = controls[min(t, steps - 1)]\n"
     slope = "def slope_of_constraint(which, row, x, u, t, data, gradient):\n"
-    for k, (source, uses_control, equality) in enumerate(constraints):
+    for k, (source, uses_control, equality, balls) in enumerate(constraints):
         prefix, own = _prefix(source), _constraint_prefix(source, equality)
         names = {"constraint_value": f"{prefix}_value", "constraint_slope": f"{prefix}_slope"}
         names |= {name: f"{own}_{name}" for name in ("augment", "augmentation", "constraint_values")}
-        parts += [_own(source), _rename(source_of(augmented_lagrangian, EQUALITY=equality), names)]
+        slope_name = names["constraint_slope"]
+        parts.append(_own(source))
+        if balls:
+            parts.append(_of_state(prefix, own, balls))
+            names |= {name: f"{own}_{inner}" for name, inner in _OF_PLACES.items()}
+            slope_name = f"{own}_constraint_slope"
+        parts.append(_rename(source_of(augmented_lagrangian, EQUALITY=equality), names))
         at = terms + 2 * k
-        slope += f"    if which == {k}:\n        {prefix}_slope(x, u, t, row, data[{at}], gradient)\n"
+        slope += f"    if which == {k}:\n        {slope_name}(x, u, t, row, data[{at}], gradient)\n"
         acts = "t < steps" if uses_control else "True"  # there is no last control
         pair = f"data[{at}], data[{at + 1}]"
         values += f"        {own}_constraint_values(states[t], u, t, {acts}, {pair}, values[{k}])\n"
     return "\n\n".join([*parts, values, slope] if constraints else [])
+
+
+# What `ball_constraint.py` calls the functions of a constraint that get the places of balls in place of the state.
+_OF_PLACES = {
+    "augment": "augment_places", "augmentation": "augmentation_places", "constraint_values": "values_of_places",
+}  # fmt: skip
+
+
+def _of_state(prefix: str, own: str, balls: int) -> str:
+    """Source of what evaluates a constraint of balls at a state, by its functions of their places."""
+    names = {name: f"{prefix}_{name}" for name in ("places", "places_jacobian")}
+    names["slope_of_places"] = f"{prefix}_slope"
+    names |= {name: f"{own}_{name}" for name in (*_OF_PLACES, *_OF_PLACES.values(), "constraint_slope")}
+    return _rename(source_of(ball_constraint, PLACES=3 * balls), names)
 
 
 def _constraint_prefix(source: str, equality: bool) -> str:
@@ -195,7 +216,7 @@ def _cost_source(name: str, terms: Structure, constraints: Constraints) -> str:
         parts.append(_rename(source_of(projection, K=len(support)), {"project": f"{name}_project"}))
         nonconvex.append(f"    {name}_project(hessian, {support})")
     added = []
-    for k, (source, uses_control, equality) in enumerate(constraints):
+    for k, (source, uses_control, equality, _) in enumerate(constraints):
         if not (uses_control and name == "final"):
             own = _constraint_prefix(source, equality)
             pair = f"data[{len(terms) + 2 * k}], data[{len(terms) + 2 * k + 1}]"

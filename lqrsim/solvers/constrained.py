@@ -107,12 +107,7 @@ def _first_feasible(
         if callback is not None:
             callback(without_cost(iteration))
 
-    costs = [
-        ObstacleCost(cost.world, radius=cost.radius, sharpness=cost.sharpness, weight=0.0)
-        if isinstance(cost, ObstacleCost)
-        else cost
-        for cost in terms_of(problem.stage_cost)
-    ]
+    costs = [cost.weighing(0.0) if isinstance(cost, ObstacleCost) else cost for cost in terms_of(problem.stage_cost)]
     plain = dataclasses.replace(problem, stage_cost=CostSum(tuple(costs)))
     without = _again(attempt, plain, dataclasses.replace(attempt.initial_guess, prior=None), found.iterations)
     kept = without.finish(each=each, callback=told)

@@ -15,6 +15,7 @@ from lqrsim.errors import Array, InputError
 from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, terms_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
+from lqrsim.results.goal import TOLERANCE, Target
 from lqrsim.results.solution_parts import Candidate
 from lqrsim.solvers.assembly import clearance_of
 from lqrsim.solvers.attempt import Attempt, AttemptResult
@@ -27,6 +28,7 @@ STARTS = 7
 SHARES = (0.0, 0.1, 0.4, 0.7)  # of the obstacle costs, in the first iterations
 PULL = 0.1  # of the path, relative to the curvature of an obstacle's cost where it is touched
 RING, STEP, WIDEST = 0.3, 0.2, 0.6  # how far paths bend, relative to the distance from start to goal
+FOLD = 0.9  # the same of the states that move balls: an arm must be folded up before it passes what it hung over
 HALVE, CHOOSE = 3, 4  # the iterations after which half of the starts are left, and one
 # Where nothing that the controls do at rest leads anywhere, as for what swims: how often they sway along the plan, and
 # how far, of what they may.
@@ -39,8 +41,9 @@ BOLD = (10.0, 100.0)
 def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior | None]]:
     """What to start from, each with what to call it: paths to the goal, the straight one first.
 
-    Problems without obstacles, or without a position to start from and one to go to, have nothing to go round: there
-    is one start, the nominal control.
+    Problems without obstacles, or without a place to start from and one to go to, have nothing to go round: there is
+    one start, the nominal control. The paths are those of the position; of a robot of balls without one, those of the
+    states that move its balls, as an arm's angles.
 
     Args:
       count: how many; by default `STARTS` where there are obstacles.
@@ -48,14 +51,15 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
     pull = _pull(problem)
     if pull == 0 or problem.start is None or problem.goal is None:
         return [("nominal control", None)]
-    position = list(problem.dynamics.state_coordinates.position)
-    ends = problem.start[position], problem.goal[position]
+    moving = _moving(problem)
+    ends = problem.start[moving], problem.goal[moving]
     weight = np.zeros(len(problem.start))
-    weight[position] = pull
-    found = []
-    for name, bend in bends(ends[1] - ends[0], STARTS if count is None else count):
+    weight[moving] = pull
+    found, unit = [], problem.dynamics.state_coordinates.units[moving[0]]
+    ring = RING if problem.dynamics.state_coordinates.position else FOLD
+    for name, bend in bends(ends[1] - ends[0], STARTS if count is None else count, ring=ring, unit=unit):
         about = np.zeros((problem.steps + 1, len(weight)))
-        about[:, position] = path(*ends, bend, problem.steps)
+        about[:, moving] = path(*ends, bend, problem.steps)
         found.append((name, InitialPrior(weight, about=about, obstacles=SHARES)))
     return found
 
@@ -68,7 +72,7 @@ def bold(problem: Problem, times: float) -> Problem:
 
     def heavier(cost: Cost) -> Cost:
         if isinstance(cost, ObstacleCost):
-            return ObstacleCost(cost.world, radius=cost.radius, sharpness=cost.sharpness, weight=times * cost.weight)
+            return cost.weighing(times * cost.weight)
         return QuadraticCost(times * cost.weight, about=cost.about) if isinstance(cost, QuadraticCost) else cost
 
     stage = [heavier(cost) if isinstance(cost, ObstacleCost) else cost for cost in terms_of(problem.stage_cost)]
@@ -98,40 +102,64 @@ def check_starts(problem: Problem, count: int | None) -> None:
 
 def _pull(problem: Problem) -> float:
     """The weight of the paths; 0 where there is nothing to go round."""
-    position = list(problem.dynamics.state_coordinates.position)
-    if not position or problem.start is None or problem.goal is None:
+    moving = _moving(problem)
+    if not moving or problem.start is None or problem.goal is None:
         return 0.0
-    if np.array_equal(problem.start[position], problem.goal[position]):
+    if np.array_equal(problem.start[moving], problem.goal[moving]):
         return 0.0
     costs = [cost for cost in problem.obstacle_costs if len(cost.world)]
     return max((PULL * cost.weight * cost.sharpness**2 for cost in costs), default=0.0)
 
 
-def bends(way: Array, count: int) -> list[tuple[str, Array]]:
+def _moving(problem: Problem) -> list[int]:
+    """The states that say where the robot is, by their indices: its position, or else what moves its balls."""
+    position = list(problem.dynamics.state_coordinates.position)
+    if position:
+        return position
+    pairs = zip(terms_of(problem.stage_cost), problem.terms("stage_cost"), strict=True)
+    return sorted({i for cost, term in pairs if isinstance(cost, ObstacleCost) for i in term.nonconvex_in or ()})
+
+
+def bends(way: Array, count: int, *, ring: float | None = None, unit: str = "m") -> list[tuple[str, Array]]:
     """How far the middle of each path is from that of the straight one, and a name: none, then to the sides.
 
-    In space the others are a ring about the straight one, in the plane pairs to the left and the right.
+    In space the others are a ring about the straight one, in the plane pairs to the left and the right; of more
+    numbers, pairs along directions at right angles to it and to each other.
+
+    Args:
+      way: from start to goal, (k,). unit: of its numbers, for the names.
+      ring: how far those in more than a plane bend, relative to the way; by default RING.
     """
+    ring = RING if ring is None else ring
     distance = float(np.linalg.norm(way))
     straight: list[tuple[str, Array]] = [("straight", np.zeros(len(way)))]
-    if count == 1:
+    if count == 1 or len(way) == 1:
         return straight
     ahead, others = way / distance, count - 1
     if len(way) == 2:
         left, step = np.array([-ahead[1], ahead[0]]), min(STEP, WIDEST / ((others + 1) // 2))
         sides = [((i // 2 + 1) * step, i % 2) for i in range(others)]
         return straight + [
-            (f"{far * distance:.3g} m to the {('left', 'right')[side]}", far * distance * (1 - 2 * side) * left)
+            (f"{far * distance:.3g} {unit} to the {('left', 'right')[side]}", far * distance * (1 - 2 * side) * left)
             for far, side in sides
         ]
+    if len(way) > 3:
+        aside = np.linalg.qr(np.column_stack([ahead, np.eye(len(way))[:, np.argsort(np.abs(ahead))[:-1]]]))[0][:, 1:]
+        far = ring * distance
+        named = [
+            (f"{far:.3g} {unit} aside, direction {sign}{side + 1}", factor * far * aside[:, side])
+            for side in range(len(way) - 1)
+            for sign, factor in (("", 1), ("-", -1))
+        ]
+        return straight + named[:others]
     across = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
     across /= np.linalg.norm(across)
     upright = np.cross(ahead, across)
     angles = 2 * np.pi * np.arange(others) / others
     return straight + [
         (
-            f"{RING * distance:.3g} m aside at {np.degrees(angle):.0f} degrees",
-            RING * distance * (np.cos(angle) * across + np.sin(angle) * upright),
+            f"{ring * distance:.3g} {unit} aside at {np.degrees(angle):.0f} degrees",
+            ring * distance * (np.cos(angle) * across + np.sin(angle) * upright),
         )
         for angle in angles
     ]
@@ -176,16 +204,22 @@ class Search:
     def poor(self, problem: Problem) -> bool:
         """Whether the best plan so far is one that nobody would want: far from the goal, or through an obstacle.
 
-        Far is further than the robot's radius, through is deeper than half of it.
+        Far is further than the robot's radius, or, without a position, than what counts as reached; through is deeper
+        than half of the radius, or of that of the largest ball.
         """
-        position = list(problem.dynamics.state_coordinates.position)
+        space = problem.dynamics.state_coordinates
         if _pull(problem) == 0 or problem.goal is None:
             return self._idle(problem)
-        (attempt, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
+        (attempt, found), radius = self.best, max(cost.largest for cost in problem.obstacle_costs)
         if not found.success:
             return attempt.iterations_left(found.iterations) > 0
-        places = found.states[:, position]
-        if not np.linalg.norm(places[-1] - problem.goal[position]) <= max(radius, 1e-3):
+        if space.position:
+            place = list(space.position)
+            arrived = np.linalg.norm(found.states[-1, place] - problem.goal[place]) <= max(radius, 1e-3)
+        else:
+            target = Target(space, problem.weighed_goal, found.states)
+            arrived = target.distance(found.states[-1]) <= TOLERANCE
+        if not arrived:
             return True
         clearance = clearance_of(problem, found.states)
         return clearance is not None and not clearance.min() >= -0.5 * radius

@@ -10,7 +10,7 @@ from lqrsim.errors import Array, InputError, check_function, check_kind
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.verify.verdict import Test
-from lqrsim.view.recorded_model import model_of, robot_body
+from lqrsim.view.recorded_model import model_of, place_in, robot_body
 
 Progress = Callable[[int, int], object]
 
@@ -47,13 +47,12 @@ def frames_at_states(rollout: Rollout, trial: int) -> tuple[Array, npt.NDArray[n
 def state_positions(rollout: Rollout, trial: int, times: Array) -> Array:
     """Positions (N, d) of the states at times that are theirs."""
     rows = np.abs(rollout.times - times[:, None]).argmin(axis=1)
-    return rollout.states[trial, rows][:, list(rollout.state_coordinates.position)]
+    return rollout.places(trial)[rows]
 
 
 def planned_positions(rollout: Rollout, times: Array) -> Array:
     """Positions (N, d) of the plan."""
-    columns = [rollout.plan.states[:, column] for column in rollout.state_coordinates.position]
-    return np.stack([np.interp(times, rollout.times, column) for column in columns], axis=1)
+    return np.stack([np.interp(times, rollout.times, column) for column in rollout.planned_places.T], axis=1)
 
 
 def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: Array) -> Array:
@@ -63,8 +62,8 @@ def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: 
     for frame in rollout.frames[trial, good]:
         data.qpos = frame
         mujoco.mj_kinematics(model, data)
-        places.append(data.xpos[body].copy())
-    columns = rollout.state_coordinates.of_world(places).T
+        places.append(place_in(data, rollout, body).copy())
+    columns = rollout.of_world(places).T
     return np.stack([np.interp(times, rollout.frame_times[good], column) for column in columns], axis=1)
 
 

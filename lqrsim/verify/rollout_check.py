@@ -15,6 +15,7 @@ from lqrsim.verify.ground_truth import Progress
 from lqrsim.verify.verdict import Positions, Verification, compare
 from lqrsim.view import cameras, gl
 from lqrsim.view.cameras import Camera
+from lqrsim.view.recorded_model import place_in, robot_body
 
 SIZE = (640, 480)
 POSITION_BOUND = 1 / 60  # the worst error that is allowed, in radii of the robot: 5 and 2.8 mm for the packaged ones
@@ -36,6 +37,7 @@ def verify_run(
     Each control period is drawn from above if the robot moves on a floor, from the side if it moves in a vertical
     plane, and from both if it moves in space. The pictures are
     segmentations that show nothing but a part of the robot that can collide: X-rays, in which obstacles hide nothing.
+    Of a robot without a position it is where its last ball is that is read.
 
     Args:
       trial: row of the rollout.
@@ -46,25 +48,27 @@ def verify_run(
       InputError: there is no such trial, nothing to draw, or no OpenGL.
     """
     ground_truth.check_arguments(solution, progress)
-    model, space = ground_truth.drawable_model(rollout, trial), rollout.state_coordinates
-    body = int(model.body(rollout.body).id)
+    model = ground_truth.drawable_model(rollout, trial)
+    body = robot_body(model, rollout.body)
+    if rollout.balls is not None and not rollout.state_coordinates.position:
+        body = rollout.balls.tracked[0]
     geom = _tracked_geom(model, body)
     views = [{"top": cameras.top, "side": cameras.side}[name](rollout) for name in cameras.measuring(rollout)]
     times, rows = ground_truth.frames_at_states(rollout, trial)
     measured: list[Array] = []
     offsets: list[Array] = []
-    for masks, offset in _silhouettes(model, geom, body, rollout.frames[trial, rows], views):
+    for masks, offset in _silhouettes(model, geom, rollout, rollout.frames[trial, rows], views):
         measured.append(
             np.array([view.measure(pixels.mask_centre(mask), SIZE) for view, mask in zip(views, masks, strict=True)])
         )
         offsets.append(offset)
         if progress:
             progress(len(measured), len(rows))
-    places, apart = pixels.triangulate(views, measured, space.plane)
+    places, apart = pixels.triangulate(views, measured, rollout.plane)
     name = model.geom(geom).name or model.geom(geom).id
     positions = Positions(
         times,
-        seen=places - space.of_world(offsets),
+        seen=places - rollout.of_world(offsets),
         actual=ground_truth.state_positions(rollout, trial, times),
         planned=ground_truth.planned_positions(rollout, times),
         apart=apart,
@@ -91,10 +95,11 @@ def _tracked_geom(model: mujoco.MjModel, body: int) -> int:
 
 
 def _silhouettes(
-    model: mujoco.MjModel, geom: int, body: int, frames: Array, views: Sequence[Camera]
+    model: mujoco.MjModel, geom: int, rollout: Rollout, frames: Array, views: Sequence[Camera]
 ) -> Iterator[tuple[list[npt.NDArray[np.bool_]], Array]]:
-    """For each frame (nq,): a mask (height, width) of the geom in each view, and where it is in the robot's body."""
+    """For each frame (nq,): a mask (height, width) of the geom in each view, and where it is from the robot's place."""
     gl.bind()
+    body = robot_body(model, rollout.body)
     model.geom_group[:], model.geom_group[geom] = 1, 0
     model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0
     model.vis.global_.offwidth, model.vis.global_.offheight = SIZE
@@ -113,4 +118,4 @@ def _silhouettes(
                 renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT.value] = 1
                 renderer.scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR.value] = 1
                 masks.append(renderer.render()[..., 0] > 0)
-            yield masks, data.geom_xpos[geom] - data.xpos[body]
+            yield masks, data.geom_xpos[geom] - place_in(data, rollout, body)

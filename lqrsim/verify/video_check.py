@@ -56,7 +56,7 @@ def verify_video(
     """
     ground_truth.check_arguments(solution, progress)
     trial = None if trial is None else check_count("trial", trial, at_least=0)
-    metadata, plane = video_metadata.read(path), rollout.state_coordinates.plane
+    metadata, plane = video_metadata.read(path), rollout.plane
     digest = video_metadata.digest(rollout)
     run = metadata.runs.index(digest) if digest in metadata.runs else 0
     panes = [pane for pane in metadata.panes if pane.run == run and pane.camera is not None]

@@ -96,6 +96,8 @@ def _overview(recorded: RecordedTrial, like: int | None, aspect: float) -> Camer
 def _extent_points(recorded: RecordedTrial, data: mujoco.MjData) -> Array:
     """Points (k, 3): corners of what is drawn and does not move, as far as it is near the run, and the run."""
     model, run = recorded.model, np.vstack([recorded.driven(recorded.times), recorded.planned(recorded.rollout.times)])
+    if recorded.rollout.balls is not None:
+        run = np.vstack([run, recorded.rollout.balls.planned.reshape(-1, 3)])
     low, high = run.min(axis=0), run.max(axis=0)
     margin = 0.4 * float(np.linalg.norm(high - low)) + 2 * recorded.rollout.radius
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T

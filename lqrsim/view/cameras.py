@@ -92,7 +92,7 @@ def top(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
 def side(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
     """From the side, level, so that the longer way lies across; the rest is as for `top`."""
     low, high = _bounds(rollout)
-    plane = rollout.state_coordinates.plane
+    plane = rollout.plane
     level = plane.replace("z", "")
     # A vertical plane is seen from across.
     right = np.eye(3)["xyz".index(level)] if len(level) == 1 else _right(high - low, 1.0)
@@ -101,7 +101,7 @@ def side(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
 
 def measuring(rollout: Rollout) -> tuple[str, ...]:
     """The cameras, of `top` and `side`, that it takes to tell where the robot is."""
-    return measuring_of(rollout.state_coordinates.plane)
+    return measuring_of(rollout.plane)
 
 
 def measuring_of(plane: str) -> tuple[str, ...]:
@@ -119,10 +119,14 @@ def _camera(name: str, low: Array, high: Array, right: Array, up: Array, aspect:
 
 
 def _bounds(rollout: Rollout) -> tuple[Array, Array]:
-    """The lowest and highest corner (3,) of what a fixed camera shows; robots seen from above are at height zero."""
-    space = rollout.state_coordinates
-    places = np.vstack([rollout.plan.states, *rollout.states])[:, list(space.position)]
-    low, high = (space.in_world(extreme(places, axis=0)) for extreme in (np.nanmin, np.nanmax))
+    """The lowest and highest corner (3,) of what a fixed camera shows; robots seen from above are at height zero.
+
+    Of a robot without a position it is all of its balls.
+    """
+    places = np.vstack([rollout.planned_places, *(rollout.places(trial) for trial in range(rollout.trials))])
+    if rollout.balls is not None and not rollout.state_coordinates.position:
+        places = np.vstack([rollout.balls.planned.reshape(-1, 3), rollout.balls.driven.reshape(-1, 3)])
+    low, high = (rollout.in_world(extreme(places, axis=0)) for extreme in (np.nanmin, np.nanmax))
     margin = rollout.radius + 0.05 * float((high - low).max())
     return low - margin, high + margin
 

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from lqrsim.results.goal import OF_RANGE
 from lqrsim.view import text_tiles
 from lqrsim.view.layout import Box
 from lqrsim.view.overlays import Overlays, Scale
@@ -88,7 +89,10 @@ class Caption:
         recorded, clearance = self.recorded, self.recorded.interpolate(self.recorded.clearance, time)
         readings = [f"time {time:.1f} s" + (f" at {self.speed:g}x" if self.speed != 1 else "")]
         error = recorded.interpolate(recorded.error, time)
-        readings += [f"tracking error {1e3 * error:.0f} mm" if error < 1 else f"tracking error {error:.2f} m"]
+        if recorded.rollout.tracking_unit == OF_RANGE:
+            readings += [f"tracking error {100 * error:.1f} % of range"]
+        else:
+            readings += [f"tracking error {1e3 * error:.0f} mm" if error < 1 else f"tracking error {error:.2f} m"]
         readings += [f"clearance {clearance:.2f} m"] if np.isfinite(clearance) else []
         if "forces" in self.overlays.show:
             readings += [f"force {np.linalg.norm(recorded.force_at(time)):.2f} N"]
@@ -112,6 +116,8 @@ class Legend:
         }
         if "trace" in overlays[0].show:
             full = f"{1e3 * scale.error:g} mm" if scale.error < 1 else f"{scale.error:g} m"
+            if overlays[0].recorded.rollout.tracking_unit == OF_RANGE:
+                full = f"{100 * scale.error:g} % of range"
             entries[f"driven, tracking error 0 to {full}"] = None
         letter_height = max(round(0.8 * _letter_height(*size)), 8)
         self.margin = letter_height if over else 0

@@ -71,8 +71,8 @@ class Overlays:
         self.knots = recorded.rollout.times[knots]
         self.plan, self.trace = recorded.planned(self.knots), recorded.driven(self.knots)
         self.errors = np.interp(self.knots, recorded.times, recorded.error)
-        self.measured = recorded.positions(recorded.measured, recorded.times, recorded.times)
-        if np.array_equal(recorded.measured, recorded.states):
+        self.measured = recorded.shown()
+        if not len(self.measured) or np.array_equal(recorded.measured, recorded.states):
             self.show.discard("measured")
         if scale.force < 1e-6:
             self.show.discard("forces")
@@ -119,11 +119,12 @@ class Overlays:
                 height = 0.2 * LIFT if recorded.planar else self.width
                 pen.add(Geom.mjGEOM_BOX, place + 3 * lift, [self.width, self.width, height], (*MEASURED, 1.0))
         if "ghost" in self.show:
-            wanted, radius = recorded.planned(time), recorded.rollout.radius
-            if recorded.planar:
-                pen.add(Geom.mjGEOM_CYLINDER, wanted + 3 * lift, [radius, LIFT, 0], (*PLAN_RGB, 0.35))
-            else:
-                pen.add(Geom.mjGEOM_SPHERE, wanted, [radius] * 3, (*PLAN_RGB, 0.10))
+            for wanted, radius in zip(*recorded.planned_balls(time), strict=True):
+                if recorded.planar:
+                    wanted[2] = recorded.floor
+                    pen.add(Geom.mjGEOM_CYLINDER, wanted + 3 * lift, [radius, LIFT, 0], (*PLAN_RGB, 0.35))
+                else:
+                    pen.add(Geom.mjGEOM_SPHERE, wanted, [radius] * 3, (*PLAN_RGB, 0.10))
 
     def draw_force(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
         """Appends the arrow of what disturbs the robot, as one camera is to see it.
@@ -140,7 +141,7 @@ class Overlays:
         if length < 2 * width or abs(force @ forward) > END_ON * strength:
             return
         direction = force / strength
-        start = data.xpos[recorded.robot] + radius * direction
+        start = recorded.place_in(data) + radius * direction
         arrow = _Pen(scene, flat=recorded.planar).add(Geom.mjGEOM_ARROW, start, [1, 1, 1], (*FORCE, 1.0))
         mujoco.mjv_connector(arrow, Geom.mjGEOM_ARROW, width, start, start + length * direction)
 
@@ -201,6 +202,8 @@ def _of_cost(recorded: RecordedTrial, solution: Solution | None) -> _Tube:
     run = recorded.rollout
     if solution is None:
         raise InputError("solution: got None with the overlay cost_tube, want the Solution that was executed")
+    if not run.state_coordinates.position:
+        raise InputError("overlays: got cost_tube of a run of a robot without a position, want others")
     if not np.array_equal(solution.trajectory.states, run.plan.states):
         raise InputError("solution: got one with another plan than that of the run, want the one that was executed")
     return _tube(recorded, Ellipsoids.of_cost(solution, run.state_coordinates.position))

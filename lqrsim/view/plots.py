@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
+from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
@@ -19,6 +20,7 @@ from lqrsim.view import obstacle_plots, prediction_plots, style
 from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 
+MOMENTS = 7  # at which the balls of a robot are drawn
 AREA = "area: "  # before what the legend says of a tube
 
 
@@ -26,6 +28,8 @@ def plot_run(
     solution: Solution, rollouts: Mapping[str, Rollout], path: str | os.PathLike[str], *, world: World, trial: int = 0
 ) -> Path:
     """Writes a figure (png, pdf or svg, by the suffix) of a solution and of runs of its policy; returns its path.
+
+    Of a robot without a position it shows the balls at several times.
 
     Runs whose tube was predicted have it about the plan, 2 standard deviations wide, as far as that is not too wide to
     be shown, and below it their chance of collision step by step.
@@ -42,6 +46,7 @@ def plot_run(
     with style.figure(path, size=(11, 7.5)) as figure:
         strips = len(solution.policy.control_coordinates)
         in_space = len(solution.policy.state_coordinates.position) == 3
+        of_balls = not solution.policy.state_coordinates.position
         chances = [
             (run.times, run.collision_chance, color)
             for run, color in zip(rollouts.values(), RUNS, strict=False)
@@ -59,7 +64,7 @@ def plot_run(
             _path_in_space(path_axes, solution, rollouts, world, trial)
         else:
             path_axes = figure.add_subplot(left)
-            _path_in_plane(path_axes, solution, rollouts, world, trial)
+            (_path_of_balls if of_balls else _path_in_plane)(path_axes, solution, rollouts, world, trial)
         if chances:
             below = figure.add_gridspec(1, 1, left=0.085, right=0.455, bottom=low, top=low + 0.1)[0]
             prediction_plots.draw_chances(figure.add_subplot(below), chances)
@@ -91,16 +96,17 @@ def _check(solution: Solution, rollouts: Mapping[str, Rollout], trial: int, worl
             raise InputError(f"rollouts[{name!r}]: got a run of another system, want states {want}")
         if not 0 <= trial < run.trials:
             raise InputError(f"trial: got {trial}, want one of 0 to {run.trials - 1} of rollouts[{name!r}]")
-    if len(spaces[0].position) not in (2, 3):
-        raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
+        if not run.plane:
+            wanted = "the 2 or 3 states that are the position, or runs of a robot with balls that have frames"
+            raise InputError(f"state_coordinates.position: got none, want {wanted}")
 
 
 def _paths(solution: Solution, rollouts: Mapping[str, Rollout], trial: int) -> list[tuple[str, str, str, Array]]:
-    """Label, colour, line style and positions (T+1, 2 or 3) of each path; the plan comes last, to lie on top."""
+    """Label, colour, line style and places (T+1, 2 or 3) of each path; the plan comes last, to lie on top."""
     position = list(solution.policy.state_coordinates.position)
-    driven = [(name, color, "-", run.states[trial]) for (name, run), color in zip(rollouts.items(), RUNS, strict=False)]
-    planned = ("planned", PLAN, "--", solution.trajectory.states)
-    return [(name, color, line, states[:, position]) for name, color, line, states in (*driven, planned)]
+    driven = [(name, color, "-", run.places(trial)) for (name, run), color in zip(rollouts.items(), RUNS, strict=False)]
+    planned = solution.trajectory.states[:, position] if position else next(iter(rollouts.values())).planned_places
+    return [*driven, ("planned", PLAN, "--", planned)]
 
 
 def _tubes(rollouts: Mapping[str, Rollout]) -> Iterator[tuple[Ellipsoids, dict[str, str]]]:
@@ -130,6 +136,31 @@ def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
     axes.plot(*plan[0], "o", color=PLAN, markersize=6, label="start")
     axes.plot(*plan[-1], "*", color=PLAN, markersize=10, label="end of the plan")
     axes.set_title("path (pale: closer than the robot's radius)")
+
+
+def _path_of_balls(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
+    """The balls of the first run several times, and the way of the last one; seen along where they move least."""
+    first = next(iter(rollouts.values()))
+    assert first.balls is not None
+    driven, radii = first.balls.driven[trial], first.balls.radii
+    low, high = np.nanmin(driven, axis=(0, 1)), np.nanmax(driven, axis=(0, 1))
+    across, up = sorted(np.argsort(high - low, kind="stable")[1:].tolist())
+    margin = float(radii.max()) + 0.1 * float((high - low).max())
+    corners = obstacle_plots.bounds(driven[np.isfinite(driven).all(axis=(1, 2))].reshape(-1, 3), world, margin)
+    obstacle_plots.draw_projected(axes, world, *corners, across, up)
+    alive = np.flatnonzero(np.isfinite(driven).all(axis=(1, 2)))
+    for number, knot in enumerate(np.unique(np.linspace(0, len(alive) - 1, MOMENTS).astype(int))):
+        paler = 0.75 * (1 - number / (MOMENTS - 1))
+        face = to_hex([paler + (1 - paler) * part for part in to_rgb(RUNS[0])])
+        for centre, radius in zip(driven[alive[knot]], radii, strict=True):
+            axes.add_patch(Circle(centre[[across, up]], radius, facecolor=face, edgecolor="none", zorder=2))
+    paths = _paths(solution, rollouts, trial)
+    for name, color, line, points in paths:
+        axes.plot(*points[:, [across, up]].T, line, color=color, label=name, zorder=3)
+    plan = paths[-1][-1][:, [across, up]]
+    axes.plot(*plan[0], "o", color=PLAN, markersize=6, label="start", zorder=3)
+    axes.plot(*plan[-1], "*", color=PLAN, markersize=10, label="end of the plan", zorder=3)
+    axes.set_title("balls, paler the earlier, and the path of the last")
 
 
 def _path_in_space(axes: Axes3D, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:

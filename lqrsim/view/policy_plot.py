@@ -31,14 +31,15 @@ def plot_policy(
     With a tube it shows where runs are predicted to be, 2 standard deviations about the plan, as far as that is not too
     wide to be shown, and the chance of collision step by step. Without, it shows the positions whose total cost is near
     its least, which says nothing of disturbances; solutions of `ilqr` have no total cost, there the plan is alone. A
-    robot in space is seen from above and from the side.
+    robot in space is seen from above and from the side. Of one without a position, the plan's states are there instead.
 
     Args:
       world: the obstacles, as the scene has them. radius: of the robot, in metres.
       tube: what `predict_tube` says of the solution and what runs it.
 
     Raises:
-      InputError: the solution has no policy or no position, the tube is of another plan, or the file cannot be written.
+      InputError: the solution has no policy, the tube is of another plan or has no position, or the file cannot be
+        written.
     """
     check_kind("solution", solution, Solution, "a Solution")
     check_kind("world", world, World, "a World, such as scene.world")
@@ -47,11 +48,11 @@ def plot_policy(
         raise InputError(
             f"solution: got one without a cost-to-go ({solution.status.name}), want one of a solve that was"
         )
-    if not solution.policy.state_coordinates.position:
-        raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
     check_kind("tube", tube, (Tube, type(None)), "a Tube, such as predict_tube(...) returns, or None")
     if tube is not None and not np.array_equal(tube.plan.states, solution.trajectory.states):
         raise InputError("tube: got one of another plan, want that of the solution")
+    if tube is not None and not solution.policy.state_coordinates.position:
+        raise InputError("tube: got one of a robot without a position, want None")
     with style.figure(path, size=(11, 7.5)) as figure:
         draw(figure, solution, world, radius, tube)
     return Path(path)
@@ -61,12 +62,17 @@ def draw(figure: Figure, solution: Solution, world: World, radius: float, tube: 
     """Draws it all."""
     policy = solution.policy
     grid = figure.add_gridspec(1, 2, left=0.07, right=0.97, bottom=0.12, top=0.95, wspace=0.2, width_ratios=(1, 1.1))
-    planes = [(0, 1)] if len(policy.state_coordinates.position) == 2 else [(0, 1), (0, 2)]
-    places = grid[0].subgridspec(len(planes), 1, hspace=0.25)
-    paths = [figure.add_subplot(place) for place in places]
-    for axes, plane in zip(paths, planes, strict=True):
-        _tube(axes, solution, world, radius, plane, tube)
-    figure.legend(*paths[0].get_legend_handles_labels(), loc="lower center", ncols=4)
+    if policy.state_coordinates.position:
+        planes = [(0, 1)] if len(policy.state_coordinates.position) == 2 else [(0, 1), (0, 2)]
+        places = grid[0].subgridspec(len(planes), 1, hspace=0.25)
+        paths = [figure.add_subplot(place) for place in places]
+        for axes, plane in zip(paths, planes, strict=True):
+            _tube(axes, solution, world, radius, plane, tube)
+        figure.legend(*paths[0].get_legend_handles_labels(), loc="lower center", ncols=4)
+    else:
+        units = list(dict.fromkeys(policy.state_coordinates.units))
+        places = grid[0].subgridspec(len(units), 1, hspace=0.18)
+        _states([figure.add_subplot(place) for place in places], units, solution)
     strips = list(
         product(dict.fromkeys(policy.control_coordinates.units), dict.fromkeys(policy.state_coordinates.units))
     )
@@ -109,6 +115,20 @@ def _tube(
     axes.plot(*path.T, "--", color=PLAN, linewidth=1.4 if tube is None else 0.9, zorder=3, label="planned")
     axes.plot(*path[0], "o", color=PLAN, markersize=6, zorder=3, label="start")
     axes.plot(*path[-1], "*", color=PLAN, markersize=10, zorder=3, label="end of the plan")
+
+
+def _states(strips: list[Axes], units: list[str], solution: Solution) -> None:
+    """The plan's states over time, those of a unit together."""
+    space, plan = solution.policy.state_coordinates, solution.trajectory
+    for axes, unit in zip(strips, units, strict=True):
+        for i, name in enumerate(space.names):
+            if space.units[i] == unit:
+                axes.plot(plan.times, plan.states[:, i], label=name.replace("_", " "))
+        axes.set_ylabel(f"({unit})" if unit else "")
+        axes.margins(x=0.01)
+        axes.legend(loc="best")
+    strips[0].set_title("planned states")
+    strips[-1].set_xlabel("time (s)")
 
 
 def _cost(axes: Axes, solution: Solution) -> None:

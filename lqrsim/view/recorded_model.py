@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from lqrsim.errors import InputError, check_count, check_kind
+from lqrsim.errors import Array, InputError, check_count, check_kind
 from lqrsim.results.rollout import Rollout
 from lqrsim.scenes.scene import model_from_xml
 
@@ -13,10 +13,15 @@ def model_of(rollout: Rollout, trial: int) -> mujoco.MjModel:
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     if not 0 <= check_count("trial", trial, at_least=0) < rollout.trials:
         raise InputError(f"trial: got {trial}, want one of 0 to {rollout.trials - 1}")
-    if len(rollout.state_coordinates.position) not in (2, 3):
-        raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
+    if not rollout.plane:
+        wanted = "the 2 or 3 states that are the position, or a run of a robot with balls that has frames"
+        raise InputError(f"state_coordinates.position: got none, want {wanted}")
+    if rollout.balls is not None and not rollout.state_coordinates.position:
+        _ = rollout.balls.tracked  # which says what is missing
     model = model_from_xml(rollout.model, "rollout.model")
     robot_body(model, rollout.body)
+    if rollout.balls is not None and (rollout.balls.anchors[:, 0] >= model.nbody).any():
+        raise InputError(f"rollout.balls.anchors: got bodies beyond the model's {model.nbody}, want its own")
     if model.nq != rollout.frames.shape[-1]:
         raise InputError(f"rollout.frames: got {rollout.frames.shape[-1]} numbers each, want the model's {model.nq}")
     return model
@@ -28,6 +33,14 @@ def robot_body(model: mujoco.MjModel, name: str) -> int:
     if number < 0:
         raise InputError(f"rollout.body: got {name!r}, want a body of its model")
     return number
+
+
+def place_in(data: mujoco.MjData, rollout: Rollout, robot: int) -> Array:
+    """Where the robot of that body is (3,): its origin, or, without a position, its last ball, if that names a site."""
+    if rollout.state_coordinates.position or rollout.balls is None:
+        return data.xpos[robot]
+    body, place = rollout.balls.tracked
+    return data.xpos[body] + data.xmat[body].reshape(3, 3) @ place
 
 
 def floor_below(model: mujoco.MjModel, data: mujoco.MjData, robot: int) -> float:

@@ -5,7 +5,7 @@ import numpy as np
 
 from lqrsim.errors import Array, InputError
 from lqrsim.results.rollout import Rollout
-from lqrsim.view.recorded_model import floor_below, model_of, robot_body
+from lqrsim.view.recorded_model import floor_below, model_of, place_in, robot_body
 
 FORCE_WINDOW = (
     0.2  # seconds for which a push is shown: one control period would be gone before it is seen, and noise flickers
@@ -59,17 +59,38 @@ class RecordedTrial:
 
     def driven(self, at: Array | float) -> Array:
         """Where the robot was at these times, (..., 3); on the floor, if it is seen from above."""
-        return self.positions(self.states, self.times, at)
+        alive = np.isin(self.rollout.times, self.times)
+        return self._between(self.rollout.places(self.trial)[alive], self.times, at)
 
     def planned(self, at: Array | float) -> Array:
         """Where it was meant to be, (..., 3)."""
-        return self.positions(self.rollout.plan.states, self.rollout.times, at)
+        return self._between(self.rollout.planned_places, self.rollout.times, at)
 
-    def positions(self, states: Array, times: Array, at: Array | float) -> Array:
-        """The positions (..., 3) of states (k, n) at `times`, at other times."""
-        space = self.rollout.state_coordinates
-        columns = [np.interp(at, times, states[:, i]) for i in space.position]
-        return space.in_world(np.stack(columns, axis=-1), height=self.floor)
+    def shown(self) -> Array:
+        """The positions (k, 3) that the controller was shown; none of a robot without a position."""
+        places = self.measured[:, list(self.rollout.state_coordinates.position)]
+        return self._between(places, self.times, self.times) if places.size else np.zeros((0, 3))
+
+    def planned_balls(self, time: float) -> tuple[Array, Array]:
+        """Where the robot's balls were meant to be (B, 3), and their radii (B,); the one that it is, without any."""
+        run = self.rollout
+        if run.balls is None:
+            return self.planned(time)[None], np.array([run.radius])
+        planned = run.balls.planned
+        flat = self._interpolated(planned.reshape(len(planned), -1), run.times, time)
+        return flat.reshape(-1, 3), run.balls.radii
+
+    def _between(self, places: Array, times: Array, at: Array | float) -> Array:
+        """Points (..., 3) in the world of places (k, 2 or 3) at `times`, at other times."""
+        return self.rollout.in_world(self._interpolated(places, times, at), height=self.floor)
+
+    @staticmethod
+    def _interpolated(values: Array, times: Array, at: Array | float) -> Array:
+        return np.stack([np.interp(at, times, column) for column in values.T], axis=-1)
+
+    def place_in(self, data: mujoco.MjData) -> Array:
+        """Where the robot is (3,) in the model as it is posed."""
+        return place_in(data, self.rollout, self.robot)
 
     def force_at(self, time: float) -> Array:
         """The force (3,) in N that has disturbed the robot lately."""

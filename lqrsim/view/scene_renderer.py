@@ -97,7 +97,7 @@ class SceneRenderer:
                 self.overlays.draw_force(scene, data, time)
                 if view.camera is not None:
                     radius = marker.radius(self.recorded.rollout)
-                    marker.draw(scene, view.camera, data.xpos[self.recorded.robot], radius)
+                    marker.draw(scene, view.camera, self.recorded.place_in(data), radius)
                 mujoco.mjr_render(where, scene, self.context)
                 scene.ngeom = common
         whole = mujoco.MjrRect(0, 0, self.pixels.shape[1], self.pixels.shape[0])
@@ -115,7 +115,7 @@ class SceneRenderer:
         view = self.scene.camera[0]
         up, forward = np.array(view.up, dtype=np.float64), np.array(view.forward, dtype=np.float64)
         right = np.cross(forward, up)
-        centre, radius = self.data.xpos[self.recorded.robot], 0.8 * self.recorded.rollout.radius
+        centre, radius = self.recorded.place_in(self.data), 0.8 * self.recorded.rollout.radius
         found, geom = np.zeros(self.model.ngeom, dtype=bool), np.zeros(1, np.int32)
         eye = np.array(view.pos, dtype=np.float64)
         for offset in (0 * up, up, -up, right, -right):

@@ -1,0 +1,358 @@
+"""Robots that are several balls: where each is, as a function of the state, and how large."""
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen import distances, symbolic
+from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order
+from lqrsim.codegen.kernel_source import check_source, source_of
+from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_flag,
+    check_function,
+    check_items,
+    check_kind,
+    check_name,
+    check_number,
+    excerpt,
+    vectors_of,
+)
+from lqrsim.kernels import ball_places, function_places, linear_algebra, place_differences, rotation_ratios
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.scenes.world import SPACE, World
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where balls are, made for one system: what gets compiled, and the numbers it reads.
+
+    Attributes:
+      source: defines `places(x, data, out)`, which writes three coordinates a ball, ball by ball, and
+        `places_jacobian(x, data, out, slopes)`, which writes them and the derivatives in the states (3 K, N) that are
+        not zero, to zeros. The numba subset; see `costs.Term`.
+      data: (any,) float64, which the source reads from the first on, after the addresses of its functions.
+      depends_on: the states that the places depend on, by their indices.
+      in_plane: whether they are places in the plane of the robot's position, the third coordinate 0; or in space.
+      functions: what the source calls with `invoke`; their addresses come first in what it is given.
+    """
+
+    source: str
+    data: Array
+    depends_on: tuple[int, ...]
+    in_plane: bool = False
+    functions: tuple[UserFunction, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_source("Places", self.source, {"places": 3, "places_jacobian": 4})
+        object.__setattr__(self, "data", check_array("Places: data", self.data, (None,), infinite=True))
+        given = check_items("Places: depends_on", self.depends_on, (int, np.integer), "a tuple of indices of states")
+        indices = tuple(check_count("Places: depends_on", i, at_least=0) for i in given)
+        object.__setattr__(self, "depends_on", indices)
+        object.__setattr__(self, "in_plane", check_flag("Places: in_plane", self.in_plane))
+        functions = check_items("Places: functions", self.functions, UserFunction, "a tuple of UserFunction")
+        object.__setattr__(self, "functions", functions)
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers of the data that compiled code is given are the places'."""
+        return len(self.functions) + len(self.data)
+
+    def world_seen(self, world: World, space: Coordinates) -> World:
+        """The obstacles, in the coordinates that the places are in."""
+        return world.seen_by(space.plane, space.offset) if self.in_plane else world.seen_by(SPACE)
+
+
+class Balls:
+    """A robot's outline as balls that its state moves: the links of an arm, the rotors of a quadrotor.
+
+        def rotors(x, p):
+            r = x[3:6]  # a rotation vector
+            arms = [(0.2, 0, 0), (0, 0.2, 0), (-0.2, 0, 0), (0, -0.2, 0)]
+            return [[a + b for a, b in zip(x[:3], ls.rotations.rotate(r, arm))] for arm in arms]
+
+        ls.Balls(rotors, [0.12] * 4)
+
+    `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all of them clear, and the `balls` of a
+    `Robot` are what collides when it is run. A robot without any is one ball at its position. `Capsule` makes chains.
+
+    Args:
+      places: `places(x, p)`, stated at one of the three levels of `Dynamics`; returns the middle of each of K balls.
+        They have 3 coordinates in the world, in metres; or 2, in the plane of the position, if the robot has a position
+        in a plane, and then they see the world as the position does: see `World.seen_by`. p has the dynamics'
+        parameters as attributes.
+      radii: (K,) of the balls, in metres.
+      names: of the balls, by which messages call them; by default "ball 0", "ball 1", ....
+      sites: of sites or geoms in the robot's MJCF, one a ball, None where there is none. A `Plant` checks that the
+        middle of each is where the formula has it.
+      jacobian: `jacobian(x, p, slopes)`, for the compiled and the plain level: writes the derivatives that are not zero
+        to slopes (K, 3 or 2, n), which it gets as zeros. Without it they are central differences.
+      depends_on: names of the states that the places depend on, for the compiled and the plain level; all by default.
+        The fewer, the faster.
+      level: "symbolic", "compiled" or "plain"; by default compiled if `places` is a numba function, else symbolic.
+
+    Raises:
+      InputError: a radius is negative, there are no balls, names are not one a ball and different, or the level does
+        not fit the function. What `places` returns is looked at when it is first needed.
+    """
+
+    def __init__(
+        self,
+        places: Callable[[Any, Any], Any],
+        radii: npt.ArrayLike,
+        *,
+        names: Sequence[str] | None = None,
+        sites: Sequence[str | None] | None = None,
+        jacobian: Callable[..., None] | None = None,
+        depends_on: Sequence[str] | None = None,
+        level: str | None = None,
+    ) -> None:
+        self.level = level_of(places, level)
+        check_signature(places, ("x", "p"))
+        if jacobian is not None:
+            if self.level == "symbolic":
+                wanted = "none (it is derived) or level='compiled' or 'plain'"
+                raise InputError(f"Balls: jacobian: got one for {name_of(places)}, which is symbolic, want {wanted}")
+            check_function("Balls: jacobian", jacobian, "a function of (x, p, slopes)")
+            level_of(jacobian, self.level)
+            check_signature(jacobian, ("x", "p", "slopes"))
+        self.function, self.jacobian = places, jacobian
+        self._set_balls(radii, names, sites)
+        if isinstance(depends_on, str):
+            said = excerpt(depends_on)
+            raise InputError(f"Balls: depends_on: got {said}, want a tuple of names: ({said},)")
+        self.depends_on = None
+        if depends_on is not None:
+            if self.level == "symbolic":
+                raise InputError("Balls: depends_on: got names for a symbolic function, want None: they are derived")
+            self.depends_on = check_items("Balls: depends_on", depends_on, str, "a tuple of names of states")
+
+    def _set_balls(self, radii: npt.ArrayLike, names: Sequence[str] | None, sites: Sequence[str | None] | None) -> None:
+        """What each ball has, checked."""
+        self.radii = check_array("Balls: radii", radii, (None,))
+        count = len(self.radii)
+        if not count:
+            raise InputError("Balls: radii: got none, want one a ball, at least one")
+        if (self.radii < 0).any():
+            k = int(np.argmax(self.radii < 0))
+            raise InputError(f"Balls: radii: got {self.radii[k]:g} for ball {k}, want at least 0")
+        wanted = f"{count} different texts, one a ball"
+        self.names = tuple(f"ball {k}" for k in range(count))
+        if names is not None:
+            self.names = check_items("Balls: names", names, str, wanted)
+            if len(set(self.names)) < count or len(self.names) != count:
+                raise InputError(f"Balls: names: got {excerpt(self.names)}, want {wanted}")
+        self.sites: tuple[str | None, ...] = (None,) * count
+        if sites is not None:
+            wanted = f"{count} names of sites or geoms, one a ball, or None in place of one"
+            self.sites = check_items("Balls: sites", sites, (str, type(None)), wanted)
+            if len(self.sites) != count:
+                raise InputError(f"Balls: sites: got {len(self.sites)}, want {wanted}")
+
+    def __len__(self) -> int:
+        return len(self.radii)
+
+    @property
+    def name(self) -> str:
+        """What messages call the function."""
+        return f"{name_of(self.function)}(x, p)"
+
+    def bind(self, dynamics: Dynamics) -> Places:
+        """The places for a system. Raises InputError if they do not fit it."""
+        if self.level != "symbolic":
+            return self._bind_functions(dynamics)
+        n, constants = len(dynamics.state_coordinates), dynamics.constants
+        details = ("balls", n, len(self), tuple(dynamics.parameters), *constants.items())
+        made = symbolic.kept(self.function, details, lambda: self._trace(n, dynamics.parameters, constants))
+        self._check_plane(made["size"], dynamics.state_coordinates)
+        return Places(made["source"], dynamics.data, tuple(made["depends_on"]), made["size"] == 2)
+
+    def _trace(self, n: int, parameters: Mapping[str, float], constants: Mapping[str, float]) -> dict[str, Any]:
+        sizes: set[int] = set()
+
+        @functools.wraps(self.function)
+        def listed(x: Any, p: Any) -> list[Any]:
+            points = _points(self.function(x, p), len(self))
+            sizes.update(len(point) for point in points)
+            return [entry for point in points for entry in point]
+
+        entries, x, _ = symbolic.trace(listed, n, None, list(parameters), constants=constants)
+        import sympy
+
+        (size,) = sizes
+        values: dict[str, Any] = {f"out[{3 * k + i}]": sympy.Integer(0) for k in range(len(self)) for i in range(3)}
+        values |= {f"out[{3 * (i // size) + i % size}]": entry for i, entry in enumerate(entries)}
+        slopes = {
+            f"slopes[{3 * (i // size) + i % size}, {j}]": entry.diff(symbol)
+            for i, entry in enumerate(entries)
+            for j, symbol in enumerate(x)
+        }
+        slopes = {target: slope for target, slope in slopes.items() if slope != 0}
+        function = functools.partial(symbolic.write_function, data="data", of=self.name)
+        return {
+            "source": "\n\n".join(
+                [
+                    function("places", "x, data, out", assignments=values),
+                    function("places_jacobian", "x, data, out, slopes", assignments=values | slopes),
+                ]
+            ),
+            "size": size,
+            "depends_on": sorted({int(target[:-1].split(", ")[1]) for target in slopes}),
+        }
+
+    def _bind_functions(self, dynamics: Dynamics) -> Places:
+        names, parameters = dynamics.state_coordinates.names, tuple(dynamics.parameters)
+        wanted = names if self.depends_on is None else self.depends_on
+        axes = tuple(sorted({names.index(check_name("Balls: depends_on", name, names)) for name in wanted}))
+        rest: dict[str, Any] = {"level": self.level, "states": len(names), "controls": 0, "parameters": parameters}
+        rest |= {"offset": 1 if self.jacobian is None else 2, "with_control": False}
+        size = self._size_of(dynamics)
+        unused = tuple((i, name) for i, name in enumerate(names) if i not in axes)
+        given, coordinates = size * len(self), 3 * len(self)
+        functions = (
+            UserFunction(function=self.function, values=given, entries=self.names, columns=size, unused=unused, **rest),
+        )
+        filled = {"BALLS": len(self), "SIZE": size, "GIVEN": given}
+        if self.jacobian is not None:
+            shape = len(self), size, len(names)
+            functions += (UserFunction(function=self.jacobian, writes=(shape,), **rest),)
+            return Places(source_of(function_places, **filled), dynamics.data, axes, size == 2, functions)
+        differences = source_of(place_differences, PLACES=coordinates, AXES=axes)
+        source = f"{source_of(function_places, 'places', **filled)}\n\n{differences}"
+        return Places(source, dynamics.data, axes, size == 2, functions)
+
+    def _size_of(self, dynamics: Dynamics) -> int:
+        """How many coordinates a compiled or plain function returns of each ball, which is seen by trying it."""
+        plain: Any = getattr(self.function, "py_func", self.function)
+        p = symbolic.Parameters(**dynamics.parameters)
+        try:
+            with np.errstate(all="ignore"):
+                returned = plain(np.zeros(len(dynamics.state_coordinates)), p)
+        except InputError as error:
+            raise InputError(f"{self.name}: {error}") from None
+        except Exception as error:  # whatever a user's function may raise becomes one line
+            said = f"{type(error).__name__} ({error})"
+            raise InputError(f"{self.name}: got {said}, want it to work at x = (0, ..., 0)") from error
+        try:
+            size = len(_points(returned, len(self))[0])
+        except InputError as error:
+            raise InputError(f"{self.name}: {error}") from None
+        self._check_plane(size, dynamics.state_coordinates)
+        return size
+
+    def _check_plane(self, size: int, space: Coordinates) -> None:
+        """Raises InputError for places in a plane of a robot that has none."""
+        if size == 2 and len(space.position) != 2:
+            has = "a position in space" if space.position else "no position"
+            raise InputError(f"{self.name}: got points of 2 coordinates for dynamics with {has}, want 3")
+
+    def centres(self, dynamics: Dynamics, states: npt.ArrayLike) -> Array:
+        """The middle of each ball, (..., K, 3), at states (..., n), in the world and in metres.
+
+        Of places in a plane that is seen from above, the height is 0.
+        """
+        check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
+        states = vectors_of("states", states, len(dynamics.state_coordinates))
+        places = self.bind(dynamics)
+        found = evaluate(places, len(self), states)
+        return dynamics.state_coordinates.in_world(found[..., :2]) if places.in_plane else found
+
+
+def check_outline(field: str, radius: float | None, balls: Balls | None) -> float | None:
+    """The radius of what an obstacle is kept clear of, checked; None where it is balls.
+
+    Raises:
+      InputError: it is negative, these are no balls, or neither or both of them are given.
+    """
+    if balls is None and radius is not None:
+        return check_number(f"{field}: radius", radius, at_least=0.0)
+    check_kind(f"{field}: balls", balls, (Balls, type(None)), "Balls(places, radii)")
+    if (radius is None) == (balls is None):
+        given = "neither radius nor balls" if balls is None else "radius and balls"
+        raise InputError(f"{field}: got {given}, want one of them: radius=robot.radius or balls=robot.balls")
+    return None
+
+
+def bind_outline(field: str, balls: Balls | None, dynamics: Dynamics, world: World) -> tuple[Places | None, World]:
+    """The balls' places, None for a robot that is one at its position, and the world as they see it.
+
+    Raises:
+      InputError: there are neither balls nor a position, or the balls do not fit the dynamics.
+    """
+    space = dynamics.state_coordinates
+    if balls is not None:
+        places = balls.bind(dynamics)
+        return places, places.world_seen(world, space)
+    if not space.position:
+        wanted = "Dynamics(..., position=(names)), or balls="
+        raise InputError(f"{field}: got dynamics without a position, want {wanted}")
+    return None, world.seen_by(space.plane, space.offset)
+
+
+def evaluate(places: Places, count: int, states: npt.ArrayLike) -> Array:
+    """Where so many balls are, compiled: (..., count, 3) at states (..., n), as `places` has it."""
+    given = np.asarray(states, dtype=np.float64)
+    flat = in_c_order(given.reshape(-1, given.shape[-1]))
+    out = np.empty((len(flat), 3 * count))
+    _call(places, "places_of", flat, out)
+    return out.reshape(*given.shape[:-1], count, 3)
+
+
+def evaluate_slopes(places: Places, count: int, states: Array) -> tuple[Array, Array]:
+    """Where so many balls are (K, count, 3), and the derivatives in the states (K, count, 3, n), at states (K, n)."""
+    flat = in_c_order(states)
+    out, slopes = np.empty((len(flat), 3 * count)), np.zeros((len(flat), 3 * count, flat.shape[1]))
+    _call(places, "slopes_of", flat, out, slopes)
+    return out.reshape(-1, count, 3), slopes.reshape(len(flat), count, 3, -1)
+
+
+def _call(places: Places, name: str, states: Array, *outputs: Array) -> None:
+    """Call a function of `kernels/ball_places.py`; what a user's function raises comes through."""
+    with compiling:
+        core = _core(places.source, states.shape[1])
+        data = np.array([*(address_of(function) for function in places.functions), *places.data], dtype=np.float64)
+    getattr(core, name)(len(states), states, data, *outputs)
+    for function in places.functions:
+        if function.raised is not None:
+            error = function.raised
+            function.forget()
+            raise error
+
+
+def clearances(balls: Balls, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> Array:
+    """Signed distance of each ball to the nearest obstacle minus its radius, (..., K), at states (..., n)."""
+    places = balls.bind(dynamics)
+    seen = places.world_seen(world, dynamics.state_coordinates)
+    return distances.signed_distance(seen, evaluate(places, len(balls), states)) - balls.radii
+
+
+@functools.cache
+def _core(source: str, n: int) -> Core:
+    parts = [source_of(rotation_ratios), source_of(linear_algebra, "clear"), source, source_of(ball_places)]
+    return Core("\n\n".join(parts), {"N": n}, f"places of balls ({n} states)")
+
+
+def _points(returned: Any, count: int) -> list[list[Any]]:
+    """What a function returned, as points. Raises InputError unless they are so many, of 2 or 3 coordinates alike."""
+    if returned is None:
+        raise InputError("got None, want the middle of each ball: is a return missing?")
+    listed = returned.tolist() if hasattr(returned, "tolist") else returned
+    try:
+        points = [point.tolist() if hasattr(point, "tolist") else list(point) for point in listed]
+    except TypeError:
+        raise InputError(f"got {excerpt(returned)}, want a list of points of 3 coordinates") from None
+    if len(points) != count:
+        raise InputError(f"got {len(points)} points, want {count}: one for each of radii")
+    sizes = {len(point) for point in points}
+    if sizes not in ({2}, {3}):
+        raise InputError(f"got points of {' and '.join(map(str, sorted(sizes)))} coordinates, want 3 of each, or 2")
+    return points

@@ -1,0 +1,114 @@
+"""Pictures of a robot of balls without a position, what is read from their pixels, and the file of its run."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.patches import Circle
+from planar_arm import LINK, PlanarArm
+
+import lqrsim as ls
+from lqrsim.results.ball_record import BallRecord
+from lqrsim.view import style
+from lqrsim.view.plots import MOMENTS, _path_of_balls
+
+FLAT = {"size": (640, 480), "fps": 4}
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> ls.Plant:
+    return ls.Plant(PlanarArm(), PlanarArm.scene(tmp_path_factory.mktemp("arm")))
+
+
+@pytest.fixture(scope="module")
+def plan(plant: ls.Plant) -> ls.Solution:
+    """A turn beside the posts; nothing of the solver is looked at here."""
+    dynamics, start = plant.robot.dynamics, (-0.9, 0.2, 0.3, 0.0, 0.0, 0.0)
+    balls = plant.robot.balls
+    problem = ls.Problem(
+        dynamics=dynamics, dt=0.05, steps=40, initial=ls.FixedState(start),
+        stage_cost=ls.ControlCost(np.full(3, 0.05)) + ls.ObstacleCost(ls.World([]), balls=balls),
+        final_cost=ls.QuadraticCost(np.full(6, 1000.0), about=(-0.3, 0.9, -0.2, 0.0, 0.0, 0.0)),
+        constraints=[ls.Clearance(ls.World([]), balls=balls)],
+    )  # fmt: skip
+    return ls.smooth(problem)
+
+
+@pytest.fixture(scope="module")
+def run(plant: ls.Plant, plan: ls.Solution) -> ls.Rollout:
+    return ls.simulate(plant, plan, disturbances=[ls.ControlNoise(0.1)], trials=2)
+
+
+def test_a_run_records_where_its_balls_were(plant: ls.Plant, plan: ls.Solution, run: ls.Rollout) -> None:
+    assert run.balls is not None
+    dynamics, balls = plant.robot.dynamics, plant.robot.balls
+    np.testing.assert_array_equal(run.balls.driven, balls.centres(dynamics, run.states))
+    np.testing.assert_array_equal(run.balls.planned, balls.centres(dynamics, plan.trajectory.states))
+    np.testing.assert_array_equal(run.places(1), run.balls.driven[1, :, -1])
+    np.testing.assert_array_equal(run.in_world(run.places(1)), run.places(1))
+    body, place = run.balls.tracked
+    assert plant.model.body(body).name == "hand"
+    np.testing.assert_array_equal(place, [0.4, 0, 0])
+    assert ls.simulate(plant, plan, frames=False).balls is None
+
+
+def test_its_file_is_the_same_run(run: ls.Rollout, tmp_path: Path) -> None:
+    read = ls.load_rollout(ls.save(run, tmp_path / "rollout.npz"))
+    assert run.balls is not None
+    assert read.balls is not None
+    for field in dataclasses.fields(BallRecord):
+        np.testing.assert_array_equal(getattr(read.balls, field.name), getattr(run.balls, field.name))
+    bare = dataclasses.replace(run, balls=None)
+    assert ls.load_rollout(ls.save(bare, tmp_path / "bare.npz")).balls is None
+
+
+def test_the_silhouette_is_where_the_last_ball_is(plan: ls.Solution, run: ls.Rollout) -> None:
+    found = ls.verify_run(run, 1, solution=plan)
+    # The plan is the solution's; the noise pushed the run off it, which the record says, too.
+    assert found.passed, str(found)
+
+
+def test_a_run_of_other_states_is_not_verified(run: ls.Rollout) -> None:
+    assert run.balls is not None
+    moved = dataclasses.replace(run.balls, driven=run.balls.driven + np.array([0.03, 0, 0]))
+    found = ls.verify_run(dataclasses.replace(run, balls=moved))
+    assert not found.passed
+    assert "a camera is off" in str(found) or "another run" in str(found)
+
+
+def test_a_video_is_verified_by_its_mark(plan: ls.Solution, run: ls.Rollout, tmp_path: Path) -> None:
+    video = ls.render(run, tmp_path / "arm.mp4", camera="top", insets=("side",), quality="draft", fps=5)
+    found = ls.verify_video(video, run, solution=plan)
+    assert found.passed, str(found)
+
+
+def test_the_figure_has_the_balls_at_several_times(
+    plan: ls.Solution, run: ls.Rollout, plant: ls.Plant, tmp_path: Path
+) -> None:
+    with style.figure(tmp_path / "axes.png", size=(5, 5)) as figure:
+        axes = figure.add_subplot()
+        _path_of_balls(axes, plan, {"run": run}, plant.scene.world, 0)
+        circles = [patch for patch in axes.patches if isinstance(patch, Circle)]
+    assert run.balls is not None
+    assert len(circles) == MOMENTS * 3 * LINK.count
+    seen = np.array([circle.center for circle in circles[-3 * LINK.count :]])
+    np.testing.assert_allclose(seen, run.balls.driven[0, -1, :, :2], rtol=0, atol=1e-12)
+    assert ls.plot_run(plan, {"run": run}, tmp_path / "run.png", world=plant.scene.world).stat().st_size > 10_000
+    assert ls.plot_policy(plan, tmp_path / "p.png", world=plant.scene.world, radius=0.1).stat().st_size > 10_000
+
+
+def test_what_is_missing_is_said(run: ls.Rollout, plan: ls.Solution, plant: ls.Plant, tmp_path: Path) -> None:
+    bare = dataclasses.replace(run, balls=None)
+    with pytest.raises(ls.InputError, match="or a run of a robot with balls that has frames"):
+        ls.render(bare, tmp_path / "arm.mp4", **FLAT)
+    with pytest.raises(ls.InputError, match="or runs of a robot with balls that have frames"):
+        ls.plot_run(plan, {"run": bare}, tmp_path / "run.png", world=plant.scene.world)
+    assert run.balls is not None
+    nameless = dataclasses.replace(run.balls, anchors=np.full_like(run.balls.anchors, np.nan))
+    with pytest.raises(ls.InputError, match="want sites= in Balls"):
+        ls.verify_run(dataclasses.replace(run, balls=nameless))
+    with pytest.raises(ls.InputError, match="got bodies beyond the model's"):
+        ls.verify_run(dataclasses.replace(run, balls=dataclasses.replace(run.balls, anchors=1e3 + run.balls.anchors)))
+    with pytest.raises(ls.InputError, match=r"balls\.driven: got shape"):
+        dataclasses.replace(run, balls=dataclasses.replace(run.balls, driven=run.balls.driven[:1]))
