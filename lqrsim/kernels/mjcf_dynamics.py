@@ -30,12 +30,13 @@ from lqrsim.kernels.rotation_ratios import sine_ratio
 # mj_forwardSkip and the integrator; the last is 0 where parts of a step cannot be had on their own. TIMESTEP: of the
 # physics, in s. NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those
 # is that the controls are for. TEAM, JOB: where threads that help find what to do, 0 without any; YIELD: the address of
-# what lets others run. TABLE: the joints' kind and places in qpos and qvel, three numbers each.
+# what lets others run; KINEMATICS: of mj_kinematics. TABLE: the joints' kind and places in qpos and qvel, three numbers
+# each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
-TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, TABLE = 13, 14, 15, 16, 17, 18, 19, 20, 21
+TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS, TABLE = 13, 14, 15, 16, 17, 18, 19, 20, 21, 22
 
 # What a slot has of each of its two MjData: addresses.
-SLOT, DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, SIZE = 16, 0, 1, 2, 3, 4, 5, 6, 7, 8
+SLOT, DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, SIZE = 20, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10
 
 # The words that a team shares: whether somebody has it, the next column to do with the number of the job above it, how
 # many are done, whether to stop, how many helpers there are.
@@ -226,7 +227,19 @@ def take_slot(p):
 def write_to(x, u, p, one):
     """Write a state and a control into an MjData."""
     nv = int(p[NV])
-    qpos, qvel, act, ctrl = at(one[QPOS]), at(one[QVEL]), at(one[ACT]), at(one[CTRL])
+    qvel, act, ctrl = at(one[QVEL]), at(one[ACT]), at(one[CTRL])
+    write_positions(x, p, at(one[QPOS]))
+    for i in range(nv):
+        qvel[i] = x[nv + i]
+    for i in range(int(p[NA])):
+        act[i] = x[2 * nv + i]
+    listed = int(p[ACTUATORS])
+    for i in range(M):
+        ctrl[int(p[listed + i])] = u[i]
+
+
+def write_positions(x, p, qpos):
+    """Write MuJoCo's positions of a state."""
     for k in range(int(p[JOINTS])):
         kind, q, d = int(p[TABLE + 3 * k]), int(p[TABLE + 3 * k + 1]), int(p[TABLE + 3 * k + 2])
         if kind == FREE:
@@ -237,13 +250,6 @@ def write_to(x, u, p, one):
             write_quaternion(x, d, qpos, q)
         else:
             qpos[q] = x[d]
-    for i in range(nv):
-        qvel[i] = x[nv + i]
-    for i in range(int(p[NA])):
-        act[i] = x[2 * nv + i]
-    listed = int(p[ACTUATORS])
-    for i in range(M):
-        ctrl[int(p[listed + i])] = u[i]
 
 
 def begin(p, wrench, one):

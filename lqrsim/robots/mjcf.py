@@ -11,8 +11,10 @@ from lqrsim.errors import Array, InputError, check_flag, check_name, check_numbe
 from lqrsim.problem.constraints import StateBounds
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.robots.base import Robot
+from lqrsim.robots.mjcf_balls import MjcfBalls
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes import mjcf_joints
+from lqrsim.scenes.mjcf_outline import outline_of
 from lqrsim.scenes.scene import Scene, load_scene, scene_from_xml
 
 _AXES = "xyz"
@@ -48,10 +50,12 @@ class MjcfRobot(Robot):
       position: the 2 or 3 states that are the body's place in the world, in metres; by default those of which MuJoCo's
         kinematics says so. () for none.
       radius: of a ball about the body's origin that has in it all that may collide; by default the least that is sure.
+      outline: whether what collides is many `balls`, fixed to the bodies, and not that one; by default where there is
+        no position. Spheres are balls, capsules chains of them, and the rest the ball that it is in.
       floors: whether level planes are for standing on.
 
     Attributes:
-      scene: what it moves in. dynamics: MuJoCo's steps.
+      scene: what it moves in. dynamics: MuJoCo's steps. balls: its outline, or None for one ball of `radius`.
 
     Raises:
       InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
@@ -65,6 +69,7 @@ class MjcfRobot(Robot):
         body: str | None = None,
         position: Sequence[str] | None = None,
         radius: float | None = None,
+        outline: bool | None = None,
         floors: bool = True,
     ) -> None:
         scene = file if isinstance(file, Scene) else load_scene(file)
@@ -95,6 +100,8 @@ class MjcfRobot(Robot):
         )  # fmt: skip
         reach = mjcf_joints.reach_of(model, number) if radius is None else radius
         self.radius = check_number(f"{who}: radius", reach, at_least=0.0)
+        many = not place if outline is None else check_flag(f"{who}: outline", outline)
+        self.balls = MjcfBalls(outline_of(model), self._balls_at) if many else None
 
     def _states(self) -> Iterator[tuple[str, str]]:
         """Names and units: positions, velocities, states of actuators."""
@@ -127,6 +134,12 @@ class MjcfRobot(Robot):
             got, told = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes) or "none"
             raise InputError(f"{who}: position: got {got}, want 2 or 3 that say where the body is, of: {told}")
         return tuple(found), plane if len(found) == 2 else ""
+
+    def _balls_at(self, state: Array) -> Array:
+        """Where the balls are, (K, 3), by MuJoCo's bindings."""
+        assert isinstance(self.balls, MjcfBalls)
+        outline = self.balls.outline
+        return mjcf_joints.places_on(self.scene.model, self.configuration(state)[0], outline.bodies, outline.offsets)
 
     @property
     def dynamics(self) -> MjcfDynamics:

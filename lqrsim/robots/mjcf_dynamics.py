@@ -79,7 +79,7 @@ class MjcfDynamics(Dynamics):
     @property
     def data(self) -> Array:
         wrench = [self.parameters.get(name, self.disturbances[name]) for name in WRENCH]
-        return np.concatenate([wrench, self.physics.numbers])
+        return np.concatenate([wrench, self.physics.numbers[kernel.WRENCH + len(wrench) :]])
 
     def with_parameters(self, **values: float) -> "MjcfDynamics":
         """The same, pushed otherwise: `dynamics.disturbed.with_parameters(force_x=1.0)`.
@@ -156,10 +156,14 @@ class MjcfDynamics(Dynamics):
         return _core(len(self.state_coordinates), len(self.control_coordinates))
 
 
+def named_places() -> dict[str, int]:
+    """Where the kernel's numbers are what, as `source_of` takes it."""
+    return {name: value for name, value in vars(kernel).items() if name.isupper() and len(name) > 1}
+
+
 @cache
 def _source() -> str:
-    names = {name: value for name, value in vars(kernel).items() if name.isupper() and len(name) > 1}
-    return source_of(kernel, **names)
+    return source_of(kernel, **named_places())
 
 
 @cache

@@ -45,11 +45,11 @@ class Actuator:
     high: float
 
 
-UNNAMED = "unnamed_"  # what begins the name of a body, joint or actuator that has none in the MJCF
+UNNAMED = "unnamed_"  # what begins the name of a body, joint, geom or actuator that has none in the MJCF
 
 
 def named(xml: str) -> str:
-    """An MJCF in which every body, joint and actuator has a name: `unnamed_<kind>_<number>`, counted from 0."""
+    """An MJCF in which every body, joint, geom and actuator has a name: `unnamed_<kind>_<number>`, counted from 0."""
     root = ElementTree.fromstring(xml)
     taken = {element.get("name") for element in root.iter()}
 
@@ -65,6 +65,7 @@ def named(xml: str) -> str:
     for world in root.iter("worldbody"):
         name(list(world.iter("body")), "body")
         name([one for one in world.iter() if one.tag in ("joint", "freejoint")], "joint")
+        name(list(world.iter("geom")), "geom")
     name([one for section in root.iter("actuator") for one in section], "actuator")
     return ElementTree.tostring(root, encoding="unicode")
 
@@ -152,6 +153,14 @@ def position_of(model: mujoco.MjModel, body: int) -> dict[int, int]:
             off = abs(float(data.xpos[body][axis] - data.qpos[candidates[dof]]))
             errors[dof, axis] = max(errors[dof, axis], off)
     return {dof: axis for (dof, axis), error in errors.items() if error < 1e-9}
+
+
+def places_on(model: mujoco.MjModel, qpos: Array, bodies: Array, offsets: Array) -> Array:
+    """Where points (K, 3) in the axes of bodies (K,) are in the world, at MuJoCo's positions (nq,)."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    return data.xpos[bodies] + np.einsum("kij,kj->ki", data.xmat[bodies].reshape(-1, 3, 3), offsets)
 
 
 def reach_of(model: mujoco.MjModel, body: int) -> float:

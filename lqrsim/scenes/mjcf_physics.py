@@ -36,7 +36,7 @@ class MjcfPhysics:
       actuators: ids of those that the controls are for, in order.
 
     Attributes:
-      model: MuJoCo's. numbers: what the kernel takes after the wrench. team: the words that its threads share.
+      model: MuJoCo's. numbers: what the kernel takes, with no wrench. team: the words that its threads share.
 
     Raises:
       InputError: it has what a state of joints and actuators does not describe.
@@ -65,6 +65,7 @@ class MjcfPhysics:
         fields = {
             kernel.QPOS: data.qpos, kernel.QVEL: data.qvel, kernel.ACT: data.act, kernel.CTRL: data.ctrl,
             kernel.WARM: data.qacc_warmstart, kernel.QACC: data.qacc, kernel.PUSH: data.xfrc_applied[body],
+            kernel.XPOS: data.xpos, kernel.XMAT: data.xmat,
         }  # fmt: skip
         for place, array in fields.items():
             row[place] = array.ctypes.data
@@ -83,8 +84,8 @@ class MjcfPhysics:
         numbers[kernel.TIMESTEP], numbers[kernel.NV], numbers[kernel.NA] = model.opt.timestep, model.nv, model.na
         numbers[kernel.JOINTS], numbers[kernel.ACTUATORS] = model.njnt, kernel.TABLE + joints.size
         numbers[kernel.TEAM], numbers[kernel.JOB] = self.team.ctypes.data, self._job.ctypes.data
-        numbers[kernel.YIELD] = _yield()
-        return np.concatenate([numbers, joints.ravel(), actuators])[kernel.WRENCH + 6 :]
+        numbers[kernel.YIELD], numbers[kernel.KINEMATICS] = _yield(), functions["mj_kinematics"]
+        return np.concatenate([numbers, joints.ravel(), actuators])
 
 
 def _check(model: mujoco.MjModel, name: str) -> None:
@@ -141,7 +142,7 @@ def _functions() -> dict[str, int]:
     (library, *_) = sorted(folder.glob(patterns.get(platform.system(), "libmujoco.so*")))
     loaded = ctypes.CDLL(str(library))
     found = {}
-    for name in ("mj_step", "mj_forwardSkip", "mj_Euler", "mj_implicit"):
+    for name in ("mj_step", "mj_forwardSkip", "mj_Euler", "mj_implicit", "mj_kinematics"):
         address = ctypes.cast(getattr(loaded, name), ctypes.c_void_p).value
         assert address is not None
         found[name] = address

@@ -30,8 +30,9 @@ class Plant:
       robot, scene: what it is made of.
       balls, places: the robot's balls, and where they are; None where it is one ball at its position.
       world: the obstacles that bound the robot's position, or its balls; none without either.
-      obstacles: names of what the robot can collide with: those; without a position all, but level planes if a free
-        joint, or a slide that is not level, lets the robot stand on them. For balls in space it is the same.
+      obstacles: names of what the robot can collide with: those; without a position all that the MJCF lets it touch,
+        but level planes if a free joint, or a slide that is not level, lets the robot stand on them. For balls in space
+        it is the same.
       model: the compiled scene, with a contact sensor for each obstacle.
       body: id of the robot's body. qpos, qvel, ctrl: where its joints' and actuators' numbers are in MuJoCo's arrays.
       contact: where the contact sensors are in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
@@ -262,7 +263,7 @@ def extent(plant: Plant) -> float:
 
 
 def _in_the_way(robot: Robot, scene: Scene) -> tuple[str, ...]:
-    """Names of the obstacles of a robot without a position: all, but the floor if it may stand on one.
+    """Names of the obstacles of a robot without a position: what it can touch, but the floor if it may stand on one.
 
     It may if a joint lets it sink to level planes, which are its floor: a free one, or a slide that is not level.
     """
@@ -276,7 +277,20 @@ def _in_the_way(robot: Robot, scene: Scene) -> tuple[str, ...]:
             sinks |= bool(slides or model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE)
         body = int(model.body_parentid[body])
     level = [one.kind == "plane" and abs(one.rotation[2, 2]) > 1 - 1e-9 for one in scene.world.obstacles]
-    return tuple(name for name, lies in zip(scene.world.names, level, strict=True) if not (sinks and lies))
+    touched = [_can_be_touched(model, geom) for geom in obstacle_geoms(model)]
+    found = zip(scene.world.names, level, touched, strict=True)
+    return tuple(name for name, lies, near in found if near and not (sinks and lies))
+
+
+def _can_be_touched(model: mujoco.MjModel, geom: int) -> bool:
+    """Whether MuJoCo lets anything that moves collide with it, by the bits of both or as a pair; if it has contacts."""
+    off = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    if model.opt.disableflags & off:
+        return False
+    moves = model.body_weldid[model.geom_bodyid] != 0
+    bits = (model.geom_contype & model.geom_conaffinity[geom]) | (model.geom_conaffinity & model.geom_contype[geom])
+    pairs = np.concatenate([model.pair_geom2[model.pair_geom1 == geom], model.pair_geom1[model.pair_geom2 == geom]])
+    return bool((moves & (bits != 0)).any() or moves[pairs].any())
 
 
 def _ranges(starts_and_sizes: Iterable[tuple[int, int]]) -> Indices:

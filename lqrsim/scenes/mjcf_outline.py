@@ -1,0 +1,60 @@
+"""What may collide of the bodies of an MJCF that move, as balls that are fixed to them."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from lqrsim.capsules import Capsule
+from lqrsim.errors import Array
+
+# Of its radius: by how much a capsule may stick out of the balls that stand for it.
+TOLERANCE = 0.25
+
+
+@dataclass(frozen=True)
+class Outline:
+    """B balls.
+
+    Attributes:
+      bodies: (B,) numbers of the bodies that they are fixed to. offsets: (B, 3) where, in the axes of these, in metres.
+      radii: (B,) in metres. names: of the balls. sites: of the geoms whose middle they are in; None for the others.
+      missed: by how much a capsule sticks out of its balls at most, in metres.
+    """
+
+    bodies: Array
+    offsets: Array
+    radii: Array
+    names: tuple[str, ...]
+    sites: tuple[str | None, ...]
+    missed: float
+
+
+def outline_of(model: mujoco.MjModel) -> Outline:
+    """Spheres as they are, capsules as chains, the rest as the ball about its middle that it is in.
+
+    What is only drawn counts where nothing collides. The last ball is in the middle of a geom.
+    """
+    moves = model.body_weldid[model.geom_bodyid] != 0
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    chosen = np.flatnonzero(moves & collides) if (moves & collides).any() else np.flatnonzero(moves)
+    rows, names, sites, missed = list[tuple[int, Array, float]](), list[str](), list[str | None](), 0.0
+    for geom in chosen.tolist():
+        body, middle, name = int(model.geom_bodyid[geom]), model.geom_pos[geom], model.geom(geom).name
+        radius, places = float(model.geom_rbound[geom]), [middle]
+        if model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_CAPSULE):
+            radius, half = (float(number) for number in model.geom_size[geom, :2])
+            capsule = Capsule(2 * half, radius, TOLERANCE * radius)
+            missed = max(missed, capsule.missed)
+            axis = np.zeros(3)
+            mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, half]), model.geom_quat[geom])
+            chain = np.array(capsule.between(tuple(middle - axis), tuple(middle + axis)))
+            places = [*(one for one in chain if np.linalg.norm(one - middle) > 1e-9), middle]
+        for number, place in enumerate(places, start=1 - len(places)):
+            rows.append((body, np.asarray(place, dtype=np.float64), radius))
+            names.append(f"{name} ({-number} before)" if number else name)
+            sites.append(None if number else name)
+    return Outline(
+        bodies=np.array([body for body, _, _ in rows]), offsets=np.array([place for _, place, _ in rows]),
+        radii=np.array([radius for _, _, radius in rows]), names=tuple(names), sites=tuple(sites), missed=missed,
+    )  # fmt: skip
