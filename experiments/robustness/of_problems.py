@@ -62,6 +62,11 @@ def ilqr_stated(**stated: Any) -> ls.Solution:
     return ls.ilqr(ls.Problem(**stated), max_iterations=2)
 
 
+CART = """<mujoco><worldbody><body name="cart"><joint name="slider" type="slide" axis="1 0 0" range="-1 1"
+  limited="true"/><geom size="0.1"/></body></worldbody><actuator><motor name="push" joint="slider"/></actuator>
+  <keyframe><key name="left" qpos="-0.5"/></keyframe></mujoco>"""
+
+
 def problems(place: Place) -> dict[str, tuple[Any, ...]]:
     cart = ls.Dynamics(
         rate, states={"x": "m", "v": "m/s"}, controls={"force": "N"}, parameters={"mass": 1.0}, level="plain"
@@ -81,8 +86,12 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
     places = balls.bind(cart)
     at, there = {"state": [0.1, 0.2], "control": [0.3]}, {"vector": [0.1, 0.2, 9.0], "near": [0.0, 0.0, 0.0]}
     source = "def value(x, u, t, row, data):\n    return x[0]\n\n\ndef slope(x, u, t, row, data, gradient):\n    pass\n"
+    file = place.folder / "cart.xml"
+    file.write_text(CART, encoding="utf-8")
+    slider = ls.MjcfRobot(file)
     known: dict[str, ls.Robot] = {
-        "Robot": ls.Quadrotor(), "Quadrotor": ls.Quadrotor(), "DifferentialDrive": ls.DifferentialDrive()
+        "Robot": ls.Quadrotor(), "Quadrotor": ls.Quadrotor(), "DifferentialDrive": ls.DifferentialDrive(),
+        "MjcfRobot": slider,
     }  # fmt: skip
     rests = {kind: np.zeros(len(robot.dynamics.state_coordinates)) for kind, robot in known.items()}
     robots = [(kind, robot, rests[kind], robot.configuration(rests[kind])) for kind, robot in known.items()]
@@ -96,6 +105,10 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             "position": (), "angles": ("x",), "rotation_vectors": (), "control_limits": (-1.0, 1.0),
             "jacobian": jacobian, "level": "plain",
         },),
+        "MjcfRobot": (
+            {"file": file, "body": "cart", "position": (), "radius": 0.2, "outline": False, "floors": True}, 0.2,
+        ),
+        "MjcfRobot.at": ({"self": slider, "keyframe": "left", "slider": 0.2},),
         "Dynamics.rate": ({"self": cart, **at},),
         "Dynamics.rate_jacobian": ({"self": cart, **at},),
         "Dynamics.step": ({"self": cart, **at, "dt": 0.1},),

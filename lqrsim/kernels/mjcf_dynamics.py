@@ -50,14 +50,14 @@ LARGEST = 1e10  # MuJoCo's mjMAXVAL: what is beyond is no state of anything
 
 def advance(x, u, p, h, out):
     """Write the state after `h` seconds, (N,): a whole number of physics steps; NaN where it leaves all numbers."""
-    substeps = steps_in(x, u, p, h)
+    z = stack(W)
+    substeps = steps_in(x, u, p, h, z)
     if substeps < 1:
         for i in range(N):
             out[i] = nan
         return
     slot = take_slot(p)
-    two = at(p[SLOTS] + 8 * SLOT * slot + 8 * SIZE)
-    run(x, u, p, p, substeps, two, out)
+    run(z, p, p, substeps, at(p[SLOTS] + 8 * SLOT * slot + 8 * SIZE), out)
     store(p[FLAGS], slot, 0)
 
 
@@ -67,7 +67,8 @@ def step_jacobian(x, u, p, h, fx, fu, out, jacobian):
     `fx` and `fu` are not used. If there are helpers and nobody has them, they do columns, too; which thread did one
     makes no difference to the last bit.
     """
-    substeps = steps_in(x, u, p, h)
+    z = stack(W)
+    substeps = steps_in(x, u, p, h, z)
     if substeps < 1:
         for i in range(N):
             out[i] = nan
@@ -79,26 +80,24 @@ def step_jacobian(x, u, p, h, fx, fu, out, jacobian):
     if together:
         job = at(p[JOB])
         job[0] = substeps
-        for i in range(N):
-            job[1 + i] = x[i]
-        for i in range(M):
-            job[1 + N + i] = u[i]
+        for i in range(W):
+            job[1 + i] = z[i]
         for i in range(6):
             job[1 + W + i] = p[WRENCH + i]
         store(team, DONE, 0)
         store(team, TICKET, JOBS * (load(team, TICKET) // JOBS + 1))
     address, warm = p[SLOTS] + 8 * SLOT * slot, stack(N)
-    run(x, u, p, p, substeps, at(address + 8 * SIZE), out)
-    linearize_here(x, u, p, p, address, warm)
+    run(z, p, p, substeps, at(address + 8 * SIZE), out)
+    linearize_here(z, p, p, address, warm)
     if not together:
         for k in range(W):
-            column(k, x, u, p, p, substeps, address, warm, jacobian)
+            column(k, z, p, p, substeps, address, warm, jacobian)
         store(p[FLAGS], slot, 0)
         return
     columns = job_columns(p)
     k = fetch_add(team, TICKET, 1) % JOBS
     while k < W:
-        column(k, x, u, p, p, substeps, address, warm, columns)
+        column(k, z, p, p, substeps, address, warm, columns)
         fetch_add(team, DONE, 1)
         k = fetch_add(team, TICKET, 1) % JOBS
     patience = 0
@@ -120,7 +119,7 @@ def help_out(p):
     """
     team, slot, known, patience = p[TEAM], take_slot(p), -1, 0
     address, warm, job, columns = p[SLOTS] + 8 * SLOT * slot, stack(N), at(p[JOB]), job_columns(p)
-    x, u, wrench = stack(N), stack(M), stack(6)
+    z, wrench = stack(W), stack(6)
     while load(team, STOP) == 0:
         if load(team, TICKET) % JOBS >= W:
             patience += 1
@@ -132,14 +131,12 @@ def help_out(p):
             continue
         if ticket // JOBS != known:
             known = ticket // JOBS
-            for i in range(N):
-                x[i] = job[1 + i]
-            for i in range(M):
-                u[i] = job[1 + N + i]
+            for i in range(W):
+                z[i] = job[1 + i]
             for i in range(6):
                 wrench[i] = job[1 + W + i]
-            linearize_here(x, u, p, wrench, address, warm)
-        column(ticket % JOBS, x, u, p, wrench, int(job[0]), address, warm, columns)
+            linearize_here(z, p, wrench, address, warm)
+        column(ticket % JOBS, z, p, wrench, int(job[0]), address, warm, columns)
         fetch_add(team, DONE, 1)
     store(p[FLAGS], slot, 0)
 
@@ -149,19 +146,19 @@ def job_columns(p):
     return rows_at(p[JOB] + 8 * (1 + W + 6), W)
 
 
-def run(x, u, p, wrench, substeps, two, out):
+def run(z, p, wrench, substeps, two, out):
     """Write where so many physics steps lead."""
-    write_to(x, u, p, two)
+    write_to(z, p, two)
     begin(p, wrench, two)
     for _ in range(substeps):
         call(p[STEP], p[MODEL], two[DATA])
-    read_from(x, p, two, out)
+    read_from(z, p, two, out)
 
 
-def linearize_here(x, u, p, wrench, address, warm):
+def linearize_here(z, p, wrench, address, warm):
     """Have the first MjData of a slot at the state that columns differ from, and write MuJoCo's accelerations there."""
     one = at(address)
-    write_to(x, u, p, one)
+    write_to(z, p, one)
     begin(p, wrench, one)
     call_with_two(p[FORWARD], p[MODEL], one[DATA], 0, 1)
     accelerations = at(one[QACC])
@@ -169,7 +166,7 @@ def linearize_here(x, u, p, wrench, address, warm):
         warm[i] = accelerations[i]
 
 
-def column(k, x, u, p, wrench, substeps, address, warm, jacobian):
+def column(k, z, p, wrench, substeps, address, warm, jacobian):
     """Write a column of the Jacobian: the k-th, of the controls first, which leave the stage of velocities as it is.
 
     What a perturbed velocity or control does not change of the first physics step, the stage of positions, is kept.
@@ -177,41 +174,35 @@ def column(k, x, u, p, wrench, substeps, address, warm, jacobian):
     their own: its tolerance is not divided by the difference.
     """
     one, two, nv = at(address), at(address + 8 * SIZE), int(p[NV])
-    z, v, ahead, behind = stack(N), stack(M), stack(N), stack(N)
-    for i in range(N):
-        z[i] = x[i]
-    for i in range(M):
-        v[i] = u[i]
+    moved, ahead, behind = stack(W), stack(N), stack(N)
+    for i in range(W):
+        moved[i] = z[i]
     j = k + N if k < M else k - M
-    size = x[j] if j < N else u[j - N]
-    difference = 1e-6 * max(1.0, abs(size))
+    difference = 1e-6 * max(1.0, abs(z[j]))
     kept = 0 if j < nv or p[INTEGRATE] == 0 else 1 if j < N else 2
     for side in range(2):
-        moved = size + difference if side == 0 else size - difference
-        if j < N:
-            z[j] = moved
-        else:
-            v[j - N] = moved
+        moved[j] = z[j] + difference if side == 0 else z[j] - difference
         begin(p, wrench, two)
         if kept > 0:
-            step_from(z, v, p, one, two, warm, kept)
+            step_from(moved, p, one, two, warm, kept)
         else:
-            write_to(z, v, p, two)
+            write_to(moved, p, two)
             start_from(p, two, warm)
         for _ in range(substeps - 1 if kept > 0 else substeps):
             call(p[STEP], p[MODEL], two[DATA])
-        read_from(x, p, two, ahead if side == 0 else behind)
+        read_from(z, p, two, ahead if side == 0 else behind)
     for i in range(N):
         jacobian[i, j] = (ahead[i] - behind[i]) / (2 * difference)
 
 
-def steps_in(x, u, p, h):
-    """How many steps of the physics there are in `h` seconds; 0 if MuJoCo cannot go there: back, or from NaN."""
-    for i in range(N):
-        if not abs(x[i]) < LARGEST:
-            return 0
-    for i in range(M):
-        if not abs(u[i]) < LARGEST:
+def steps_in(x, u, p, h, z):
+    """How many steps of the physics there are in `h` seconds; 0 if MuJoCo cannot go there: back, or from NaN.
+
+    Writes the state and the control one after the other, (W,).
+    """
+    for i in range(W):
+        z[i] = x[i] if i < N else u[i - N]
+        if not abs(z[i]) < LARGEST:
             return 0
     return int(h / p[TIMESTEP] + 0.5) if h > 0 else 0
 
@@ -224,18 +215,18 @@ def take_slot(p):
     return slot
 
 
-def write_to(x, u, p, one):
+def write_to(z, p, one):
     """Write a state and a control into an MjData."""
     nv = int(p[NV])
     qvel, act, ctrl = at(one[QVEL]), at(one[ACT]), at(one[CTRL])
-    write_positions(x, p, at(one[QPOS]))
+    write_positions(z, p, at(one[QPOS]))
     for i in range(nv):
-        qvel[i] = x[nv + i]
+        qvel[i] = z[nv + i]
     for i in range(int(p[NA])):
-        act[i] = x[2 * nv + i]
+        act[i] = z[2 * nv + i]
     listed = int(p[ACTUATORS])
     for i in range(M):
-        ctrl[int(p[listed + i])] = u[i]
+        ctrl[int(p[listed + i])] = z[N + i]
 
 
 def write_positions(x, p, qpos):
@@ -268,14 +259,14 @@ def start_from(p, one, guess):
         warm[i] = guess[i]
 
 
-def step_from(z, v, p, one, two, guess, kept):
+def step_from(z, p, one, two, guess, kept):
     """A step of the physics with the stages kept that `one` has, and that the state and control share; to `two`."""
-    write_to(z, v, p, one)
+    write_to(z, p, one)
     start_from(p, one, guess)
     call_with_two(p[FORWARD], p[MODEL], one[DATA], kept, 1)
     call(p[INTEGRATE], p[MODEL], one[DATA])
     nv = int(p[NV])
-    write_to(z, v, p, two)
+    write_to(z, p, two)
     for k in range(int(p[JOINTS])):
         kind, q = int(p[TABLE + 3 * k]), int(p[TABLE + 3 * k + 1])
         copy_between(one[QPOS], two[QPOS], q, 7 if kind == FREE else 4 if kind == BALL else 1)

@@ -16,6 +16,7 @@ from lqrsim.errors import (
     Array,
     InputError,
     check_array,
+    check_count,
     check_function,
     check_items,
     check_name,
@@ -245,9 +246,11 @@ class Dynamics:
 
     def check_period(self, dt: float) -> None:
         """Raises InputError if they cannot be stepped by `dt` seconds; they always can, but where MuJoCo steps them."""
+        check_number("dt", dt)
 
     def solving(self, threads: int) -> contextlib.AbstractContextManager[None]:
         """What lasts while a solver is at work that may use so many threads for one trajectory."""
+        check_count("threads", threads)
         return contextlib.nullcontext()
 
     def rate(self, state: npt.ArrayLike, control: npt.ArrayLike) -> Array:

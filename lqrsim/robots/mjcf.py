@@ -158,7 +158,7 @@ class MjcfRobot(Robot):
             {name: low for name, (low, _) in limited.items()}, {name: high for name, (_, high) in limited.items()}
         )
 
-    def at(self, keyframe: str | None = None, /, **values: float) -> Array:
+    def at(self, keyframe: str | None = None, **values: float) -> Array:
         """A state (n,): at rest as the MJCF has it, or in one of its keyframes, but for the states that are named.
 
         Raises:

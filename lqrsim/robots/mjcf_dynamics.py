@@ -12,9 +12,10 @@ import numpy.typing as npt
 
 from lqrsim.codegen.jit import Core, in_c_order
 from lqrsim.codegen.kernel_source import source_of
-from lqrsim.errors import Array, InputError, check_name, check_number
+from lqrsim.errors import Array, InputError, check_count, check_name, check_number
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.kernels import rotation_ratios
+from lqrsim.machine import processors
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
@@ -95,7 +96,7 @@ class MjcfDynamics(Dynamics):
 
     def check_period(self, dt: float) -> None:
         """Raises InputError unless `dt` seconds are a whole number of physics steps."""
-        timestep = float(self.physics.model.opt.timestep)
+        timestep, dt = float(self.physics.model.opt.timestep), check_number("dt", dt, above=0.0)
         steps = dt / timestep
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise InputError(
@@ -112,7 +113,7 @@ class MjcfDynamics(Dynamics):
     def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
         """The state (n,) after `dt` seconds, control held; NaN where it leaves all numbers."""
         x, u = self._check(state, control)
-        self.check_period(check_number("dt", dt))
+        self.check_period(dt)
         out = np.empty(len(x))
         with unlogged():
             self._core.advance(in_c_order(x), in_c_order(u), self.data, float(dt), out)
@@ -121,7 +122,7 @@ class MjcfDynamics(Dynamics):
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
         """A (n, n), B (n, m) and c (n,) of the step about a state and control: x' = A x + B u + c."""
         x, u = self._check(state, control)
-        self.check_period(check_number("dt", dt))
+        self.check_period(dt)
         n, m = len(x), len(u)
         out, jacobian, unused = np.empty(n), np.empty((n, n + m)), np.empty((n, n))
         self._core.step_jacobian(
@@ -132,7 +133,11 @@ class MjcfDynamics(Dynamics):
 
     @contextlib.contextmanager
     def solving(self, threads: int) -> Iterator[None]:
-        """While it lasts, so many threads linearise together, and MuJoCo says nothing of what statuses tell."""
+        """While it lasts, so many threads linearise together, and MuJoCo says nothing of what statuses tell.
+
+        More threads than processors would wait for each other, and are not begun.
+        """
+        threads = min(check_count("threads", threads), processors())
         team, helpers = self.physics.team, list[threading.Thread]()
         with unlogged():
             with _forming:

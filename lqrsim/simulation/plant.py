@@ -109,7 +109,9 @@ class Plant:
     def state(self, qpos: Array, qvel: Array, act: Array, near: Array | None = None) -> Array:
         """The analytic state (..., n) of the robot's `qpos`, `qvel` and the actuators' `act`; see `Robot.state`."""
         state = self.robot.state(qpos, qvel, near=near)
-        return np.concatenate([state, act], axis=-1) if self.robot.activations else state
+        if not self.robot.activations:
+            return state
+        return np.concatenate([state, vectors_of("act", act, self.robot.activations)], axis=-1)
 
     def clearance(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
         """Signed distance to the nearest obstacle minus the robot's radius in metres, (...), at states (..., n).
