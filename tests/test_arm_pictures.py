@@ -42,7 +42,7 @@ def run(plant: ls.Plant, plan: ls.Solution) -> ls.Rollout:
 
 def test_a_run_records_where_its_balls_were(plant: ls.Plant, plan: ls.Solution, run: ls.Rollout) -> None:
     assert run.balls is not None
-    dynamics, balls = plant.robot.dynamics, plant.robot.balls
+    dynamics, balls = plant.robot.dynamics, PlanarArm().balls
     np.testing.assert_array_equal(run.balls.driven, balls.centres(dynamics, run.states))
     np.testing.assert_array_equal(run.balls.planned, balls.centres(dynamics, plan.trajectory.states))
     np.testing.assert_array_equal(run.places(1), run.balls.driven[1, :, -1])

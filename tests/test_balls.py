@@ -48,6 +48,7 @@ def three_numbers(x, p):
     return out
 
 
+balls_of: Any = ls.Balls  # whose types nobody checks
 RADII = (0.02, 0.05, 0.08)
 THREE = ls.Balls(three, RADII)
 
@@ -170,6 +171,8 @@ class TestOneBallAtThePosition:
         assert other.success
         assert other.cost == pytest.approx(one.cost, rel=1e-6)
         np.testing.assert_allclose(other.trajectory.states, one.trajectory.states, rtol=0, atol=1e-5)
+        assert one.clearance is not None
+        assert other.clearance is not None
         np.testing.assert_allclose(other.clearance, one.clearance, rtol=0, atol=1e-5)
 
 
@@ -292,10 +295,10 @@ def with_u(x, u, p):
         (lambda: ls.Balls(of_another_size, [0.1, 0.1]).bind(ARM.dynamics), "points of 2 and 3 coordinates"),
         (lambda: ls.Balls(in_the_plane, [0.1]).bind(ARM.dynamics), "2 coordinates for dynamics with no position"),
         (lambda: ls.Balls(of_the_unknown, [0.1]).bind(ARM.dynamics), "parameter: got 'height', want one of: length"),
-        (lambda: ls.Balls(with_u, [0.1]), "want a function of \\(x, p\\)"),
+        (lambda: balls_of(with_u, [0.1]), "want a function of \\(x, p\\)"),
         (lambda: ls.Balls(nobody, [0.1], names=("a", "b")), "names: got"),
         (lambda: ls.Balls(nobody, [0.1], sites=("a", "b")), "sites: got 2"),
-        (lambda: ls.Balls(nobody, [0.1], jacobian=nobody), "jacobian: got one for nobody, which is symbolic"),
+        (lambda: balls_of(nobody, [0.1], jacobian=nobody), "jacobian: got one for nobody, which is symbolic"),
         (lambda: ls.Balls(nobody, [0.1], depends_on=("a",)), "depends_on: got names for a symbolic function"),
         (
             lambda: ls.Balls(three_numbers, RADII, level="plain", depends_on=("shoulder", "knee")).bind(ARM.dynamics),
