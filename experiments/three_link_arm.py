@@ -79,7 +79,7 @@ def motion(x: Any, u: Any, p: Any) -> list[Any]:
 class ThreeLinkArm(ls.Robot):
     """State: the joints' angles and speeds. Control: their torques in N m."""
 
-    radius: float = 0.3  # m, how large pictures take it to be
+    radius: float = 0.15  # m, how large pictures take it to be
 
     name = "three_link_arm"
     body = "upper"

@@ -85,6 +85,8 @@ class Balls:
     `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all of them clear, and the `balls` of a
     `Robot` are what collides when it is run. A robot without any is one ball at its position. `Capsule` makes chains.
 
+    To place balls otherwise, subclass it and write `bind`.
+
     Args:
       places: `places(x, p)`, stated at one of the three levels of `Dynamics`; returns the middle of each of K balls.
         They have 3 coordinates in the world, in metres; or 2, in the plane of the position, if the robot has a position
