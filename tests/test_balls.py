@@ -211,6 +211,32 @@ class TestLevels:
         found = balls.centres(ARM.dynamics, np.array([state, 2 * state]))
         np.testing.assert_allclose(found, [in_numpy(state), in_numpy(2 * state)], rtol=0, atol=1e-12)
 
+    @pytest.mark.parametrize("level", ["compiled", "plain"])
+    def test_plans(self, level: str) -> None:
+        """The same plan, which the balls' clearance and cost shape, whoever says where they are."""
+        world = ls.World(
+            [ls.Obstacle("rock", "sphere", np.array([1.34, 0.35, 0.1]), np.eye(3), np.array([0.1, 0.0, 0.0]))]
+        )
+
+        def solved(balls: ls.Balls) -> ls.Solution:
+            start, goal = (-0.2, 0.1, 0.1, 0.0, 0.0, 0.0), (0.55, 0.1, 0.1, 0.0, 0.0, 0.0)
+            problem = ls.Problem(
+                dynamics=ARM.dynamics, dt=0.1, steps=20, initial=ls.FixedState(start), control_limits=(-2.0, 2.0),
+                stage_cost=ls.ControlCost([1.0] * 3) + ls.ObstacleCost(world, balls=balls, weight=0.01),
+                final_cost=ls.QuadraticCost(np.full(6, 100.0), about=goal),
+                constraints=[ls.Clearance(world, balls=balls, margin=0.05)],
+            )  # fmt: skip
+            return ls.smooth(problem, starts=1, tolerance=1e-7, gap_tolerance=1e-4)
+
+        theirs = solved(THREE)
+        assert theirs.success
+        assert theirs.multipliers  # it presses
+        options = {"level": level, "depends_on": STATES[:3], "jacobian": self.jacobian if level == "plain" else None}
+        ours = solved(ls.Balls(three_numbers, RADII, **options))
+        assert ours.status is theirs.status
+        assert ours.cost == pytest.approx(theirs.cost, rel=1e-6)
+        np.testing.assert_allclose(ours.trajectory.states, theirs.trajectory.states, rtol=0, atol=1e-4)
+
     def test_a_plain_function_that_raises_is_told_of(self) -> None:
         def failing(x, p):
             if x[0] > 1:
