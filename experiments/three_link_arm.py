@@ -27,8 +27,8 @@ MASS, INERTIA = 0.6, 0.6 * 0.4**2 / 12  # of a link, kg and kg m^2, in whose mid
 ROTOR, DAMPING, TORQUE = 0.02, 0.4, 2.0  # of a joint: kg m^2, N m s; the most that its motor can do, N m
 LINK = ls.Capsule(LENGTH, RADIUS, 0.002)
 JOINTS = ("shoulder", "elbow", "wrist")
-POSTS = {"first": (0.42, -0.36), "second": (0.62, 0.22), "third": (0.1, 0.6), "pillar": (-0.45, 0.45)}
-POST = 0.04  # m, their radius
+POSTS = {"first": (0.45, -0.55), "second": (0.6, 0.05), "third": (0.35, 0.6), "fourth": (-0.25, 0.65)}
+POST, MARGIN = 0.04, 0.02  # m: their radius, and what is to be left between links and posts at the steps
 START, GOAL = (-1.15, 0.1, 0.1), (2.6, 0.3, -0.2)  # rad
 
 
@@ -79,7 +79,7 @@ def motion(x: Any, u: Any, p: Any) -> list[Any]:
 class ThreeLinkArm(ls.Robot):
     """State: the joints' angles and speeds. Control: their torques in N m."""
 
-    radius: float = 0.3  # m, how large pictures take it to be
+    radius: float = 0.15  # m, how large pictures take it to be
 
     name = "three_link_arm"
     body = "upper"
@@ -176,10 +176,10 @@ def problem(robot: ThreeLinkArm, world: ls.World) -> ls.Problem:
         steps=160,
         initial=ls.FixedState((*START, *rest)),
         stage_cost=ls.ControlCost(np.full(3, 0.05))
-        + ls.ObstacleCost(world, balls=robot.balls, sharpness=20.0, weight=0.05),
+        + ls.ObstacleCost(world, balls=robot.balls, sharpness=20.0, weight=0.002),
         final_cost=ls.QuadraticCost(np.full(6, 1000.0), about=(*GOAL, *rest)),
         # What the balls miss of the links is kept free, too, and what a link may move between two steps.
-        constraints=[ls.Clearance(world, balls=robot.balls, margin=LINK.missed + 0.01)],
+        constraints=[ls.Clearance(world, balls=robot.balls, margin=LINK.missed + MARGIN)],
     )
 
 
@@ -202,7 +202,7 @@ class Config:
     """Where the files go."""
     trials: int = 100
     """Disturbed runs."""
-    noise: float = 0.1
+    noise: float = 0.05
     """Of each torque, in N m."""
     quick: bool = False
     """Ten disturbed runs, and no pictures."""

@@ -62,7 +62,7 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
         return self.length / widest * (1 - 1e-12) // 1 + 2 if self.length else 1
 
     @property
-    def count(self) -> int:
+    def count(self) -> int:  # pyright: ignore[reportIncompatibleMethodOverride] of tuples, which nobody counts here
         """How many balls there are."""
         return int(self._fewest)
 

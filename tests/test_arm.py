@@ -115,14 +115,14 @@ def test_obstacles_elsewhere(plant: ls.Plant, plan: ls.Solution) -> None:
             ]
         )
         states = rollout.states[k, ::30]
-        centres = plant.robot.balls.centres(plant.robot.dynamics, states)
-        wanted = (moved.distance(centres) - plant.robot.balls.radii).min(axis=-1)
+        centres = PlanarArm().balls.centres(plant.robot.dynamics, states)
+        wanted = (moved.distance(centres) - PlanarArm().balls.radii).min(axis=-1)
         np.testing.assert_allclose(rollout.clearance[k, ::30], wanted, rtol=0, atol=1e-9)
 
 
 def test_clearances_that_chances_of_collision_are_of(plant: ls.Plant, plan: ls.Solution) -> None:
     """The nearest ball's to each obstacle, and its slope; with a position, those of a radius are the same."""
-    stated, balls = problem(plant, plant.world), plant.robot.balls
+    stated, balls = problem(plant, plant.world), PlanarArm().balls
     surroundings, dynamics = Surroundings.of(stated, 0.02), plant.robot.dynamics
     states = plan.trajectory.states[5:110:15]
     clearance, slope, variance = surroundings.clearances(states)

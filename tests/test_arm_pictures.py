@@ -2,16 +2,20 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from matplotlib.patches import Circle
 from planar_arm import LINK, PlanarArm
 
 import lqrsim as ls
+from lqrsim.errors import Array
 from lqrsim.results.ball_record import BallRecord
-from lqrsim.view import style
+from lqrsim.view import style, viewer
 from lqrsim.view.plots import MOMENTS, _path_of_balls
+from lqrsim.view.viewer_base import Viewer
 
 FLAT = {"size": (640, 480), "fps": 4}
 
@@ -42,7 +46,7 @@ def run(plant: ls.Plant, plan: ls.Solution) -> ls.Rollout:
 
 def test_a_run_records_where_its_balls_were(plant: ls.Plant, plan: ls.Solution, run: ls.Rollout) -> None:
     assert run.balls is not None
-    dynamics, balls = plant.robot.dynamics, plant.robot.balls
+    dynamics, balls = plant.robot.dynamics, PlanarArm().balls
     np.testing.assert_array_equal(run.balls.driven, balls.centres(dynamics, run.states))
     np.testing.assert_array_equal(run.balls.planned, balls.centres(dynamics, plan.trajectory.states))
     np.testing.assert_array_equal(run.places(1), run.balls.driven[1, :, -1])
@@ -96,6 +100,45 @@ def test_the_figure_has_the_balls_at_several_times(
     np.testing.assert_allclose(seen, run.balls.driven[0, -1, :, :2], rtol=0, atol=1e-12)
     assert ls.plot_run(plan, {"run": run}, tmp_path / "run.png", world=plant.scene.world).stat().st_size > 10_000
     assert ls.plot_policy(plan, tmp_path / "p.png", world=plant.scene.world, radius=0.1).stat().st_size > 10_000
+
+
+class Closing(Viewer):
+    """A viewer that no one looks at, which closes after so many frames."""
+
+    def __init__(self, frames: int, **options: Any) -> None:
+        super().__init__(speed=1000.0, **options)
+        self.count = frames
+        self.apart: list[float] = []
+
+    def refresh(self) -> bool:
+        return len(self.apart) < self.count
+
+    def show(self, time: float, qpos: Array) -> Array:
+        place = super().show(time, qpos)
+        self.apart.append(float(np.linalg.norm(place - self.planned_position())))
+        return place
+
+
+def test_viewers_follow_its_last_ball(plant: ls.Plant, plan: ls.Solution, run: ls.Rollout) -> None:
+    assert run.balls is not None
+    recorded = Closing(len(run.frame_times), **viewer.arguments_for_rollout(run, 0))
+    viewer.play(run, recorded)
+    off = np.linalg.norm(run.balls.driven[0, :, -1] - run.balls.planned[:, -1], axis=1)
+    assert max(recorded.apart) == pytest.approx(off.max(), rel=0.2)
+    assert "mm from the plan" in recorded.caption
+    at_work = Closing(60, **viewer.arguments_for_plant(plant, plan))
+    viewer.live(plant, plan, at_work)
+    assert max(at_work.apart) < 2e-3
+    scene = mujoco.MjvScene(plant.model, 1000)
+
+    def new() -> mujoco.MjvGeom:
+        scene.ngeom += 1
+        return scene.geoms[scene.ngeom - 1]
+
+    at_work.draw_overlays(new)
+    np.testing.assert_allclose(scene.geoms[scene.ngeom - 1].pos, at_work.planned_position(), rtol=0, atol=1e-6)
+    with pytest.raises(ls.InputError, match="the position, or balls"):
+        Closing(1, **viewer.arguments_for_rollout(run, 0) | {"balls": None})
 
 
 def test_what_is_missing_is_said(run: ls.Rollout, plan: ls.Solution, plant: ls.Plant, tmp_path: Path) -> None:

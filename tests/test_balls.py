@@ -48,6 +48,7 @@ def three_numbers(x, p):
     return out
 
 
+balls_of: Any = ls.Balls  # whose types nobody checks
 RADII = (0.02, 0.05, 0.08)
 THREE = ls.Balls(three, RADII)
 
@@ -170,6 +171,8 @@ class TestOneBallAtThePosition:
         assert other.success
         assert other.cost == pytest.approx(one.cost, rel=1e-6)
         np.testing.assert_allclose(other.trajectory.states, one.trajectory.states, rtol=0, atol=1e-5)
+        assert one.clearance is not None
+        assert other.clearance is not None
         np.testing.assert_allclose(other.clearance, one.clearance, rtol=0, atol=1e-5)
 
 
@@ -207,6 +210,32 @@ class TestLevels:
             np.testing.assert_allclose(mine, symbolic, rtol=1e-12 if with_jacobian else 1e-8, atol=1e-9)
         found = balls.centres(ARM.dynamics, np.array([state, 2 * state]))
         np.testing.assert_allclose(found, [in_numpy(state), in_numpy(2 * state)], rtol=0, atol=1e-12)
+
+    @pytest.mark.parametrize("level", ["compiled", "plain"])
+    def test_plans(self, level: str) -> None:
+        """The same plan, which the balls' clearance and cost shape, whoever says where they are."""
+        world = ls.World(
+            [ls.Obstacle("rock", "sphere", np.array([1.34, 0.35, 0.1]), np.eye(3), np.array([0.1, 0.0, 0.0]))]
+        )
+
+        def solved(balls: ls.Balls) -> ls.Solution:
+            start, goal = (-0.2, 0.1, 0.1, 0.0, 0.0, 0.0), (0.55, 0.1, 0.1, 0.0, 0.0, 0.0)
+            problem = ls.Problem(
+                dynamics=ARM.dynamics, dt=0.1, steps=20, initial=ls.FixedState(start), control_limits=(-2.0, 2.0),
+                stage_cost=ls.ControlCost([1.0] * 3) + ls.ObstacleCost(world, balls=balls, weight=0.01),
+                final_cost=ls.QuadraticCost(np.full(6, 100.0), about=goal),
+                constraints=[ls.Clearance(world, balls=balls, margin=0.05)],
+            )  # fmt: skip
+            return ls.smooth(problem, starts=1, tolerance=1e-7, gap_tolerance=1e-4)
+
+        theirs = solved(THREE)
+        assert theirs.success
+        assert theirs.multipliers  # it presses
+        options = {"level": level, "depends_on": STATES[:3], "jacobian": self.jacobian if level == "plain" else None}
+        ours = solved(ls.Balls(three_numbers, RADII, **options))
+        assert ours.status is theirs.status
+        assert ours.cost == pytest.approx(theirs.cost, rel=1e-6)
+        np.testing.assert_allclose(ours.trajectory.states, theirs.trajectory.states, rtol=0, atol=1e-4)
 
     def test_a_plain_function_that_raises_is_told_of(self) -> None:
         def failing(x, p):
@@ -292,10 +321,10 @@ def with_u(x, u, p):
         (lambda: ls.Balls(of_another_size, [0.1, 0.1]).bind(ARM.dynamics), "points of 2 and 3 coordinates"),
         (lambda: ls.Balls(in_the_plane, [0.1]).bind(ARM.dynamics), "2 coordinates for dynamics with no position"),
         (lambda: ls.Balls(of_the_unknown, [0.1]).bind(ARM.dynamics), "parameter: got 'height', want one of: length"),
-        (lambda: ls.Balls(with_u, [0.1]), "want a function of \\(x, p\\)"),
+        (lambda: balls_of(with_u, [0.1]), "want a function of \\(x, p\\)"),
         (lambda: ls.Balls(nobody, [0.1], names=("a", "b")), "names: got"),
         (lambda: ls.Balls(nobody, [0.1], sites=("a", "b")), "sites: got 2"),
-        (lambda: ls.Balls(nobody, [0.1], jacobian=nobody), "jacobian: got one for nobody, which is symbolic"),
+        (lambda: balls_of(nobody, [0.1], jacobian=nobody), "jacobian: got one for nobody, which is symbolic"),
         (lambda: ls.Balls(nobody, [0.1], depends_on=("a",)), "depends_on: got names for a symbolic function"),
         (
             lambda: ls.Balls(three_numbers, RADII, level="plain", depends_on=("shoulder", "knee")).bind(ARM.dynamics),

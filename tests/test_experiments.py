@@ -282,7 +282,7 @@ def test_three_links_go_round_posts(tmp_path: Path) -> None:
     script: Any = import_module("three_link_arm")
     found = script.main(script.Config(quick=True, out=tmp_path))
     assert found["status"] == "converged"
-    assert found["planned"] >= found["missed"] + 0.01
+    assert found["planned"] >= found["missed"] + script.MARGIN
     assert found["calm"] == "reached"
     # MuJoCo's own distances, at each frame: undisturbed what was planned, within what the balls miss and a step moves.
     assert found["planned"] - found["missed"] - 0.01 < found["calm clear"] < found["planned"] + 1e-4

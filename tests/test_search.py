@@ -112,6 +112,18 @@ class TestPaths:
             assert [name.endswith("left") for name, _ in found[1:]] == (side > 0).tolist()
             np.testing.assert_allclose(others[1::2], -others[: count - 1][0::2][: len(others[1::2])], atol=1e-12)
 
+    @pytest.mark.parametrize("size", [1, 4, 7])
+    @pytest.mark.parametrize("count", [1, 2, 7, 20])
+    def test_of_joints_they_bend_in_pairs_at_right_angles(self, size: int, count: int) -> None:
+        way = np.random.default_rng(size).normal(size=size)
+        found = bends(way, count, ring=0.5, unit="rad")
+        assert len(found) == len({name for name, _ in found}) == min(count, 1 + 2 * (size - 1))
+        others = np.array([bend for _, bend in found[1:]]).reshape(-1, size)
+        np.testing.assert_allclose(others @ way, 0, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(others, axis=1), 0.5 * np.linalg.norm(way), rtol=1e-12)
+        np.testing.assert_allclose(others[1::2], -others[0::2][: len(others[1::2])], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(np.tril(others[0::2] @ others[0::2].T, -1), 0, atol=1e-12)
+
     def test_they_go_from_rest_to_rest(self) -> None:
         start, goal, bend = np.array([1.0, 2.0]), np.array([5.0, -1.0]), np.array([0.6, 0.8])
         steps = 1000

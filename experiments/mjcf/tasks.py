@@ -52,9 +52,9 @@ class Task:
         """From rest at the start to the goal."""
         space, m = robot.dynamics.control_coordinates, len(robot.dynamics.control_coordinates)
         return ls.Problem(
-            dynamics=robot.dynamics, dt=self.dt, steps=self.steps, initial=ls.FixedState(robot.at(**self.start)),
+            dynamics=robot.dynamics, dt=self.dt, steps=self.steps, initial=ls.FixedState(robot.at(None, **self.start)),
             stage_cost=ls.ControlCost(np.full(m, self.effort)),
-            final_cost=ls.QuadraticCost(self.weights(robot), about=robot.at(**self.goal)),
+            final_cost=ls.QuadraticCost(self.weights(robot), about=robot.at(None, **self.goal)),
             control_limits=(space.low, space.high),
         )  # fmt: skip
 

@@ -61,7 +61,9 @@ class Surroundings:
         kept, first = [], 0
         for one, seen in zip(self.worlds, self.seen, strict=True):
             own = margin[:, first : first + len(seen)]
-            kept.append(Clearance(one.world, radius=one.radius, balls=one.balls, margin=own))
+            kept.append(
+                Clearance(one.world, radius=one.radius if one.balls is None else None, balls=one.balls, margin=own)
+            )
             first += len(seen)
         return kept
 
@@ -88,7 +90,7 @@ class Surroundings:
             distances, across = distances_with_normals(seen, states[:, list(self.place)])
             normals = np.zeros((*distances.shape, len(self.position)))
             normals[..., [self.position.index(i) for i in self.place]] = across
-            return distances - (one.radius or 0.0), normals
+            return distances - one.radius, normals
         count, knots = len(one.balls), np.arange(len(states))[:, None]
         middles, slopes = evaluate_slopes(places, count, states)
         distances, normals = distances_with_normals(seen, middles.reshape(-1, 3))

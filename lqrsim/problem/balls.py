@@ -85,6 +85,8 @@ class Balls:
     `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all of them clear, and the `balls` of a
     `Robot` are what collides when it is run. A robot without any is one ball at its position. `Capsule` makes chains.
 
+    To place balls otherwise, subclass it and write `bind`.
+
     Args:
       places: `places(x, p)`, stated at one of the three levels of `Dynamics`; returns the middle of each of K balls.
         They have 3 coordinates in the world, in metres; or 2, in the plane of the position, if the robot has a position
@@ -267,8 +269,8 @@ class Balls:
         return dynamics.state_coordinates.in_world(found[..., :2]) if places.in_plane else found
 
 
-def check_outline(field: str, radius: float | None, balls: Balls | None) -> float | None:
-    """The radius of what an obstacle is kept clear of, checked; None where it is balls.
+def check_outline(field: str, radius: float | None, balls: Balls | None) -> float:
+    """The radius of what an obstacle is kept clear of, checked; of balls, that of the largest.
 
     Raises:
       InputError: it is negative, these are no balls, or neither or both of them are given.
@@ -276,10 +278,10 @@ def check_outline(field: str, radius: float | None, balls: Balls | None) -> floa
     if balls is None and radius is not None:
         return check_number(f"{field}: radius", radius, at_least=0.0)
     check_kind(f"{field}: balls", balls, (Balls, type(None)), "Balls(places, radii)")
-    if (radius is None) == (balls is None):
+    if balls is None or radius is not None:
         given = "neither radius nor balls" if balls is None else "radius and balls"
         raise InputError(f"{field}: got {given}, want one of them: radius=robot.radius or balls=robot.balls")
-    return None
+    return float(balls.radii.max())
 
 
 def bind_outline(field: str, balls: Balls | None, dynamics: Dynamics, world: World) -> tuple[Places | None, World]:

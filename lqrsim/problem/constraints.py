@@ -136,7 +136,7 @@ class Clearance(Constraint):
         if not isinstance(self.margin, np.ndarray):
             return self
         left = self.margin[min(steps, len(self.margin) - 1) :]
-        return Clearance(self.world, radius=self.radius, balls=self.balls, margin=left)
+        return Clearance(self.world, radius=self.radius if self.balls is None else None, balls=self.balls, margin=left)
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         balls = self.balls

@@ -162,6 +162,7 @@ class ObstacleCost(Cost):
     Args:
       world: the obstacles.
       radius: of the robot at its position, in metres. balls: the robot in its place, as `robot.balls`; one of the two.
+        With balls the attribute `radius` is that of the largest.
       sharpness: in 1/m. weight: cost of touching one obstacle, with one ball, for one step.
     """
 
@@ -181,14 +182,10 @@ class ObstacleCost(Cost):
         self.sharpness = check_number("ObstacleCost: sharpness", sharpness, above=0.0)
         self.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
 
-    @property
-    def largest(self) -> float:
-        """The radius of the robot, or of its largest ball, in metres."""
-        return float(self.balls.radii.max()) if self.balls is not None else self.radius or 0.0
-
     def weighing(self, weight: float) -> "ObstacleCost":
         """The same with another weight."""
-        return ObstacleCost(self.world, radius=self.radius, balls=self.balls, sharpness=self.sharpness, weight=weight)
+        radius = self.radius if self.balls is None else None
+        return ObstacleCost(self.world, radius=radius, balls=self.balls, sharpness=self.sharpness, weight=weight)
 
     def bind(self, dynamics: Dynamics) -> Term:
         places, world = bind_outline("ObstacleCost", self.balls, dynamics, self.world)

@@ -71,7 +71,7 @@ def _radius(problem: Problem) -> float | None:
     goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
     if not position or (goal is not None and np.isnan(goal[position]).all()):
         return None
-    return max((one.radius or 0.0 for one in _kept_clear(problem)), default=0.0) or None
+    return max((one.radius for one in _kept_clear(problem) if one.balls is None), default=0.0) or None
 
 
 def clearance_of(problem: Problem, states: Array) -> Array | None:
@@ -86,7 +86,7 @@ def clearance_of(problem: Problem, states: Array) -> Array | None:
     for one in worlds.values():
         if one.balls is not None:
             found.append(clearances(one.balls, problem.dynamics, one.world, states).min(axis=1))
-        elif one.radius is not None:
+        else:
             seen = one.world.seen_by(space.plane, space.offset)
             found.append(distances.signed_distance(seen, place) - one.radius)
     return np.min(found, axis=0) if found else None

@@ -210,7 +210,7 @@ class Search:
         space = problem.dynamics.state_coordinates
         if _pull(problem) == 0 or problem.goal is None:
             return self._idle(problem)
-        (attempt, found), radius = self.best, max(cost.largest for cost in problem.obstacle_costs)
+        (attempt, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
         if not found.success:
             return attempt.iterations_left(found.iterations) > 0
         if space.position:

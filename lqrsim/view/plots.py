@@ -150,8 +150,8 @@ def _path_of_balls(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
     obstacle_plots.draw_projected(axes, world, *corners, across, up)
     alive = np.flatnonzero(np.isfinite(driven).all(axis=(1, 2)))
     for number, knot in enumerate(np.unique(np.linspace(0, len(alive) - 1, MOMENTS).astype(int))):
-        paler = 0.75 * (1 - number / (MOMENTS - 1))
-        face = to_hex([paler + (1 - paler) * part for part in to_rgb(RUNS[0])])
+        paler, (red, green, blue) = 0.75 * (1 - number / (MOMENTS - 1)), to_rgb(RUNS[0])
+        face = to_hex((paler + (1 - paler) * red, paler + (1 - paler) * green, paler + (1 - paler) * blue))
         for centre, radius in zip(driven[alive[knot]], radii, strict=True):
             axes.add_patch(Circle(centre[[across, up]], radius, facecolor=face, edgecolor="none", zorder=2))
     paths = _paths(solution, rollouts, trial)

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 
 from lqrsim.errors import Array, InputError, check_count, check_kind
+from lqrsim.results.ball_record import BallRecord
 from lqrsim.results.rollout import Rollout
 from lqrsim.scenes.scene import model_from_xml
 
@@ -36,10 +37,15 @@ def robot_body(model: mujoco.MjModel, name: str) -> int:
 
 
 def place_in(data: mujoco.MjData, rollout: Rollout, robot: int) -> Array:
-    """Where the robot of that body is (3,): its origin, or, without a position, its last ball, if that names a site."""
-    if rollout.state_coordinates.position or rollout.balls is None:
+    """Where the robot of that body is (3,): its origin, or, without a position, its last ball."""
+    return place_of(data, robot, None if rollout.state_coordinates.position else rollout.balls)
+
+
+def place_of(data: mujoco.MjData, robot: int, balls: BallRecord | None) -> Array:
+    """The origin of that body (3,), or where the last of the balls is, by the site that it names."""
+    if balls is None:
         return data.xpos[robot]
-    body, place = rollout.balls.tracked
+    body, place = balls.tracked
     return data.xpos[body] + data.xmat[body].reshape(3, 3) @ place
 
 

@@ -98,14 +98,16 @@ def arguments_for_rollout(rollout: Rollout, trial: int) -> dict[str, Any]:
     if not np.isfinite(rollout.frames[trial]).all(axis=1).any():
         raise InputError(f"rollout: got trial {trial} without one finite state, want something to show")
     where = {"space": rollout.state_coordinates, "body": rollout.body, "radius": rollout.radius}
-    return {"model": model, "plan": rollout.plan, **where}
+    return {"model": model, "plan": rollout.plan, "balls": rollout.balls, **where}
 
 
 def arguments_for_plant(plant: Plant, solution: Solution) -> dict[str, Any]:
     """What a Viewer needs to show a live run."""
     robot = plant.robot
     where = {"space": robot.dynamics.state_coordinates, "body": robot.body, "radius": robot.radius}
-    return {"model": plant.model, "plan": solution.trajectory, **where}
+    states = solution.trajectory.states
+    balls = plant.record_of_balls(states, states[None])
+    return {"model": plant.model, "plan": solution.trajectory, "balls": balls, **where}
 
 
 class _UserForces(Disturbance):
@@ -154,10 +156,9 @@ def live(
     Args:
       ended: called with a line on each run that has ended.
     """
-    space = plant.robot.dynamics.state_coordinates
 
     def watch(time: float, qpos: Array, unstable: np.ndarray) -> None:
-        apart = np.linalg.norm(space.of_world(viewer.show(time, qpos[0]) - viewer.planned_position()))
+        apart = np.linalg.norm(viewer.of_world(viewer.show(time, qpos[0]) - viewer.planned_position()))
         if unstable.any() or not apart < plant.model.stat.extent:
             ended(f"run {run}: lost after {time:.1f} s")
             raise RestartRequested

@@ -11,10 +11,11 @@ import numpy as np
 from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError
+from lqrsim.results.ball_record import BallRecord
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.view.decorative_geoms import PLAN_RGB, decorate
-from lqrsim.view.recorded_model import floor_below, robot_body
+from lqrsim.view.recorded_model import floor_below, place_of, robot_body
 
 PLANNED_RGBA = (*PLAN_RGB, 0.25)
 TRACE_RGBA = (0.05, 0.35, 0.62, 1.0)
@@ -46,7 +47,8 @@ class Viewer(abc.ABC):
 
     Args:
       model: what moves. plan: what it should do. space: of the plan's states. body: the robot's in the model.
-      radius: of the robot, in metres. push: what a key adds to its velocity, in m/s.
+      radius: of the robot, in metres. balls: of one without a position, where they should be.
+      push: what a key adds to its velocity, in m/s.
       speed: of the time shown, 1 is real. seconds: after which the viewer closes; never by default.
 
     Attributes:
@@ -61,21 +63,27 @@ class Viewer(abc.ABC):
         body: str,
         *,
         radius: float,
+        balls: BallRecord | None = None,
         push: float = 0.3,
         speed: float = 1.0,
         seconds: float | None = None,
     ) -> None:
-        if not space.position:
-            raise InputError("state_coordinates.position: got none, want the 2 or 3 states that are the position")
+        if not space.position and balls is None:
+            wanted = "the 2 or 3 states that are the position, or balls"
+            raise InputError(f"state_coordinates.position: got none, want {wanted}")
         # A copy: a viewer has sliders for gravity and the like.
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
         self.space, self.robot = space, robot_body(model, body)
         self.radius, self.speed, self.paused, self.caption = radius, speed, False, ""
+        self._balls = None if space.position else balls
         self.wrench = np.zeros(6)
         self._mass = float(model.body_subtreemass[self.robot])
         self._push, self._impulse = push * self._mass, np.zeros(3)
         self._times, self._places = plan.times, plan.states[:, list(space.position)]
+        if self._balls is not None:
+            _ = self._balls.tracked  # which says what is missing
+            self._places = self._balls.planned[:, -1]
         self._time, self._ahead, self._restart = 0.0, 0.0, False
         self._until = np.inf if seconds is None else clock.monotonic() + seconds
         self._trace: list[Array] = []
@@ -96,16 +104,20 @@ class Viewer(abc.ABC):
         self._time, self.data.time, self.data.qpos[:] = time, time, qpos
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
-        place = self.data.xpos[self.robot].copy()
+        place = place_of(self.data, self.robot, self._balls).copy()
         if begins:
             self._trace.clear()
             self._floor = floor_below(self.model, self.data, self.robot)
         apart = float(np.linalg.norm(np.ptp(self._places, axis=0))) / SEGMENTS
-        on_floor = self._on_floor(self.space.of_world(place))
+        on_floor = self._on_floor(self.of_world(place))
         if not self._trace or np.linalg.norm(on_floor - self._trace[-1]) > apart:
             self._trace = [*self._trace, on_floor][-2 * SEGMENTS :]
         self.caption = f"{time:.1f} s, {1e3 * np.linalg.norm(on_floor - self.planned_position()):.0f} mm from the plan"
         return place
+
+    def of_world(self, points: Array) -> Array:
+        """The coordinates (..., 2 or 3) of points (..., 3) that a plan has, too."""
+        return self.space.of_world(points) if self._balls is None else points
 
     def wait(self, seconds: float) -> None:
         """Stand still for a while. Raises what `show` does."""
@@ -147,8 +159,9 @@ class Viewer(abc.ABC):
             for ends in itertools.pairwise(points):
                 geom = decorate(new(), Geom.mjGEOM_CAPSULE, [thick] * 3, ends[0], colour)
                 mujoco.mjv_connector(geom, Geom.mjGEOM_CAPSULE, thick, *ends)
+        radius = self.radius if self._balls is None else float(self._balls.radii[-1])
         flat = self.space.from_above
-        shape = (Geom.mjGEOM_CYLINDER, [self.radius, LIFT, 0.0]) if flat else (Geom.mjGEOM_SPHERE, [self.radius] * 3)
+        shape = (Geom.mjGEOM_CYLINDER, [radius, LIFT, 0.0]) if flat else (Geom.mjGEOM_SPHERE, [radius] * 3)
         decorate(new(), *shape, self.planned_position(), PLANNED_RGBA)
 
     def aim_camera(self, camera: mujoco.MjvCamera) -> None:
@@ -163,6 +176,8 @@ class Viewer(abc.ABC):
             camera.elevation = np.degrees(np.arctan2(away[2], np.hypot(away[0], away[1])))
 
     def _on_floor(self, place: Array | list[float]) -> Array:
+        if self._balls is not None:
+            return np.array(place)
         return self.space.in_world(place, height=self._floor + LIFT)
 
     def _wait(self, left: float) -> None:

@@ -56,7 +56,7 @@ class PlanarArm(ls.Robot):
         )
 
     @cached_property
-    def balls(self):
+    def balls(self) -> ls.Balls:  # pyright: ignore[reportIncompatibleVariableOverride]
         sites = [None] * (LINK.count - 1)
         return ls.Balls(places, 3 * LINK.radii, sites=[*sites, "end 0", *sites, "end 1", *sites, "end 2"])
 
