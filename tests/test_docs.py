@@ -30,6 +30,19 @@ def run_page(name: str) -> dict[str, Any]:
     return namespace
 
 
+def test_a_robot_from_an_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_page("mjcf_robots.md")
+    solution, kept = names["solution"], names["kept"]
+    assert solution.success
+    assert names["rollout"].outcome == ("reached",)
+    # The pole stands at the end, and the plan is what MuJoCo did.
+    assert np.abs(solution.trajectory.states[-1]).max() < 0.05
+    assert names["rollout"].tracking_error.max() < 1e-6
+    assert kept.success
+    assert np.abs(kept.trajectory.states[:, 0]).max() <= 3
+
+
 def test_a_robot_scene_cost_and_disturbance_of_ones_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

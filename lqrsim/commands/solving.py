@@ -42,8 +42,8 @@ class Solve:
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
-    """A name that `lqrsim list` prints, or a function of yours that returns a Scenario: file.py:name or module:name.
-    Settings follow after commas, as in quadrotor,query=3."""
+    """A name that `lqrsim list` prints; a function of yours that returns a Scenario, file.py:name or module:name; or an
+    MJCF, file.xml. Settings follow after commas: quadrotor,query=3 or "cartpole.xml,start={'pole': 3.14},steps=200"."""
     out: Folder = None
     """Folder for solution.npz. By default runs/ and the name of the scenario."""
     solver: Literal["smooth", "ilqr"] = "smooth"

@@ -1,3 +1,4 @@
+from .mjcf import mjcf as mjcf
 from .packaged import Scenario as Scenario
 from .packaged import differential_drive as differential_drive
 from .packaged import get as get

@@ -4,6 +4,7 @@ quadrotor                     a name that `lqrsim list` prints
 quadrotor,query=3,seed=1      the same with settings: the keyword arguments of the scenario's function
 my_robot.py:hallway,width=2   a function in a file of yours that returns a Scenario
 my_package.robots:hallway     a function in a module of yours
+my_robot.xml,start={'x': 1}   any MJCF, with the settings of `lqrsim.scenarios.mjcf`
 """
 
 import ast
@@ -38,6 +39,10 @@ def resolve(reference: str, *, registered_only: bool = False) -> "Scenario":
     from lqrsim.scenarios.packaged import Scenario
 
     target, settings = _parts(reference)
+    if target.lower().endswith(".xml"):
+        from lqrsim.scenarios.mjcf import mjcf
+
+        return mjcf(target, **_keywords(target, mjcf, settings))  # pyright: ignore[reportArgumentType]
     if ":" in target:
         if registered_only:
             option = shlex.join(["--scenario", reference])
@@ -57,6 +62,8 @@ def from_anywhere(reference: str) -> str:
     place, colon, name = target.rpartition(":")
     if colon and place.endswith(".py"):
         target = f"{Path(place).absolute()}:{name}"
+    if target.lower().endswith(".xml"):
+        target = str(Path(target).absolute())
     return ",".join([target, *settings])
 
 
@@ -107,7 +114,8 @@ def _import(name: str) -> ModuleType:
 
 
 def _keywords(target: str, make: Callable[..., object], settings: list[str]) -> dict[str, object]:
-    valid = [name for name, p in inspect.signature(make).parameters.items() if p.kind is not p.VAR_KEYWORD]
+    parameters = inspect.signature(make).parameters.items()
+    valid = [name for name, p in parameters if p.kind is not p.VAR_KEYWORD and name != "path"]
     keywords: dict[str, object] = {}
     for setting in settings:
         name, _, text = setting.strip().partition("=")

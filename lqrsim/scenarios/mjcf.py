@@ -1,0 +1,87 @@
+"""A scenario of any MJCF, from its path and what to do: `lqrsim solve "cartpole.xml,start={'pole': 3.14}"`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from lqrsim.control.uncertainty import PerEntry, per_entry
+from lqrsim.errors import Array, InputError, check_kind, excerpt
+from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost
+from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.robots.mjcf import MjcfRobot
+from lqrsim.scenarios.packaged import Scenario
+from lqrsim.simulation.plant import Plant
+
+PERIOD = 0.02  # s, of the control, or the physics step that is nearest to it
+
+Place = str | Mapping[str, float] | None
+
+
+def mjcf(
+    path: str,
+    *,
+    start: Place = None,
+    goal: Place = None,
+    weights: PerEntry = 100.0,
+    effort: PerEntry | None = None,
+    dt: float | None = None,
+    steps: int = 150,
+    body: str | None = None,
+    floors: bool = True,
+    obstacles: bool = True,
+) -> Scenario:
+    """From a start to a goal in so many steps, with the limits of the actuators and clear of obstacles.
+
+    Args:
+      path: of the MJCF.
+      start, goal: the name of a keyframe, or states by name, {"pole": 3.14}; a keyframe among them is
+        {"keyframe": "home", "pole": 3.14}. What is not named is at rest as the MJCF has it.
+      weights: of what misses the goal at the end: of all states, by name, or by unit, as {"m": 100, "rad": 100}; what
+        is not named then has none.
+      effort: of the controls, a number, by name or by unit; by default 1 for a control at its limit, or at 1.
+      dt: seconds of a control period, by default about 0.02. steps: how many.
+      body, floors: as in `MjcfRobot`. obstacles: whether to keep clear of them.
+
+    Raises:
+      InputError: no such file, keyframe, state or unit; or as `MjcfRobot` and `Problem` do.
+    """
+    robot = MjcfRobot(path, body=body, floors=floors)
+    plant, timestep = Plant(robot, robot.scene), float(robot.scene.model.opt.timestep)
+    dynamics = robot.dynamics
+    space, controls = dynamics.state_coordinates, dynamics.control_coordinates
+    ends = per_entry("weights", weights, space)
+    if effort is None:
+        largest = np.maximum(np.abs(controls.low), np.abs(controls.high))
+        efforts = np.where(np.isfinite(largest) & (largest > 0), largest, 1.0) ** -2.0
+    else:
+        efforts = per_entry("effort", effort, controls, above=0.0)
+    cost: Cost = ControlCost(efforts)
+    if obstacles and len(plant.world):
+        if robot.balls is None:
+            cost = cost + ObstacleCost(robot.scene.world, radius=robot.radius)
+        else:
+            cost = cost + ObstacleCost(plant.world, balls=robot.balls)
+    problem = Problem(
+        dynamics=dynamics, dt=max(1, round(PERIOD / timestep)) * timestep if dt is None else dt, steps=steps,
+        initial=FixedState(_state(robot, "start", start)), stage_cost=cost,
+        final_cost=QuadraticCost(ends, about=_state(robot, "goal", goal)),
+        control_limits=(controls.low, controls.high),
+    )  # fmt: skip
+    return Scenario(
+        name=Path(path).stem, summary=f"{robot.name}, by MuJoCo's own steps", robot=robot, scene=robot.scene,
+        problem=problem, tracking_bound=robot.radius or 0.1,
+    )  # fmt: skip
+
+
+def _state(robot: MjcfRobot, field: str, place: Place) -> Array:
+    """The state that is meant. Raises InputError if there is none such."""
+    check_kind(field, place, (str, Mapping, type(None)), "a keyframe's name, or states by name: {'x': 1.0}")
+    stated = {"keyframe": place} if isinstance(place, str) else dict(place or {})
+    keyframe = stated.pop("keyframe", None)
+    if not isinstance(keyframe, str | None):
+        raise InputError(f"{field}: keyframe: got {excerpt(keyframe)}, want its name")
+    try:
+        return robot.at(keyframe, **stated)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        raise InputError(f"{field}: got {excerpt(place)}, want states by name: {{'x': 1.0}}") from None

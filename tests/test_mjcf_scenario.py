@@ -1,0 +1,86 @@
+"""An MJCF by its path, where a scenario's name could stand."""
+
+from pathlib import Path
+
+import mjcf_files
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim.cli import main
+from lqrsim.errors import InputError
+from lqrsim.scenarios.references import from_anywhere, resolve
+
+
+@pytest.fixture
+def cart(tmp_path: Path) -> Path:
+    file = tmp_path / "cart.xml"
+    key = '<keyframe><key name="tilted" qpos="0.1 0.5"/></keyframe></mujoco>'
+    file.write_text(mjcf_files.draw("cart", 3, "implicitfast").xml.replace("</mujoco>", key), encoding="utf-8")
+    return file
+
+
+def test_start_goal_and_weights_are_by_name_unit_and_keyframe(cart: Path) -> None:
+    settings = "start=tilted,goal={'keyframe': 'tilted', 'pole': 3.0},weights={'rad': 7, 'slider': 5},steps=20,effort=2"
+    scenario = resolve(f"{cart},{settings}")
+    problem = scenario.problem
+    assert (problem.steps, problem.dt) == (20, pytest.approx(0.02))
+    np.testing.assert_array_equal(problem.start, [0.1, 0.5, 0, 0])
+    np.testing.assert_array_equal(problem.goal, [0.1, 3.0, 0, 0])
+    weighed = problem.final_cost
+    assert isinstance(weighed, ls.QuadraticCost)
+    np.testing.assert_array_equal(np.diag(weighed.weight), [5, 7, 0, 0])
+    assert isinstance(problem.stage_cost, ls.ControlCost)
+    np.testing.assert_array_equal(problem.stage_cost.weight, [[2.0]])
+    assert problem.control_limits == ((-1.0,), (1.0,))
+    assert scenario.name == "cart"
+
+
+def test_a_box_among_posts_keeps_clear_of_them(tmp_path: Path) -> None:
+    file = tmp_path / "box.xml"
+    post = '<geom name="post" type="cylinder" size="0.1 1" pos="2 0 1"/></worldbody>'
+    file.write_text(mjcf_files.draw("box", 3, "Euler").xml.replace("</worldbody>", post), encoding="utf-8")
+    scenario = ls.scenarios.mjcf(str(file), start={"z": 1.0}, goal={"x": 3.0, "z": 1.0})
+    (cost,) = scenario.problem.obstacle_costs
+    assert cost.world.names == ("floor", "post")
+    assert not ls.scenarios.mjcf(str(file), start={"z": 1.0}, obstacles=False).problem.obstacle_costs
+
+
+def test_the_path_is_found_from_any_folder(cart: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(cart.parent)
+    assert from_anywhere("cart.xml,steps=5") == f"{cart},steps=5"
+
+
+def test_solve_and_simulate_on_the_command_line(
+    cart: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(cart.parent)
+    assert main(["solve", f"{cart.name},start={{'pole': 2.9}},goal={{'pole': 3.14159}},steps=40"]) == 0
+    assert main(["simulate", "runs/cart/solution.npz"]) == 0
+    assert "1 of 1 trials reached the goal" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ("start={'hinge': 1}", "state: got 'hinge', want one of: slider, pole"),
+        ("start=upright", "keyframe: got 'upright', want one of: tilted"),
+        ("start=3", "start: got 3, want a keyframe's name, or states by name"),
+        ("start={1: 2}", "start: got {1: 2}, want states by name"),
+        ("start={'keyframe': 3}", "start: keyframe: got 3, want its name"),
+        ("weights={'kg': 1}", "weights: got 'kg', want one of"),
+        ("effort=0", "effort: got 0"),
+        ("dt=0.003", "dt: got 0.003 s, want a multiple of the physics step"),
+        ("speed=3", "got 'speed', want one of: start, goal, weights"),
+    ],
+)
+def test_what_does_not_fit_is_named(cart: Path, settings: str, message: str) -> None:
+    with pytest.raises(InputError) as refused:
+        resolve(f"{cart},{settings}")
+    assert message in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_file_that_is_not_there_is_named() -> None:
+    with pytest.raises(InputError, match=r"scene: got 'nowhere.xml', want a file that exists"):
+        resolve("nowhere.xml")
