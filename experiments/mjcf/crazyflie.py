@@ -42,7 +42,13 @@ def crazyflie_in_cage(path: Path) -> ls.Scene:
                 kind = {"type": "cylinder", "size": size, "pos": text, "zaxis": along, "rgba": "0.2 0.38 0.62 0.25"}
                 beams.append(ElementTree.Element("geom", {"name": f"beam_{len(beams)}", **kind}))
     world.append(beams)
-    world.append(ElementTree.Element("light", {"pos": "0 0 3", "dir": "0 0 -1"}))
+    world.append(ElementTree.Element("light", {"pos": "-1 -1 3", "dir": "0.3 0.3 -1", "directional": "true"}))
+    sky = {"name": "sky", "type": "skybox", "builtin": "flat", "rgb1": "0.93 0.95 0.97", "rgb2": "0.93 0.95 0.97"}
+    assets, visual = ElementTree.Element("asset"), ElementTree.Element("visual")
+    assets.append(ElementTree.Element("texture", sky | {"width": "16", "height": "16"}))
+    visual.append(ElementTree.Element("headlight", {"ambient": "0.4 0.4 0.4", "diffuse": "0.4 0.4 0.4"}))
+    visual.append(ElementTree.Element("global", {"offwidth": "1920", "offheight": "1080"}))
+    root.extend([assets, visual])
     world.append(ElementTree.Element("camera", {"name": "overview", "pos": "-1.4 -3.1 1.6",
                                                 "xyaxes": "0.94 -0.34 0 0.16 0.43 0.89", "fovy": "32"}))  # fmt: skip
     motors = ElementTree.Element("actuator")

@@ -12,7 +12,7 @@ import numpy as np
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from mjcf.crazyflie import crazyflie_in_cage
+from mjcf.crazyflie import SCALE, crazyflie_in_cage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +73,7 @@ class CrazyflieTask(Task):
     def problem(self, robot: ls.MjcfRobot) -> ls.Problem:
         bare = super().problem(robot)
         hover = 9.81 * float(robot.scene.model.body_mass.sum()) / 4
-        obstacles = ls.ObstacleCost(robot.scene.world, radius=robot.radius, sharpness=60.0)
+        obstacles = ls.ObstacleCost(robot.scene.world, radius=robot.radius, sharpness=10.0 / SCALE)
         return ls.Problem(
             dynamics=bare.dynamics, dt=bare.dt, steps=bare.steps, initial=bare.initial, final_cost=bare.final_cost,
             stage_cost=ls.ControlCost(np.full(4, self.effort), about=np.full(4, hover)) + obstacles,
@@ -83,11 +83,6 @@ class CrazyflieTask(Task):
 
 DM, GYM = "dm_control", "gymnasium"
 ASSETS = "envs/mujoco/assets/"
-
-
-def everything(**numbers: float) -> dict[str, float]:
-    """Weights by name: a clearer way to write a dictionary."""
-    return numbers
 
 
 TASKS: tuple[Task, ...] = (
@@ -102,15 +97,15 @@ TASKS: tuple[Task, ...] = (
     ),
     Task(
         name="acrobot", package=DM, file="suite/acrobot.xml", start={"shoulder": np.pi}, goal={},
-        ends={"shoulder": 100, "elbow": 100, "shoulder_velocity": 100, "elbow_velocity": 100},
-        effort=0.1, dt=0.02, steps=250,
+        ends={"shoulder": 100, "elbow": 100, "shoulder_velocity": 10, "elbow_velocity": 10},
+        effort=0.1, dt=0.04, steps=150,
     ),
     Task(
         name="double inverted pendulum", package=GYM, file=ASSETS + "inverted_double_pendulum.xml",
         start={"hinge": np.pi}, goal={},
         ends={"slider": 100, "hinge": 100, "hinge2": 100, "slider_velocity": 10, "hinge_velocity": 10,
               "hinge2_velocity": 10},
-        effort=0.1, dt=0.02, steps=150,
+        effort=0.1, dt=0.02, steps=200,
     ),
     Task(
         name="reacher", package=DM, file="suite/reacher.xml", goal={"shoulder": 2.0, "wrist": -1.0},
@@ -124,8 +119,8 @@ TASKS: tuple[Task, ...] = (
     Task(
         name="point mass", package=DM, file="suite/point_mass.xml", start={"root_x": -0.2, "root_y": -0.2},
         goal={"root_x": 0.2, "root_y": 0.2},
-        ends={"root_x": 100, "root_y": 100, "root_x_velocity": 100, "root_y_velocity": 100}, effort=0.1, dt=0.02,
-        steps=100,
+        ends={"root_x": 100, "root_y": 100, "root_x_velocity": 100, "root_y_velocity": 100}, effort=0.001, dt=0.02,
+        steps=200,
     ),
     Task(
         name="ball in cup", package=DM, file="suite/ball_in_cup.xml", goal={"ball_z": 0.3},
@@ -145,7 +140,7 @@ TASKS: tuple[Task, ...] = (
     ),
     CrazyflieTask(
         name="Crazyflie through the cage", package="crazyflow", file="drones/cf2x_L250.xml",
-        start={"x": -0.35, "y": -0.35, "z": -0.35}, goal={"x": 0.35, "y": 0.35, "z": 0.35},
+        start={"x": -0.55, "y": -0.55, "z": -0.55}, goal={"x": 0.55, "y": 0.55, "z": 0.55},
         ends={"x": 500, "y": 500, "z": 500, "rx": 5, "ry": 5, "rz": 5, "vx": 50, "vy": 50, "vz": 50, "wx": 0.5,
               "wy": 0.5, "wz": 0.5},
         effort=200.0, dt=0.02, steps=150,
