@@ -8,12 +8,15 @@ from paper.common import interval, table
 import lqrsim as ls
 from robust.common import Config, progress, reach_exactly
 
+# In turns. In this order: few plans collide as often as 1e-1 without any clearance, and are not safer than asked.
+ASKED = (1e-2, 1e-3, 1e-4, 1e-1)
+
 
 def measure(config: Config) -> dict[str, Any]:
     rows = []
     for query in progress(range(config.plans), "predicted chances"):
         scenario = ls.scenarios.quadrotor(query)
-        plant, asked = scenario.plant(), 10.0 ** -(1 + query % 4)
+        plant, asked = scenario.plant(), ASKED[query % len(ASKED)]
         disturbances = ls.preset("light", plant)
         stated = ls.uncertainty_of(plant, disturbances)
         safe = ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=asked)
