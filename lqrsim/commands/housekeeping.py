@@ -47,8 +47,8 @@ class Reproduce:
     """
 
     results: Annotated[Positional[tuple[str, ...]], arg(metavar="RESULT ...", help_behavior_hint="")] = ()
-    """Which: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback, stress_test. By
-    default all."""
+    """Which: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback, stress_test,
+    robust_policies. By default all."""
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/paper")
     """Where to write."""
     quick: bool = False
