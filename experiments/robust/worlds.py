@@ -86,7 +86,7 @@ def ends(rng: Generator, world: ls.World, radius: float) -> tuple[Array, Array]:
     """A start and a goal at rest, clear of everything, 3 m apart or more, and something in the way between them."""
     while True:
         places = rng.uniform(-2.5, 2.5, size=(2, 3))
-        between = np.linspace(*places, 100)
+        between = np.linspace(places[0], places[1], 100)
         nearest = world.distance(between)
         clear = min(nearest[0], nearest[-1]) > radius + ROOM
         if clear and nearest.min() < radius and np.linalg.norm(places[1] - places[0]) > 3:
