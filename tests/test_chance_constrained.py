@@ -79,8 +79,8 @@ def test_less_chance_costs_more_and_keeps_farther(problem: ls.Problem) -> None:
 def test_a_plan_is_not_much_safer_than_asked(problem: ls.Problem, sharpness: float) -> None:
     """Where one clearance for all directions, as the second plan has, is too much: noise is along the way, not across.
 
-    A plan with no margin costs 16 and collides too often. One of a margin as large across as along costs 22 and is
-    safer than asked by a factor of 5 or more.
+    Without a margin the plan collides too often; with one as large across as along it is five times safer than asked,
+    and costs more than it need.
     """
     cost = ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(PILLAR, radius=RADIUS, sharpness=sharpness)
     changed: dict[str, Any] = {"stage_cost": cost}
