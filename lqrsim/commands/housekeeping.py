@@ -41,7 +41,7 @@ class Reproduce:
     """Run the paper's experiments, and say which of its statements hold.
 
     Writes results.md, which sums them up, results.json, which has every number, and the figures as png and pdf. Takes
-    about an hour, three quarters of it for robust_policies. Other people's solvers and controllers are compared with
+    under an hour, most of it for robust_policies. Other people's solvers and controllers are compared with
     where the bench extra is installed.
 
     Exits with 1 if an experiment failed; whether the paper's statements hold does not count.
