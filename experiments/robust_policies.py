@@ -1,6 +1,6 @@
 """Policies that survive: tracking, estimation and safe plans, against the smoother's own policy and RotorPy's law.
 
-    python experiments/robust_policies.py                              # everything, about half an hour
+    python experiments/robust_policies.py                              # everything, some forty minutes
     python experiments/robust_policies.py --sections presets steady    # some of it
     python experiments/robust_policies.py --quick                      # as little as shows how it works
 
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Literal
 
-from paper.common import Result, opening, run
+from paper.common import Result, Statement, opening, run
 from robust import alone, chances, common, consistency, drive, presets, steady, worlds
 
 from lqrsim.results.save_load import replacing
@@ -63,5 +63,10 @@ def report(result: Result) -> str:
     return "\n\n".join(parts)
 
 
+def statements(result: Result) -> list[Statement]:
+    """None: the paper says nothing of disturbances."""
+    return []
+
+
 if __name__ == "__main__":
-    run(Config, main, report, lambda result: [], __doc__)  # the paper says nothing of disturbances
+    run(Config, main, report, statements, __doc__)

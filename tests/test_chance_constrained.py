@@ -75,6 +75,24 @@ def test_less_chance_costs_more_and_keeps_farther(problem: ls.Problem) -> None:
     assert nearest[0] < nearest[1]
 
 
+@pytest.mark.parametrize("sharpness", [10.0, 100.0])
+def test_a_plan_is_not_much_safer_than_asked(problem: ls.Problem, sharpness: float) -> None:
+    """Where one clearance for all directions, as the second plan has, is too much: noise is along the way, not across.
+
+    Without a margin the plan collides too often; with one as large across as along it is five times safer than asked,
+    and costs more than it need.
+    """
+    cost = ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(PILLAR, radius=RADIUS, sharpness=sharpness)
+    changed: dict[str, Any] = {"stage_cost": cost}
+    narrow = ls.Uncertainty(start=0.02, control={"ax": 2.0, "ay": 0.2}, measurement=0.01)
+    asked = ls.Problem(**(fields(problem) | changed))
+    plan = ls.smooth_chance_constrained(asked, narrow, chance=1e-3, controller=tracked)
+    assert 0.5e-3 <= plan.tube.collision_chance <= 1e-3
+    second = plan.rounds[1]
+    assert second[3] < 0.2e-3  # or this would be no such case
+    assert plan.solution.cost < second[2]
+
+
 def test_what_is_safe_enough_stays_as_it_is(problem: ls.Problem) -> None:
     calm = ls.Uncertainty(start=1e-6)
     plan = ls.smooth_chance_constrained(problem, calm, chance=0.5, controller=tracked)

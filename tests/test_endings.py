@@ -17,6 +17,7 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.control.controllers import Control, Controller, Feedback
 from lqrsim.errors import InputError
+from lqrsim.reports.page import report
 from lqrsim.results.goal import OF_RANGE, Target
 from lqrsim.results.trial_outcome import endings
 from lqrsim.robots.base import Robot
@@ -485,7 +486,12 @@ def test_a_campaign_says_whose_filter_diverged(tmp_path: Path, monkeypatch: pyte
     reasons = results.reasons(cell)
     assert sorted(reasons) == diverged.tolist()
     assert all(re.fullmatch(r"filter at .* s: the estimate of \w+ is .*", reason) for reason in reasons.values())
-    assert " trials came to nothing: filter at " in results.summary()
+    said = results.came_to_nothing()
+    assert len(said) == min(len(set(reasons.values())), 5)
+    assert all(re.fullmatch(r"[1-9]\d* trials came to nothing: filter at .*", line) for line in said)
+    assert all(line in results.summary().splitlines() for line in said)
+    page = report(results, tmp_path / "page.html", videos=0).read_text(encoding="utf-8")
+    assert all(f"{line}." in page for line in said)
     trial = int(diverged[0])
     again = replay(results, cell, trial)
     assert again.reasons == (reasons[trial],)

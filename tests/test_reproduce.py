@@ -189,6 +189,19 @@ def test_stress_test_counts_what_simulations_do(quick: tuple[Path, dict[str, Any
                 assert run.outcome.count("reached") == pytest.approx(rate * robot["trials_alone"])
 
 
+def test_robust_policies_counts_what_simulations_do(quick: tuple[Path, dict[str, Any]]) -> None:
+    """The policy of the smoother needs none of the script's plans and laws."""
+    result = quick[1]["results"]["robust_policies"]["result"]
+    scenario, presets = ls.scenarios.quadrotor(), result["presets"]
+    plant, trials = scenario.plant(), presets["trials"]
+    run = ls.simulate(plant, ls.smooth(scenario.problem), disturbances=ls.preset("light", plant), trials=trials)
+    told = presets["presets"]["light"]["reached"]
+    assert told["smoother's policy"][0] == pytest.approx(100 * run.outcome.count("reached") / trials)
+    assert told["offset free, safe plan"][0] > 80  # it misses fewer than 1 in 100: docs/robust_policies.md
+    (chances,) = result["chances"]["rows"]
+    assert all(one["predicted"] <= one["asked"] for one in chances.values())
+
+
 def test_minimal_total_cost_states_obey_the_true_dynamics(quick: tuple[Path, dict[str, Any]]) -> None:
     """Statements of the paper that do not depend on how many queries were looked at."""
     said = {

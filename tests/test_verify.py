@@ -12,6 +12,7 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.verify import pixels
+from lqrsim.verify.ground_truth import check_plan
 from lqrsim.view import cameras, gl, video_metadata
 from lqrsim.view.cameras import Camera
 from lqrsim.view.video_metadata import VideoMetadata
@@ -140,14 +141,25 @@ def test_a_plan_that_is_not_the_runs_is_told(case: Case) -> None:
     found = ls.verify_run(changed, solution=case.solution)
     assert failed(found) == {"plan"}
     assert "plan" in found.likely
-    # With the solution that the plan is of, too: it was not that solution's policy that was run.
+    # With the solution that the plan is of it is untold: that solution's policy was not run.
     policy = dataclasses.replace(case.solution.policy, nominal=plan.states[:-1])
     its_own = dataclasses.replace(case.solution, trajectory=plan, policy=policy)
-    assert failed(ls.verify_run(changed, solution=its_own)) == {"plan"}
+    assert "untold  plan" in ls.verify_run(changed, solution=its_own).summary()
     assert failed(ls.verify_video(case.video, dataclasses.replace(case.run, plan=plan))) == {"run"}
     untold = ls.verify_run(case.beginning())
     assert untold.passed
     assert "untold  plan" in untold.summary()
+
+
+def test_a_controllers_run_is_about_the_solutions_plan(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
+    law = ls.track(quadrotor.problem, quadrotor_solution, tolerate={"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s": 1.0})
+    run = ls.simulate(quadrotor.plant(), quadrotor_solution, controller=ls.Feedback(law))
+    told = check_plan(run, quadrotor_solution)
+    assert (told.passed, told.detail.partition(";")[0]) == (None, "as the solution has it")
+    tracked = dataclasses.replace(quadrotor_solution, policy=law)
+    assert check_plan(run, tracked).passed
+    other = dataclasses.replace(tracked, trajectory=quadrotor_solution.candidates[1].trajectory)
+    assert check_plan(run, other).passed is False
 
 
 def off(view: str, axis: int) -> Callable[[Camera, object, float], None]:

@@ -1,7 +1,7 @@
 """How strong a disturbance alone must be for half of the trials to fail: the smoother's policy, and OffsetFree.
 
 OffsetFree is told of the disturbance, at the strength that it has: how large the noise is, how late a measurement, how
-slow the motors. It flies the safe plan of the preset 'moderate'.
+slow the motors. It flies the default plan, as the smoother's policy does, and the safe plan of the preset 'moderate'.
 """
 
 from typing import Any
@@ -15,6 +15,7 @@ import lqrsim as ls
 from lqrsim.stress.statistics import rate
 from robust.common import ASKED, Config, progress, reach_exactly, reached
 
+OWN, DEFAULT, SAFE = "smoother's policy", "offset free, default plan", "offset free, safe plan"
 LATE = (ls.ControlDelay(1), ls.MeasurementLatency(1))
 
 
@@ -25,26 +26,24 @@ def measure(config: Config) -> dict[str, Any]:
 
 def of_robot(config: Config, scenario: ls.Scenario) -> dict[str, Any]:
     plant, plan = scenario.plant(), ls.smooth(scenario.problem)
-    problem, solution = scenario.problem, plan
-    if scenario.name == "quadrotor":
-        stated = ls.uncertainty_of(plant, ls.preset("moderate", plant))
-        safe = ls.smooth_chance_constrained(reach_exactly(problem), stated, chance=ASKED["moderate"])
-        problem, solution = safe.problem, safe.solution
+    stated = ls.uncertainty_of(plant, ls.preset("moderate", plant))
+    safe = ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=ASKED["moderate"])
+    flown = {OWN: (scenario.problem, plan), DEFAULT: (scenario.problem, plan), SAFE: (safe.problem, safe.solution)}
     rows = []
     grid = GRID[::6] if config.quick else GRID
     kinds = [*ls.preset("light", plant), *LATE]
     kinds = kinds[-1:] if config.quick else kinds
     for one in progress(kinds, f"{NAMES[scenario.name]}, one disturbance alone"):
         strengths = [strength for strength in possible(one, grid) if strength >= 1 or one not in LATE]
-        points: dict[str, list[tuple[float, list[float]]]] = {"smooth": [], "offset_free": []}
+        points: dict[str, list[tuple[float, list[float]]]] = {policy: [] for policy in flown}
         for policy, found in points.items():
+            problem, solution = flown[policy]
             for strength in strengths:
                 disturbances = [one.scaled(strength)]
-                if policy == "smooth":
-                    ended = reached(plant, plan, None, disturbances, trials=config.alone, seed=config.seed)
-                else:
+                law = None
+                if policy != OWN:
                     law = ls.OffsetFree(problem, solution, ls.uncertainty_of(plant, disturbances))
-                    ended = reached(plant, solution, law, disturbances, trials=config.alone, seed=config.seed)
+                ended = reached(plant, solution, law, disturbances, trials=config.alone, seed=config.seed)
                 found.append((strength, interval(rate(int(ended.sum()), len(ended)))))
                 if found[-1][1][2] < 0.5:
                     break  # surely more than half fail, and stronger is no better
@@ -57,21 +56,29 @@ def report(found: dict[str, Any]) -> list[str]:
     lines = []
     for name, robot in found.items():
         rows = [
-            [row["kind"], told(row, "smooth"), told(row, "offset_free"), ratio(row)]
-            for row in sorted(robot["rows"], key=lambda row: row["half"]["smooth"]["value"] or np.inf)
+            [row["kind"], *(told(row, policy) for policy in row["half"]), ratio(row)]
+            for row in sorted(robot["rows"], key=lambda row: row["half"][OWN]["value"] or np.inf)
         ]
-        head = ("half fail at", "smoother's policy", "offset free", "ratio")
-        lines += [f"{NAMES[name].capitalize()}, {robot['trials']} trials a strength.", table(head, rows)]
+        head = ("half fail at strength", OWN, DEFAULT, SAFE, "last against first")
+        lines += [
+            f"{NAMES[name].capitalize()}, {robot['trials']} trials a strength; 1 is that of the preset 'light'. In"
+            " brackets are the strengths between which it surely is: where the exact interval of 95 % is above one"
+            " half, and where it is below.",
+            table(head, rows),
+        ]
     return lines
 
 
 def told(row: dict[str, Any], policy: str) -> str:
-    value = row["half"][policy]["value"]
-    return f"over {row['points'][policy][-1][0]:.3g}" if value is None else f"{value:.2g}"
+    half, last = row["half"][policy], row["points"][policy][-1][0]
+    if half["value"] is None:
+        return f"over {half['above']:.3g}" if half["above"] else f"about {last:.3g}"
+    low, high = (f"{half[side]:.3g}" if half[side] else "" for side in ("above", "below"))
+    return f"{half['value']:.3g} ({low or 'less'} to {high or 'more'})"
 
 
 def ratio(row: dict[str, Any]) -> str:
-    before, after = row["half"]["smooth"]["value"], row["half"]["offset_free"]["value"]
+    before, after = row["half"][OWN]["value"], row["half"][SAFE]["value"]
     if before is None:
         return "-"
-    return f"{after / before:.1f}" if after else f"over {row['points']['offset_free'][-1][0] / before:.1f}"
+    return f"{after / before:.2g}" if after else f"over {row['points'][SAFE][-1][0] / before:.2g}"

@@ -1,4 +1,4 @@
-"""The predicted chance of collision against what splitting measures, for safe plans asked for 1e-1 to 1e-4."""
+"""The predicted chance of collision against what is measured: by splitting at 'light', by counting at 'moderate'."""
 
 from typing import Any
 
@@ -6,36 +6,67 @@ import numpy as np
 from paper.common import interval, table
 
 import lqrsim as ls
-from robust.common import Config, progress, reach_exactly
+from lqrsim.stress.statistics import rate
+from robust import common
+from robust.common import Config, progress, reach_exactly, run
+
+# In turns. In this order: few plans collide as often as 1e-1 without any clearance, and are not safer than asked.
+ASKED = (1e-2, 1e-3, 1e-4, 1e-1)
 
 
 def measure(config: Config) -> dict[str, Any]:
-    rows = []
-    for query in progress(range(config.plans), "predicted chances"):
-        scenario = ls.scenarios.quadrotor(query)
-        plant, asked = scenario.plant(), 10.0 ** -(1 + query % 4)
-        disturbances = ls.preset("light", plant)
-        stated = ls.uncertainty_of(plant, disturbances)
-        safe = ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=asked)
-        score = ls.TrialScore(plant, safe.solution, disturbances, controller=safe.controller)
-        row: dict[str, Any] = {"query": query, "asked": asked, "predicted": safe.tube.collision_chance}
-        try:
-            found = ls.split(score, score.size, particles=config.particles, repetitions=6, moves=3, seed=config.seed)
-            row |= {"measured": interval(found.probability), "simulations": found.simulations}
-        except ls.NoFailure:
-            row |= {"measured": None, "simulations": score.simulations}
-        rows.append(row)
+    queries = progress(range(config.plans), "predicted chances")
+    rows = [{"light": of_light(config, query), "moderate": of_moderate(config, query)} for query in queries]
     return {"rows": rows}
 
 
+def planned(query: int, preset: str, asked: float) -> tuple[ls.Plant, list[ls.Disturbance], ls.SafePlan]:
+    scenario = ls.scenarios.quadrotor(query)
+    plant = scenario.plant()
+    disturbances = ls.preset(preset, plant)
+    stated = ls.uncertainty_of(plant, disturbances)
+    return plant, disturbances, ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=asked)
+
+
+def of_light(config: Config, query: int) -> dict[str, Any]:
+    asked = ASKED[query % len(ASKED)]
+    plant, disturbances, safe = planned(query, "light", asked)
+    score = ls.TrialScore(plant, safe.solution, disturbances, controller=safe.controller)
+    row: dict[str, Any] = {"query": query, "asked": asked, "predicted": safe.tube.collision_chance}
+    try:
+        found = ls.split(score, score.size, particles=config.particles, repetitions=6, moves=3, seed=config.seed)
+        return row | {"measured": interval(found.probability), "simulations": found.simulations}
+    except ls.NoFailure:
+        return row | {"measured": None, "simulations": score.simulations}
+
+
+def of_moderate(config: Config, query: int) -> dict[str, Any]:
+    asked = common.ASKED["moderate"]
+    plant, disturbances, safe = planned(query, "moderate", asked)
+    trials = config.world_trials
+    rollout = run(plant, safe.solution, safe.controller, disturbances, trials=trials, seed=config.seed)
+    measured = interval(rate(int(np.isfinite(rollout.collided_at).sum()), trials))
+    return {
+        "query": query, "asked": asked, "predicted": safe.tube.collision_chance, "measured": measured,
+        "simulations": trials,
+    }  # fmt: skip
+
+
 def report(found: dict[str, Any]) -> list[str]:
-    rows = []
-    for row in found["rows"]:
-        value, low, high = row["measured"] or (np.nan,) * 3
-        ratio = row["predicted"] / value if row["measured"] else np.nan
-        rows.append([
-            row["query"], f"{row['asked']:g}", f"{row['predicted']:.2g}", f"{value:.2g}", f"{low:.1g} to {high:.1g}",
-            f"{ratio:.2g}", row["simulations"],
-        ])  # fmt: skip
-    head = ("query", "asked", "predicted", "measured by splitting", "95 %", "predicted / measured", "simulations")
-    return ["Preset 'light', OffsetFree on safe plans.", table(head, rows)]
+    head = ("query", "asked", "predicted", "measured", "95 %", "predicted / measured", "simulations")
+    return [
+        "Preset 'light', OffsetFree on safe plans; measured by splitting.",
+        table(head, [cells(row["light"]) for row in found["rows"]]),
+        "Preset 'moderate', the same by counting. There controls are at their limits for much of the time, which the"
+        " linear model does not have: runs collide more often than predicted.",
+        table(head, [cells(row["moderate"]) for row in found["rows"]]),
+    ]
+
+
+def cells(row: dict[str, Any]) -> list[Any]:
+    value, low, high = row["measured"] or (np.nan,) * 3
+    ratio = row["predicted"] / value if value > 0 else np.nan
+    return [
+        row["query"], f"{row['asked']:g}", f"{row['predicted']:.2g}", f"{value:.2g}", f"{low:.1g} to {high:.1g}",
+        f"{ratio:.2g}", row["simulations"],
+    ]  # fmt: skip

@@ -41,14 +41,15 @@ class Reproduce:
     """Run the paper's experiments, and say which of its statements hold.
 
     Writes results.md, which sums them up, results.json, which has every number, and the figures as png and pdf. Takes
-    some minutes. Other people's solvers are compared with where the bench extra is installed.
+    under an hour, most of it for robust_policies. Other people's solvers and controllers are compared with
+    where the bench extra is installed.
 
     Exits with 1 if an experiment failed; whether the paper's statements hold does not count.
     """
 
     results: Annotated[Positional[tuple[str, ...]], arg(metavar="RESULT ...", help_behavior_hint="")] = ()
-    """Which: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback, stress_test. By
-    default all."""
+    """Which: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback, stress_test,
+    robust_policies. By default all."""
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/paper")
     """Where to write."""
     quick: bool = False

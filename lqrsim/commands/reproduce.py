@@ -31,6 +31,7 @@ SCRIPTS = (
     "state_of_the_art",
     "feedback",
     "stress_test",
+    "robust_policies",
 )
 
 TIDYING = 20.0  # s

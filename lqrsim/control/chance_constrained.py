@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtri
 
-from lqrsim.control.collision_chance import Surroundings, chance_of_clearances
+from lqrsim.control.collision_chance import Spread, Surroundings, chance_of_clearances
 from lqrsim.control.controllers import Controller, Feedback
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import (
-    Array,
     InputError,
     check_array,
     check_count,
@@ -33,6 +32,7 @@ from lqrsim.solvers.smoother import smooth
 
 # How far below what is asked a plan may be, and is not made cheaper any more.
 ENOUGH = 0.5
+HELD = 1e-3  # m, by how much a clearance may be larger than its margin and be so because of it
 AIM = 0.8  # of what is asked, the chance that a next plan is to have
 MakeController = Callable[[Problem, Solution], Controller | AffinePolicy]
 
@@ -133,30 +133,33 @@ class _Search:
         self.problem, self.uncertainty, self.asked = problem, uncertainty, asked
         self.make, self.surroundings = make, surroundings
         self.plans: list[SafePlan] = []
+        self.margin = np.zeros((1, 1))  # that the last of them kept, (T+1, O)
         self.tolerate: tuple[float, ...] | None = None
         self.lines: list[tuple[float, float, float, float]] = []
         # Of standard deviations: the most that are too few, the fewest that are enough, the fewest without a plan.
         self.too_few, self.enough, self.impossible = 0.0, np.inf, np.inf
+        self.log_of_too_few = self.log_of_enough = 0.0  # logarithms of the chances then
 
     def solve(self, deviations: float | None) -> None:
         """Plan with so many standard deviations of clearance, and predict what becomes of it."""
-        problem, start, margin = self.problem, None, np.zeros(1)
+        problem, start, margin = self.problem, None, self.margin
+        second = len(self.plans) == 1  # of which all steps have the same clearance: where the first is matters little
         if deviations is not None:
             base = self.plans[-1]
-            margin = deviations * self._deviation(base)
-            if len(self.plans) == 1:
+            margin = deviations * self._spread(base).std
+            if second:
                 margin = np.full_like(margin, np.sqrt((margin**2).mean()))
             kept = self.surroundings.keep_away(margin)
             problem = replace(problem, constraints=(*problem.constraints, *kept))
             # The first plan may cut through obstacles: from there the way round would be as it happens.
-            start = base.solution.trajectory if len(self.plans) > 1 else None
+            start = None if second else base.solution.trajectory
         solution = smooth(problem, start=start) if start is not None else smooth(problem)
         if not solution.success and start is not None:
             solution = smooth(problem)
         if not solution.success and self.plans:
             self.impossible = min(self.impossible, deviations or 0.0)
             return
-        controller = self._controller(problem, solution)
+        controller, self.margin = self._controller(problem, solution), margin
         tube = predict_tube(problem, solution, self.uncertainty, controller)
         self.lines.append((float(margin.min()), float(margin.max()), solution.cost, tube.collision_chance))
         self.plans.append(
@@ -165,11 +168,13 @@ class _Search:
                 rounds=tuple(self.lines),
             )
         )  # fmt: skip
-        if deviations is not None:
-            if tube.collision_chance <= self.asked:
-                self.enough = min(self.enough, deviations)
-            else:
-                self.too_few = max(self.too_few, deviations)
+        if deviations is None:
+            return
+        if tube.collision_chance > self.asked:
+            if deviations > self.too_few:
+                self.too_few, self.log_of_too_few = deviations, np.log(tube.collision_chance)
+        elif not second and deviations < self.enough:  # the second plan's margins are others, and may be too large
+            self.enough, self.log_of_enough = deviations, np.log(max(tube.collision_chance, 1e-300))
 
     def _controller(self, problem: Problem, solution: Solution) -> Controller:
         if self.make is not None:
@@ -180,10 +185,10 @@ class _Search:
             self.tolerate = tuple((law.weights.state**-0.5).tolist())
         return law
 
-    def _deviation(self, plan: SafePlan) -> Array:
-        """Standard deviation of the clearance to each obstacle, at each knot, (T+1, O)."""
-        states = plan.solution.trajectory.states + plan.tube.mean
-        return self.surroundings.spread(states, plan.tube.covariance)[1]
+    def _spread(self, plan: SafePlan) -> Spread:
+        """Of the clearances along the plan, (T+1, O)."""
+        tube = plan.tube
+        return self.surroundings.spread(plan.solution.trajectory.states + tube.mean, tube.covariance, tube.across)
 
     def next_deviations(self) -> float | None:
         """How many standard deviations to try next; None where there is no use in more."""
@@ -192,7 +197,8 @@ class _Search:
         first = len(self.plans) == 1 and self.impossible == np.inf
         if first and (chance <= self.asked or not plan.solution.success):
             return None
-        if not first and np.isfinite(self.enough) and self._best().tube.collision_chance >= ENOUGH * self.asked:
+        best = self._best()
+        if not first and best.success and best.tube.collision_chance >= ENOUGH * self.asked:
             return None
         if np.isfinite(self.impossible):  # between what has a plan and what has none
             low = self.too_few if not np.isfinite(self.enough) else None
@@ -200,18 +206,23 @@ class _Search:
                 return None
             return (low + self.impossible) / 2
         wanted = max(float(-ndtri(self.asked)), 0.5) if first else self._needed(plan)
-        if np.isfinite(self.enough) and not self.too_few < wanted < self.enough:
-            wanted = (self.too_few + self.enough) / 2
-        elif not np.isfinite(self.enough) and wanted <= self.too_few:
-            wanted = 1.05 * self.too_few
-        known = [one for one in (self.too_few, self.enough) if np.isfinite(one) and one > 0]
-        return None if any(abs(wanted - one) < 0.003 * one for one in known) else float(wanted)
+        if not np.isfinite(self.enough):
+            return max(wanted, 1.01 * self.too_few)
+        if self.enough - self.too_few < 0.003 * self.enough:
+            return None
+        if self.too_few == 0 and self.too_few < wanted < self.enough:
+            return wanted
+        # Between the two the logarithm of the chance is taken to be linear.
+        share = (self.log_of_too_few - np.log(AIM * self.asked)) / (self.log_of_too_few - self.log_of_enough)
+        return self.too_few + float(np.clip(share, 0.1, 0.9)) * (self.enough - self.too_few)
 
     def _needed(self, plan: SafePlan) -> float:
-        """Of how many standard deviations the plan would be as safe as asked, if all that is nearer moved out there."""
-        states, tube = plan.solution.trajectory.states + plan.tube.mean, plan.tube
-        clearance, std = self.surroundings.spread(states, tube.covariance)
-        correlation = self.surroundings.correlation(states, tube.across, std)
+        """Of how many standard deviations the plan would be as safe as asked.
+
+        If all that is nearer moved out there, and what only keeps the margin that it must moved in.
+        """
+        clearance, std, correlation = self._spread(plan)
+        clearance = np.where(clearance <= self.margin + HELD, -np.inf, clearance)
         low, high = 0.0, 12.0
         for _ in range(40):
             middle = (low + high) / 2

@@ -7,6 +7,7 @@ times.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
@@ -18,6 +19,18 @@ from lqrsim.problem.constraints import Clearance
 from lqrsim.problem.costs import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.scenes.world import World
+
+
+class Spread(NamedTuple):
+    """How the clearances to O obstacles are distributed at T+1 knots.
+
+    Attributes:
+      mean: in m, (T+1, O). std: in m, (T+1, O). correlation: of each with that of the knot before, (T, O).
+    """
+
+    mean: Array
+    std: Array
+    correlation: Array
 
 
 @dataclass(frozen=True)
@@ -100,19 +113,14 @@ class Surroundings:
         moves = slopes[knots, nearest][..., list(self.position)]
         return clearance[knots, nearest, obstacle], np.einsum("kod,kodi->koi", normals, moves)
 
-    def spread(self, states: Array, covariance: Array) -> tuple[Array, Array]:
-        """Clearances at mean states (T+1, n), and their standard deviations, both (T+1, O)."""
+    def spread(self, states: Array, covariance: Array, across: Array) -> Spread:
+        """At mean states (T+1, n), of covariances (T+1, n, n), and (T, n, n) with the states of the knot before."""
         place = list(self.position)
         clearance, normal, displaced = self.clearances(states)
         variance = np.einsum("toi,tij,toj->to", normal, covariance[:, place][:, :, place], normal) + displaced
-        return clearance, np.maximum(np.sqrt(np.maximum(variance, 0.0)), 1e-12)
-
-    def correlation(self, states: Array, across: Array, std: Array) -> Array:
-        """Of each clearance with that of the step before, (T, O)."""
-        place = list(self.position)
-        _, normal, displaced = self.clearances(states)
+        std = np.maximum(np.sqrt(np.maximum(variance, 0.0)), 1e-12)
         shared = np.einsum("toi,tij,toj->to", normal[1:], across[:, place][:, :, place], normal[:-1]) + displaced
-        return np.clip(shared / (std[1:] * std[:-1]), -1.0, 1.0)
+        return Spread(clearance, std, np.clip(shared / (std[1:] * std[:-1]), -1.0, 1.0))
 
 
 def collision_chance(
@@ -125,8 +133,8 @@ def collision_chance(
     """
     if not surroundings.worlds:
         return np.zeros(len(states)), 0.0
-    clearance, std = surroundings.spread(states, covariance)
-    return chance_of_clearances(clearance / std, surroundings.correlation(states, across, std))
+    clearance, std, correlation = surroundings.spread(states, covariance, across)
+    return chance_of_clearances(clearance / std, correlation)
 
 
 def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, float]:

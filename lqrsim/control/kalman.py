@@ -57,14 +57,13 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
 def check_observable(who: str, model: PlanModel) -> None:
     """Raise InputError for an unknown that changes nothing of what is measured, by name."""
     first = model.n + model.lagging
-    effect, seen = np.eye(model.size)[:, first:], np.zeros((model.size - first,))
+    effect, seen = np.eye(model.size)[:, first:], np.zeros(model.size - first)
     for t in range(model.plan.steps + 1):
         seen = np.maximum(seen, np.abs(model.H[t] @ effect[: model.n]).max(axis=0, initial=0.0))
         if t < model.plan.steps:
             effect = model.F[t] @ effect
-    states = [len(part[0]) for part in model._filters]
-    for unknown, last, count in zip(model.remembered, np.cumsum(states), states, strict=True):
-        if (unknown.std or unknown.drift) and not seen[last - count : last].max() > 0:
+    for unknown, own in zip(model.remembered, model.own_states, strict=True):
+        if (unknown.std or unknown.drift) and not seen[own].max() > 0:
             measured = ", ".join(model.sensor.names)
             raise InputError(
                 f"{who}: unknowns: got {unknown.name}, which changes nothing of what is measured ({measured}),"

@@ -7,12 +7,30 @@ noise.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
 
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.errors import Array
+
+
+class Moments(NamedTuple):
+    """Of a closed loop about its plan, X as above.
+
+    Attributes:
+      mean: of X, (T+1, X). covariance: of X, (T+1, X, X).
+      across: of the deviation of the states with that of the knot before, (T, n, n).
+      command: standard deviation of each command, before it is limited, (T, m).
+      saturation: share of the commands that are beyond the limits, (T, m).
+    """
+
+    mean: Array
+    covariance: Array
+    across: Array
+    command: Array
+    saturation: Array
 
 
 @dataclass
@@ -32,11 +50,8 @@ class Loop:
     low: Array
     high: Array
 
-    def moments(self) -> tuple[Array, Array, Array, Array, Array]:
-        """Mean and covariance of X at each knot, of that with X a step before, and std and saturation of the commands.
-
-        (T+1, X), (T+1, X, X), (T, n, n) of the states alone, (T, m) and (T, m).
-        """
+    def moments(self) -> Moments:
+        """What is predicted of it, from the start to the plan's end."""
         model, steps, n, size = self.model, self.model.plan.steps, self.model.n, self.model.size
         estimates = self.filter_gain is not None
         width = 2 * size if estimates else size
@@ -72,7 +87,7 @@ class Loop:
             mean[t + 1, :size] += model.c[t]
             if estimates:
                 mean[t + 1, size:] += model.c[t]
-        return mean, covariance, across, std, saturation
+        return Moments(mean, covariance, across, std, saturation)
 
     def _seen(self, t: int) -> tuple[Array, Array]:
         """What the law is told, as a matrix times X, and the covariance of the noise on that."""

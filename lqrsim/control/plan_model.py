@@ -11,6 +11,7 @@ the planned controls.
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -74,8 +75,7 @@ class PlanModel:
     def names(self) -> tuple[str, ...]:
         """What messages call the entries of z, (Z,)."""
         controls = self.dynamics.control_coordinates.names[: self.lagging]
-        counts = [len(part[0]) for part in self._filters]
-        unknowns = (one.name for one, count in zip(self.remembered, counts, strict=True) for _ in range(count))
+        unknowns = (one.name for one, own in zip(self.remembered, self.own_states, strict=True) for _ in own)
         return (*self.dynamics.state_coordinates.names, *(f"what {one} has reached" for one in controls), *unknowns)
 
     # Sizes.
@@ -101,6 +101,12 @@ class PlanModel:
     def remembered(self) -> tuple[Unknown, ...]:
         """The unknowns that have states."""
         return tuple(one for one in self.uncertainty.unknowns if not one.white)
+
+    @cached_property
+    def own_states(self) -> list[range]:
+        """Which of the unknowns' states are those of each remembered one."""
+        ends = np.cumsum([0, *(len(part[0]) for part in self._filters)])
+        return [range(first, end) for first, end in pairwise(ends.tolist())]
 
     @property
     def size(self) -> int:

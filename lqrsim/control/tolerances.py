@@ -3,8 +3,8 @@
 To fail is to collide, or to end farther from the plan's end than the goal's radius, as the linear model predicts it.
 All tolerances follow from one number, the time in which a deviation is to be gone: a state may be off by as much as
 random controls of the tolerated effort move it in that time. So it does not matter what the units are, and no part of
-the state is held much more tightly than the controls can hold it: weights that were searched for one by one had better
-predictions and were fragile in the simulation.
+the state is held much more tightly than the controls can hold it. Weights that are searched for one by one can have
+better predictions, but then the linear model is what they are made for.
 
 What the linear model does not have is what happens when the controls are at their limits for much of the time, so that
 is held against a law, too.
@@ -27,8 +27,8 @@ PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # that a deviation may 
 # What a tube of twice the width of the narrowest counts for as a chance of failing: little, so that it decides where
 # the plan is clear of everything, or collides whatever the law.
 NARROW = 0.02
-# What the square of the share of commands beyond the limits adds to the chance of failing: a choice of ours, of the
-# order of what fails of the quadrotor's flights through the cage besides what is predicted to.
+# What the square of the share of commands beyond the limits adds to the chance of failing. A choice of ours: small
+# where few commands are limited, and near 1 where half of them are, for then the linear model says little.
 FRAGILE = 3.0
 
 

@@ -60,12 +60,10 @@ def track(
         surroundings = Surroundings.of(problem, uncertainty.obstacles)
 
         def predicted(tried: Weights) -> Prediction:
-            loop = Loop(truth, *tracking_laws(model, tried), None, *limits)
-            mean, covariance, across, _, saturation = loop.moments()
-            n = model.n
+            moments, n = Loop(truth, *tracking_laws(model, tried), None, *limits).moments(), model.n
             return prediction_of(
-                truth, mean[:, :n], covariance[:, :n, :n], across, float(saturation.mean()), surroundings,
-                solution.goal_radius,
+                truth, moments.mean[:, :n], moments.covariance[:, :n, :n], moments.across,
+                float(moments.saturation.mean()), surroundings, solution.goal_radius,
             )  # fmt: skip
 
         weights = choose_tolerances(model, predicted, efforts, at_end).weights

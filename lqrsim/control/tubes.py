@@ -130,17 +130,17 @@ def tube_of(loop: Loop, surroundings: Surroundings) -> Tube:
                 f"Uncertainty: {field}: got {getattr(model.uncertainty, field)} control periods, want 0 for a tube:"
                 " it takes measurements and commands as they come"
             )
-    mean, covariance, across, std, saturation = loop.moments()
+    moments = loop.moments()
     n, size = model.n, model.size
+    mean, covariance = moments.mean[:, :n], moments.covariance[:, :n, :n]
     estimate = None
     if loop.filter_gain is not None:
-        truth, guess = covariance[:, :n, :n], covariance[:, size : size + n, size : size + n]
-        both = covariance[:, :n, size : size + n]
-        estimate = truth + guess - both - both.transpose(0, 2, 1)
-    chance, total = collision_chance(model.plan.states + mean[:, :n], covariance[:, :n, :n], across, surroundings)
+        whole = moments.covariance
+        guess, both = whole[:, size : size + n, size : size + n], whole[:, :n, size : size + n]
+        estimate = covariance + guess - both - both.transpose(0, 2, 1)
+    chance, total = collision_chance(model.plan.states + mean, covariance, moments.across, surroundings)
     return Tube(
-        plan=model.plan, state_coordinates=model.dynamics.state_coordinates, mean=mean[:, :n],
-        covariance=covariance[:, :n, :n], across=across, estimate_covariance=estimate, command=std,
-        saturation=saturation,
-        step_chance=chance, collision_chance=total,
+        plan=model.plan, state_coordinates=model.dynamics.state_coordinates, mean=mean, covariance=covariance,
+        across=moments.across, estimate_covariance=estimate, command=moments.command,
+        saturation=moments.saturation, step_chance=chance, collision_chance=total,
     )  # fmt: skip

@@ -90,6 +90,7 @@ def _text_and_tables(results: Results, table: analysis.Table, scenario: Scenario
     warnings = [] if done == all_trials else [f"Not finished: {done} of {all_trials} trials have been run."]
     if erred:
         warnings.append(f"{erred} trials did not run through; they count as failures.")
+    warnings += [f"{line}." for line in results.came_to_nothing()]
     commands = {
         "To go on with the campaign, or to repair it": results.command,
         "This page": results.command_of("report"),

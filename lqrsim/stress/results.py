@@ -24,6 +24,8 @@ from lqrsim.stress.statistics import CONFIDENCE, rate
 from lqrsim.stress.trial_tables import Damaged, Table, read
 from lqrsim.stress.trials import Trials
 
+MOST_REASONS = 5  # that a summary lists
+
 
 class Results:
     """The folder of a campaign, finished or not.
@@ -97,7 +99,7 @@ class Results:
         others = [name for name in OUTCOMES if name != "reached"]
         interval = f"reached, {100 * CONFIDENCE:g} % interval"
         head = f"{'sweep':<{width}} {'strength':>8} {'policy':<{wide}} {interval:>33}"
-        lines, reasons = [head + "".join(f" {name:>9}" for name in others)], Counter[str]()
+        lines = [head + "".join(f" {name:>9}" for name in others)]
         for cell in self.cells:
             ends = self.tally(cell, partial=True)
             if not (total := ends.total()):
@@ -109,12 +111,18 @@ class Results:
                 share = f"{among:>13} deterministic: 1 run"
             line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {share:>33}"
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
-            if ends["error"] or ends["diverged"]:
-                reasons.update(self.reasons(cell).values())
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
         lines += self.plans()
-        lines += [f"{count} trials came to nothing: {reason}" for reason, count in reasons.most_common(5)]
-        return "\n".join(lines)
+        return "\n".join(lines + self.came_to_nothing())
+
+    def came_to_nothing(self) -> list[str]:
+        """A line for each of the most frequent reasons why trials are an "error", or have a filter that diverged."""
+        reasons: Counter[str] = Counter()
+        for cell in self.cells:
+            ends = self.tally(cell, partial=True)
+            if ends["error"] or ends["diverged"]:
+                reasons.update(self.reasons(cell).values())
+        return [f"{count} trials came to nothing: {reason}" for reason, count in reasons.most_common(MOST_REASONS)]
 
     def plans(self) -> list[str]:
         """Where the plan of each policy ends, and whether it misses the goal."""
