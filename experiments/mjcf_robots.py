@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 from mjcf.tasks import TASKS, Task
 from paper.common import FIGURES, Result, Settings, opening, run, still, table
+from PIL import Image
 from solver_benchmark.common import progress
 
 import lqrsim as ls
 
 OUT = Path("runs/mjcf_robots")
+TILE = 400, 225  # pixels of a picture on the sheet of all
 WORSE, BETTER = 1.01, 0.99  # of iLQR's cost: from where a cost is worse, and below what it is better
 
 
@@ -43,7 +45,21 @@ def main(config: Config) -> Result:
     result = opening(config) | {"rows": [], "missing": [task.name for task in wanted if task not in here]}
     for task in progress(here, "robots"):
         result["rows"].append(of_task(config, task, most, result))
+    if result["figures"]:
+        sheet(config, result)
     return result
+
+
+def sheet(config: Config, result: Result) -> None:
+    """All pictures on one."""
+    folder, names, across = config.out / FIGURES, list(result["figures"]), 3
+    pictures = [Image.open(folder / name).convert("RGB").resize(TILE, Image.Resampling.LANCZOS) for name in names]
+    rows = -(-len(pictures) // across)
+    whole = Image.new("RGB", (across * TILE[0], rows * TILE[1]), "white")
+    for number, picture in enumerate(pictures):
+        whole.paste(picture, (number % across * TILE[0], number // across * TILE[1]))
+    whole.save(folder / "mjcf_robots.png", optimize=True)
+    result["figures"].append("mjcf_robots.png")
 
 
 def of_task(config: Config, task: Task, most: int, result: Result) -> dict[str, Any]:
@@ -74,7 +90,8 @@ def of_task(config: Config, task: Task, most: int, result: Result) -> dict[str, 
     if config.pictures:
         (config.out / FIGURES).mkdir(parents=True, exist_ok=True)
         name = task.name.replace(" ", "_")
-        still(config, result, name, rollout, every=rollout.times[-1] / 8, camera=camera_of(robot))
+        camera = camera_of(robot)
+        still(config, result, name, rollout, every=rollout.times[-1] / 8, camera=camera, overlays=("trace", "caption"))
     return row
 
 

@@ -41,6 +41,13 @@ def crazyflie_in_cage(path: Path) -> ls.Scene:
                 size = f"{0.4 * SCALE:.6g} {3 * SCALE:.6g}"
                 kind = {"type": "cylinder", "size": size, "pos": text, "zaxis": along, "rgba": "0.2 0.38 0.62 0.25"}
                 beams.append(ElementTree.Element("geom", {"name": f"beam_{len(beams)}", **kind}))
+    for axis in range(3):
+        for sign in (-1, 1):  # walls, floor and ceiling; what one looks through is not drawn
+            place, inwards = 3 * SCALE * sign * np.eye(3)[axis], -sign * np.eye(3)[axis]
+            kind = {"type": "plane", "size": "1 1 0.1", "group": "3", "rgba": "0.4 0.8 0.4 0.2"}
+            kind |= {"pos": " ".join(f"{number:.6g}" for number in place)}
+            kind |= {"zaxis": " ".join(str(int(number)) for number in inwards)}
+            beams.append(ElementTree.Element("geom", {"name": f"wall_{axis}_{sign:+}", **kind}))
     world.append(beams)
     world.append(ElementTree.Element("light", {"pos": "-1 -1 3", "dir": "0.3 0.3 -1", "directional": "true"}))
     sky = {"name": "sky", "type": "skybox", "builtin": "flat", "rgb1": "0.93 0.95 0.97", "rgb2": "0.93 0.95 0.97"}
@@ -49,7 +56,7 @@ def crazyflie_in_cage(path: Path) -> ls.Scene:
     visual.append(ElementTree.Element("headlight", {"ambient": "0.4 0.4 0.4", "diffuse": "0.4 0.4 0.4"}))
     visual.append(ElementTree.Element("global", {"offwidth": "1920", "offheight": "1080"}))
     root.extend([assets, visual])
-    world.append(ElementTree.Element("camera", {"name": "overview", "pos": "-1.4 -3.1 1.6",
+    world.append(ElementTree.Element("camera", {"name": "overview", "pos": "-1.5 -3.4 1.75",
                                                 "xyaxes": "0.94 -0.34 0 0.16 0.43 0.89", "fovy": "32"}))  # fmt: skip
     motors = ElementTree.Element("actuator")
     for number in range(4):

@@ -108,6 +108,10 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "MjcfRobot": (
             {"file": file, "body": "cart", "position": (), "radius": 0.2, "outline": False, "floors": True}, 0.2,
         ),
+        "scenarios.mjcf": ({
+            "path": str(file), "start": "left", "goal": {"slider": 0.5}, "weights": {"m": 10.0}, "effort": 1.0,
+            "dt": 0.02, "steps": 5, "body": "cart", "floors": True, "obstacles": True,
+        }, 0.2),
         "MjcfRobot.at": ({"self": slider, "keyframe": "left", "slider": 0.2},),
         "Dynamics.rate": ({"self": cart, **at},),
         "Dynamics.rate_jacobian": ({"self": cart, **at},),

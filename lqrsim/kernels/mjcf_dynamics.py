@@ -30,10 +30,11 @@ from lqrsim.kernels.rotation_ratios import sine_ratio
 # mj_forwardSkip and the integrator; the last is 0 where parts of a step cannot be had on their own. TIMESTEP: of the
 # physics, in s. NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those
 # is that the controls are for. TEAM, JOB: where threads that help find what to do, 0 without any; YIELD: the address of
-# what lets others run; KINEMATICS: of mj_kinematics. TABLE: the joints' kind and places in qpos and qvel, three numbers
-# each.
+# what lets others run; KINEMATICS, RESET: of mj_kinematics and mj_resetData. TABLE: the joints' kind and places in qpos
+# and qvel, three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
-TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS, TABLE = 13, 14, 15, 16, 17, 18, 19, 20, 21, 22
+TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
+RESET, TABLE = 22, 23
 
 # What a slot has of each of its two MjData: addresses.
 SLOT, DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, SIZE = 20, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10
@@ -304,6 +305,7 @@ def read_from(near, p, one, out):
     for i in range(N):
         good = good and abs(out[i]) < LARGEST
     if not good:
+        call(p[RESET], p[MODEL], one[DATA])  # so that nothing of it is left
         for i in range(N):
             out[i] = nan
 

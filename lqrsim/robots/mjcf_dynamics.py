@@ -125,9 +125,10 @@ class MjcfDynamics(Dynamics):
         self.check_period(dt)
         n, m = len(x), len(u)
         out, jacobian, unused = np.empty(n), np.empty((n, n + m)), np.empty((n, n))
-        self._core.step_jacobian(
-            in_c_order(x), in_c_order(u), self.data, float(dt), unused, np.empty((n, m)), out, jacobian
-        )
+        with unlogged():
+            self._core.step_jacobian(
+                in_c_order(x), in_c_order(u), self.data, float(dt), unused, np.empty((n, m)), out, jacobian
+            )
         a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
         return a, b, out - a @ x - b @ u
 

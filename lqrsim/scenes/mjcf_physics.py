@@ -85,6 +85,7 @@ class MjcfPhysics:
         numbers[kernel.JOINTS], numbers[kernel.ACTUATORS] = model.njnt, kernel.TABLE + joints.size
         numbers[kernel.TEAM], numbers[kernel.JOB] = self.team.ctypes.data, self._job.ctypes.data
         numbers[kernel.YIELD], numbers[kernel.KINEMATICS] = _yield(), functions["mj_kinematics"]
+        numbers[kernel.RESET] = functions["mj_resetData"]
         return np.concatenate([numbers, joints.ravel(), actuators])
 
 
@@ -142,7 +143,7 @@ def _functions() -> dict[str, int]:
     (library, *_) = sorted(folder.glob(patterns.get(platform.system(), "libmujoco.so*")))
     loaded = ctypes.CDLL(str(library))
     found = {}
-    for name in ("mj_step", "mj_forwardSkip", "mj_Euler", "mj_implicit", "mj_kinematics"):
+    for name in ("mj_step", "mj_forwardSkip", "mj_Euler", "mj_implicit", "mj_kinematics", "mj_resetData"):
         address = ctypes.cast(getattr(loaded, name), ctypes.c_void_p).value
         assert address is not None
         found[name] = address

@@ -2,7 +2,7 @@
 
 The one rule for obstacles, which anyone can apply to their own file: **every geom that is fixed to the world and can
 collide is an obstacle.** Fixed to the world: no joint and no mocap between the geom and the world. Can collide:
-contype or conaffinity is not zero. So
+contype or conaffinity is not zero, and contacts are not switched off by a flag. So
 
 - geoms that are only drawn (both zero) are no obstacles, nor is anything that can move, the robot included;
 - planes are walls, floors and ceilings, infinite whatever size they are drawn with, solid behind. One that is parallel
@@ -39,6 +39,7 @@ except Exception as error:
 
 # In the wheel models/ lies inside the package, in the repository beside it.
 _PACKAGED = [Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models"]
+_FLAGS = mujoco.mjtDisableBit
 DEEPEST = 490  # MuJoCo's reader refuses a little more
 MOST_CELLS = 4096**2  # of a height field; MuJoCo crashes with far more
 
@@ -163,6 +164,8 @@ def free_name(name: str, taken: Collection[str]) -> str:
 
 def obstacle_geoms(model: mujoco.MjModel) -> list[int]:
     """Ids of the geoms that are obstacles by the module's rule, in the order of `Scene.world`."""
+    if model.opt.disableflags & (_FLAGS.mjDSBL_CONTACT | _FLAGS.mjDSBL_CONSTRAINT):
+        return []
     fixed = model.body_weldid[model.geom_bodyid] == 0
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     return np.flatnonzero(fixed & collides).tolist()

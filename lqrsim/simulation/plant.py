@@ -285,10 +285,7 @@ def _in_the_way(robot: Robot, scene: Scene) -> tuple[str, ...]:
 
 
 def _can_be_touched(model: mujoco.MjModel, geom: int) -> bool:
-    """Whether MuJoCo lets anything that moves collide with it, by the bits of both or as a pair; if it has contacts."""
-    off = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    if model.opt.disableflags & off:
-        return False
+    """Whether MuJoCo lets anything that moves collide with it, by the bits of both or as a pair."""
     moves = model.body_weldid[model.geom_bodyid] != 0
     bits = (model.geom_contype & model.geom_conaffinity[geom]) | (model.geom_conaffinity & model.geom_contype[geom])
     pairs = np.concatenate([model.pair_geom2[model.pair_geom1 == geom], model.pair_geom1[model.pair_geom2 == geom]])

@@ -1,0 +1,22 @@
+"""Small MJCFs to measure with."""
+
+CART_POLE = """<mujoco><option timestep="0.01" integrator="implicitfast"/><worldbody><body name="cart">
+  <joint name="slider" type="slide" axis="1 0 0" damping="0.1"/><geom type="box" size="0.15 0.1 0.08" mass="1"/>
+  <body name="pole"><joint name="pole" axis="0 1 0" damping="0.01"/><geom type="capsule" fromto="0 0 0 0 0 0.6"
+  size="0.03" mass="0.2" contype="0" conaffinity="0"/></body></body></worldbody>
+  <actuator><motor joint="slider" gear="10" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+BOX = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="5 5 0.1"/><body pos="0 0 0.1"><freejoint/>
+  <geom type="box" size="0.2 0.15 0.1" mass="1"/><site name="middle"/></body></worldbody>
+  <actuator><motor site="middle" gear="1 0 0 0 0 0"/><motor site="middle" gear="0 0 0 0 0 1"/></actuator></mujoco>"""
+
+ARM = """<mujoco><option timestep="0.01" integrator="implicitfast"/><compiler autolimits="true"/>
+  <default><joint damping="0.2" armature="0.01"/><geom contype="0" conaffinity="0"/></default><worldbody><body>
+  <joint name="a" axis="0 0 1"/><joint name="b" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03"/>
+  <body pos="0.4 0 0"><joint name="c" axis="0 1 0"/><joint name="d" axis="1 0 0"/>
+  <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03"/><body pos="0.4 0 0"><joint name="e" axis="0 1 0"/>
+  <joint name="f" axis="1 0 0"/><geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02"/></body></body></body>
+  </worldbody><actuator><motor joint="a"/><motor joint="b"/><motor joint="c"/><motor joint="d"/><motor joint="e"/>
+  <motor joint="f"/></actuator></mujoco>"""
+
+FILES = {"cart-pole": CART_POLE, "box on the floor": BOX, "arm of six hinges": ARM}
