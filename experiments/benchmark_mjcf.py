@@ -65,8 +65,9 @@ def measure(config: Config, name: str, robot: ls.MjcfRobot) -> Row:
     states, controls = np.tile(robot.at(), (config.steps, 1)), np.zeros((config.steps, m))
     for _ in range(config.rounds + 1):
         for which, threads in (("alone", 1), ("together", 2)):
-            solution = ls.smooth(problem, max_iterations=2, threads=threads, start=controls, safeguard=False)
-            times[which].append(1000 * solution.iterations[-1].seconds)
+            solution = ls.smooth(problem, max_iterations=4, threads=threads, start=controls, safeguard=False)
+            # Not the first, which has a pass more, nor the last, which may be certified.
+            times[which].append(1000 * solution.iterations[1].seconds)
         one = steps_alone(dynamics, states, controls, dt)
         times["needed"].append(1000 * one * (2 * (2 * (n + m) + 1) + 1))
     return Row(name, *(float(np.median(times[which][1:])) for which in ("alone", "together", "needed")))
