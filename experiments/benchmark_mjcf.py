@@ -53,8 +53,8 @@ def main(config: Config) -> list[Row]:
 
 def measure(config: Config, name: str, robot: ls.MjcfRobot) -> Row:
     """One iteration about the same trajectory again and again, on one thread and on two, and the steps alone."""
-    dynamics, dt = robot.dynamics, round(0.02 / robot.scene.model.opt.timestep) * robot.scene.model.opt.timestep
-    dt = dt or float(robot.scene.model.opt.timestep)
+    dynamics, timestep = robot.dynamics, float(robot.scene.model.opt.timestep)
+    dt = max(1, round(0.02 / timestep)) * timestep
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     goal = robot.at() + 0.1
     problem = ls.Problem(

@@ -63,6 +63,14 @@ def test_distances_in_the_cage_are_those_of_twelve_infinite_bars_and_a_cube():
     np.testing.assert_allclose(world.distance(points), np.min(distances, axis=0), atol=1e-12)
 
 
+def test_without_contacts_nothing_is_an_obstacle(scene_of):
+    body = '<worldbody><geom name="post" size="0.1"/></worldbody>'
+    assert scene_of(text=f"<mujoco>{body}</mujoco>").world.names == ("post",)
+    for flag in ("contact", "constraint"):
+        off = f'<option><flag {flag}="disable"/></option>'
+        assert scene_of(text=f"<mujoco>{off}{body}</mujoco>").world.names == ()
+
+
 @pytest.mark.parametrize("name", names())
 def test_packaged_scenes(name):
     scene = load_scene(name)

@@ -247,3 +247,22 @@ class TestWithoutAWay:
         for start in (prior, lambda problem: prior):
             with pytest.raises(ls.InputError, match="start: got an InitialPrior, want controls"):
                 ls.ilqr(in_the_plane(), start=start)
+
+
+def test_where_no_control_helps_by_itself_some_do_together() -> None:
+    """Sideways is only reached by turns of both controls: at rest the cost is flat, and to do nothing is stationary."""
+
+    def rate(x, u, p):
+        return [u[0], u[1], x[0] * u[1] - x[1] * u[0]]
+
+    dynamics = ls.Dynamics(rate, states=dict.fromkeys(("a", "b", "c"), ""), controls=dict.fromkeys(("u", "v"), ""))
+    problem = ls.Problem(
+        dynamics=dynamics, dt=0.05, steps=40, initial=ls.FixedState(np.zeros(3)), stage_cost=ls.ControlCost([0.1, 0.1]),
+        final_cost=ls.QuadraticCost([100.0, 100.0, 100.0], about=[0.0, 0.0, 1.0]),
+    )  # fmt: skip
+    idle, found = ls.smooth(problem, start=np.zeros(2)), ls.smooth(problem)
+    assert idle.cost == pytest.approx(50.0)
+    # c counts twice the area that (a, b) encloses; the least effort goes round it in a circle, once. With a radius r,
+    # 2 pi r^2 = 1 and a speed of 2 pi r / T, that is 1/2 0.1 (T / dt) (2 pi r / T)^2 = 0.1 pi / (dt T).
+    assert found.cost == pytest.approx(0.1 * np.pi / (0.05 * 2.0), rel=0.05)
+    assert [one.start for one in found.candidates][:1] == ["nominal control"]

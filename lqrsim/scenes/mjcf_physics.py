@@ -107,24 +107,22 @@ def _check(model: mujoco.MjModel, name: str) -> None:
 
 
 def _prepare(model: mujoco.MjModel, floors: bool) -> None:
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
     for geom in obstacle_geoms(model):
-        level = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE and _is_level(model, geom)
-        if not (floors and level):
-            model.geom_contype[geom] = model.geom_conaffinity[geom] = 0
-            if ((model.pair_geom1 == geom) | (model.pair_geom2 == geom)).any():
-                raise InputError(f"geom {geom}: got an obstacle in a <contact><pair>, want contype and conaffinity")
+        plane = model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_PLANE)
+        if floors and plane and abs(data.geom_xmat[geom][8]) > 1 - 1e-9:
+            continue  # level: to stand on
+        model.geom_contype[geom] = model.geom_conaffinity[geom] = 0
+        if ((model.pair_geom1 == geom) | (model.pair_geom2 == geom)).any():
+            who = model.geom(geom).name
+            raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype and conaffinity")
     option, flags = model.opt, mujoco.mjtDisableBit
     option.disableflags |= int(flags.mjDSBL_CLAMPCTRL) | int(flags.mjDSBL_AUTORESET) | int(flags.mjDSBL_SENSOR)
     option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     option.tolerance = min(option.tolerance, _CONVERGED)
     if mujoco.__version__ == "4.0.0":
         option.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # on sparse ones its Newton solver is wrong
-
-
-def _is_level(model: mujoco.MjModel, geom: int) -> bool:
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    return abs(data.geom_xmat[geom][8]) > 1 - 1e-9
 
 
 @cache
