@@ -8,8 +8,9 @@ from .control.chance_constrained import SafePlan as SafePlan
 from .control.chance_constrained import smooth_chance_constrained as smooth_chance_constrained
 from .control.controllers import Controller as Controller
 from .control.controllers import Feedback as Feedback
-from .control.controllers import Replanning as Replanning
 from .control.offset_free import OffsetFree as OffsetFree
+from .control.replanner import ReplanRecord as ReplanRecord
+from .control.replanning import Replanning as Replanning
 from .control.tracking import track as track
 from .control.tubes import Tube as Tube
 from .control.tubes import predict_tube as predict_tube
@@ -41,6 +42,7 @@ from .reports.page import report as report
 from .results.coordinates import Coordinates as Coordinates
 from .results.output_feedback import OutputFeedbackPolicy as OutputFeedbackPolicy
 from .results.policy import AffinePolicy as AffinePolicy
+from .results.replan import Replan as Replan
 from .results.rollout import Rollout as Rollout
 from .results.save_load import load_policy as load_policy
 from .results.save_load import load_rollout as load_rollout
@@ -106,6 +108,8 @@ from .solvers.ilqr import ilqr as ilqr
 from .solvers.ilqr import ilqr_many as ilqr_many
 from .solvers.initial_guess import InitialPrior as InitialPrior
 from .solvers.linear_quadratic import smooth_lq as smooth_lq
+from .solvers.prepared import PreparedSolver as PreparedSolver
+from .solvers.prepared import prepare as prepare
 from .solvers.smoother import smooth as smooth
 from .solvers.smoother import smooth_many as smooth_many
 from .stress.campaign import run_campaign as run_campaign

@@ -13,12 +13,13 @@ import numpy as np
 
 from lqrsim.codegen.jit import in_c_order
 from lqrsim.control.collision_chance import Surroundings
-from lqrsim.control.controllers import Control, Controller, SolvingAgain
+from lqrsim.control.controllers import Control, Controller
 from lqrsim.control.kalman import check_observable, kalman_filter
 from lqrsim.control.loop_moments import Loop
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.policy_of_filter import policy_of
 from lqrsim.control.replanned import Replanned
+from lqrsim.control.replanner import Replanner
 from lqrsim.control.sensors import Sensors, sensor_of
 from lqrsim.control.tolerances import Prediction, choose_tolerances, with_filter
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of, tracking_laws
@@ -30,6 +31,7 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
+from lqrsim.results.replan import Replan
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 
@@ -102,11 +104,11 @@ class OffsetFree(Controller):
         self.innovations: Array | None = None
         self.plans: list[dict[int, Trajectory]] = []
         self._lost: Mapping[int, str] = {}
-        self._again = None if replan_every is None else self._solving_again(replan_every)
         sensor = sensor_of(sensors, problem.dynamics.state_coordinates)
         efforts = effort_of(effort, problem.dynamics)
         self.model = PlanModel.of(problem.dynamics, plan, for_filter(uncertainty, memory, efforts, problem), sensor)
         check_observable("OffsetFree", self.model)
+        self._again = None if replan_every is None else self._replanner(replan_every)
         self.filter = kalman_filter(self.model)
         self.weights = self._weights(tolerate, efforts, at_end)
         self._make_law(np.zeros(len(self.model.transition)))
@@ -119,7 +121,7 @@ class OffsetFree(Controller):
         self.nominal = np.concatenate([plan.states, self.model.reached, np.tile(granted, (plan.steps + 1, 1))], axis=1)
         self.offset = plan.controls + offset - np.einsum("tij,tj->ti", self.gain, self.nominal[:-1])
 
-    def _about(self, solution: Solution, model: PlanModel, corrected: Array, granted: Array) -> "OffsetFree":
+    def _about(self, solution: Replan, model: PlanModel, corrected: Array, granted: Array) -> "OffsetFree":
         """The same about another plan, which begins with a measurement that is taken in already.
 
         Args:
@@ -131,12 +133,13 @@ class OffsetFree(Controller):
         law._make_law(granted)
         return law
 
-    def _solving_again(self, every: float) -> SolvingAgain:
+    def _replanner(self, every: float) -> Replanner:
         late = self.uncertainty.latency, self.uncertainty.delay
         if any(late):
             got = f"{every:g} with a latency of {late[0]} and a delay of {late[1]} periods"
             raise InputError(f"OffsetFree: replan_every: got {got}, want None, or an uncertainty without both")
-        return SolvingAgain("OffsetFree", self.problem, self.solution, every, "replan_every")
+        problem = replace(self.problem, dynamics=self.model.dynamics)
+        return Replanner("OffsetFree", problem, self.solution, every, name="replan_every")
 
     def _weights(self, tolerate: PerEntry | None, effort: Array, at_end: float) -> Weights:
         """Of the tolerances, or of those that are chosen."""
@@ -167,14 +170,14 @@ class OffsetFree(Controller):
 
     @property
     def solved(self) -> int:
-        return 0 if self._again is None else self._again.solved
+        return 0 if self._again is None else self._again.account.solved
 
     @property
     def kept(self) -> Counter[str]:
-        return Counter() if self._again is None else self._again.kept
+        return Counter() if self._again is None else self._again.account.kept
 
     def summary(self) -> str:
-        return "" if self._again is None else self._again.summary()
+        return "" if self._again is None else self._again.account.summary()
 
     def _check_one_plan(self, what: str) -> None:
         """Raise InputError if there will be others: no matrices are known of these ahead of time."""

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lqrsim.control.controllers import SolvingAgain
+from lqrsim.codegen.jit import in_c_order
 from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.replanner import Replanner, Task
 from lqrsim.errors import Array, InputError
 from lqrsim.results.solution_parts import Trajectory
+from lqrsim.solvers.initial_guess import InitialGuess
 
 if TYPE_CHECKING:
     from lqrsim.control.offset_free import _Run
@@ -30,7 +32,7 @@ class Replanned:
         beyond all that a robot can be -> why, in a line.
     """
 
-    def __init__(self, again: SolvingAgain, runs: Sequence["_Run"]) -> None:
+    def __init__(self, again: Replanner, runs: Sequence["_Run"]) -> None:
         again.start()
         self._again, self._runs = again, runs
         self.plans: list[dict[int, Trajectory]] = [{} for _ in runs]
@@ -40,14 +42,14 @@ class Replanned:
         commands: list[Array] = []
         for k, run in enumerate(self._runs):
             run.take_in(step, shown[k : k + 1])
-            if self._again.due(step) and step < run.law.problem.steps and not run.lost:
-                self._replan(run, step, self.plans[k])
+            if self._again.due(step) and not run.lost:
+                self._replan(run, k, step)
             commands.append(run.command(step))
             if run.lost:
                 self.lost.setdefault(k, run.lost[0])
         return np.concatenate(commands)
 
-    def _replan(self, run: "_Run", step: int, plans: dict[int, Trajectory]) -> None:
+    def _replan(self, run: "_Run", trial: int, step: int) -> None:
         """The law from now on is about a new plan, if there is one."""
         law, model, z = run.law, run.model, run.estimates[0]
         n, done = model.n, step - run.first
@@ -61,17 +63,21 @@ class Replanned:
             dynamics = model.dynamics.with_parameters(**values)
             problem = replace(law.problem, dynamics=dynamics)
         except InputError as error:  # an estimate is not finite
-            self._again.keep(str(error))
+            self._again.account.refuse(str(error))
             return
         # By that model the actuators have no lag, and no gains and offsets.
         gain, reached = law.gain[done:], law.nominal[done:-1, n : n + model.lagging]
         rest = np.concatenate([reached, np.tile(granted, (len(gain), 1))], axis=1)
         offset = law.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], rest)
         here = dynamics.state_coordinates.nearest(z[:n], law.nominal[done, :n])
-        solution = self._again.solve(problem, step, here, gain[:, :, :n], offset)
-        if solution is None:
+        plan = law.solution
+        start = InitialGuess(
+            in_c_order(gain[:, :, :n]), in_c_order(offset), plan.shifted(done, horizon="shrinking").cost_to_go, None, ""
+        )
+        solution = self._again.solve(Task(step, step, here, start, problem))
+        if not self._again.account.enter(step, trial, solution):
             return
-        plans[step] = solution.trajectory
+        self.plans[trial][step] = solution.trajectory
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
         run.law, run.first = law._about(solution, about, law.filter.corrected[done], granted), step
 

@@ -1,7 +1,9 @@
 """The optimal control problem of Eqs. (1)-(2), in discrete time."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -105,6 +107,32 @@ class Problem:
             _check_within_reach(limited, self.dynamics.control_coordinates)
             object.__setattr__(self, "control_limits", (limited.low, limited.high))
         self._check_start_clear()
+
+    def from_state(self, state: npt.ArrayLike, *, after: int = 0) -> "Problem":
+        """What is left of it after so many steps, from a state (n,) that is given exactly.
+
+        It may begin within an obstacle, unlike a problem that is stated: there a plan is to find out of it.
+
+        Raises:
+          InputError: the state is not one, or no step is left.
+        """
+        after = check_count("after", after, at_least=0, at_most=self.steps - 1)
+        start = FixedState(check_array("state", state, (len(self.dynamics.state_coordinates),)))
+        if isinstance(self.initial, FixedState):  # a quarter of the time that making the cost anew takes
+            term = copy.copy(self._terms["initial"][0])
+            object.__setattr__(term, "data", np.concatenate([start.state, term.data[len(start.state) :]]))
+        else:
+            term = QuadraticCost(np.zeros(len(start.state)), about=start.state).bind(self.dynamics)
+        changed: dict[str, Any] = {"initial": start, "_terms": self._terms | {"initial": (term,)}}
+        if after:
+            steps, constraints = self.steps - after, tuple(one.ahead(after) for one in self.constraints)
+            terms = bind_all(constraints, self.dynamics, steps)
+            changed |= {"steps": steps, "constraints": constraints, "_constraint_terms": terms}
+        # All of it was checked when it was stated, and this is done at every solve of a robot that plans as it goes.
+        other = copy.copy(self)
+        for name, value in changed.items():
+            object.__setattr__(other, name, value)
+        return other
 
     @property
     def bytes_per_step(self) -> int:

@@ -5,7 +5,7 @@ each trial the bits that it gets alone, which NumPy's products of matrices do no
 need be no compiler. `tests/test_policy.py` holds one against the other.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ from lqrsim.errors import (
 )
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
+from lqrsim.results.solution_parts import left_after
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +69,11 @@ class AffinePolicy:
     def digest(self) -> str:
         """Hash of the laws and their times, 16 hexadecimal digits; `Rollout.policy_digest` of a run of this policy."""
         return sha256(self.gain, self.offset, self.nominal, np.float64(self.dt))[:16]
+
+    def after(self, steps: int, *, filled: bool) -> "AffinePolicy":
+        """What is left of it after so many steps; `filled` up with the last law to as many as there are."""
+        parts = {name: left_after(steps, getattr(self, name), filled=filled) for name in ("gain", "offset", "nominal")}
+        return replace(self, **parts)
 
     def control(self, state: npt.ArrayLike, step: int) -> Array:
         """The law of one step before saturation, (..., m), at states (..., n) given in the nominal's representative.

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.errors import (
     Array,
@@ -15,6 +16,7 @@ from lqrsim.errors import (
     check_count,
     check_items,
     check_kind,
+    check_name,
     check_number,
     check_shape,
     excerpt,
@@ -22,7 +24,16 @@ from lqrsim.errors import (
 )
 from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
+from lqrsim.results.solution_parts import (
+    HORIZONS,
+    Candidate,
+    Certificate,
+    Iteration,
+    Multipliers,
+    Status,
+    Trajectory,
+    left_after,
+)
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 
 
@@ -165,34 +176,31 @@ class Solution:
             )
         return TotalCost(self.cost_to_go, self.cost_to_come)
 
-    def shifted(self, steps: int) -> "Solution":
-        """What is left of it after so many steps, to start the next solve of a horizon that moves along.
+    def shifted(self, steps: int, *, horizon: str = "moving") -> "Solution":
+        """What is left of it after so many steps, to start the next solve with: `start=solution.shifted(k)`.
 
-        The end is filled up: the last law, value function and multipliers stay in force, as a policy's last law does
-        after its horizon, and the last control is held. Status, log, cost and digest stay those of the whole.
-        `smooth(problem, start=solution.shifted(k))`.
+        Of a "moving" horizon the end is filled up: the last law, value function and multipliers stay in force, as a
+        policy's last law does after its horizon, and the last control is held. A "shrinking" one has so many steps
+        less. Status, log, cost and digest stay those of the whole.
 
         Raises:
-          InputError: `steps` is not a whole number from 0 to the last step.
+          InputError: `steps` is not a whole number from 0 to the last step, or `horizon` is neither of the two.
         """
         if check_count("steps", steps, at_least=0) >= self.trajectory.steps:
             raise InputError(f"steps: got {steps}, want less than {self.trajectory.steps}, the steps of the solution")
+        filled = check_name("horizon", horizon, HORIZONS) == "moving"
 
-        def moved(array: Array) -> Array:
-            kept = np.minimum(np.arange(steps, steps + len(array)), len(array) - 1)
-            return array[kept]
-
-        def law(policy: AffinePolicy) -> AffinePolicy:
-            return replace(policy, gain=moved(policy.gain), offset=moved(policy.offset), nominal=moved(policy.nominal))
+        def moved(array: npt.ArrayLike) -> Array:
+            return left_after(steps, array, filled=filled)
 
         plan, value = self.trajectory, self.cost_to_go
         return replace(
             self,
-            policy=law(self.policy),
+            policy=self.policy.after(steps, filled=filled),
             inverse_policy=None,
             cost_to_go=None
             if value is None
-            else Quadratic(moved(value.hessian), moved(value.gradient), moved(np.asarray(value.constant))),
+            else Quadratic(moved(value.hessian), moved(value.gradient), moved(value.constant)),
             cost_to_come=None,
             trajectory=Trajectory(moved(plan.states), moved(plan.controls), plan.dt),
             clearance=None if self.clearance is None else moved(self.clearance),

@@ -4,8 +4,19 @@ import enum
 from dataclasses import dataclass, fields
 
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, check_text, shaped
+
+# How a horizon goes on: it moves along with the robot, or its end stays where it is.
+HORIZONS = ("moving", "shrinking")
+
+
+def left_after(steps: int, array: npt.ArrayLike, *, filled: bool) -> Array:
+    """What is left of an array (T, ...) after so many steps; `filled` up with the last to the same length."""
+    array = np.asarray(array)
+    rest = array[steps:]
+    return np.concatenate([rest, np.repeat(array[-1:], steps, axis=0)]) if filled and steps else rest
 
 
 @dataclass(frozen=True)

@@ -135,10 +135,12 @@ class Stop:
 
     deadline: float = np.inf
     error: BaseException | None = None
+    # How long the next iteration may take, in s: one that would end after the deadline is not begun.
+    reserve: float = 0.0
 
     @property
     def due(self) -> bool:
-        return self.error is not None or time.perf_counter() >= self.deadline
+        return self.error is not None or time.perf_counter() + self.reserve >= self.deadline
 
     def finish(self, solution: Solution) -> Solution:
         """The solution; or, where something was raised, raises it again."""

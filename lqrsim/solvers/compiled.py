@@ -130,10 +130,14 @@ def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
 
 
 def rollout(problem: Problem, gain: Array, offset: Array, state: Array) -> tuple[Array, Array]:
-    """Where the laws u_t = gain_t x + offset_t lead from a state, by the model: states (T+1, n) and controls (T, m)."""
-    states, controls = np.empty((problem.steps + 1, len(state))), np.empty((problem.steps, offset.shape[1]))
+    """Where the laws u_t = gain_t x + offset_t lead from a state, by the model.
+
+    Gains (T, m, n), offsets (T, m); returns states (T+1, n) and controls (T, m). T is the number of laws.
+    """
+    steps = len(gain)
+    states, controls = np.empty((steps + 1, len(state))), np.empty((steps, offset.shape[1]))
     policy, plan = Policy(in_c_order(gain), in_c_order(offset)), Plan(states, controls)
-    core(problem).rollout(problem.steps, state, policy, arguments(problem), plan)
+    core(problem).rollout(steps, in_c_order(state), policy, arguments(problem), plan)
     return states, controls
 
 

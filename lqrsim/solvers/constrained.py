@@ -30,7 +30,7 @@ def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) ->
     """Run an attempt to its end, the method, its safeguard where that fails, and then the constraints; certified."""
     tried: tuple[Iteration, ...] = ()
     if attempt.initial_guess.multipliers and attempt.run_opening_pass():
-        found = _satisfy(attempt, None, each=each, callback=callback)
+        found = satisfy(attempt, None, each=each, callback=callback)
         if found.success or attempt.stop.due or not attempt.iterations_left(found.iterations):
             return attempt.certified(found)
         # What is known of another problem does not help here.
@@ -58,11 +58,11 @@ def _with_constraints(
             found = dataclasses.replace(found, status=status, detail="before the constraints could be met")
         return attempt, found
     if found.success:
-        return attempt, _satisfy(attempt, found, each=each, callback=callback)
+        return attempt, satisfy(attempt, found, each=each, callback=callback)
     return _first_feasible(attempt, found, each=each, callback=callback)
 
 
-def _satisfy(
+def satisfy(
     attempt: Attempt, found: AttemptResult | None, *, each: bool, callback: Callback | None = None
 ) -> AttemptResult:
     """Go on from what was found without the constraints, or, without it, from the multipliers of another solution."""
@@ -112,7 +112,7 @@ def _first_feasible(
     without = _again(attempt, plain, dataclasses.replace(attempt.initial_guess, prior=None), found.iterations)
     kept = without.finish(each=each, callback=told)
     if kept.success and not attempt.stop.due and without.iterations_left(kept.iterations):
-        kept = _satisfy(without, kept, each=each, callback=told)
+        kept = satisfy(without, kept, each=each, callback=told)
     before = (*found.iterations, *(without_cost(iteration) for iteration in kept.iterations))
     if not kept.success or attempt.stop.due or not attempt.iterations_left(before):
         # Of the plan, only what the constraints say is known: its certificate tells the cost.
@@ -123,11 +123,11 @@ def _first_feasible(
         cost_to_go=kept.values.get("cost_to_go"), multipliers=kept.multipliers,
     )  # fmt: skip
     attempt = _again(attempt, problem, initial_guess, before)
-    again = _satisfy(attempt, None, each=each, callback=callback) if kept.multipliers else None
+    again = satisfy(attempt, None, each=each, callback=callback) if kept.multipliers else None
     if again is None:
         again = attempt.finish(each=each, callback=callback)
         if again.success and not attempt.stop.due and attempt.iterations_left(again.iterations):
-            again = _satisfy(attempt, again, each=each, callback=callback)
+            again = satisfy(attempt, again, each=each, callback=callback)
     return attempt, dataclasses.replace(again, iterations=(*before, *again.iterations))
 
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.control.controllers import Controller, Feedback, Replanning
+from lqrsim.control.controllers import Controller, Feedback
 from lqrsim.control.offset_free import OffsetFree
+from lqrsim.control.replanning import Replanning
 from lqrsim.control.tracking import track
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import InputError, check_name, told

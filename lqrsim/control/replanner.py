@@ -1,0 +1,202 @@
+"""Solving again as a robot goes: what is solved, from where, and how that went. Who runs it is another matter.
+
+`replanning.py` runs it in simulations, of many robots at once, `planner.py` on a robot, in a thread of its own, and
+`replanned.py` within output feedback.
+"""
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from lqrsim.errors import Array, InputError, check_flag, check_kind, check_name, check_number
+from lqrsim.problem.problem import Problem
+from lqrsim.results.replan import Replan
+from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import HORIZONS
+from lqrsim.solvers import compiled
+from lqrsim.solvers.initial_guess import InitialGuess
+from lqrsim.solvers.prepared import prepare
+
+
+@dataclass(frozen=True)
+class Law:
+    """What is in force, or will be: a plan with its law, and the step that it begins at."""
+
+    plan: Solution | Replan
+    first: int
+
+    def row(self, step: int) -> int:
+        """Which of its laws is in force at a step: after its horizon the last one."""
+        return min(max(step - self.first, 0), self.plan.trajectory.steps - 1)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be solved: at a step, for a law that begins at another, from a state (n,) and with a law."""
+
+    step: int
+    first: int
+    state: Array
+    start: Solution | Replan | InitialGuess
+    problem: Problem
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplanRecord:
+    """How one solve went.
+
+    Attributes:
+      step: the control period in which it began. trial: of a simulation, else 0.
+      status: how the solve ended. iterations: how many it took. seconds: how long it took.
+      cost, before: of the new plan, and of where the law in force led from there.
+      used: whether its plan came into force. reason: why not, or why it is no better; empty if all went well.
+    """
+
+    step: int
+    trial: int
+    status: str
+    iterations: int
+    seconds: float
+    cost: float
+    before: float
+    used: bool
+    reason: str
+
+
+class Account:
+    """How solves went.
+
+    Attributes:
+      records: one a solve. solved: how many were used. kept: why others were not, and the law before went on: reason ->
+        how many.
+    """
+
+    def __init__(self) -> None:
+        self.records: list[ReplanRecord] = []
+        self.solved, self.kept = 0, Counter[str]()
+
+    def enter(self, step: int, trial: int, replan: Replan, *, late: bool = False) -> bool:
+        """Count a solve; whether its plan is to be used."""
+        reason = "" if replan.success else replan.status.name
+        if late:
+            reason = "not ready in time"
+        elif not replan.improved and not replan.success:
+            reason = f"{replan.status.name}, without a better plan"
+        finite = np.isfinite(replan.cost)
+        used = finite and not late and (replan.success or replan.improved)
+        if not finite:
+            reason = "the law before leads to infinity by the model"
+        self.solved += used
+        if not used:
+            self.kept[reason] += 1
+        self.records.append(
+            ReplanRecord(
+                step=step, trial=trial, status=replan.status.name, iterations=replan.iterations, seconds=replan.seconds,
+                cost=replan.cost, before=replan.before, used=used, reason=reason,
+            )
+        )  # fmt: skip
+        return used
+
+    def refuse(self, reason: str) -> None:
+        """Count a solve that did not begin."""
+        self.kept[reason] += 1
+
+    def summary(self) -> str:
+        """How often it was solved, and why the law before was kept where it was, in a line."""
+        line = f"solved again {self.solved} times"
+        early = Counter(one.reason for one in self.records if one.used and one.reason)
+        if early:
+            line += f" ({', '.join(f'{count} {reason}' for reason, count in early.most_common())})"
+        if self.kept:
+            reasons = "; ".join(f"{count} times {reason}" for reason, count in self.kept.most_common())
+            line += f", kept the law before {self.kept.total()} times: {reasons}"
+        return line
+
+
+class Replanner:
+    """What is solved, when and from where.
+
+    Args:
+      who: for messages. problem: that was solved. solution: its solution.
+      every: seconds between two solves. deadline: seconds until its answer comes into force. Both are rounded to
+        control periods, the deadline up.
+      horizon: "shrinking", to the end of the first plan, or "moving", as long as that.
+      predict: whether to solve from where the law in force leads by the deadline, or from the state at the beginning.
+
+    Attributes:
+      periods: control periods between two solves. delay: until the answer comes into force.
+      solver: the prepared solver. account: how the solves of the last run went.
+
+    Raises:
+      InputError: as `Replanning`.
+    """
+
+    def __init__(
+        self,
+        who: str,
+        problem: Problem,
+        solution: Solution,
+        every: float,
+        *,
+        name: str = "every",
+        deadline: float = 0.0,
+        horizon: str = "shrinking",
+        predict: bool = True,
+    ) -> None:
+        check_kind(f"{who}: problem", problem, Problem, "a Problem, such as scenario.problem")
+        check_kind(f"{who}: solution", solution, Solution, "its Solution")
+        dynamics, plan = problem.dynamics, solution.trajectory
+        spaces = solution.policy.state_coordinates.names, solution.policy.control_coordinates.names
+        if spaces != (dynamics.state_coordinates.names, dynamics.control_coordinates.names):
+            raise InputError(f"{who}: solution: got one of another system, want the problem's")
+        if (plan.steps, plan.dt) != (problem.steps, problem.dt):
+            got, want = f"{plan.steps} steps of {plan.dt:g} s", f"{problem.steps} steps of {problem.dt:g} s"
+            raise InputError(f"{who}: solution: got {got}, want the problem's: {want}")
+        self.every = check_number(f"{who}: {name}", every, at_least=0.999 * problem.dt)
+        self.periods = round(self.every / problem.dt)
+        self.deadline = check_number(f"{who}: deadline", deadline, at_least=0.0)
+        self.delay = math.ceil(self.deadline / problem.dt - 1e-9)
+        if self.delay > self.periods:
+            raise InputError(
+                f"{who}: deadline: got {self.deadline:g} s, {self.delay} control periods, want at most"
+                f" {name}={self.every:g} s, {self.periods} control periods: one solve at a time"
+            )
+        self.horizon = check_name(f"{who}: horizon", horizon, HORIZONS)
+        self.predict = check_flag(f"{who}: predict", predict)
+        self.problem, self.solution = problem, solution
+        self.solver = prepare(problem)
+        self.account = Account()
+
+    def start(self) -> Law:
+        """The law to begin with; the last run is forgotten."""
+        self.account = Account()
+        return Law(self.solution, 0)
+
+    def due(self, step: int) -> bool:
+        """Whether a solve begins at a step."""
+        left = self.horizon == "moving" or step + self.delay < self.problem.steps
+        return step > 0 and step % self.periods == 0 and left
+
+    def task(self, law: Law, step: int, state: Array, problem: Problem | None = None) -> Task:
+        """What is to be solved at a step, in which the robot has a state (n,) and that law is in force."""
+        plan, first = law.plan, step + self.delay
+        row = law.row(step)
+        here = plan.policy.state_coordinates.nearest(state, plan.policy.nominal[row])
+        problem = self.problem if problem is None else problem
+        if self.delay and self.predict:
+            here = self._ahead(law, step, here, problem)
+        done = min(first - law.first, plan.trajectory.steps - 1)
+        return Task(step, first, here, plan.shifted(done, horizon=self.horizon), problem)
+
+    def _ahead(self, law: Law, step: int, state: Array, problem: Problem) -> Array:
+        """Where the law in force leads by the deadline, by the model."""
+        rows = [law.row(step + i) for i in range(self.delay)]
+        gain, offset = law.plan.policy.gain[rows], law.plan.policy.offset[rows]
+        return compiled.rollout(problem, gain, offset, state)[0][-1]
+
+    def solve(self, task: Task, time_limit: float | None = None) -> Replan:
+        """The answer, to a task that is due."""
+        after = task.first if self.horizon == "shrinking" else 0
+        return self.solver.solve(task.state, task.start, problem=task.problem, after=after, time_limit=time_limit)

@@ -1,0 +1,215 @@
+"""Solving again and again in real time: all is compiled beforehand, and each solve ends in time with what it has."""
+
+import time
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen.jit import in_c_order
+from lqrsim.errors import Array, InputError, check_array, check_kind, check_number
+from lqrsim.problem.problem import Problem
+from lqrsim.results.policy import AffinePolicy
+from lqrsim.results.replan import Replan
+from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Iteration, Status, Trajectory
+from lqrsim.results.value_functions import Quadratic
+from lqrsim.solvers import compiled
+from lqrsim.solvers.attempt import Attempt, AttemptResult
+from lqrsim.solvers.common import SmootherSettings, Stop, check_problem
+from lqrsim.solvers.constrained import satisfy
+from lqrsim.solvers.initial_guess import InitialGuess
+
+ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
+
+
+def prepare(
+    problem: Problem,
+    *,
+    tolerance: float = 1e-4,
+    gap_tolerance: float = 1e-3,
+    constraint_tolerance: float = 1e-3,
+    max_iterations: int = 100,
+) -> "PreparedSolver":
+    """Compile all that solving problems of this structure can need, now: nothing is compiled while a robot runs.
+
+    Args:
+      problem: what is to be solved again and again, with other states, goals, obstacles and parameters.
+      tolerance, gap_tolerance, constraint_tolerance, max_iterations: as in `smooth`.
+
+    Raises:
+      InputError: an argument is not as described.
+    """
+    settings = SmootherSettings(
+        form="dual", first_pass="forward", safeguard=True, stop="optimal", tolerance=tolerance,
+        gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=None, start=None, starts=1,
+        constraint_tolerance=constraint_tolerance,
+    )  # fmt: skip
+    check_problem(problem)
+    return PreparedSolver(problem, settings)
+
+
+class PreparedSolver:
+    """Solves problems of one structure, from one state after the other; `prepare` makes it.
+
+    Attributes:
+      problem: what is solved by default.
+    """
+
+    def __init__(self, problem: Problem, settings: SmootherSettings) -> None:
+        self.problem, self._settings = problem, settings
+        self._states = problem.dynamics.state_coordinates
+        self._controls = problem.control_coordinates.within(problem.dynamics.control_coordinates)
+        self._core = compiled.core(problem)
+        self._pace = 0.0  # s, of a slow iteration
+        self._compile()
+
+    def _compile(self) -> None:
+        n, m, steps = len(self._states), len(self._controls), self.problem.steps
+        state = np.zeros(n) if self.problem.start is None else self.problem.start.copy()
+        control = self.problem.nominal_control.copy()
+        law = np.zeros((steps, m, n)), np.tile(control, (steps, 1))
+        attempt = Attempt(self.problem, self._settings, InitialGuess(*law, None, None, ""), state, Stop())
+        attempt.roll_out()
+        compiled.rollout(self.problem, *law, state)
+        attempt.work.constraint_values(*attempt.work.plan)
+        for which in range(len(self.problem.constraint_terms)):
+            attempt.work.constraint_slope(which, 0, state, control, 0)
+
+    def check(self, problem: Problem) -> Problem:
+        """The problem. Raises InputError if it would have to be compiled: only numbers may differ from `problem`."""
+        check_problem(problem)
+        if compiled.core(problem) is not self._core:
+            raise InputError(
+                "problem: got one of another structure, want the prepared one with other numbers: goal, weights,"
+                " obstacles, parameters, limits, steps"
+            )
+        return problem
+
+    def solve(
+        self,
+        state: npt.ArrayLike,
+        start: Solution | Replan | InitialGuess,
+        *,
+        problem: Problem | None = None,
+        after: int = 0,
+        time_limit: float | None = None,
+    ) -> Replan:
+        """Solve from a state, beginning with a law: the answer is no worse than to go on with that; see `Replan`.
+
+        Args:
+          state: (n,) where the plan is to begin.
+          start: the law, of as many steps as are left of the problem: `before.shifted(k)`.
+          problem: what to solve, the start apart; the prepared one, or one with other numbers.
+          after: how many steps of it are over: what is left is solved.
+          time_limit: seconds from this call to its end. An iteration that would probably end later is not begun.
+
+        Raises:
+          InputError: an argument is not as described.
+        """
+        clock = time.perf_counter()
+        problem = (self.problem if problem is None else self.check(problem)).from_state(state, after=after)
+        check_kind("start", start, (Solution, Replan, InitialGuess), "a Solution or a Replan")
+        stop = Stop() if time_limit is None else Stop(clock + check_number("time_limit", time_limit, above=0.0))
+        stop.reserve = self._pace
+        guess = start if isinstance(start, InitialGuess) else _initial_guess(start, problem)
+        attempt = Attempt(problem, self._settings, guess, np.array(state, dtype=np.float64), stop)
+        best = _Best(attempt)
+        with problem.dynamics.solving(1):
+            found = _run(attempt, best)
+        iterating = sum(one.seconds for one in found.iterations)
+        self._pace = max(0.5 * self._pace, max((one.seconds for one in found.iterations), default=0.0))
+        best.consider(found)
+        return self._answer(problem, best, found, clock, iterating)
+
+    def _answer(self, problem: Problem, best: "_Best", found: AttemptResult, clock: float, iterating: float) -> Replan:
+        states, controls = best.plan
+        policy = AffinePolicy(
+            gain=best.law[0], offset=best.law[1], nominal=states[:-1], dt=problem.dt, state_coordinates=self._states,
+            control_coordinates=self._controls,
+        )  # fmt: skip
+        return Replan(
+            status=found.status, detail=found.detail, improved=best.improved, policy=policy,
+            trajectory=Trajectory(states, controls, problem.dt), cost=best.cost, before=best.before,
+            violation=best.violation, cost_to_go=best.cost_to_go, multipliers=best.multipliers,
+            iterations=len(found.iterations), seconds=time.perf_counter() - clock, iterating=iterating,
+        )  # fmt: skip
+
+
+def _initial_guess(start: Solution | Replan, problem: Problem) -> InitialGuess:
+    """The law to begin with, and what is known of its cost-to-go and of the multipliers."""
+    n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
+    law = start.policy
+    gain, offset = (
+        check_array("start: gain", law.gain, (steps, m, n)),
+        check_array("start: offset", law.offset, (steps, m)),
+    )
+    multipliers = start.multipliers
+    if [one.values.shape for one in multipliers] != [(steps + 1, one.rows) for one in problem.constraint_terms]:
+        multipliers = ()  # of other constraints
+    return InitialGuess(in_c_order(gain), in_c_order(offset), start.cost_to_go, None, "", multipliers=multipliers)
+
+
+def _run(attempt: Attempt, best: "_Best") -> AttemptResult:
+    """The method, its safeguard and the constraints, until it converges or has to stop."""
+    try:
+        if attempt.initial_guess.multipliers:
+            return satisfy(attempt, None, each=True, callback=best)
+        found = attempt.finish(each=True, callback=best)
+        if attempt.problem.constraints and found.success and not attempt.stop.due:
+            found = satisfy(attempt, found, each=True, callback=best)
+        return found
+    except InputError as error:  # a function that is not finite at the start
+        states, controls = attempt.work.states, attempt.work.controls
+        return AttemptResult(
+            status=Status.NOT_FINITE, detail=str(error), iterations=(), states=states, controls=controls,
+            law=(attempt.initial_guess.gain, attempt.initial_guess.offset), cost=np.inf, violation=np.inf, gap=np.nan,
+        )  # fmt: skip
+
+
+class _Best:
+    """The best plan so far, which is at first that of the law that the solve began with; called after each iteration.
+
+    Attributes:
+      plan: states and controls. law: gain and offset. cost_to_go: of the law; None where that is not known.
+      multipliers: that it was found with. cost, violation: of it. before: the cost of the first.
+      improved: whether it is another than the first.
+    """
+
+    def __init__(self, attempt: Attempt) -> None:
+        self._attempt, self._work, guess = attempt, attempt.work, attempt.initial_guess
+        attempt.roll_out()
+        values = self._work.constraint_values(self._work.states, self._work.controls)
+        self.cost, self.violation = float(self._work.memory["plan_cost"]), self._work.violation(values)
+        self.before = self.cost
+        self.plan = self._work.states.copy(), self._work.controls.copy()
+        self.law, self.cost_to_go, self.multipliers = (guess.gain, guess.offset), guess.cost_to_go, guess.multipliers
+        self.improved = False
+
+    def __call__(self, iteration: Iteration) -> None:
+        if iteration.method == "smooth" and self._beaten_by(iteration.cost, iteration.violation):
+            kept = self._work.arrays.kept
+            self._keep(iteration.cost, iteration.violation, self._work.arrays.rollout, kept)
+
+    def consider(self, found: AttemptResult) -> None:
+        """What it ended with: that, if it converged and is as good; and if it is better in any case."""
+        as_good = found.success and not self._better(self.cost, self.violation, found.cost, found.violation)
+        if as_good or self._beaten_by(found.cost, found.violation):
+            self._keep(found.cost, found.violation, (found.states, found.controls), found.law)
+            self.multipliers = found.multipliers
+
+    def _beaten_by(self, cost: float, violation: float) -> bool:
+        return self._better(cost, violation, self.cost, self.violation)
+
+    def _better(self, cost: float, violation: float, than_cost: float, than_violation: float) -> bool:
+        """Whether one plan is better than another: constraints first, then the cost, beyond rounding."""
+        if not np.isfinite(cost) or np.isnan(violation):
+            return False
+        if violation > 0 or than_violation > 0:
+            return violation < than_violation
+        return not cost >= than_cost - ROUNDING * abs(than_cost)
+
+    def _keep(self, cost: float, violation: float, plan: tuple[Array, Array], law: tuple[Array, Array]) -> None:
+        self.cost, self.violation, self.improved = cost, violation, True
+        self.plan = plan[0].copy(), plan[1].copy()
+        self.law = law[0].copy(), law[1].copy()
+        self.cost_to_go = Quadratic(*(array.copy() for array in self._work.arrays.to_go))
