@@ -9,6 +9,7 @@ from .control.chance_constrained import smooth_chance_constrained as smooth_chan
 from .control.controllers import Controller as Controller
 from .control.controllers import Feedback as Feedback
 from .control.offset_free import OffsetFree as OffsetFree
+from .control.planner import Planner as Planner
 from .control.replanner import ReplanRecord as ReplanRecord
 from .control.replanning import Replanning as Replanning
 from .control.tracking import track as track

@@ -179,22 +179,28 @@ class Replanner:
         left = self.horizon == "moving" or step + self.delay < self.problem.steps
         return step > 0 and step % self.periods == 0 and left
 
-    def task(self, law: Law, step: int, state: Array, problem: Problem | None = None) -> Task:
-        """What is to be solved at a step, in which the robot has a state (n,) and that law is in force."""
+    def task(self, law: Law, step: int, state: Array, problem: Problem | None = None, *, late: float = 0.0) -> Task:
+        """What is to be solved in a control period, of a state (n,) that was measured `late` seconds after it began."""
         plan, first = law.plan, step + self.delay
         row = law.row(step)
         here = plan.policy.state_coordinates.nearest(state, plan.policy.nominal[row])
         problem = self.problem if problem is None else problem
         if self.delay and self.predict:
-            here = self._ahead(law, step, here, problem)
+            here = self._ahead(law, step, here, problem, late)
         done = min(first - law.first, plan.trajectory.steps - 1)
         return Task(step, first, here, plan.shifted(done, horizon=self.horizon), problem)
 
-    def _ahead(self, law: Law, step: int, state: Array, problem: Problem) -> Array:
+    def _ahead(self, law: Law, step: int, state: Array, problem: Problem, late: float) -> Array:
         """Where the law in force leads by the deadline, by the model."""
+        policy, dt = law.plan.policy, problem.dt
         rows = [law.row(step + i) for i in range(self.delay)]
-        gain, offset = law.plan.policy.gain[rows], law.plan.policy.offset[rows]
-        return compiled.rollout(problem, gain, offset, state)[0][-1]
+        if late > 1e-9 * dt:
+            rest, now = problem.dynamics.period_near(dt - late), rows.pop(0)
+            if rest > 0:
+                state = compiled.rollout(problem, policy.gain[[now]], policy.offset[[now]], state, dt=rest)[0][-1]
+        if rows:
+            state = compiled.rollout(problem, policy.gain[rows], policy.offset[rows], state)[0][-1]
+        return state
 
     def solve(self, task: Task, time_limit: float | None = None) -> Replan:
         """The answer, to a task that is due."""

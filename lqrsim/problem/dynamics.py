@@ -244,6 +244,10 @@ class Dynamics:
             ]
         )
 
+    def period_near(self, dt: float) -> float:
+        """The duration nearest to `dt` seconds that they can be stepped by: that, but where MuJoCo steps them."""
+        return check_number("dt", dt)
+
     def check_period(self, dt: float) -> None:
         """Raises InputError if they cannot be stepped by `dt` seconds; they always can, but where MuJoCo steps them."""
         check_number("dt", dt)

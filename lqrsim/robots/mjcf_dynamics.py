@@ -94,6 +94,11 @@ class MjcfDynamics(Dynamics):
             other.parameters[check_name("parameters", name, self.parameters)] = check_number(name, value)
         return other
 
+    def period_near(self, dt: float) -> float:
+        """The whole number of physics steps nearest to `dt`, in seconds."""
+        timestep = float(self.physics.model.opt.timestep)
+        return round(check_number("dt", dt) / timestep) * timestep
+
     def check_period(self, dt: float) -> None:
         """Raises InputError unless `dt` seconds are a whole number of physics steps."""
         timestep, dt = float(self.physics.model.opt.timestep), check_number("dt", dt, above=0.0)

@@ -129,15 +129,20 @@ def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
     return costs
 
 
-def rollout(problem: Problem, gain: Array, offset: Array, state: Array) -> tuple[Array, Array]:
+def rollout(
+    problem: Problem, gain: Array, offset: Array, state: Array, *, dt: float | None = None
+) -> tuple[Array, Array]:
     """Where the laws u_t = gain_t x + offset_t lead from a state, by the model.
 
-    Gains (T, m, n), offsets (T, m); returns states (T+1, n) and controls (T, m). T is the number of laws.
+    Gains (T, m, n), offsets (T, m); returns states (T+1, n) and controls (T, m). T is the number of laws, and `dt` how
+    long each is in force, by default the problem's control period.
     """
+    model = arguments(problem)
+    model = model if dt is None else model._replace(dt=float(dt))
     steps = len(gain)
     states, controls = np.empty((steps + 1, len(state))), np.empty((steps, offset.shape[1]))
     policy, plan = Policy(in_c_order(gain), in_c_order(offset)), Plan(states, controls)
-    core(problem).rollout(steps, in_c_order(state), policy, arguments(problem), plan)
+    core(problem).rollout(steps, in_c_order(state), policy, model, plan)
     return states, controls
 
 
