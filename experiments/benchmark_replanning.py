@@ -1,0 +1,64 @@
+"""Re-planning in real time: how long it takes, what it is worth, and what others take.
+
+    python experiments/benchmark_replanning.py                           # everything
+    python experiments/benchmark_replanning.py --sections times          # some of it
+    python experiments/benchmark_replanning.py --quick                   # as little as shows how it works
+
+Each section's numbers are in the folder of the output, as JSON, as soon as they are there.
+
+times   How long a re-plan takes: both robots, with the obstacle's cost, with control limits and with a clearance.
+changes A goal that jumps, and a pillar that appears where the plan leads.
+delay   What a delay of one control period costs, predicted or ignored.
+"""
+
+import json
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Literal
+
+from paper.common import Result, Statement, opening, run
+from replan import changes, common, delay, times
+
+from lqrsim.results.save_load import replacing
+
+Section = Literal["times", "changes", "delay"]
+SECTIONS: dict[Section, tuple[ModuleType, str]] = {
+    "times": (times, "How long re-plans take"),
+    "changes": (changes, "What changes on the way"),
+    "delay": (delay, "What a delay costs"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(common.Config):
+    sections: tuple[Section, ...] = tuple(SECTIONS)
+    """Which of them."""
+
+
+def main(config: Config) -> Result:
+    result = opening(config)
+    asked: Any = common.few(config) if config.quick else config
+    for name in config.sections:
+        result[name] = SECTIONS[name][0].measure(asked)
+        if not config.quick:
+            config.out.mkdir(parents=True, exist_ok=True)
+            with replacing(config.out / f"replanning_{name}.json") as unfinished:
+                unfinished.write_text(json.dumps(result[name], allow_nan=False) + "\n", encoding="utf-8")
+    return result
+
+
+def report(result: Result) -> str:
+    parts = ["## Re-planning in real time"]
+    for name, (section, title) in SECTIONS.items():
+        if name in result:
+            parts += [f"### {title}", *section.report(result[name])]
+    return "\n\n".join(parts)
+
+
+def statements(result: Result) -> list[Statement]:
+    """None: the paper does not re-plan."""
+    return []
+
+
+if __name__ == "__main__":
+    run(Config, main, report, statements, __doc__)

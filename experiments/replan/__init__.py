@@ -1,0 +1,1 @@
+"""The questions that `benchmark_replanning.py` asks."""

@@ -1,0 +1,343 @@
+"""Solving again in time: prepared solvers, re-planning in simulations, and the planner of a robot's own loop."""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from point_mass import RADIUS, Oracle, balls, problem
+
+import lqrsim as ls
+from lqrsim.codegen import jit
+from lqrsim.errors import Array
+
+STEPS, DT = 20, 0.1
+
+
+@pytest.fixture(scope="module")
+def stated() -> ls.Problem:
+    return problem(weight=1.0)
+
+
+@pytest.fixture(scope="module")
+def solution(stated: ls.Problem) -> ls.Solution:
+    found = ls.smooth(stated)
+    assert found.success
+    return found
+
+
+@pytest.fixture(scope="module")
+def solver(stated: ls.Problem) -> ls.PreparedSolver:
+    return ls.prepare(stated)
+
+
+def went(stated: ls.Problem, law: ls.AffinePolicy, state: Array) -> tuple[Array, Array]:
+    """Where a law leads, by the point mass's own matrices: states and controls within the limits."""
+    states, controls, limit = [state], [], stated.control_coordinates.high[0]
+    for gain, offset in zip(law.gain, law.offset, strict=True):
+        u = np.clip(gain @ states[-1] + offset, -limit, limit)
+        x = states[-1]
+        states.append(np.concatenate([x[:2] + DT * x[2:] + DT**2 / 2 * u, x[2:] + DT * u]))
+        controls.append(u)
+    return np.array(states), np.array(controls)
+
+
+def price(stated: ls.Problem, states: Array, controls: Array) -> tuple[float, float]:
+    """Cost and violation, by the oracle, which knows nothing of the solvers."""
+    oracle = Oracle(stated.from_state(states[0]))
+    cost = oracle.cost(controls.ravel())
+    (clearance,) = (one for one in stated.constraints if isinstance(one, ls.Clearance))
+    short = RADIUS + float(np.max(clearance.margin)) - Oracle.distances(states[1:], clearance.world)
+    return cost, max(float(short.max()), 0.0)
+
+
+class TestPreparedSolver:
+    @settings(max_examples=40)
+    @given(
+        away=st.lists(st.floats(-0.3, 0.3), min_size=4, max_size=4), limit=st.sampled_from([None, 1e-9, 5e-4, 2e-3]),
+        shift=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)), goal=st.floats(-1.0, 1.0),
+        steps=st.integers(0, 5),
+    )  # fmt: skip
+    def test_no_plan_is_worse_than_to_go_on(
+        self, stated: ls.Problem, solution: ls.Solution, solver: ls.PreparedSolver, away: list[float],
+        limit: float | None, shift: tuple[float, float], goal: float, steps: int,
+    ) -> None:  # fmt: skip
+        """Whatever the state, the time, the goal and where the obstacle has gone; and it is what it says it is.
+
+        To 1e-9 of the cost, and 1e-9 m: rounding. What converges keeps the clearance.
+        """
+        world = balls((shift[0], 0.1 + shift[1], 0.5))
+        changed = problem(world, weight=1.0, goal=(2, goal, 0, 0))
+        state = solution.trajectory.states[steps] + np.array(away)
+        start = solution.shifted(steps)
+        found = solver.solve(state, start, problem=changed, time_limit=limit)
+        before = price(changed, *went(changed, start.policy, state))
+        states, controls = went(changed, found.policy, state)
+        np.testing.assert_allclose(found.trajectory.states, states, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found.trajectory.controls, controls, rtol=0, atol=1e-9)
+        cost, violation = price(changed, states, controls)
+        assert found.cost == pytest.approx(cost, rel=1e-9)
+        assert found.violation == pytest.approx(violation, abs=1e-9)
+        assert np.abs(found.trajectory.controls).max() <= 20
+        assert found.before == pytest.approx(before[0], rel=1e-9)
+        if before[1] == 0:
+            assert violation == 0
+            assert cost <= before[0] * (1 + 1e-8)
+        else:
+            assert violation <= before[1] + 1e-9
+        if found.success:
+            assert violation == 0
+        if limit == 1e-9:
+            assert not found.improved
+            assert found.iterations == 0
+
+    def test_what_converges_is_an_optimum(
+        self, stated: ls.Problem, solution: ls.Solution, solver: ls.PreparedSolver
+    ) -> None:
+        """That of SLSQP from the same plan: to 1e-3 of the cost, for both stop within about 1e-4 of it."""
+        state = solution.trajectory.states[3] + np.array([0.02, -0.05, 0.1, 0.1])
+        found = solver.solve(state, solution.shifted(3))
+        oracle = Oracle(stated.from_state(state))
+        assert found.success
+        assert found.cost == pytest.approx(oracle.least(oracle.pack(found.trajectory)), rel=1e-3)
+
+    def test_nothing_is_compiled_after_it_is_made(self, stated: ls.Problem, solution: ls.Solution) -> None:
+        """Other goals, obstacles, limits, parameters and horizons are numbers."""
+        solver, before = ls.prepare(stated), len(jit.compilations)
+        changed = problem(balls((0.1, 0.2, 0.4), (1.0, -1.0, 0.3)), weight=2.0, goal=(1, 1, 0, 0), limit=10.0)
+        found = solver.solve(solution.trajectory.states[4], solution.shifted(4), problem=changed)
+        assert found.success
+        shorter = solution.shifted(4, horizon="shrinking")
+        left = solver.solve(solution.trajectory.states[4], shorter, after=4)
+        assert left.trajectory.steps == STEPS - 4
+        solver.solve(solution.trajectory.states[4], found.shifted(2), problem=changed)
+        assert len(jit.compilations) == before
+
+    def test_another_structure_is_refused(self, stated: ls.Problem, solver: ls.PreparedSolver, solution: Any) -> None:
+        other = replace(stated, stage_cost=ls.ControlCost([0.1, 0.1]))
+        with pytest.raises(ls.InputError, match="problem: got one of another structure"):
+            solver.solve(np.zeros(4), solution, problem=other)
+        with pytest.raises(ls.InputError, match=r"start: gain: got shape \(20, 2, 4\), want \(17, 2, 4\)"):
+            solver.solve(np.zeros(4), solution, after=3)
+        refused: list[tuple[dict[str, Any], str]] = [
+            ({"time_limit": 0.0}, "time_limit: got 0"), ({"start": None}, "start: got None"),
+            ({"state": np.zeros(3)}, "state: got shape"), ({"after": 20}, "after: got 20"),
+        ]  # fmt: skip
+        for wrong, line in refused:
+            with pytest.raises(ls.InputError, match=line):
+                solver.solve(**{"state": np.zeros(4), "start": solution} | wrong)
+
+
+class TestShifted:
+    @pytest.mark.parametrize("of", ["solution", "replan"])
+    def test_a_shrinking_horizon_has_what_is_left(self, solver: Any, solution: ls.Solution, of: str) -> None:
+        whole: Any = solution if of == "solution" else solver.solve(solution.trajectory.states[0], solution)
+        left = whole.shifted(6, horizon="shrinking")
+        for name in ("states", "controls"):
+            np.testing.assert_array_equal(getattr(left.trajectory, name), getattr(whole.trajectory, name)[6:])
+        np.testing.assert_array_equal(left.policy.gain, whole.policy.gain[6:])
+        np.testing.assert_array_equal(left.cost_to_go.gradient, whole.cost_to_go.gradient[6:])
+        for one, other in zip(left.multipliers, whole.multipliers, strict=True):
+            np.testing.assert_array_equal(one.values, other.values[6:])
+        moving = whole.shifted(6)
+        np.testing.assert_array_equal(moving.policy.gain[:-6], whole.policy.gain[6:])
+        assert moving.trajectory.steps == whole.trajectory.steps
+        with pytest.raises(ls.InputError, match="horizon: got 'fixed', want one of"):
+            whole.shifted(1, horizon="fixed")
+
+
+NOISE = [ls.ForceNoise(0.1), ls.ControlNoise(0.05)]
+
+
+def simulated(plant: ls.Plant, solution: ls.Solution, law: ls.Replanning, **options: Any) -> ls.Rollout:
+    return ls.simulate(plant, solution, controller=law, frames=False, contacts=False, **options)
+
+
+@pytest.fixture(scope="module")
+def plant(quadrotor: ls.Scenario) -> ls.Plant:
+    return quadrotor.plant()
+
+
+class TestReplanning:
+    @pytest.mark.parametrize("computing", [1 / 30, 0.01, lambda random: random.exponential(0.02)])
+    def test_each_trial_gets_what_it_gets_alone(
+        self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution, computing: Any
+    ) -> None:
+        """To the last bit, on one thread or on several, where the delay does not come from a clock."""
+        law = ls.Replanning(quadrotor.problem, quadrotor_solution, every=0.5, computing=computing)
+        together = simulated(plant, quadrotor_solution, law, disturbances=NOISE, trials=3)
+        late = law.kept["not ready in time"]
+        assert (late > 0) == callable(computing)
+        alone = simulated(plant, quadrotor_solution, law, disturbances=NOISE, first_trial=2)
+        np.testing.assert_array_equal(alone.states[0], together.states[2])
+
+    def test_a_delay_that_is_predicted_costs_nothing_where_nothing_disturbs(
+        self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution
+    ) -> None:
+        """The model is MuJoCo's to 1e-6: where the solves begin is where the robot then is."""
+        law = ls.Replanning(quadrotor.problem, quadrotor_solution, every=0.5, computing=0.1)
+        run = simulated(plant, quadrotor_solution, law)
+        assert law.solved == 9
+        assert {one.step for one in law.records} == {15 * i for i in range(1, 10)}
+        begun = law._replanner.task(law._replanner.start(), 15, run.states[0, 15])
+        np.testing.assert_allclose(begun.state, run.states[0, 18], rtol=0, atol=1e-6)
+
+    def test_what_is_not_ready_is_not_used(self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution) -> None:
+        law = ls.Replanning(quadrotor.problem, quadrotor_solution, every=0.5, computing=0.2, deadline=0.1)
+        late = simulated(plant, quadrotor_solution, law, disturbances=NOISE)
+        plain = ls.simulate(plant, quadrotor_solution, disturbances=NOISE, frames=False, contacts=False)
+        np.testing.assert_array_equal(late.states, plain.states)
+        assert (law.solved, law.kept) == (0, {"not ready in time": 9})
+        assert law.summary() == "solved again 0 times, kept the law before 9 times: 9 times not ready in time"
+
+    def test_the_goal_and_the_obstacles_that_are_known_by_then(
+        self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution
+    ) -> None:
+        """A goal half a metre aside, from 2 s on: the run ends there, and not where it was planned to."""
+        goal = quadrotor.problem.final_cost.about.copy()  # pyright: ignore[reportAttributeAccessIssue]
+        goal[2] += 0.5 if goal[2] < 0 else -0.5
+        later = ls.QuadraticCost(np.full(12, 5000.0), about=goal)
+
+        def known(t: float, problem: ls.Problem) -> ls.Problem:
+            return replace(problem, final_cost=later) if t >= 2 else problem
+
+        law = ls.Replanning(quadrotor.problem, quadrotor_solution, every=0.2, computing=0.033, changes=known)
+        end = simulated(plant, quadrotor_solution, law).states[0, -1, :3]
+        assert np.linalg.norm(end - goal[:3]) < 0.1
+        assert np.linalg.norm(end - quadrotor_solution.trajectory.states[-1, :3]) > 0.3
+
+    def test_measured_it_says_how_long_it_took(self, plant: ls.Plant, quadrotor: Any, quadrotor_solution) -> None:
+        law = ls.Replanning(
+            quadrotor.problem, quadrotor_solution, every=1.0, deadline=0.5, computing="measured", horizon="moving"
+        )
+        run = simulated(plant, quadrotor_solution, law, disturbances=NOISE)
+        assert np.isfinite(run.states).all()
+        assert law.solved + law.kept.total() == len(law.records) == 4
+        assert "ms in the median" in law.summary()
+
+    @pytest.mark.parametrize(
+        ("wrong", "line"),
+        [
+            ({"every": 0.01}, r"every: got 0\.01, want a finite number >= 0\.033"),
+            ({"deadline": 1.1}, r"deadline: got 1\.1 s, 33 control periods, want at most every=1 s"),
+            ({"deadline": -1.0}, "deadline: got -1"),
+            ({"horizon": "fixed"}, "horizon: got 'fixed', want one of"),
+            ({"computing": "fast"}, "computing: got 'fast', want seconds, a function or \"measured\""),
+            ({"computing": -0.1}, r"computing: got -0\.1"),
+            ({"computing": lambda: 1.0}, "computing: got"),
+            ({"predict": 1}, "predict: got 1"),
+            ({"changes": 3}, "changes: got 3"),
+            ({"seed": -1}, "seed: got -1"),
+        ],
+    )
+    def test_bad_input(self, quadrotor: ls.Scenario, quadrotor_solution, wrong: dict[str, Any], line: str) -> None:
+        with pytest.raises(ls.InputError, match=f"Replanning: {line}"):
+            ls.Replanning(quadrotor.problem, quadrotor_solution, **{"every": 1.0} | wrong)
+
+    def test_changes_that_would_compile_are_a_failure_with_its_reason(
+        self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution
+    ) -> None:
+        problem = quadrotor.problem
+        other = replace(problem, stage_cost=ls.ControlCost(np.ones(4)))
+        law = ls.Replanning(problem, quadrotor_solution, every=1.0, changes=lambda t, problem: other)
+        run = simulated(plant, quadrotor_solution, law)
+        assert "another structure" in run.reasons[0]
+
+
+def ready(planner: ls.Planner) -> None:
+    """Wait for the answer that the planner's thread is at."""
+    solve = planner._solve
+    while solve is not None and solve.answer is None and solve.error is None:
+        time.sleep(1e-3)
+
+
+class TestPlanner:
+    def test_answers_come_into_force_at_their_deadline(self, stated: ls.Problem, solution: ls.Solution) -> None:
+        """The loop is ten times as fast as the plan; the robot is the point mass itself, which the model knows."""
+        state, laws = solution.trajectory.states[0], []
+        with ls.Planner(stated, solution, every=2 * DT, deadline=DT, clock=lambda: 0.0) as planner:
+            for i in range(100):
+                t = i * DT / 10
+                control = planner.step(state, t)
+                ready(planner)
+                laws.append(planner.law.first)
+                expected = planner.law.plan.policy(state, max(t - planner.law.first * DT, 0.0))
+                np.testing.assert_array_equal(control, expected)
+                x, h = state, DT / 10
+                state = np.concatenate([x[:2] + h * x[2:] + h**2 / 2 * control, x[2:] + h * control])
+        # Solves begin at 0, 0.2, 0.4 ... s, and act 0.1 s later, for a moving horizon.
+        assert laws == [max(((i // 10) - 1) // 2 * 2 + 1, 0) for i in range(100)]
+        assert planner.account.solved == 5
+        assert planner.law.plan.trajectory.steps == STEPS
+        assert "solved again 5 times" in planner.summary()
+
+    def test_a_state_between_two_knots_is_taken_on_to_the_next(self, stated: ls.Problem, solution: Any) -> None:
+        """Where the solve begins is where the point mass is then: to rounding, for its steps are exact."""
+        state, late = solution.trajectory.states[3], 0.04
+        with ls.Planner(stated, solution, every=DT, clock=lambda: 0.0) as planner:
+            control = planner.step(state, 3 * DT + late)
+            begun = planner._solve.task.state  # pyright: ignore[reportOptionalMemberAccess]
+            h = DT - late
+            there = np.concatenate([state[:2] + h * state[2:] + h**2 / 2 * control, state[2:] + h * control])
+            np.testing.assert_allclose(begun, there, rtol=0, atol=1e-12)
+
+    def test_what_comes_too_late_is_not_used(self, stated: ls.Problem, solution: ls.Solution) -> None:
+        """The thread is held until the deadline is over."""
+        held, main = threading.Event(), threading.current_thread()
+
+        def clock() -> float:
+            if threading.current_thread() is not main:
+                held.wait(60)
+            return 0.0
+
+        state = solution.trajectory.states[0]
+        with ls.Planner(stated, solution, every=DT, clock=clock) as planner:
+            planner.step(state, 0.0)
+            control = planner.step(solution.trajectory.states[1], DT)
+            np.testing.assert_array_equal(control, solution.policy(solution.trajectory.states[1], DT))
+            held.set()
+            ready(planner)
+            planner.step(solution.trajectory.states[2], 2 * DT)
+            assert planner.law.first == 0
+            assert planner.account.kept == {"not ready in time": 1}
+            ready(planner)
+            planner.step(solution.trajectory.states[3], 3 * DT)
+            assert planner.law.first == 3
+
+    def test_it_plans_for_what_is_changed(self, stated: ls.Problem, solution: ls.Solution) -> None:
+        with ls.Planner(stated, solution, every=DT, clock=lambda: 0.0) as planner:
+            planner.change(final_cost=ls.QuadraticCost([100.0] * 4, about=(2, 1.5, 0, 0)))
+            for i in range(4):
+                planner.step(solution.trajectory.states[i], i * DT)
+                ready(planner)
+            planner.step(solution.trajectory.states[4], 4 * DT)
+            assert np.abs(planner.law.plan.trajectory.states[-1] - (2, 1.5, 0, 0)).max() < 0.2
+            with pytest.raises(ls.InputError, match="problem: got one of another structure"):
+                planner.change(constraints=())
+            with pytest.raises(ls.InputError, match="change: got gaol, want fields of a Problem: dynamics, dt"):
+                planner.change(gaol=1)
+
+    def test_bad_input(self, stated: ls.Problem, solution: ls.Solution) -> None:
+        planner: Any = ls.Planner(stated, solution, every=DT)
+        with pytest.raises(ls.InputError, match="Planner: got a step without its thread"):
+            planner.step(np.zeros(4), 0.0)
+        with planner:
+            refused: list[tuple[tuple[Any, Any], str]] = [
+                ((np.zeros(3), 0.0), "state: got shape"), ((np.full(4, np.nan), 0.0), "state: got"),
+                ((np.zeros(4), -1.0), "t: got -1"), ((np.zeros(4), "now"), "t: got 'now'"),
+            ]  # fmt: skip
+            for wrong, line in refused:
+                with pytest.raises(ls.InputError, match=line):
+                    planner.step(*wrong)
+        calls: list[Callable[[], object]] = [
+            lambda: ls.Planner(stated, solution, every=DT, deadline=0.0),
+            lambda: ls.Planner(stated, solution, every=DT, interpolate=1),  # pyright: ignore[reportArgumentType]
+        ]
+        for call in calls:
+            with pytest.raises(ls.InputError, match="Planner: "):
+                call()
