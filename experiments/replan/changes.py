@@ -110,10 +110,10 @@ def report(found: dict[str, Any]) -> list[str]:
         "law", "at the new goal (%)", "distance, median (cm)", "past the pillar (%)", "clearance to it, median (cm)",
     )  # fmt: skip
     return [
-        f"The quadrotor, {found['queries']} queries of {found['trials']} trials each under the scenario's noise, planned"
-        f" with a clearance and again every {1000 * EVERY:.0f} ms, with as long a delay. The goal jumps {JUMP:g} m at"
-        f" {JUMPS_AT:g} s of 5; reached is within the robot's radius. The pillar, {100 * PILLAR:g} cm in radius, appears at"
-        f" {SEEN_AT:g} s where the plan will be {AHEAD:g} s later, its axis at most {100 * ASIDE:g} cm aside. In brackets"
-        " exact intervals of 95 %.",
+        f"The quadrotor, {found['queries']} queries of {found['trials']} trials each under the scenario's noise,"
+        f" planned with a clearance and again every {1000 * EVERY:.0f} ms, with as long a delay. The goal jumps"
+        f" {JUMP:g} m at {JUMPS_AT:g} s of 5; reached is within the robot's radius. The pillar, {100 * PILLAR:g} cm in"
+        f" radius, appears at {SEEN_AT:g} s where the plan will be {AHEAD:g} s later, its axis at most"
+        f" {100 * ASIDE:g} cm aside. In brackets exact intervals of 95 %.",
         table(head, rows),
     ]

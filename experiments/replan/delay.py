@@ -49,7 +49,7 @@ def measure(config: Config) -> dict[str, Any]:
 def report(found: dict[str, Any]) -> list[str]:
     rows = [[name, between(share, ".1f"), f"{found['used'][name]:.1f}"] for name, share in found["reached"].items()]
     return [
-        f"The quadrotor under the preset light, {found['queries']} queries of {found['trials']} trials, re-planned every"
-        " control period for what is left of the horizon.",
+        f"The quadrotor under the preset light, {found['queries']} queries of {found['trials']} trials, re-planned"
+        " every control period for what is left of the horizon.",
         table(("delay", "reached (%)", "plans that were used (%)"), rows),
     ]

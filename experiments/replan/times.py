@@ -14,8 +14,10 @@ from lqrsim.errors import Array
 from lqrsim.scenes.scene import scene_from_xml
 from replan.common import ROBOTS, WAYS, Config, progress, scenario_of, stated
 
-# Control period in s, steps, and the most that 99.9 % of the solves may take in ms.
+# Control period in s and steps, where they are others than the scenario's.
 RATES = {"as planned": (None, None), "100 Hz, 2 s": (0.01, 200)}
+
+FAST = 0.007  # s, that a solve may take at 100 Hz
 
 
 def measure(config: Config) -> dict[str, Any]:
@@ -40,7 +42,7 @@ def of_one(config: Config, robot: str, rate: str, way: str) -> dict[str, Any]:
         if not solution.success:
             worst[solution.status.name] += 1
             continue
-        deadline = min(config.deadline, 0.999 * problem.dt)
+        deadline = min(config.deadline, FAST if problem.dt < 2 * FAST else np.inf)
         law = ls.Replanning(
             problem, solution, every=problem.dt, deadline=deadline, horizon="moving", computing="measured"
         )
@@ -105,9 +107,9 @@ def report(found: dict[str, Any]) -> list[str]:
         ])  # fmt: skip
     lines = [
         "Every control period of runs in MuJoCo, under the scenario's noise without its push, each re-planned with a"
-        f" moving horizon and at most {1000 * found['deadline']:g} ms. As planned is 30 Hz with a horizon of 5 s for the"
-        " quadrotor, and 6 Hz with 25 s for the drive. A solve that ends at its time limit has a plan that is no worse"
-        " than to go on.",
+        f" moving horizon and at most {1000 * found['deadline']:g} ms, {1000 * FAST:g} ms at 100 Hz. As planned is 30 Hz"
+        " with a horizon of 5 s for the quadrotor, and 6 Hz with 25 s for the drive. A solve that ends at its time"
+        " limit has a plan that is no worse than to go on.",
         table(head, rows),
     ]
     told = [

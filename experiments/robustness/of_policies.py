@@ -53,4 +53,32 @@ def policies(place: Place) -> dict[str, tuple[Any, ...]]:
         ),
         "Tube.added_to": ({"self": tube, "rollout": place.rollout},),
         "load_policy": ({"path": saved},),
+        **replanning(place),
+    }
+
+
+def replanning(place: Place) -> dict[str, tuple[Any, ...]]:
+    solver, state = ls.prepare(place.problem), place.solution.trajectory.states[1]
+    replan = solver.solve(state, place.solution.shifted(1))
+    record = {"step": 3, "trial": 0, "status": "CONVERGED", "iterations": 2, "seconds": 0.01, "cost": 1.0,
+              "before": 1.0, "used": True, "reason": ""}  # fmt: skip
+    planner = {"problem": place.problem, "solution": place.solution, "every": 1 / 3}
+    running = ls.Planner(**planner)
+    running.__enter__()  # its thread ends with the process
+    parts = {field.name: getattr(replan, field.name) for field in dataclasses.fields(replan)}
+    return {
+        "prepare": ({"problem": place.problem, "tolerance": 1e-4, "max_iterations": 5}, 0.3),
+        "PreparedSolver": ({"problem": place.problem, "settings": solver.settings}, 0.3),
+        "PreparedSolver.solve": (
+            {"self": solver, "state": state, "start": replan, "problem": place.problem, "after": 0, "time_limit": 0.01},
+        ),
+        "Replan": (parts,),
+        "Replan.shifted": ({"self": replan, "steps": 1, "horizon": "moving"},),
+        "ReplanRecord": (record,),
+        "AffinePolicy.shifted": ({"self": place.solution.policy, "steps": 1, "horizon": "moving"},),
+        "Problem.from_state": ({"self": place.problem, "state": state, "after": 1},),
+        "Dynamics.period_near": ({"self": place.problem.dynamics, "dt": 0.1},),
+        "Planner": (planner | {"deadline": 1 / 3, "horizon": "moving", "interpolate": True}, 0.3),
+        "Planner.step": ({"self": running, "state": state, "t": 0.2},),
+        "Planner.change": ({"self": running, "initial": ls.FixedState(state)},),
     }

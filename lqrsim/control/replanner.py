@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_flag, check_kind, check_name, check_number
+from lqrsim.errors import Array, InputError, check_count, check_flag, check_kind, check_name, check_number
 from lqrsim.problem.problem import Problem
 from lqrsim.results.replan import Replan
 from lqrsim.results.solution import Solution
@@ -63,6 +63,10 @@ class ReplanRecord:
     before: float
     used: bool
     reason: str
+
+    def __post_init__(self) -> None:
+        for name in ("step", "trial", "iterations"):
+            check_count(f"ReplanRecord: {name}", getattr(self, name), at_least=0)
 
 
 class Account:

@@ -16,6 +16,7 @@ from lqrsim.errors import (
     check_count,
     check_flag,
     check_kind,
+    check_name,
     check_number,
     excerpt,
     shaped,
@@ -23,7 +24,7 @@ from lqrsim.errors import (
 )
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
-from lqrsim.results.solution_parts import left_after
+from lqrsim.results.solution_parts import HORIZONS, left_after
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,8 +71,10 @@ class AffinePolicy:
         """Hash of the laws and their times, 16 hexadecimal digits; `Rollout.policy_digest` of a run of this policy."""
         return sha256(self.gain, self.offset, self.nominal, np.float64(self.dt))[:16]
 
-    def after(self, steps: int, *, filled: bool) -> "AffinePolicy":
-        """What is left of it after so many steps; `filled` up with the last law to as many as there are."""
+    def shifted(self, steps: int, *, horizon: str = "moving") -> "AffinePolicy":
+        """What is left of it after so many steps; see `Solution.shifted`."""
+        steps = check_count("steps", steps, at_least=0, at_most=self.steps - 1)
+        filled = check_name("horizon", horizon, HORIZONS) == "moving"
         parts = {name: left_after(steps, getattr(self, name), filled=filled) for name in ("gain", "offset", "nominal")}
         return replace(self, **parts)
 

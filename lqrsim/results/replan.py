@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass, replace
 
-from lqrsim.errors import check_count, check_name
+import numpy.typing as npt
+
+from lqrsim.errors import Array, check_items, check_kind
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution_parts import HORIZONS, Multipliers, Status, Trajectory, left_after
+from lqrsim.results.solution_parts import Multipliers, Status, Trajectory, left_after
 from lqrsim.results.value_functions import Quadratic
 
 
@@ -41,6 +43,14 @@ class Replan:
     seconds: float
     iterating: float
 
+    def __post_init__(self) -> None:
+        check_kind("Replan: status", self.status, Status, f"a Status, one of {', '.join(Status.__members__)}")
+        check_kind("Replan: policy", self.policy, AffinePolicy, "an AffinePolicy")
+        check_kind("Replan: trajectory", self.trajectory, Trajectory, "a Trajectory")
+        check_kind("Replan: cost_to_go", self.cost_to_go, (Quadratic, type(None)), "a Quadratic or None")
+        multipliers = check_items("Replan: multipliers", self.multipliers, Multipliers, "a tuple of Multipliers")
+        object.__setattr__(self, "multipliers", multipliers)
+
     @property
     def success(self) -> bool:
         """Whether the solve converged within its time."""
@@ -48,20 +58,15 @@ class Replan:
 
     def shifted(self, steps: int, *, horizon: str = "moving") -> "Replan":
         """What is left of it after so many steps; see `Solution.shifted`."""
-        kept = check_count("steps", steps, at_least=0, at_most=self.trajectory.steps - 1)
-        filled = check_name("horizon", horizon, HORIZONS) == "moving"
-        plan, value, policy = self.trajectory, self.cost_to_go, self.policy
+        policy = self.policy.shifted(steps, horizon=horizon)
+        plan, value, filled = self.trajectory, self.cost_to_go, horizon == "moving"
+
+        def moved(array: npt.ArrayLike) -> Array:
+            return left_after(steps, array, filled=filled)
+
         if value is not None:
-            arrays = (value.hessian, value.gradient, value.constant)
-            value = Quadratic(*(left_after(kept, array, filled=filled) for array in arrays))
+            value = Quadratic(moved(value.hessian), moved(value.gradient), moved(value.constant))
         return replace(
-            self,
-            policy=policy.after(kept, filled=filled),
-            trajectory=Trajectory(
-                left_after(kept, plan.states, filled=filled), left_after(kept, plan.controls, filled=filled), plan.dt
-            ),
-            cost_to_go=value,
-            multipliers=tuple(
-                replace(one, values=left_after(kept, one.values, filled=filled)) for one in self.multipliers
-            ),
-        )
+            self, policy=policy, trajectory=Trajectory(moved(plan.states), moved(plan.controls), plan.dt),
+            cost_to_go=value, multipliers=tuple(replace(one, values=moved(one.values)) for one in self.multipliers),
+        )  # fmt: skip

@@ -196,7 +196,7 @@ class Solution:
         plan, value = self.trajectory, self.cost_to_go
         return replace(
             self,
-            policy=self.policy.after(steps, filled=filled),
+            policy=self.policy.shifted(steps, horizon=horizon),
             inverse_policy=None,
             cost_to_go=None
             if value is None

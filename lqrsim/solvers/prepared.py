@@ -44,7 +44,6 @@ def prepare(
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=None, start=None, starts=1,
         constraint_tolerance=constraint_tolerance,
     )  # fmt: skip
-    check_problem(problem)
     return PreparedSolver(problem, settings)
 
 
@@ -52,11 +51,13 @@ class PreparedSolver:
     """Solves problems of one structure, from one state after the other; `prepare` makes it.
 
     Attributes:
-      problem: what is solved by default.
+      problem: what is solved by default. settings: as `prepare` was told.
     """
 
     def __init__(self, problem: Problem, settings: SmootherSettings) -> None:
-        self.problem, self._settings = problem, settings
+        check_problem(problem)
+        check_kind("PreparedSolver: settings", settings, SmootherSettings, "what prepare(problem) makes of its options")
+        self.problem, self.settings = problem, settings
         self._states = problem.dynamics.state_coordinates
         self._controls = problem.control_coordinates.within(problem.dynamics.control_coordinates)
         self._core = compiled.core(problem)
@@ -68,7 +69,7 @@ class PreparedSolver:
         state = np.zeros(n) if self.problem.start is None else self.problem.start.copy()
         control = self.problem.nominal_control.copy()
         law = np.zeros((steps, m, n)), np.tile(control, (steps, 1))
-        attempt = Attempt(self.problem, self._settings, InitialGuess(*law, None, None, ""), state, Stop())
+        attempt = Attempt(self.problem, self.settings, InitialGuess(*law, None, None, ""), state, Stop())
         attempt.roll_out()
         compiled.rollout(self.problem, *law, state)
         attempt.work.constraint_values(*attempt.work.plan)
@@ -112,7 +113,7 @@ class PreparedSolver:
         stop = Stop() if time_limit is None else Stop(clock + check_number("time_limit", time_limit, above=0.0))
         stop.reserve = self._pace
         guess = start if isinstance(start, InitialGuess) else _initial_guess(start, problem)
-        attempt = Attempt(problem, self._settings, guess, np.array(state, dtype=np.float64), stop)
+        attempt = Attempt(problem, self.settings, guess, np.array(state, dtype=np.float64), stop)
         best = _Best(attempt)
         with problem.dynamics.solving(1):
             found = _run(attempt, best)
