@@ -107,8 +107,8 @@ def report(found: dict[str, Any]) -> list[str]:
         ])  # fmt: skip
     lines = [
         "Every control period of runs in MuJoCo, under the scenario's noise without its push, each re-planned with a"
-        f" moving horizon and at most {1000 * found['deadline']:g} ms, {1000 * FAST:g} ms at 100 Hz. As planned is 30 Hz"
-        " with a horizon of 5 s for the quadrotor, and 6 Hz with 25 s for the drive. A solve that ends at its time"
+        f" moving horizon and at most {1000 * found['deadline']:g} ms, {1000 * FAST:g} ms at 100 Hz. As planned is 30"
+        " Hz with a horizon of 5 s for the quadrotor, and 6 Hz with 25 s for the drive. A solve that ends at its time"
         " limit has a plan that is no worse than to go on.",
         table(head, rows),
     ]
