@@ -8,9 +8,9 @@ hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
 
 
-# The files that take longest, in that order. They begin first: what a file takes is not divided among processors, and
-# all would wait for one that begins last.
-LONGEST = ("reproduce", "experiments", "campaign", "docs", "balls", "packaging", "whole_problems", "viewer")
+# The files that take longest begin first: what a file takes is not divided among processors, and all would wait for one
+# that begins last. In this order the first two do not compile the same at the same time, nor those that follow.
+LONGEST = ("reproduce", "campaign", "experiments", "docs", "balls", "packaging", "whole_problems", "viewer")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
