@@ -57,8 +57,10 @@ def main() -> int:
     if options.command == "demo":
         return run([PYTHON, "-m", "lqrsim.cli", "demo", *rest])
     if options.command == "test":
-        # All of them: on every processor, each file on one, so that what its tests share is made once.
-        return run([PYTHON, "-m", "pytest", *(rest or ["-n", "auto", "--dist", "loadfile"])])
+        # All of them: on every processor, each file on one, so that what its tests share is made once, in the order
+        # that tests/conftest.py puts them in.
+        every = ["-n", "auto", "--dist", "loadfile", "--no-loadscope-reorder"]
+        return run([PYTHON, "-m", "pytest", *(rest or every)])
     if options.command == "check":
         steps = (["ruff", "check"], ["ruff", "format", "--check"], ["basedpyright", "--pythonpath", str(PYTHON)])
         return max([run([PYTHON, "-m", *step]) for step in steps])

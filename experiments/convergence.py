@@ -1,7 +1,7 @@
 """How fast smoothing and iLQR converge, and what holds where they have: Secs. V-C and VI-B.
 
     python experiments/convergence.py            # 100 of the quadrotor's queries, and the differential drive
-    python experiments/convergence.py --quick    # 8 queries
+    python experiments/convergence.py --quick    # 2 queries
 
 Begun as in the paper (soft start, its priors, no limits of the controls; iLQR from hover), the iterations go on until
 rounding stops them. Smoothing is without its safeguard, which would take over where costs no longer change. Everything
@@ -64,7 +64,7 @@ class Config(Settings):
 
 
 def main(config: Config) -> Result:
-    count = min(config.queries, 8) if config.quick else config.queries
+    count = min(config.queries, 2) if config.quick else config.queries
     robots = {
         "quadrotor": [ls.scenarios.quadrotor(query=query, seed=config.seed) for query in range(count)],
         "drive": [ls.scenarios.differential_drive()],

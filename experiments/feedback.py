@@ -1,7 +1,7 @@
 """What the feedback is worth: the policy against its own plan without feedback, in MuJoCo, under the same disturbances.
 
     python experiments/feedback.py            # 200 trials of each
-    python experiments/feedback.py --quick    # 10
+    python experiments/feedback.py --quick    # 4
 
 Both robots meet the demo's disturbances, at several times their strength. A trial has the same random numbers with
 feedback and without. Without, nothing is measured, so that the noise of measurements is met by the feedback alone.
@@ -52,7 +52,7 @@ class Config(Settings):
 
 
 def main(config: Config) -> Result:
-    trials = min(config.trials, 10) if config.quick else config.trials
+    trials = min(config.trials, 4) if config.quick else config.trials
     strengths = sorted({*config.strengths, FULL})
     result = opening(config) | {"trials": trials, "robots": {}}
     scenarios = [ls.scenarios.get(name) for name in NAMES]

@@ -1,7 +1,7 @@
 """How often the policies fail: campaigns of thousands of trials under all disturbances of the presets, and each alone.
 
     python experiments/stress_test.py            # 300 trials of each policy and strength
-    python experiments/stress_test.py --quick    # 6
+    python experiments/stress_test.py --quick    # 3
 
 Strengths are multiples of the preset 'light'. All policies meet the same trials; the plan is that of `smooth`, or that
 of `ilqr`. What breaks first is found by one kind of disturbance at a time, made stronger until half of the trials fail.
@@ -78,7 +78,7 @@ def together(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, A
     asked = ls.Campaign(
         scenario=scenario.name, sweeps={"light": tuple(light)}, seed=config.seed, shard=100,
         strengths=(0.25, 1.0) if config.quick else tuple(strengths),
-        trials=min(config.trials, 6) if config.quick else config.trials,
+        trials=min(config.trials, 3) if config.quick else config.trials,
         replan_every=scenario.problem.steps * scenario.problem.dt / 10,
     )  # fmt: skip
     results = finished(config, asked, folder / "together")
@@ -113,8 +113,8 @@ def alone(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, Any]
 
     First at every fourth strength of a grid, then at those of the grid around where success falls through one half.
     """
-    stride = 12 if config.quick else 4
-    trials = min(config.alone, 6) if config.quick else config.alone
+    stride = len(GRID) if config.quick else 4
+    trials = min(config.alone, 3) if config.quick else config.alone
     plant = scenario.plant()
     kinds = {in_words(one): one for one in ls.preset("light", plant)}
     grids = {name: possible(one, GRID) for name, one in kinds.items()}

@@ -8,6 +8,16 @@ hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
 
 
+# The files that take longest begin first: what a file takes is not divided among processors, and all would wait for one
+# that begins last. In this order the first two do not compile the same at the same time, nor those that follow.
+LONGEST = ("reproduce", "campaign", "experiments", "docs", "balls", "packaging", "whole_problems", "viewer")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    names = [f"test_{name}.py" for name in LONGEST]
+    items.sort(key=lambda item: names.index(item.path.name) if item.path.name in names else len(names))
+
+
 @pytest.fixture(scope="session")
 def differential_drive() -> ls.Scenario:
     return ls.scenarios.differential_drive()

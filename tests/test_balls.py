@@ -231,8 +231,8 @@ class TestLevels:
         theirs = solved(THREE)
         assert theirs.success
         assert theirs.multipliers  # it presses
-        options = {"level": level, "depends_on": STATES[:3], "jacobian": self.jacobian if level == "plain" else None}
-        ours = solved(ls.Balls(three_numbers, RADII, **options))
+        # Both with a Jacobian: so they are compiled once, and `test_numbers` has them without.
+        ours = solved(ls.Balls(three_numbers, RADII, level=level, depends_on=STATES[:3], jacobian=self.jacobian))
         assert ours.status is theirs.status
         assert ours.cost == pytest.approx(theirs.cost, rel=1e-6)
         np.testing.assert_allclose(ours.trajectory.states, theirs.trajectory.states, rtol=0, atol=1e-4)

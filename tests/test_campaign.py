@@ -179,13 +179,13 @@ def test_a_killed_driver_is_resumed(reference: Results, tmp_path: Path) -> None:
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
         ) as driver:
-            begun, before = time.monotonic(), len(list(folder.glob("shards/*")))
-            while time.monotonic() < begun + 20 and len(list(folder.glob("shards/*"))) == before:
+            begun, before = time.monotonic(), len(list(folder.glob("shards/[!.]*")))
+            while time.monotonic() < begun + 20 and len(list(folder.glob("shards/[!.]*"))) == before:
                 time.sleep(0.01)
             time.sleep(draws.uniform(0, 0.2))
             driver.kill()
             driver.wait()
-            counts.append(len(list(folder.glob("shards/*.parquet"))))
+            counts.append(len(list(folder.glob("shards/[!.]*.parquet"))))
             gone = time.monotonic() + 10
             while time.monotonic() < gone:
                 try:

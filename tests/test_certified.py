@@ -129,7 +129,7 @@ class TestLimits:
 
     def test_a_slack_constraint_behind_a_solve_that_fails_ends(self) -> None:
         """Once it called itself until Python gave up."""
-        scenario = ls.scenarios.quadrotor()
+        scenario = ls.scenarios.differential_drive()
         slack = ls.Clearance(scenario.scene.world, radius=scenario.robot.radius, margin=-1.0)
         problem = dataclasses.replace(scenario.problem, constraints=[slack])
         solution = ls.smooth(problem, max_iterations=3)

@@ -144,12 +144,12 @@ def test_python_and_the_commands_give_the_same(own: str, tmp_path: Path, capsys:
     """One problem is asked twice: what the first search simulated does not count for the second."""
     reference = f"{own}:shifted"
     command, python = tmp_path / "command", tmp_path / "python"
-    more = [*OPEN, "--strength", "0.9", "--out", str(command)]
-    assert main(["rare", reference, "--particles", "40", "--repetitions", "3", "--shown", "2", *more]) == 0
+    more = [*OPEN, "--strength", "2", "--out", str(command)]
+    assert main(["rare", reference, "--particles", "20", "--repetitions", "2", "--shown", "2", *more]) == 0
     rare_says = capsys.readouterr().out
-    problem = ls.ReliabilityProblem(reference, strength=0.9, policy="open_loop")
+    problem = ls.ReliabilityProblem(reference, strength=2, policy="open_loop")
     told: list[str] = []
-    rare = problem.rare_failures(particles=40, repetitions=3, report=told.append)
+    rare = problem.rare_failures(particles=20, repetitions=2, report=told.append)
     shown = rare.save(python, shown=2)
     assert (shown.trials, shown.outcome) == (2, ("collided",) * 2)
     assert rare_says.startswith("\n".join([*told, str(rare)]))

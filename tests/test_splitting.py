@@ -234,7 +234,7 @@ def test_a_quadrotor_against_plain_monte_carlo(quadrotor: ls.Scenario, quadrotor
     """Wind in which 1 to 2 % of the trials collide: the two agree within four standard errors of their difference."""
     trials = TrialScore(quadrotor.plant(), quadrotor_solution, [ls.ForceNoise(0.19)])
     rng = np.random.default_rng(8)
-    plain = trials(rng.standard_normal((2000, trials.size))) > 0
+    plain = trials(rng.standard_normal((1000, trials.size))) > 0
     expected = rate(int(plain.sum()), len(plain))
     assert 0.002 < expected.value < 0.03
     found = split(trials, trials.size, particles=100, moves=2, keep=0.25, repetitions=4, seed=2)

@@ -23,8 +23,8 @@ CAMPAIGN = ls.Campaign(
     strengths=(2.0,),
     policies=POLICIES,
     replan_every=12.0,
-    trials=8,
-    shard=4,
+    trials=4,
+    shard=2,
     stated=LIGHT,
 )
 
@@ -67,14 +67,14 @@ def test_trials_are_those_of_the_controllers_as_users_make_them(
         "offset_free": ls.OffsetFree(problem, plan, stated),
     }
     for policy, law in made.items():
-        rollout = ls.simulate(plant, plan, controller=law, disturbances=wrong, trials=8, contacts=False)
+        rollout = ls.simulate(plant, plan, controller=law, disturbances=wrong, trials=4, contacts=False)
         rows, own = results.outcomes(ls.Cell(policy, "own", 2.0)), ls.outcomes(rollout, problem)
         np.testing.assert_array_equal(rows.rms, own.rms)
         np.testing.assert_array_equal(rows.clearance, own.clearance)
         np.testing.assert_array_equal(rows.outcome, own.outcome)
     assert results.solution("track").policy.digest == made["track"].digest
-    again = ls.replay(results, ls.Cell("offset_free", "own", 2.0), 5)
-    wanted = ls.simulate(plant, plan, controller=made["offset_free"], disturbances=wrong, first_trial=5)
+    again = ls.replay(results, ls.Cell("offset_free", "own", 2.0), 3)
+    wanted = ls.simulate(plant, plan, controller=made["offset_free"], disturbances=wrong, first_trial=3)
     np.testing.assert_array_equal(again.states, wanted.states)
 
 
@@ -86,7 +86,7 @@ def test_what_is_stated_is_written_down_and_part_of_the_digest(results: ls.Resul
     }
     other = replace(CAMPAIGN, stated=(ls.ControlNoise(0.1), ls.MeasurementNoise(0.01)), trials=1)
     with pytest.raises(InputError, match=r"^stated: got .*want .* or another folder"):
-        ls.run_campaign(replace(other, trials=8), results.folder, workers=0)
+        ls.run_campaign(replace(other, trials=4), results.folder, workers=0)
     small = replace(other, policies=("track",), strengths=(1.0,))
     digests = []
     for number, stated in enumerate((None, LIGHT, other.stated)):

@@ -19,7 +19,7 @@ KINDS = ("linear", "pendulum", "parking", "planar", "drive", "quadrotor")
 pytestmark = pytest.mark.timeout(900)
 
 
-@settings(max_examples=220, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=120, suppress_health_check=[HealthCheck.too_slow])
 @given(kind=st.sampled_from(KINDS), number=st.integers(0, 2**32 - 1))
 def test_nothing_that_a_solution_claims_is_false(kind: str, number: int) -> None:
     drawn = draws.draw(kind, number)

@@ -8,7 +8,7 @@ from paper.common import interval, table
 import lqrsim as ls
 from lqrsim.stress.statistics import rate
 from robust import common
-from robust.common import Config, progress, reach_exactly, run
+from robust.common import Config, progress, run, safe_plan
 
 # In turns. In this order: few plans collide as often as 1e-1 without any clearance, and are not safer than asked.
 ASKED = (1e-2, 1e-3, 1e-4, 1e-1)
@@ -21,11 +21,8 @@ def measure(config: Config) -> dict[str, Any]:
 
 
 def planned(query: int, preset: str, asked: float) -> tuple[ls.Plant, list[ls.Disturbance], ls.SafePlan]:
-    scenario = ls.scenarios.quadrotor(query)
-    plant = scenario.plant()
-    disturbances = ls.preset(preset, plant)
-    stated = ls.uncertainty_of(plant, disturbances)
-    return plant, disturbances, ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=asked)
+    plant = ls.scenarios.quadrotor(query).plant()
+    return plant, ls.preset(preset, plant), safe_plan(query, preset, asked)
 
 
 def of_light(config: Config, query: int) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -42,9 +43,9 @@ class Config(Settings):
 def few(config: Config) -> Config:
     """What `--quick` comes to."""
     return replace(
-        config, trials=min(config.trials, 10), queries=min(config.queries, 1), alone=min(config.alone, 6),
+        config, trials=min(config.trials, 5), queries=min(config.queries, 1), alone=min(config.alone, 3),
         plans=min(config.plans, 1), particles=min(config.particles, 20), worlds=min(config.worlds, 1),
-        world_trials=min(config.world_trials, 50),
+        world_trials=min(config.world_trials, 20),
     )  # fmt: skip
 
 
@@ -55,6 +56,15 @@ def reach_exactly(problem: ls.Problem) -> ls.Problem:
     space = problem.dynamics.state_coordinates
     place = ls.GoalState(goal[list(space.position)], states=[space.names[i] for i in space.position])
     return replace(fixed(problem), constraints=[*problem.constraints, place])
+
+
+@cache
+def safe_plan(query: int, preset: str, asked: float) -> ls.SafePlan:
+    """Of a query of the quadrotor; several sections ask for the same one."""
+    scenario = ls.scenarios.quadrotor(query)
+    plant = scenario.plant()
+    stated = ls.uncertainty_of(plant, ls.preset(preset, plant))
+    return ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=asked)
 
 
 def reached(

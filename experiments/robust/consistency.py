@@ -14,7 +14,7 @@ from paper.common import table
 from scipy.stats import chi2
 
 import lqrsim as ls
-from robust.common import ASKED, PRESETS, Config, reach_exactly, run
+from robust.common import ASKED, PRESETS, Config, run, safe_plan
 
 
 def measure(config: Config) -> dict[str, Any]:
@@ -24,7 +24,7 @@ def measure(config: Config) -> dict[str, Any]:
     for preset in PRESETS[:1] if config.quick else PRESETS:
         disturbances = ls.preset(preset, plant)
         stated = ls.uncertainty_of(plant, disturbances)
-        safe = ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=ASKED[preset])
+        safe = safe_plan(0, preset, ASKED[preset])
         law = ls.OffsetFree(safe.problem, safe.solution, stated, record=True)
         rollout = run(plant, safe.solution, law, disturbances, trials=trials, seed=config.seed)
         well = np.flatnonzero(np.array(ls.outcomes(rollout).outcome) == "reached")

@@ -10,7 +10,7 @@ from peers.rotorpy import BEST_AT_LIGHT, BEST_AT_MODERATE
 import lqrsim as ls
 from lqrsim.control.controllers import Controller
 from lqrsim.stress.statistics import compare
-from robust.common import ASKED, PRESETS, Config, Reached, progress, reach_exactly, reached, share
+from robust.common import ASKED, PRESETS, Config, Reached, progress, reached, safe_plan, share
 
 OWN, PLAN, SAFE = "smoother's policy", "default plan", "safe plan"
 POSES = {
@@ -31,7 +31,7 @@ def measure(config: Config) -> dict[str, Any]:
         for preset in PRESETS[:1] if config.quick else PRESETS:
             disturbances = ls.preset(preset, plant)
             stated = ls.uncertainty_of(plant, disturbances)
-            safe = ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=ASKED[preset])
+            safe = safe_plan(query, preset, ASKED[preset])
             costs[preset].append([plan.cost, safe.solution.cost, safe.tube.collision_chance])
             flown = laws(scenario, plan, safe, stated, preset)
             try:

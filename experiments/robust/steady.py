@@ -6,7 +6,7 @@ import numpy as np
 from paper.common import between, table
 
 import lqrsim as ls
-from robust.common import ASKED, Config, progress, reach_exactly, reached, run, share
+from robust.common import ASKED, Config, progress, reached, run, safe_plan, share
 
 SPEED = 3.0  # m/s
 MASSES = (0.8, 1.2)
@@ -19,8 +19,7 @@ def measure(config: Config) -> dict[str, Any]:
     for query in progress(range(config.queries), "steady disturbances"):
         scenario = ls.scenarios.quadrotor(query)
         plant, plan = scenario.plant(), ls.smooth(scenario.problem)
-        stated = ls.uncertainty_of(plant, ls.preset("moderate", plant))
-        safe = ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=ASKED["moderate"])
+        safe = safe_plan(query, "moderate", ASKED["moderate"])
         flown = ("smoother", plan, None), ("offset free", safe.solution, safe.controller)
         winds = rng.normal(size=(DIRECTIONS, 3))
         cases = {f"wind of {SPEED:g} m/s": [[ls.MeanWind(SPEED * one / np.linalg.norm(one))] for one in winds]}

@@ -56,7 +56,10 @@ class Core:
     """
 
     def __init__(self, source: str, sizes: dict[str, int], what: str) -> None:
-        self.source = ast.unparse(ast.fix_missing_locations(_Specialise(sizes).visit(ast.parse(source))))
+        tree = ast.fix_missing_locations(_Specialise(sizes).visit(ast.parse(source)))
+        texts = [(node.name, ast.unparse(node)) for node in tree.body]
+        self.source = "\n\n".join(text for _, text in texts)
+        self._texts = dict(texts)
         self.what = what
         self._entries: dict[tuple[Any, ...], Any] = {}
         self._compilable: dict[str, Any] = {}
@@ -106,8 +109,8 @@ class Core:
 
     def _entry_source(self, name: str, kinds: tuple[Any, ...]) -> str:
         """The function of that name under the name `entry`, which makes pointers and records of its arguments first."""
-        functions = {node.name: node for node in ast.parse(self.source).body if isinstance(node, ast.FunctionDef)}
-        node = functions[name]
+        (node,) = ast.parse(self._texts[name]).body
+        assert isinstance(node, ast.FunctionDef)
         names = [f"leaf_{number}" for number in range(len(signature_of(kinds)))]
         leaf = iter(names)
         lines = [f"{one.arg} = {converted(kind, leaf)}" for one, kind in zip(node.args.args, kinds, strict=True)]
@@ -119,14 +122,13 @@ class Core:
     def _namespace(self) -> dict[str, Any]:
         """The functions that the entries call, each made of its text and what it calls."""
         if not self._compilable:
-            nodes = {node.name: node for node in ast.parse(self.source).body if isinstance(node, ast.FunctionDef)}
             keys: dict[str, str] = {}
 
             def make(name: str) -> str:
                 if name not in keys:
-                    text = ast.unparse(nodes[name])
-                    names = {node.id for node in ast.walk(nodes[name]) if isinstance(node, ast.Name)}
-                    callees = sorted(names & nodes.keys() - {name})
+                    text = self._texts[name]
+                    names = {node.id for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Name)}
+                    callees = sorted(names & self._texts.keys() - {name})
                     key = disk.key(text, *map(make, callees))
                     if key not in _parts:
                         namespace = {**_vocabulary(), **{callee: _parts[keys[callee]] for callee in callees}}
@@ -135,7 +137,7 @@ class Core:
                     keys[name] = key
                 return keys[name]
 
-            self._compilable.update(_vocabulary(), **{name: _parts[make(name)] for name in nodes})
+            self._compilable.update(_vocabulary(), **{name: _parts[make(name)] for name in self._texts})
         return self._compilable
 
 
