@@ -56,10 +56,11 @@ class OffsetFree(Controller):
         SymPy symbols, as in `Dynamics`, that does not depend on u.
       memory: in s, by default 5 s, or the plan's horizon where that is shorter.
       record: whether to keep what the filter makes of the last run, for holding it against `filter`: see there.
-      replan_every: seconds, rounded to control periods, after which each trial is solved again, and so on: for what is
-        left of the horizon, from its estimated state, with the unknown parameters as they are estimated; by default
-        never. Where a solve does not succeed, the law before goes on. Costs that depend on the step's number are not
-        supported then.
+      replan_every: seconds, rounded to control periods, after which it is looked at, again and again, whether the law
+        still leads to the goal and clear of obstacles: by the model, from the estimated state and with the estimated
+        constants. Where it does not, what is left of the horizon is solved from there; by default never. Where a solve
+        does not succeed, the law before goes on. Costs that depend on the step's number are not supported then.
+      replan_always: whether to solve at each of these times, wherever the law leads.
 
     Attributes:
       model, filter: the linear model about the plan, with z = (state, what the actuators have reached, unknowns), and
@@ -92,6 +93,7 @@ class OffsetFree(Controller):
         memory: float | None = None,
         record: bool = False,
         replan_every: float | None = None,
+        replan_always: bool = False,
     ) -> None:
         check_plan("OffsetFree", problem, solution)
         check_kind("OffsetFree: uncertainty", uncertainty, Uncertainty, "an Uncertainty, such as uncertainty_of(...)")
@@ -100,6 +102,7 @@ class OffsetFree(Controller):
         memory = check_number("OffsetFree: memory", memory, above=0.0)
         self.problem, self.solution, self.uncertainty = problem, solution, uncertainty
         self.record = check_flag("OffsetFree: record", record)
+        self.replan_always = check_flag("OffsetFree: replan_always", replan_always)
         self.estimates: Array | None = None
         self.innovations: Array | None = None
         self.plans: list[dict[int, Trajectory]] = []
@@ -213,7 +216,7 @@ class OffsetFree(Controller):
         numbers = np.array([model.plan.dt, self.uncertainty.lag, self.uncertainty.latency, self.uncertainty.delay])
         moved = model.dynamics.fixed or np.array(list(model.dynamics.parameters.values()), dtype=np.float64)
         sources = model.dynamics.source, moved, model.sensor.source, model.sensor.data
-        again = () if self._again is None else (f"{self.problem.digest} {self._again.periods}", self.filter.corrected)
+        again = () if self._again is None else (f"{self.problem.digest} {self._again.periods} {self.replan_always}", self.filter.corrected)
         return sha256(*parts, numbers, *sources, *again)[:16]
 
     @property

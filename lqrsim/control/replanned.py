@@ -1,10 +1,12 @@
-"""Output feedback that plans again as it goes, with what it has estimated in the model.
+"""Output feedback that plans again where its law no longer leads to the goal, with what it has estimated in the model.
 
-At each of these steps, and for each trial, what is left of the horizon is solved from the estimated state, with the
-unknown parameters at their estimated values, and the law and the filter are made anew about that plan. The estimates go
-on as they are; the law acts on what they differ by from what the new plan takes for granted. As for the law, what
-disturbs the robot now will go on as it is, gusts too. Gains and offsets of the controls are no parameters of the model,
-so that they stay with the law, and so does the lag of the actuators. A solve takes no time in the simulation.
+At each of these steps, and for each trial, the law is run on by the model from the estimated state, with the unknown
+constants at their estimated values. Where that collides or misses the goal, what is left of the horizon is solved from
+there, and the law and the filter are made anew about that plan. Elsewhere a new plan would do harm: it is of less cost,
+and as near to obstacles as its constraints let it. The estimates go on as they are; the law acts on what they differ by
+from what the new plan takes for granted. Gusts pass, and plans do not know of them; gains and offsets of the controls
+and the lag of the actuators are no parameters of the model: all these stay with the law. A solve takes no time in the
+simulation.
 """
 
 from collections.abc import Sequence
@@ -17,7 +19,10 @@ from lqrsim.codegen.jit import in_c_order
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.replanner import Replanner, Task
 from lqrsim.errors import Array, InputError
+from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Trajectory
+from lqrsim.solvers import compiled
+from lqrsim.solvers.assembly import clearance_of
 from lqrsim.solvers.initial_guess import InitialGuess
 
 if TYPE_CHECKING:
@@ -49,11 +54,23 @@ class Replanned:
                 self.lost.setdefault(k, run.lost[0])
         return np.concatenate(commands)
 
+    def _leads_there(self, problem: Problem, gain: Array, offset: Array, state: Array) -> bool:
+        """Whether a law leads from a state (n,) to the goal, clear of obstacles, by the model."""
+        states, _ = compiled.rollout(problem, gain, offset, state)
+        if not np.isfinite(states).all():
+            return False
+        clearance, solution = clearance_of(problem, states), self._again.solution
+        target, radius = solution.target, solution.goal_radius
+        if radius is None and not target.places:
+            radius = target.radius(None, None, None)
+        near = radius is None or bool(target.distance(states[-1]) <= radius)
+        return near and (clearance is None or bool(clearance.min() >= 0))
+
     def _replan(self, run: "_Run", trial: int, step: int) -> None:
         """The law from now on is about a new plan, if there is one."""
         law, model, z = run.law, run.model, run.estimates[0]
         n, done = model.n, step - run.first
-        granted = np.where(in_parameters(model), z[n + model.lagging :], 0.0)
+        granted = np.where(in_parameters(model) & constants(model), z[n + model.lagging :], 0.0)
         changes = model.output[: len(model.parameters)] @ granted
         values = {
             name: float(model.dynamics.parameters[name] + change)
@@ -70,16 +87,25 @@ class Replanned:
         rest = np.concatenate([reached, np.tile(granted, (len(gain), 1))], axis=1)
         offset = law.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], rest)
         here = dynamics.state_coordinates.nearest(z[:n], law.nominal[done, :n])
+        gain = in_c_order(gain[:, :, :n])
+        if not law.replan_always and self._leads_there(problem, gain, offset, here):
+            return
         plan = law.solution
-        start = InitialGuess(
-            in_c_order(gain[:, :, :n]), in_c_order(offset), plan.shifted(done, horizon="shrinking").cost_to_go, None, ""
-        )
+        start = InitialGuess(gain, in_c_order(offset), plan.shifted(done, horizon="shrinking").cost_to_go, None, "")
         solution = self._again.solve(Task(step, step, here, start, problem))
         if not self._again.account.enter(step, trial, solution):
             return
         self.plans[trial][step] = solution.trajectory
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
         run.law, run.first = law._about(solution, about, law.filter.corrected[done], granted), step
+
+
+def constants(model: PlanModel) -> Array:
+    """Which of the unknowns' states are constants, (D,): what will still be so at the end of the horizon."""
+    found = np.zeros(len(model.transition), dtype=bool)
+    for one, own in zip(model.remembered, model.own_states, strict=True):
+        found[list(own)] = one.constant
+    return found
 
 
 def in_parameters(model: PlanModel) -> Array:
