@@ -289,3 +289,27 @@ def test_three_links_go_round_posts(tmp_path: Path) -> None:
     assert found["noisy clear"] > 0
     assert found["noisy reached"] >= 0.7 * found["trials"]
     assert str(found["trials"]) in script.report(found)
+
+
+def test_numbers_are_fitted_to_a_run_that_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plan on paper fails in the plant; what that run recorded, with noise, is enough for one that does not."""
+    script: Any = import_module("fit_to_data")
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "tabulate", None)
+        with pytest.raises(ls.InputError, match=r"want what it needs: pip install 'lqrsim\[sysid\]'"):
+            script.main(script.Config(quick=True))
+    try:
+        script.library()
+    except ls.InputError as error:
+        pytest.skip(str(error))
+    result = script.main(script.Config(quick=True))
+    (case,) = result["cases"]
+    for one in case["numbers"]:
+        assert one["on paper"] < 0.8 * one["true"]
+        # Four times the half of a 95 % interval that the fit itself states; and near in any case.
+        assert abs(one["fitted"] - one["true"]) < 4 * one["within"] < 0.2 * one["true"]
+    on_paper, fitted, true = case["plans"]
+    assert on_paper["reached"] == 0
+    assert fitted["reached"] == true["reached"] == fitted["trials"] == 10
+    np.testing.assert_allclose(fitted["cost"], true["cost"], rtol=0.05)
+    assert "slider_damping" in script.report(result)
