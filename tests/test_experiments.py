@@ -313,3 +313,14 @@ def test_numbers_are_fitted_to_a_run_that_failed(monkeypatch: pytest.MonkeyPatch
     assert fitted["reached"] == true["reached"] == fitted["trials"] == 10
     np.testing.assert_allclose(fitted["cost"], true["cost"], rtol=0.05)
     assert "slider_damping" in script.report(result)
+
+
+def test_the_packaged_quadrotor_by_its_mjcf() -> None:
+    """MuJoCo's steps lead to the optimum of the formulas: to 1e-6 of the cost is wanted, what is left is rounding."""
+    script: Any = import_module("mjcf_packaged")
+    result = script.main(script.Config(quick=True, only=("quadrotor",)))
+    found = result["quadrotor"]
+    assert found["formulas"]["status"] == found["MJCF"]["status"] == "CONVERGED"
+    assert found["relative"] < 1e-9
+    assert found["apart"] < 1e-6
+    assert "quadrotor" in script.report(result)

@@ -9,7 +9,6 @@ from lqrsim.errors import Array
 
 ORDER = (0, 1, 2, 6, 7, 8, 3, 4, 5, 9, 10, 11)  # the quadrotor's states in MuJoCo's order: positions, then velocities
 FRAME = ("create_base_x", "create_base_y", "create_base_rz")  # the drive's states by their names in MuJoCo
-HEIGHT = 0.036  # m, of the drive's axle above the floor: the radius of its wheels
 
 
 def quadrotor(scenario: ls.Scenario, dynamics: ls.Dynamics) -> ls.Problem:
@@ -28,8 +27,12 @@ def _reordered(cost: ls.QuadraticCost) -> ls.QuadraticCost:
 
 
 def on_floor(robot: ls.MjcfRobot, pose: Array) -> Array:
-    """The state (16,) of the drive at rest at a place and heading (3,)."""
-    return robot.at(None, create_base_z=HEIGHT, **dict(zip(FRAME, map(float, pose), strict=True)))
+    """The state (16,) of the drive at rest at a place and heading (3,), as deep in the floor as it sinks."""
+    state = robot.at()
+    for _ in range(10):
+        state = robot.dynamics.step(state, np.zeros(2), 0.2)
+    height = float(state[robot.dynamics.state_coordinates.names.index("create_base_z")])
+    return robot.at(None, create_base_z=height, **dict(zip(FRAME, map(float, pose), strict=True)))
 
 
 def drive(scenario: ls.Scenario, robot: ls.MjcfRobot) -> ls.Problem:
