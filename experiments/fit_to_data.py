@@ -175,18 +175,18 @@ def of_case(case: Case, trials: int, seed: int) -> dict[str, Any]:
     return {
         "name": case.name, "seconds": float(min(recorded.times[-1], recorded.collided_at[0])), "numbers": numbers,
         "plans": [
-            {"model": name} | outcome(plant, plan, noise, trials=trials, seed=seed + 1)
+            {"model": name} | outcome(plant, plan, noise, trials, seed + 1)
             for name, plan in plans.items()
         ],
     }  # fmt: skip
 
 
-def outcome(plant: ls.Plant, plan: ls.Solution, noise: list[Any], **options: int) -> dict[str, Any]:
+def outcome(plant: ls.Plant, plan: ls.Solution, noise: list[Any], trials: int, seed: int) -> dict[str, Any]:
     """How a plan's policy does in the plant."""
-    runs = ls.simulate(plant, plan, disturbances=noise, frames=False, **options)
+    runs = ls.simulate(plant, plan, disturbances=noise, frames=False, trials=trials, seed=seed)
     counted = ls.outcomes(runs)
     return {
-        "status": plan.status.name, "cost": plan.cost, "trials": options["trials"], "unit": runs.tracking_unit,
+        "status": plan.status.name, "cost": plan.cost, "trials": trials, "unit": runs.tracking_unit,
         "reached": int(runs.reached.sum()), "collided": int(np.isfinite(runs.collided_at).sum()),
         "off": float(np.median(counted.worst)),
     }  # fmt: skip

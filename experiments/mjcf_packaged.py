@@ -63,7 +63,9 @@ def of_drive(most: int) -> dict[str, Any]:
     names = robot.dynamics.state_coordinates.names
     place = [names.index(name) for name in FRAME[:2]]
     pillars = np.array([one.position[:2] for one in scenario.scene.world.obstacles if one.kind == "cylinder"])
-    ends = problem.start[place], problem.goal[place]
+    start, goal = problem.start, problem.goal
+    assert start is not None
+    assert goal is not None
     other = formulas.trajectory.states[:, :2]
     found: dict[str, Any] = {"formulas": _of(formulas)}
     begun = {
@@ -71,10 +73,12 @@ def of_drive(most: int) -> dict[str, Any]:
         "a path on the floor": on_a_path(problem),
         "the formulas' controls": formulas.trajectory.controls,
     }
-    for name, start in begun.items():
-        solution = ls.smooth(problem, start=start, max_iterations=most)
+    for name, beginning in begun.items():
+        solution = ls.smooth(problem, start=beginning, max_iterations=most)
         path = solution.trajectory.states[:, place]
-        ways = [way(np.vstack([ends[0], one, ends[1]]), pillars) for one in (path, other)]  # ways keep their ends
+        ways = [
+            way(np.vstack([start[place], one, goal[place]]), pillars) for one in (path, other)
+        ]  # ways keep their ends
         runs = ls.simulate(ls.Plant(robot, robot.scene), solution)
         found[name] = _of(solution) | {
             "apart": float(np.linalg.norm(path - other, axis=1).max()), "same way": ways[0] == ways[1],

@@ -43,7 +43,7 @@ def robot_of(**numbers: Any) -> ls.MjcfRobot:
 def stepped(dynamics: ls.Dynamics) -> Array:
     """Some steps from rest on the floor, under forces that slide it."""
     rng = np.random.default_rng(0)
-    states = [np.zeros(8)]
+    states: list[Array] = [np.zeros(8)]
     for _ in range(20):
         states.append(dynamics.step(states[-1], [4 * rng.normal(), rng.normal()], 0.01))
     return np.array(states)
