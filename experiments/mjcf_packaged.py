@@ -69,7 +69,7 @@ def of_drive(most: int) -> dict[str, Any]:
     other = formulas.trajectory.states[:, :2]
     found: dict[str, Any] = {"formulas": _of(formulas)}
     begun = {
-        "rest": None,
+        "the default search": None,
         "a path on the floor": on_a_path(problem),
         "the formulas' controls": formulas.trajectory.controls,
     }
@@ -90,8 +90,8 @@ def of_drive(most: int) -> dict[str, Any]:
 def on_a_path(problem: ls.Problem) -> ls.InitialPrior:
     """What draws the first iterations: straight to the goal, blind to obstacles at first, and level on the floor.
 
-    The method linearises about states of least total cost, which no motion has to lead through. A drive that is half a
-    millimetre in the floor is thrown out of it.
+    The method linearises about states of least total cost, which no motion has to lead through. Above the floor, wheels
+    drive nothing.
     """
     start, goal = problem.start, problem.goal
     assert start is not None
@@ -127,7 +127,7 @@ def report(result: Result) -> str:
 
 
 def _cells(one: dict[str, Any]) -> list[Any]:
-    return [one["status"], f"{one['cost']:.4f}", one["iterations"]]
+    return [one["status"], f"{one['cost']:.6g}", one["iterations"]]
 
 
 if __name__ == "__main__":
