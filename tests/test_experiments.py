@@ -289,3 +289,38 @@ def test_three_links_go_round_posts(tmp_path: Path) -> None:
     assert found["noisy clear"] > 0
     assert found["noisy reached"] >= 0.7 * found["trials"]
     assert str(found["trials"]) in script.report(found)
+
+
+def test_numbers_are_fitted_to_a_run_that_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plan on paper fails in the plant; what that run recorded, with noise, is enough for one that does not."""
+    script: Any = import_module("fit_to_data")
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "tabulate", None)
+        with pytest.raises(ls.InputError, match=r"want what it needs: pip install 'lqrsim\[sysid\]'"):
+            script.main(script.Config(quick=True))
+    try:
+        script.library()
+    except ls.InputError as error:
+        pytest.skip(str(error))
+    result = script.main(script.Config(quick=True))
+    (case,) = result["cases"]
+    for one in case["numbers"]:
+        assert one["on paper"] < 0.8 * one["true"]
+        # Four times the half of a 95 % interval that the fit itself states; and near in any case.
+        assert abs(one["fitted"] - one["true"]) < 4 * one["within"] < 0.2 * one["true"]
+    on_paper, fitted, true = case["plans"]
+    assert on_paper["reached"] == 0
+    assert fitted["reached"] == true["reached"] == fitted["trials"] == 10
+    np.testing.assert_allclose(fitted["cost"], true["cost"], rtol=0.05)
+    assert "slider_damping" in script.report(result)
+
+
+def test_the_packaged_quadrotor_by_its_mjcf() -> None:
+    """MuJoCo's steps lead to the optimum of the formulas: to 1e-6 of the cost is wanted, what is left is rounding."""
+    script: Any = import_module("mjcf_packaged")
+    result = script.main(script.Config(quick=True, only=("quadrotor",)))
+    found = result["quadrotor"]
+    assert found["formulas"]["status"] == found["MJCF"]["status"] == "CONVERGED"
+    assert found["relative"] < 1e-9
+    assert found["apart"] < 1e-6
+    assert "quadrotor" in script.report(result)

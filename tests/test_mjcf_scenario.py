@@ -46,6 +46,16 @@ def test_a_box_among_posts_keeps_clear_of_them(tmp_path: Path) -> None:
     assert not ls.scenarios.mjcf(str(file), start={"z": 1.0}, obstacles=False).problem.obstacle_costs
 
 
+def test_numbers_of_the_mjcf_are_by_name(cart: Path) -> None:
+    scenario = resolve(f"{cart},parameters={{'cart_mass': 2.5, 'pole_damping': 0.03}},steps=20")
+    plain = resolve(f"{cart},steps=20")
+    np.testing.assert_allclose(scenario.plant().model.body("cart").mass, [2.5], rtol=1e-15)
+    assert scenario.problem.digest != plain.problem.digest
+    for wrong, message in ((0.6, "parameters: got 0.6, want numbers by name"), ({"weight": 1.0}, "want one of: mass")):
+        with pytest.raises(InputError, match=message):
+            ls.scenarios.mjcf(str(cart), parameters=wrong)  # pyright: ignore[reportArgumentType]
+
+
 def test_the_path_is_found_from_any_folder(cart: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(cart.parent)
     assert from_anywhere("cart.xml,steps=5") == f"{cart},steps=5"

@@ -111,7 +111,9 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "scenarios.mjcf": ({
             "path": str(file), "start": "left", "goal": {"slider": 0.5}, "weights": {"m": 10.0}, "effort": 1.0,
             "dt": 0.02, "steps": 5, "body": "cart", "floors": True, "obstacles": True,
+            "parameters": {"mass": 2.0},
         }, 0.2),
+        "MjcfRobot.with_parameters": ({"self": slider, "mass": 2.0, "slider_damping": 0.1},),
         "MjcfRobot.at": ({"self": slider, "keyframe": "left", "slider": 0.2},),
         "Dynamics.rate": ({"self": cart, **at},),
         "Dynamics.rate_jacobian": ({"self": cart, **at},),

@@ -77,6 +77,9 @@ class MjcfRobot(Robot):
         self.name = self.scene.name
         model, who = self.scene.model, f"MjcfRobot {self.name}"
         number = mjcf_joints.body_of(model, body, who)
+        self._stated = {
+            "body": body, "position": position, "radius": radius, "outline": outline, "floors": floors,
+        }  # fmt: skip
         self._joints, actuators = mjcf_joints.joints_of(model), mjcf_joints.actuators_of(model)
         self.body = model.body(number).name
         self.joints = tuple(one.name for one in self._joints)
@@ -144,6 +147,17 @@ class MjcfRobot(Robot):
     @property
     def dynamics(self) -> MjcfDynamics:
         return self._dynamics
+
+    def with_parameters(self, **values: float) -> "MjcfRobot":
+        """The same in an MJCF with other numbers, for a plant, too: `robot.with_parameters(mass=0.6)`.
+
+        `dynamics.numbers` has their names and values; `dynamics.with_parameters` is the same for a plan alone.
+
+        Raises:
+          InputError: as there.
+        """
+        changed = self.dynamics.with_parameters(**values)
+        return MjcfRobot(scene_from_xml(changed.xml, self.name), **self._stated)
 
     @property
     def joint_limits(self) -> StateBounds:

@@ -19,6 +19,7 @@ from lqrsim.machine import processors
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
+from lqrsim.scenes.mjcf_numbers import numbers_of, with_numbers
 from lqrsim.scenes.mjcf_physics import MjcfPhysics
 from lqrsim.scenes.scene import unlogged
 
@@ -37,7 +38,7 @@ class MjcfDynamics(Dynamics):
     continuous time do not take them, nor those that need an inverse.
 
     Attributes:
-      physics: MuJoCo's model, and memory for each thread.
+      xml: the MJCF. physics: MuJoCo's model, and memory for each thread.
     """
 
     discrete: ClassVar[bool] = True
@@ -48,12 +49,15 @@ class MjcfDynamics(Dynamics):
     ) -> None:  # fmt: skip
         self._name = name
         self._stated: dict[str, Any] = {"body": body, "floors": floors, "actuators": actuators}
-        self._xml, self.fixed = xml, sha256(xml, repr(self._stated))
         self.functions, self.level = (), "compiled"
         self.parameters: dict[str, float] = {}
         self.disturbances = dict.fromkeys(WRENCH, 0.0)
         self.state_coordinates, self.control_coordinates = states, controls
-        self.physics = MjcfPhysics(xml, name, **self._stated)
+        self._set_mjcf(xml)
+
+    def _set_mjcf(self, xml: str) -> None:
+        self.xml, self.fixed = xml, sha256(xml, repr(self._stated))
+        self.physics = MjcfPhysics(xml, self._name, **self._stated)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without MuJoCo's memory, which another process makes anew."""
@@ -61,7 +65,7 @@ class MjcfDynamics(Dynamics):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self.physics = MjcfPhysics(self._xml, self._name, **self._stated)
+        self._set_mjcf(self.xml)
 
     def __copy__(self) -> "MjcfDynamics":
         """With the same memory of MuJoCo's."""
@@ -82,16 +86,34 @@ class MjcfDynamics(Dynamics):
         wrench = [self.parameters.get(name, self.disturbances[name]) for name in WRENCH]
         return np.concatenate([wrench, self.physics.numbers[kernel.WRENCH + len(wrench) :]])
 
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The numbers of the MJCF that `with_parameters` takes, and what they are.
+
+        `mass` in kg, of all that moves, and `<body>_mass`; `<joint>_damping`, `_stiffness`, `_armature` and
+        `_frictionloss`; `<geom>_friction`, sliding, of what collides; `<actuator>_gear`, where there are several
+        numbers the largest; `density` and `viscosity` of what it moves in. In MuJoCo's units.
+        """
+        return {name: one.value for name, one in numbers_of(self.xml, self.physics.model).items()}
+
     def with_parameters(self, **values: float) -> "MjcfDynamics":
-        """The same, pushed otherwise: `dynamics.disturbed.with_parameters(force_x=1.0)`.
+        """The same with other `numbers`: `dynamics.with_parameters(mass=0.6, pole_damping=0.02)`. Nothing compiles.
+
+        A body's inertia is as many times its own as its mass is; several numbers of a gear keep their ratios. What is
+        pushed is pushed otherwise, too: `dynamics.disturbed.with_parameters(force_x=1.0)`.
 
         Raises:
-          InputError: there is no such parameter, or the value is not finite.
+          InputError: there is no such number, the value is out of range, or the masses are those of all and of one.
         """
+        numbers = self.numbers
+        for name in values:
+            check_name(f"{self.name}: parameters", name, [*self.parameters, *numbers])
         other = copy.copy(self)
-        other.parameters = dict(self.parameters)
-        for name, value in values.items():
-            other.parameters[check_name("parameters", name, self.parameters)] = check_number(name, value)
+        pushed = {name: check_number(name, value) for name, value in values.items() if name in self.parameters}
+        other.parameters = self.parameters | pushed
+        stated = {name: value for name, value in values.items() if name not in pushed}
+        if stated:
+            other._set_mjcf(with_numbers(self.xml, self.physics.model, stated, self.name))
         return other
 
     def period_near(self, dt: float) -> float:

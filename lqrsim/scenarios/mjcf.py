@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from lqrsim.control.uncertainty import PerEntry, per_entry
-from lqrsim.errors import Array, InputError, check_kind, excerpt
+from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt
 from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.robots.mjcf import MjcfRobot
@@ -30,6 +30,7 @@ def mjcf(
     body: str | None = None,
     floors: bool = True,
     obstacles: bool = True,
+    parameters: Mapping[str, float] | None = None,
 ) -> Scenario:
     """From a start to a goal in so many steps, with the limits of the actuators and clear of obstacles.
 
@@ -42,11 +43,16 @@ def mjcf(
       effort: of the controls, a number, by name or by unit; by default 1 for a control at its limit, or at 1.
       dt: seconds of a control period, by default about 0.02. steps: how many.
       body, floors: as in `MjcfRobot`. obstacles: whether to keep clear of them.
+      parameters: other numbers of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
 
     Raises:
-      InputError: no such file, keyframe, state or unit; or as `MjcfRobot` and `Problem` do.
+      InputError: no such file, keyframe, state, unit or number; or as `MjcfRobot` and `Problem` do.
     """
     robot = MjcfRobot(path, body=body, floors=floors)
+    given = check_kind("parameters", parameters, (Mapping, type(None)), "numbers by name: {'mass': 0.6}")
+    if given:
+        names = check_items("parameters", list(given), str, "names and numbers: {'mass': 0.6}")
+        robot = robot.with_parameters(**{name: given[name] for name in names})
     plant, timestep = Plant(robot, robot.scene), float(robot.scene.model.opt.timestep)
     dynamics = robot.dynamics
     space, controls = dynamics.state_coordinates, dynamics.control_coordinates

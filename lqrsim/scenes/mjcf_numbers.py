@@ -1,0 +1,157 @@
+"""The numbers of an MJCF that may be others: masses, damping, friction, gears; read from a model, changed in the text.
+
+In the text, for it alone makes the model again: what MuJoCo derives of a number, it derives when it compiles that.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from lqrsim.errors import InputError, check_number
+
+WHOLE = "mass"  # of all that moves
+_OF_JOINTS = ("damping", "stiffness", "armature", "frictionloss")
+_MEDIUM = ("density", "viscosity")
+_BOUNDS = {"mass": {"above": 0.0}, "gear": {}}  # of the rest: none is negative
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number of an MJCF: which one, of which body, joint, geom or actuator (of all if empty), and its value."""
+
+    what: str
+    part: str
+    value: float
+
+
+def numbers_of(xml: str, model: mujoco.MjModel) -> dict[str, Number]:
+    """All of them, by the names that parameters have: `mass`, `<body>_mass`, `<joint>_damping`, `<actuator>_gear`.
+
+    Only of what is in the text by its name, and has the number: bodies that move, geoms that collide.
+
+    Args:
+      xml: an MJCF in which all has a name. model: compiled from it.
+    """
+    elements, found = _elements(ElementTree.fromstring(xml)), list[Number]()
+    masses = {name: float(model.body(name).mass[0]) for name in _heavy(model)}
+    if _bodies(model) == elements["body"].keys():  # else there are some whose mass the text has no place for
+        found += [Number("mass", "", sum(masses.values()))] if masses else []
+        found += [Number("mass", name, mass) for name, mass in masses.items()]
+    for number in range(model.njnt):
+        name, dof = model.joint(number).name, int(model.jnt_dofadr[number])
+        if name in elements["joint"]:
+            values = {key: getattr(model, f"dof_{key}")[dof] for key in _OF_JOINTS if key != "stiffness"}
+            values["stiffness"] = model.jnt_stiffness[number]
+            found += [Number(key, name, float(values[key])) for key in _OF_JOINTS]
+    for number in np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0)):
+        if (name := model.geom(number).name) in elements["geom"]:
+            found.append(Number("friction", name, float(model.geom_friction[number, 0])))
+    for number, gear in enumerate(model.actuator_gear):
+        if (name := model.actuator(number).name) in elements["actuator"] and gear.any():
+            found.append(Number("gear", name, float(gear[np.abs(gear).argmax()])))
+    found += [Number(key, "", float(getattr(model.opt, key))) for key in _MEDIUM]
+    return {f"{one.part}_{one.what}" if one.part else one.what: one for one in found}
+
+
+def with_numbers(xml: str, model: mujoco.MjModel, values: Mapping[str, float], what: str) -> str:
+    """The MJCF with others of its numbers, by name, as in `numbers_of`.
+
+    A body's inertia is as many times its own as its mass is, and so it is for all bodies with `mass`. The numbers of a
+    gear keep their ratios.
+
+    Args:
+      what: it is, for messages.
+
+    Raises:
+      InputError: a value is out of range, or both the whole mass and that of a body are there.
+    """
+    numbers, root = numbers_of(xml, model), ElementTree.fromstring(xml)
+    elements, scales = _elements(root), dict[str, float]()
+    for name, value in values.items():
+        one = numbers[name]
+        value = check_number(f"{what}: {name}", value, **_BOUNDS.get(one.what, {"at_least": 0.0}))
+        ratio = value / one.value if one.value else 0.0
+        if name == WHOLE:
+            scales |= dict.fromkeys(_heavy(model), ratio)
+            if other := next((key for key in values if key != WHOLE and numbers[key].what == "mass"), None):
+                raise InputError(f"{what}: {WHOLE}: got it together with {other}, want the mass of all or of bodies")
+        elif one.what == "mass":
+            scales[one.part] = ratio
+        elif one.what in _OF_JOINTS:
+            _set(elements["joint"][one.part], one.what, [value, *_higher(model, one)])
+        elif one.what == "friction":
+            _set(elements["geom"][one.part], "friction", [value, *model.geom(one.part).friction[1:]])
+        elif one.what == "gear":
+            _set(elements["actuator"][one.part], "gear", [*(ratio * model.actuator(one.part).gear)])
+        else:
+            _set(_last(root, "option"), one.what, [value])
+    if scales:
+        _state_masses(root, elements["body"], model, scales)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _state_masses(
+    root: ElementTree.Element,
+    bodies: Mapping[str, ElementTree.Element],
+    model: mujoco.MjModel,
+    scales: Mapping[str, float],
+) -> None:
+    """Write the mass and inertia of each body, times its scale: as compiled, in place of how they came about."""
+    for name, body in bodies.items():
+        for inertial in body.findall("inertial"):
+            body.remove(inertial)
+        compiled, scale = model.body(name), scales.get(name, 1.0)
+        if compiled.mass[0] > 0:
+            inertial = ElementTree.Element("inertial")
+            _set(inertial, "pos", [*compiled.ipos])
+            _set(inertial, "quat", [*compiled.iquat])
+            _set(inertial, "mass", [scale * compiled.mass[0]])
+            _set(inertial, "diaginertia", [*(scale * compiled.inertia)])
+            body.insert(0, inertial)
+    compiler = {"inertiafromgeom": "false", "settotalmass": "-1", "boundmass": "0", "boundinertia": "0"}
+    root.append(ElementTree.Element("compiler", compiler))
+
+
+def _elements(root: ElementTree.Element) -> dict[str, dict[str, ElementTree.Element]]:
+    """What has a name, by kind and name. Replicas have other names in the model, and are not found by these."""
+    found = {"body": {}, "joint": {}, "geom": {}, "actuator": {}}
+    for world in root.iter("worldbody"):
+        for element in world.iter():
+            if element.tag in found:
+                found[element.tag][element.get("name", "")] = element
+    for section in root.findall("actuator"):
+        found["actuator"] |= {element.get("name", ""): element for element in section}
+    return found
+
+
+def _bodies(model: mujoco.MjModel) -> set[str]:
+    return {model.body(number).name for number in range(1, model.nbody)}
+
+
+def _heavy(model: mujoco.MjModel) -> list[str]:
+    """The bodies that move, or are moved with others, and have mass."""
+    moves = (model.body_treeid >= 0) & (model.body_mass > 0)
+    return [model.body(number).name for number in np.flatnonzero(moves)]
+
+
+def _higher(model: mujoco.MjModel, one: Number) -> list[float]:
+    """What comes after the number that is linear in the text: damping and stiffness may be polynomials."""
+    joint = model.joint(one.part).id
+    if one.what == "stiffness":
+        return model.jnt_stiffnesspoly[joint].tolist()
+    return model.dof_dampingpoly[model.jnt_dofadr[joint]].tolist() if one.what == "damping" else []
+
+
+def _set(element: ElementTree.Element, name: str, numbers: list[float]) -> None:
+    """Write numbers so that they are read as the same."""
+    element.set(name, " ".join(repr(float(number)) for number in numbers))
+
+
+def _last(root: ElementTree.Element, tag: str) -> ElementTree.Element:
+    """A new element at the end, which wins over those before."""
+    element = ElementTree.Element(tag)
+    root.append(element)
+    return element
