@@ -216,7 +216,11 @@ class OffsetFree(Controller):
         numbers = np.array([model.plan.dt, self.uncertainty.lag, self.uncertainty.latency, self.uncertainty.delay])
         moved = model.dynamics.fixed or np.array(list(model.dynamics.parameters.values()), dtype=np.float64)
         sources = model.dynamics.source, moved, model.sensor.source, model.sensor.data
-        again = () if self._again is None else (f"{self.problem.digest} {self._again.periods} {self.replan_always}", self.filter.corrected)
+        again = (
+            ()
+            if self._again is None
+            else (f"{self.problem.digest} {self._again.periods} {self.replan_always}", self.filter.corrected)
+        )
         return sha256(*parts, numbers, *sources, *again)[:16]
 
     @property

@@ -53,10 +53,8 @@ class Job:
 
 
 def without_diagnostics(solution: Solution) -> Solution:
-    """What running it takes, without what only tells how it was found: a fifth of the size."""
-    return replace(
-        solution, inverse_policy=None, cost_to_go=None, cost_to_come=None, iterations=(), candidates=(), multipliers=()
-    )
+    """What running it and solving it again take, without what only tells how it was found."""
+    return replace(solution, inverse_policy=None, cost_to_come=None, iterations=(), candidates=())
 
 
 def solve(
