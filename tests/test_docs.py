@@ -175,3 +175,10 @@ def test_commands_of_pages_exist() -> None:
         assert set(re.findall(r"^`*lqrsim (\w+)", page.read_text(encoding="utf-8"), re.MULTILINE)) <= COMMANDS.keys(), (
             page
         )
+
+
+def test_replanning_in_simulations_and_on_a_robot() -> None:
+    names = run_page("replanning.md")
+    assert names["replan"].trajectory.steps == 150
+    assert names["law"].solved > 40
+    assert names["planner"].problem.dynamics.parameters["wind_x"] == 2.0
