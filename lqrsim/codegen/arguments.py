@@ -20,13 +20,19 @@ def kind_of(argument: Any) -> tuple[Any, ...]:
     return (next(name for types, name in kinds if isinstance(argument, types)),)
 
 
-def leaves(arguments: Iterable[Any]) -> Iterator[Any]:
+def leaves(arguments: Iterable[Any]) -> list[Any]:
     """The arguments with records taken apart: numba looks at named tuples in Python, at what is in them in C."""
+    found: list[Any] = []
+    _take_apart(arguments, found)
+    return found
+
+
+def _take_apart(arguments: Iterable[Any], found: list[Any]) -> None:
     for argument in arguments:
         if isinstance(argument, tuple) and hasattr(argument, "_fields"):
-            yield from leaves(argument)
+            _take_apart(argument, found)
         else:
-            yield argument
+            found.append(argument)
 
 
 def converted(kind: tuple[Any, ...], names: Iterator[str]) -> str:

@@ -26,7 +26,7 @@ class Replan:
       violation: by how much the worst constraint is missed at the steps; 0 where none is.
       cost_to_go, multipliers: what the next solve begins with.
       iterations: how many there were. seconds: how long the solve took. iterating: how much of that, in seconds, the
-        iterations took.
+        iterations took, and to see where the law leads that the solve began with.
     """
 
     status: Status

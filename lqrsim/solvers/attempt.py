@@ -106,8 +106,11 @@ class Attempt:
         """See where the start leads, if nothing has been done yet; the states and controls are in `work`."""
         self._loop(*self._arguments(0, 0, self._log))
 
-    def finish(self, *, each: bool, callback: Callback | None = None) -> AttemptResult:
-        """The method, and its safeguard where that fails."""
+    def finish(self, *, each: bool, callback: Callback | None = None, look_back: bool = True) -> AttemptResult:
+        """The method, and its safeguard where that fails.
+
+        With `look_back`, what is stopped has the best plan so far; it takes another pass to make its policy.
+        """
         settings = self.settings
         self.run(settings.max_iterations, each=each, callback=callback)
         termination = check_outcome(
@@ -120,7 +123,7 @@ class Attempt:
         if termination.outcome == declarations.TIMED_OUT or (
             settings.safeguard and self.iterations_left(found.iterations) == 0
         ):
-            return self.best(found)
+            return self.best(found) if look_back else found
         return self.rescue(found, each=each, callback=callback) if settings.safeguard else found
 
     def iterations_left(self, iterations: tuple[Iteration, ...]) -> int:

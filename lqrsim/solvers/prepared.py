@@ -117,7 +117,7 @@ class PreparedSolver:
         best = _Best(attempt)
         with problem.dynamics.solving(1):
             found = _run(attempt, best)
-        iterating = sum(one.seconds for one in found.iterations)
+        iterating = best.rolling_out + sum(one.seconds for one in found.iterations)
         self._pace = max(0.5 * self._pace, max((one.seconds for one in found.iterations), default=0.0))
         best.consider(found)
         return self._answer(problem, best, found, clock, iterating)
@@ -155,7 +155,7 @@ def _run(attempt: Attempt, best: "_Best") -> AttemptResult:
     try:
         if attempt.initial_guess.multipliers:
             return satisfy(attempt, None, each=True, callback=best)
-        found = attempt.finish(each=True, callback=best)
+        found = attempt.finish(each=True, callback=best, look_back=False)
         if attempt.problem.constraints and found.success and not attempt.stop.due:
             found = satisfy(attempt, found, each=True, callback=best)
         return found
@@ -173,29 +173,40 @@ class _Best:
     Attributes:
       plan: states and controls. law: gain and offset. cost_to_go: of the law; None where that is not known.
       multipliers: that it was found with. cost, violation: of it. before: the cost of the first.
-      improved: whether it is another than the first.
+      improved: whether it is another than the first. rolling_out: how long it took to see where that leads, in s.
     """
 
     def __init__(self, attempt: Attempt) -> None:
         self._attempt, self._work, guess = attempt, attempt.work, attempt.initial_guess
+        clock = time.perf_counter()
         attempt.roll_out()
+        self.rolling_out = time.perf_counter() - clock
         values = self._work.constraint_values(self._work.states, self._work.controls)
         self.cost, self.violation = float(self._work.memory["plan_cost"]), self._work.violation(values)
         self.before = self.cost
         self.plan = self._work.states.copy(), self._work.controls.copy()
         self.law, self.cost_to_go, self.multipliers = (guess.gain, guess.offset), guess.cost_to_go, guess.multipliers
         self.improved = False
+        self._copies: tuple[Array, ...] = ()
 
     def __call__(self, iteration: Iteration) -> None:
+        if iteration.optimality < self._attempt.settings.tolerance and iteration.violation == 0:
+            return  # the last, most likely, and considered as such
         if iteration.method == "smooth" and self._beaten_by(iteration.cost, iteration.violation):
-            kept = self._work.arrays.kept
-            self._keep(iteration.cost, iteration.violation, self._work.arrays.rollout, kept)
+            arrays = self._work.arrays
+            there = *arrays.rollout, *arrays.kept, *arrays.to_go
+            # The next iteration writes over these; and what is allocated anew each time is slow to write to.
+            self._copies = self._copies or tuple(np.empty_like(array) for array in there)
+            for copy, array in zip(self._copies, there, strict=True):
+                np.copyto(copy, array)
+            self._keep(iteration.cost, iteration.violation, self._copies)
 
     def consider(self, found: AttemptResult) -> None:
         """What it ended with: that, if it converged and is as good; and if it is better in any case."""
         as_good = found.success and not self._better(self.cost, self.violation, found.cost, found.violation)
         if as_good or self._beaten_by(found.cost, found.violation):
-            self._keep(found.cost, found.violation, (found.states, found.controls), found.law)
+            there = found.states, found.controls, *found.law, *self._work.arrays.to_go
+            self._keep(found.cost, found.violation, there)
             self.multipliers = found.multipliers
 
     def _beaten_by(self, cost: float, violation: float) -> bool:
@@ -209,8 +220,7 @@ class _Best:
             return violation < than_violation
         return not cost >= than_cost - ROUNDING * abs(than_cost)
 
-    def _keep(self, cost: float, violation: float, plan: tuple[Array, Array], law: tuple[Array, Array]) -> None:
+    def _keep(self, cost: float, violation: float, arrays: tuple[Array, ...]) -> None:
+        states, controls, gain, offset, *to_go = arrays
         self.cost, self.violation, self.improved = cost, violation, True
-        self.plan = plan[0].copy(), plan[1].copy()
-        self.law = law[0].copy(), law[1].copy()
-        self.cost_to_go = Quadratic(*(array.copy() for array in self._work.arrays.to_go))
+        self.plan, self.law, self.cost_to_go = (states, controls), (gain, offset), Quadratic(*to_go)
