@@ -15,6 +15,7 @@ import browsing
 import mujoco
 import numpy as np
 import pytest
+from planar_arm import LENGTH, LINK, PlanarArm
 from viewers import Recorder, said, viewing
 
 import lqrsim as ls
@@ -30,6 +31,13 @@ FREE = np.zeros(3)  # a metre from all beams: closer to them, what they cost kee
 
 def planning() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name == "lqrsim planner"]
+
+
+def wait_for(planner: ls.Planner) -> None:
+    """For the answer that its thread is at."""
+    solve = planner._solve
+    while solve is not None and solve.answer is None and solve.error is None:
+        time.sleep(1e-3)
 
 
 class Run:
@@ -56,13 +64,7 @@ class Run:
         for one in self.acts:
             one(time)
         if self.patient:
-            self.wait()
-
-    def wait(self) -> None:
-        """For the answer that the planner's thread is at."""
-        solve = self.planners[-1]._solve
-        while solve is not None and solve.answer is None and solve.error is None:
-            time.sleep(1e-3)
+            wait_for(self.planners[-1])
 
     def planner(self) -> ls.Planner:
         self.planners.append(ls.Planner(self.scenario.problem, self.solution, **self.options))
@@ -103,14 +105,14 @@ def test_a_run_goes_on_after_the_first_plan(moved: Run) -> None:
 def test_the_caption_tells_solves_and_the_law(moved: Run) -> None:
     """Of the last frame: what the planner's own records say, and the law that begins at a multiple of 0.2 s."""
     (planner,) = moved.planners
-    _, solves, law = moved.captions[-1].splitlines()
+    _, law, solves = moved.captions[-1].splitlines()
     known = planner.records[:-1]  # the last answer came after the last frame
     took, used = [1e3 * one.seconds for one in known], sum(one.used for one in known)
     assert len(took) == 450 // 6 - 1
-    begins = f"last solve {took[-1]:.1f} ms, median {np.median(took):.1f} ms; {used} plans used"
+    begins = f"solve {took[-1]:.1f} ms, median {np.median(took):.1f} ms; {used} used"
     assert solves.startswith(begins)
     assert law == "in force: plan of 14.8 s, 0.2 s old"
-    assert moved.captions[0].splitlines()[1:] == ["no solve yet", "in force: first plan, 0.0 s old"]
+    assert moved.captions[0].splitlines()[1:] == ["in force: first plan, 0.0 s old", "no solve yet"]
 
 
 def test_the_plan_in_force_is_drawn(moved: Run) -> None:
@@ -171,7 +173,7 @@ def test_what_is_not_ready_is_missed_and_the_run_goes_on(
     def release(time: float) -> None:
         if time > 0.99:
             held.set()
-            run.wait()
+            wait_for(run.planners[-1])
 
     run.acts.append(release)
     run.go()
@@ -289,10 +291,44 @@ def test_goals_that_cannot_be_moved(quadrotor: ls.Scenario) -> None:
     cases = (
         (replace(problem, final_cost=problem.final_cost + problem.final_cost), "got 2 QuadraticCosts of the position"),
         (replace(problem, final_cost=ls.QuadraticCost(weight, about=np.zeros(12))), "got 0 QuadraticCosts"),
+        (replace(problem, constraints=(ls.GoalState([1.0], states=["y"]),)), "got a GoalState that holds y"),
+        (arm_problem(PlanarArm()), "got a robot without a position"),
     )
     for wrong, line in cases:
         with pytest.raises(ls.InputError, match=f"goal: {line}"):
             MovableGoal(wrong)
+
+
+def arm_problem(arm: PlanarArm) -> ls.Problem:
+    """To another place from its first; 1 s."""
+    return ls.Problem(
+        dynamics=arm.dynamics, dt=0.05, steps=20, initial=ls.FixedState(np.zeros(6)),
+        stage_cost=ls.ControlCost(np.ones(3)), final_cost=ls.QuadraticCost([100.0] * 6, about=[0.3, 0.2, 0.1, 0, 0, 0]),
+    )  # fmt: skip
+
+
+def test_a_robot_without_a_position_plans_again(tmp_path: Path) -> None:
+    """It has no goal to move, and Enter leaves the robot selected; its last ball is drawn where the new plan has it."""
+    arm = PlanarArm()
+    problem, plant = arm_problem(arm), ls.Plant(arm, PlanarArm.scene(tmp_path, things=""))
+    solution, made = ls.smooth(problem), []
+
+    def planner() -> ls.Planner:
+        made.append(ls.Planner(problem, solution, every=0.2, deadline=0.2, clock=lambda: 0.0))
+        return made[-1]
+
+    screen = Recorder(120, **viewer.arguments_for_plant(plant, solution))
+    screen.act = lambda time: wait_for(made[-1])
+    viewer.live(plant, solution, screen, planner=planner)
+    assert screen.hold(screen.other()) == screen.robot
+    (planner_made,) = made
+    law = planner_made.law
+    assert law.first * 0.05 > 1.0
+    angles = np.cumsum(law.plan.trajectory.states[0, :3])
+    end = LENGTH * np.array([np.cos(angles).sum(), np.sin(angles).sum()])
+    screen._time = law.first * 0.05
+    assert screen.planned_position()[:2] == pytest.approx(end, abs=LENGTH / LINK.count)
+    assert planning() == []
 
 
 def test_rates_and_options_that_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

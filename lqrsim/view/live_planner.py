@@ -32,7 +32,7 @@ class LivePlanner(Controller):
         self, planner: Planner, plant: Plant, viewer: Viewer, goal: MovableGoal | None, ended: Callable[[str], object]
     ) -> None:
         self.planner, self.plant, self.viewer, self.goal, self.ended = planner, plant, viewer, goal, ended
-        self._place = None if goal is None else goal.place
+        self._place = np.zeros(0) if goal is None else goal.place  # that is planned for
 
     def __enter__(self) -> Self:
         """Start its thread, with the goal and the plan at the problem's own."""
@@ -85,17 +85,17 @@ class LivePlanner(Controller):
 
 
 def caption(planner: Planner, t: float) -> str:
-    """How the solves went and which law is in force at a time, in two lines."""
+    """Which law is in force at a time and how the solves went, in two lines, with what may be long at the end."""
     begun, account = planner.law.first * planner.problem.dt, planner.account
     took, kept = [1e3 * one.seconds for one in account.records[-RECENT:]], account.kept
     if not took:
         solves = "no solve yet"
     else:
-        solves = f"last solve {took[-1]:.1f} ms, median {np.median(took):.1f} ms; {account.solved} plans used"
+        solves = f"solve {took[-1]:.1f} ms, median {np.median(took):.1f} ms; {account.solved} used"
     if kept:
         solves += f", {kept.total()} missed: " + "; ".join(f"{count} {why}" for why, count in kept.most_common())
     name = f"plan of {begun:.1f} s" if planner.law.first else "first plan"
-    return f"{solves}\nin force: {name}, {t - begun:.1f} s old"
+    return f"in force: {name}, {t - begun:.1f} s old\n{solves}"
 
 
 def lengthened(solution: Solution) -> Solution:
