@@ -13,7 +13,7 @@ from lqrsim.errors import Array
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Trajectory
+from lqrsim.results.solution_parts import Status, Trajectory
 from lqrsim.simulation.plant import Plant
 from lqrsim.view.movable_goal import MovableGoal
 from lqrsim.view.viewer_base import Viewer
@@ -85,7 +85,7 @@ class LivePlanner(Controller):
 
 
 def caption(planner: Planner, t: float) -> str:
-    """Which law is in force at a time and how the solves went, in two lines, with what may be long at the end."""
+    """Which law is in force at a time and how the solves went, in lines, with what may be long at the end."""
     begun, account = planner.law.first * planner.problem.dt, planner.account
     took, kept = [1e3 * one.seconds for one in account.records[-RECENT:]], account.kept
     if not took:
@@ -93,7 +93,10 @@ def caption(planner: Planner, t: float) -> str:
     else:
         solves = f"solve {took[-1]:.1f} ms, median {np.median(took):.1f} ms; {account.solved} used"
     if kept:
-        solves += f", {kept.total()} missed: " + "; ".join(f"{count} {why}" for why, count in kept.most_common())
+        reasons = "; ".join(f"{count} {why}" for why, count in kept.most_common())
+        for status in Status:
+            reasons = reasons.replace(status.name, status.value)  # in words
+        solves += f"\n{kept.total()} missed: {reasons}"
     name = f"plan of {begun:.1f} s" if planner.law.first else "first plan"
     return f"in force: {name}, {t - begun:.1f} s old\n{solves}"
 
