@@ -160,10 +160,10 @@ class View:
         kind = self.viewer if self.viewer != "auto" else "window" if viewer.has_display() else "browser"
         options = {"push": self.push, "speed": self.speed, "seconds": self.seconds}
         if self.what.endswith(".npz"):
-            if self.controller != "feedback" or self.stated is not None or self.replan is not None:
-                raise InputError(
-                    f"--controller, --stated, --replan: got one with {self.what}, want them with a SCENARIO"
-                )
+            if self.controller != "feedback" or self.stated is not None:
+                raise InputError(f"--controller, --stated: got one with {self.what}, want them with a SCENARIO")
+            if self.replan is not None:
+                raise InputError(f"--replan: got {self.replan:g} with {self.what}, want it with a SCENARIO")
             rollout = save_load.load_rollout(self.what)
             shown = viewer.arguments_for_rollout(rollout, self.trial)
 
