@@ -1,34 +1,31 @@
 """Viewers: nobody but this machine reaches them, they show what was run, and whoever sits before them can interfere."""
 
-import contextlib
 import itertools
 import os
 import re
-import signal
 import socket
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import browsing
 import mujoco
 import numpy as np
 import pytest
+from viewers import Recorder, said, viewing
 from websockets import Origin
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.codegen import disk_cache
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import InputError
 from lqrsim.results import save_load
 from lqrsim.simulation.disturbances import ForceNoise
 from lqrsim.view import viewer
 from lqrsim.view.browser import Browser
-from lqrsim.view.viewer_base import PUSHES, Viewer
+from lqrsim.view.viewer_base import PUSHES
 
 PORT = 18650 + os.getpid() % 1000  # of our own, also where tests run side by side
 
@@ -36,62 +33,6 @@ PORT = 18650 + os.getpid() % 1000  # of our own, also where tests run side by si
 @pytest.fixture(scope="module")
 def rollout(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> ls.Rollout:
     return ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[ForceNoise(0.1)], seed=1)
-
-
-class Recorder(Viewer):
-    """A viewer that no one looks at; it keeps what it showed, and closes after so many frames."""
-
-    def __init__(self, frames: int, **options: object) -> None:
-        super().__init__(speed=100.0, **options)  # pyright: ignore[reportArgumentType] of `arguments_for_plant`
-        self.count, self.shown, self.errors, self.act = frames, [], [], lambda time: None
-        self.shown: list[Array]
-        self.errors: list[float]
-        self.act: Callable[[float], object]
-
-    def refresh(self) -> bool:
-        return len(self.shown) < self.count
-
-    def show(self, time: float, qpos: Array) -> Array:
-        place = super().show(time, qpos)
-        self.shown.append(self.data.qpos.copy())
-        self.errors.append(float(np.linalg.norm(place - self.planned_position())))
-        self.act(time)
-        return place
-
-
-@contextlib.contextmanager
-def viewing(folder: Path, *arguments: str, before: str = "") -> Iterator[subprocess.Popen[str]]:
-    """`lqrsim view` in a process of its own, for a minute at most, and as it ends with Ctrl-C.
-
-    Args:
-      before: what that process does first.
-    """
-    code = f"{before}\nimport sys; from lqrsim.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "view", *arguments, "--viewer", "browser", "--seconds", "100"]
-    # MuJoCo keeps the layout of its panels in the home; what is compiled stays where it is.
-    environment = {**os.environ, "HOME": str(folder), "LQRSIM_CACHE_DIR": str(disk_cache.folder())}
-    outside = {"cwd": folder, "env": environment}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **outside) as process:
-        try:
-            yield process
-        finally:
-            process.send_signal(signal.SIGINT)
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                raise
-
-
-def said(process: subprocess.Popen[str], text: str) -> str:
-    """What the process has written, once it has written that."""
-    assert process.stdout is not None
-    found = ""
-    for line in process.stdout:
-        found += line
-        if text in line:
-            return found
-    raise AssertionError(f"{text!r} is not in {found}")
 
 
 @pytest.fixture(scope="module")

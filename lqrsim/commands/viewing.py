@@ -1,7 +1,9 @@
 """Commands that show what was executed."""
 
 import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,6 +13,10 @@ from lqrsim.commands.options import ControllerName, optional
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
+    from lqrsim.control.planner import Planner
+    from lqrsim.problem.problem import Problem
+    from lqrsim.results.solution import Solution
+    from lqrsim.view.movable_goal import MovableGoal
     from lqrsim.view.viewer_base import Viewer
 
 
@@ -101,7 +107,8 @@ class View:
 
     lqrsim view RUN.npz plays what `lqrsim simulate` wrote. lqrsim view SCENARIO solves the scenario and runs its policy
     live, again and again, and you interfere: the arrow keys and Page Up and Down push the robot, seen from the camera;
-    Ctrl and the right mouse button drag it. Space pauses, Backspace starts again.
+    Ctrl and the right mouse button drag it. Space pauses, Backspace starts again. With --replan 30 it plans again 30
+    times a second, and Enter has the same keys and mouse move the goal.
 
     The browser's server can be reached from this machine only. Ctrl-C ends it.
     """
@@ -128,6 +135,9 @@ class View:
     """What flies or drives a live run, as in `lqrsim simulate`."""
     stated: Annotated[str | None, optional("NAME")] = None
     """Disturbances that track or offset_free is made for, as in `lqrsim simulate`. By default moderate."""
+    replan: Annotated[float | None, optional("HZ")] = None
+    """Plan again as the robot goes, so many times a second, rounded to control periods; the run then goes on after the
+    plan's horizon. What is not ready within a control period of the clock is not used."""
     push: Annotated[float, arg(metavar="M/S")] = 0.3
     """By how much a key changes the robot's velocity."""
 
@@ -152,6 +162,8 @@ class View:
         if self.what.endswith(".npz"):
             if self.controller != "feedback" or self.stated is not None:
                 raise InputError(f"--controller, --stated: got one with {self.what}, want them with a SCENARIO")
+            if self.replan is not None:
+                raise InputError(f"--replan: got {self.replan:g} with {self.what}, want it with a SCENARIO")
             rollout = save_load.load_rollout(self.what)
             shown = viewer.arguments_for_rollout(rollout, self.trial)
 
@@ -159,19 +171,57 @@ class View:
                 viewer.play(rollout, screen, trial=self.trial, loop=self.loop)
         else:
             scenario = resolve(self.what)
+            self._check_replanning(scenario.problem)
             plant = scenario.plant()
             solution = console.solve(scenario.problem, "smooth", reach=scenario.target_radius())
-            shown = viewer.arguments_for_plant(plant, solution)
+            planner, goal = (None, None) if self.replan is None else self._planning(scenario.problem, solution)
+            shown = viewer.arguments_for_plant(plant, solution, goal)
             law = controller_by_name(self.controller, scenario, solution, self.stated)
             wrong = [one.scaled(self.disturbances) for one in scenario.disturbances if self.disturbances]
 
             def go(screen: "Viewer") -> None:
-                console.say(viewer.KEYS)
+                console.say(viewer.KEYS if goal is None else f"{viewer.KEYS}\n{viewer.GOAL_KEYS}")
                 options = {"controller": law, "disturbances": wrong, "seed": self.seed}
-                viewer.live(plant, solution, screen, ended=console.say, **options)
+                viewer.live(plant, solution, screen, ended=console.say, planner=planner, goal=goal, **options)
 
         with viewer.open_viewer(kind, self.port, title=f"lqrsim {self.what}", **shown, **options) as screen:
             console.say(screen.instructions)
             with contextlib.suppress(KeyboardInterrupt):
                 go(screen)
         return 0
+
+    def _check_replanning(self, problem: "Problem") -> None:
+        """Raises InputError for a rate that does not fit the problem, or options that do not go with it."""
+        from lqrsim.errors import InputError, check_number
+
+        if self.replan is None:
+            return
+        # At least one plan in a horizon, at most one in a control period; as given, with two or three digits.
+        slowest, fastest = 0.999 / (problem.steps * problem.dt), 1.001 / problem.dt
+        check_number("--replan", self.replan, at_least=slowest, at_most=fastest)
+        if self.controller != "feedback":
+            raise InputError(f"--controller: got {self.controller} with --replan, want one of the two")
+        if self.speed > 1:
+            raise InputError(
+                f"--speed: got {self.speed:g} with --replan, want at most 1: a solve takes the time it takes"
+            )
+
+    def _planning(
+        self, problem: "Problem", solution: "Solution"
+    ) -> tuple["Callable[[], Planner]", "MovableGoal | None"]:
+        """What makes a planner for each run, tried once, and the goal if it can be moved."""
+        from lqrsim.commands import console
+        from lqrsim.control.planner import Planner
+        from lqrsim.errors import InputError
+        from lqrsim.view.movable_goal import MovableGoal
+
+        assert self.replan is not None
+        every = max(round(1 / (self.replan * problem.dt)), 1) * problem.dt
+        console.say(f"plans again every {every:.4g} s, {1 / every:.4g} times a second")
+        make = partial(Planner, problem, solution, every=every, horizon="moving")
+        make()  # compiles, and says what is wrong, before anything opens
+        try:
+            return make, MovableGoal(problem)
+        except InputError as error:
+            console.say(f"the goal cannot be moved: {error}")
+            return make, None

@@ -41,6 +41,8 @@ HOST_NAMES = LOOPBACK, "localhost"  # that it may be called by
 PRIVATE_HEADERS = {"Cross-Origin-Resource-Policy": "same-origin", "Content-Security-Policy": "frame-ancestors 'none'"}
 SHARING_HEADER = "Access-Control-Allow-Origin"
 START_TIMEOUT = 10.0  # s, that the server may take to start
+# What a dragged goal comes with, and what it comes without; an earlier state of the run has both.
+MOCAP, TIME = mujoco.mjtState.mjSTATE_MOCAP_POS.value, mujoco.mjtState.mjSTATE_TIME.value
 RELEASE_AFTER = 0.5  # s; a hand that is not heard of for so long has let go
 
 
@@ -52,7 +54,7 @@ class _SceneUpdate(messages.Snapshot):
 
 
 class _KeyPress(messages.Event):
-    """From the viewer to the simulation: a key was pressed."""
+    """From the viewer to the simulation: a key was pressed that moves something."""
 
     def __init__(self, key: str, azimuth: float) -> None:
         self.key, self.azimuth = key, azimuth
@@ -74,7 +76,7 @@ class _ViewerSide(plugin.ViewerPlugin):
     @messages.handler
     def on_scene_update(self, event: _SceneUpdate) -> None:
         self.viewer.extra_geoms[:] = event.geoms
-        self.studio.status = f"{self.title}: {event.caption}"
+        self.studio.status = f"{self.title}: {'; '.join(event.caption.splitlines())}"
 
     @messages.handler(priority=0)  # after the viewer has set up its own
     def on_model(self, event: messages.PostModelEvent) -> None:
@@ -84,7 +86,11 @@ class _ViewerSide(plugin.ViewerPlugin):
 
     @messages.handler
     def on_update(self, event: messages.UpdateEvent) -> None:
+        perturb = self.viewer.perturb
+        perturb.select = self.owner.hold(perturb.select)
         if not imgui.GetIO().WantCaptureKeyboard:
+            if imgui.IsKeyChordPressed(imgui.Key.Enter):
+                perturb.select = self.owner.hold(self.owner.other())
             for key in PUSHES:
                 if imgui.IsKeyChordPressed(getattr(imgui.Key, key)):
                     self.viewer.send_to_sim(_KeyPress(key, self.viewer.camera.azimuth))
@@ -94,11 +100,11 @@ class _SimulationSide(plugin.SimPlugin):
     """The simulation's side: what the person does reaches the Browser, and nothing reaches anything else."""
 
     def __init__(self, owner: Viewer) -> None:
-        self.owner, self.last_drag = owner, 0.0
+        self.owner, self.last_drag, self.edited = owner, 0.0, mujoco.MjData(owner.model)
 
     @messages.handler(priority=messages.Priority.CRITICAL)
     def on_key_press(self, event: _KeyPress) -> None:
-        self.owner.push(PUSHES[event.key], event.azimuth)
+        self.owner.press(PUSHES[event.key], event.azimuth)
 
     @messages.handler(priority=messages.Priority.CRITICAL)
     def on_perturb(self, event: messages.PerturbSnapshot) -> bool:
@@ -119,7 +125,16 @@ class _SimulationSide(plugin.SimPlugin):
 
     @messages.handler(priority=messages.Priority.CRITICAL)
     def on_edit(self, event: messages.StateEvent) -> bool:
-        return True  # the state is the simulation's
+        owner, model, kinds = self.owner, self.owner.model, event.state_sig
+        if (
+            owner.goal_body
+            and kinds & MOCAP
+            and not kinds & TIME
+            and event.state.size == mujoco.mj_stateSize(model, kinds)
+        ):
+            mujoco.mj_setState(model, self.edited, event.state, kinds)
+            owner.move_goal(owner.space.of_world(self.edited.mocap_pos[model.body_mocapid[owner.goal_body]]))
+        return True  # the rest of the state is the simulation's
 
     @messages.handler(priority=messages.Priority.CRITICAL)
     def on_load(self, event: messages.LoadModelEvent) -> bool:

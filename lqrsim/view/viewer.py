@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from lqrsim.control.controllers import Controller
+from lqrsim.control.planner import Planner
 from lqrsim.errors import Array, InputError
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -19,11 +20,14 @@ from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
 from lqrsim.view.browser import Browser
+from lqrsim.view.live_planner import LONGEST_RUN, LivePlanner, lengthened
+from lqrsim.view.movable_goal import MovableGoal, model_with_goal
 from lqrsim.view.recorded_model import model_of
 from lqrsim.view.viewer_base import PUSHES, RestartRequested, Viewer, ViewerClosed
 
 KEYS = """Arrow keys and Page Up/Down push the robot, seen from the camera. Ctrl and the right mouse button drag it.
 Space pauses, Backspace starts again."""
+GOAL_KEYS = "Enter, or a double click on the orange goal: the same keys and mouse move the goal; and back to the robot."
 PAUSE_SECONDS = 1.0  # s, between the end of a run and the next
 GLFW_KEYS = {"RightArrow": 262, "LeftArrow": 263, "DownArrow": 264, "UpArrow": 265, "PageUp": 266, "PageDown": 267}
 
@@ -41,7 +45,9 @@ class Window(Viewer):
 
         def pressed(code: int) -> None:
             if code in keys:
-                self.push(keys[code], self._viewer.cam.azimuth)
+                self.press(keys[code], self._viewer.cam.azimuth)
+            elif code == 257:  # enter
+                self._viewer.perturb.select = self.other()
             elif code == 32:  # the space bar
                 self.paused = not self.paused
             elif code == 259:  # backspace
@@ -69,7 +75,9 @@ class Window(Viewer):
     def refresh(self) -> bool:
         if not self._viewer.is_running():
             return False
-        self._viewer.sync()
+        self._viewer.sync()  # which takes the goal to where it is dragged
+        with self._viewer.lock():
+            self._viewer.perturb.select = self.hold(self._viewer.perturb.select)
         self.drag(self.data.xfrc_applied)
         return True
 
@@ -101,13 +109,14 @@ def arguments_for_rollout(rollout: Rollout, trial: int) -> dict[str, Any]:
     return {"model": model, "plan": rollout.plan, "balls": rollout.balls, **where}
 
 
-def arguments_for_plant(plant: Plant, solution: Solution) -> dict[str, Any]:
-    """What a Viewer needs to show a live run."""
+def arguments_for_plant(plant: Plant, solution: Solution, goal: MovableGoal | None = None) -> dict[str, Any]:
+    """What a Viewer needs to show a live run, and to move its goal."""
     robot = plant.robot
     where = {"space": robot.dynamics.state_coordinates, "body": robot.body, "radius": robot.radius}
     states = solution.trajectory.states
     balls = plant.record_of_balls(states, states[None])
-    return {"model": plant.model, "plan": solution.trajectory, "balls": balls, **where}
+    model, name = (plant.model, None) if goal is None else model_with_goal(plant, goal)
+    return {"model": model, "goal": name, "plan": solution.trajectory, "balls": balls, **where}
 
 
 class _UserForces(Disturbance):
@@ -145,6 +154,8 @@ def live(
     *,
     disturbances: Sequence[Disturbance] = (),
     controller: Controller | None = None,
+    planner: Callable[[], Planner] | None = None,
+    goal: MovableGoal | None = None,
     seed: int = 0,
     ended: Callable[[str], object] = lambda line: None,
 ) -> None:
@@ -154,6 +165,9 @@ def live(
     large, or when the simulation becomes unstable. Run k has the random numbers of trial k of that seed.
 
     Args:
+      planner: makes what plans again as the robot goes, for each run, in place of a controller. A run then goes on
+        after the plan's horizon, for ten minutes at most.
+      goal: that a person moves, with a planner and a viewer that shows it.
       ended: called with a line on each run that has ended.
     """
 
@@ -163,13 +177,21 @@ def live(
             ended(f"run {run}: lost after {time:.1f} s")
             raise RestartRequested
 
+    def once() -> str:
+        """One run to its end, and how it went."""
+        options = {"disturbances": everything, "seed": seed, "first_trial": run, "watch": watch}
+        if planner is None:
+            rollout = simulate(plant, solution, controller=controller, **options)
+            return rollout.summary().splitlines()[-1].strip().replace("trial", "run")
+        with LivePlanner(planner(), plant, viewer, goal, ended) as law:
+            rollout = simulate(plant, lengthened(solution), controller=law, **options)
+        return f"run {run}: {rollout.reasons[0] or f'has lasted {LONGEST_RUN:g} s'}"
+
     run, everything = 0, [*disturbances, _UserForces(viewer)]
     with contextlib.suppress(ViewerClosed):
         while True:
             with contextlib.suppress(RestartRequested):
-                options = {"controller": controller, "disturbances": everything, "seed": seed, "first_trial": run}
-                rollout = simulate(plant, solution, watch=watch, **options)
-                ended(rollout.summary().splitlines()[-1].strip().replace("trial", "run"))
+                ended(once())
                 viewer.wait(PAUSE_SECONDS)
             run += 1
 

@@ -22,8 +22,9 @@ TRACE_RGBA = (0.05, 0.35, 0.62, 1.0)
 SEGMENTS = 60  # of the plan; the trace has twice as many
 LIFT = 0.008  # metres between the floor and the lines on it
 STRONGEST_DRAG = 2.0  # times the robot's weight that someone drags it with at most
+GOAL_STEP = 0.1  # metres, by which a key moves the goal
 MOST_DELAY = 0.2  # s; what a slow machine is behind by more than that is not made up for
-# What a key adds to the velocity of the robot, seen from the camera: right, away, up.
+# Where a key pushes the robot, or moves the goal, seen from the camera: right, away, up.
 PUSHES = {
     "LeftArrow": (-1.0, 0.0, 0.0),
     "RightArrow": (1.0, 0.0, 0.0),
@@ -48,11 +49,13 @@ class Viewer(abc.ABC):
     Args:
       model: what moves. plan: what it should do. space: of the plan's states. body: the robot's in the model.
       radius: of the robot, in metres. balls: of one without a position, where they should be.
+      goal: name of the body that is the goal, a mocap body, if it can be moved; see `movable_goal.py`.
       push: what a key adds to its velocity, in m/s.
       speed: of the time shown, 1 is real. seconds: after which the viewer closes; never by default.
 
     Attributes:
-      data: what is shown now. caption: says in words what is going on. wrench: force and torque (6,) of a hand.
+      data: what is shown now. caption: says in words what is going on, in lines. remark: what it says besides.
+      wrench: force and torque (6,) of a hand. holds_goal: whether mouse and keys move the goal, or the robot.
     """
 
     def __init__(
@@ -64,6 +67,7 @@ class Viewer(abc.ABC):
         *,
         radius: float,
         balls: BallRecord | None = None,
+        goal: str | None = None,
         push: float = 0.3,
         speed: float = 1.0,
         seconds: float | None = None,
@@ -75,15 +79,16 @@ class Viewer(abc.ABC):
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
         self.space, self.robot = space, robot_body(model, body)
-        self.radius, self.speed, self.paused, self.caption = radius, speed, False, ""
+        self.radius, self.speed, self.paused, self.caption, self.remark = radius, speed, False, "", ""
+        self.goal_body, self.holds_goal = 0 if goal is None else robot_body(model, goal), False
         self._balls = None if space.position else balls
         self.wrench = np.zeros(6)
         self._mass = float(model.body_subtreemass[self.robot])
         self._push, self._impulse = push * self._mass, np.zeros(3)
-        self._times, self._places = plan.times, plan.states[:, list(space.position)]
         if self._balls is not None:
             _ = self._balls.tracked  # which says what is missing
-            self._places = self._balls.planned[:, -1]
+        self.follow(plan, self._balls)
+        self._apart = float(np.linalg.norm(np.ptp(self._places, axis=0))) / SEGMENTS  # of points of the trace
         self._time, self._ahead, self._restart = 0.0, 0.0, False
         self._until = np.inf if seconds is None else clock.monotonic() + seconds
         self._trace: list[Array] = []
@@ -108,12 +113,31 @@ class Viewer(abc.ABC):
         if begins:
             self._trace.clear()
             self._floor = floor_below(self.model, self.data, self.robot)
-        apart = float(np.linalg.norm(np.ptp(self._places, axis=0))) / SEGMENTS
         on_floor = self._on_floor(self.of_world(place))
-        if not self._trace or np.linalg.norm(on_floor - self._trace[-1]) > apart:
+        if not self._trace or np.linalg.norm(on_floor - self._trace[-1]) > self._apart:
             self._trace = [*self._trace, on_floor][-2 * SEGMENTS :]
         self.caption = f"{time:.1f} s, {1e3 * np.linalg.norm(on_floor - self.planned_position()):.0f} mm from the plan"
+        if self.remark:
+            self.caption += f"\n{self.remark}"
+        if self.goal_body:
+            self.move_goal(self.goal)  # what was dragged off the floor, or turned, is put back
         return place
+
+    def follow(self, plan: Trajectory, balls: BallRecord | None, *, begins: float = 0.0) -> None:
+        """From now on that is the plan, with where its balls are if it has no position; it begins at a time."""
+        self._times, self._places = begins + plan.times, plan.states[:, list(self.space.position)]
+        if not self.space.position and balls is not None:
+            self._places = balls.planned[:, -1]
+
+    @property
+    def goal(self) -> Array:
+        """Where the goal is that can be moved, in the coordinates of a plan's position, (2 or 3,)."""
+        return self.space.of_world(self.data.mocap_pos[self.model.body_mocapid[self.goal_body]])
+
+    def move_goal(self, place: Array) -> None:
+        """Put the goal there, (2 or 3,)."""
+        number = self.model.body_mocapid[self.goal_body]
+        self.data.mocap_pos[number], self.data.mocap_quat[number] = self._on_floor(place), (1.0, 0.0, 0.0, 0.0)
 
     def of_world(self, points: Array) -> Array:
         """The coordinates (..., 2 or 3) of points (..., 3) that a plan has, too."""
@@ -123,12 +147,27 @@ class Viewer(abc.ABC):
         """Stand still for a while. Raises what `show` does."""
         self._wait(seconds * self.speed)
 
+    def hold(self, selected: int) -> int:
+        """Someone has selected a body, or none, which is 0; the one that is to be selected: the goal or the robot."""
+        if selected:
+            self.holds_goal = selected == self.goal_body
+        return selected or (self.goal_body if self.holds_goal else self.robot)
+
+    def other(self) -> int:
+        """Of robot and goal the one that is not held, if there is a goal: what Enter selects."""
+        return self.robot if self.holds_goal or not self.goal_body else self.goal_body
+
+    def press(self, right_away_up: tuple[float, float, float], azimuth: float) -> None:
+        """A key pushes the robot, or moves the goal if that is held, as a camera sees it; see `push`."""
+        if not self.holds_goal:
+            self.push(right_away_up, azimuth)
+            return
+        step = GOAL_STEP * _seen_from(azimuth, right_away_up)
+        self.move_goal(self.goal + self.space.of_world(step))
+
     def push(self, right_away_up: tuple[float, float, float], azimuth: float) -> None:
-        """Someone has pressed a key while the camera looked along `azimuth`, in degrees."""
-        along, (right, away, up) = np.radians(azimuth), right_away_up
-        x = right * np.sin(along) + away * np.cos(along)
-        y = away * np.sin(along) - right * np.cos(along)
-        self._impulse += self._push * np.array([x, y, up])
+        """Push the robot in a direction that is seen from a camera that looks along `azimuth`, in degrees."""
+        self._impulse += self._push * _seen_from(azimuth, right_away_up)
 
     def drag(self, wrenches: Array) -> None:
         """Someone drags bodies with forces and torques (nbody, 6); a hand is only so strong."""
@@ -197,3 +236,11 @@ class Viewer(abc.ABC):
                 break
             clock.sleep(float(np.clip(left / self.speed, 0.001, 0.01)))
         self._ahead = -left
+
+
+def _seen_from(azimuth: float, right_away_up: tuple[float, float, float]) -> Array:
+    """A direction (3,) in the world, as a camera sees it that looks along `azimuth`, in degrees."""
+    along, (right, away, up) = np.radians(azimuth), right_away_up
+    x = right * np.sin(along) + away * np.cos(along)
+    y = away * np.sin(along) - right * np.cos(along)
+    return np.array([x, y, up])
