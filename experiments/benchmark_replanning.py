@@ -6,9 +6,10 @@
 
 Each section's numbers are in the folder of the output, as JSON, as soon as they are there.
 
-times   How long a re-plan takes: both robots, with the obstacle's cost, with control limits and with a clearance.
-changes A goal that jumps, and a pillar that appears where the plan leads.
-delay   What a delay of one control period costs, predicted or ignored.
+times     How long a re-plan takes: both robots, with the obstacle's cost, with control limits and with a clearance.
+changes   A goal that jumps, and a pillar that appears where the plan leads.
+delay     What a delay of one control period costs, predicted or ignored.
+estimate  Output feedback with new plans, made with what is estimated, against the same without.
 """
 
 import json
@@ -17,15 +18,16 @@ from types import ModuleType
 from typing import Any, Literal
 
 from paper.common import Result, Statement, opening, run
-from replan import changes, common, delay, times
+from replan import changes, common, delay, estimate, times
 
 from lqrsim.results.save_load import replacing
 
-Section = Literal["times", "changes", "delay"]
+Section = Literal["times", "changes", "delay", "estimate"]
 SECTIONS: dict[Section, tuple[ModuleType, str]] = {
     "times": (times, "How long re-plans take"),
     "changes": (changes, "What changes on the way"),
     "delay": (delay, "What a delay costs"),
+    "estimate": (estimate, "Planning again with estimates"),
 }
 
 
