@@ -62,6 +62,39 @@ def test_two_processes_compile_the_same_at_once_and_the_third_finds_it(tmp_path:
     assert all((name.endswith(".item") and not name.startswith(".")) or name == "durations.json" for name in names)
 
 
+# Each of these processes compiles one function, or loads both; a function that is called is too long to be inlined.
+FACTORS = """
+import sys
+import numpy as np
+from lqrsim.codegen import jit
+
+for factor in sys.argv[1:]:
+    lines = "".join(f"    total = cos(total + {factor} * sin(x[0] * {i}))\\n" for i in range(40))
+    source = f"def helper(x):\\n    total = {factor}.0\\n{lines}    return total\\n\\n"
+    source += "def compute(x, out):\\n    for i in range(3):\\n        out[i] = helper(x) + helper(out)\\n"
+    out = np.ones(3)
+    jit.Core(source, {}, "a test").compute(np.array([0.5]), out)
+    print(repr(out.tolist()))
+print(len(jit.compilations))
+"""
+
+
+def test_what_two_processes_have_kept_does_not_run_each_other(tmp_path: Path) -> None:
+    """Both count their functions alike, and hash alike, so that numba gives the same names to functions of both."""
+    environment = {**os.environ, "LQRSIM_CACHE_DIR": str(tmp_path), "PYTHONHASHSEED": "0"}
+
+    def run(*factors: str) -> list[str]:
+        command = [sys.executable, "-c", FACTORS, *factors]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=120)
+        return done.stdout.splitlines()
+
+    alone = [run("2"), run("3")]
+    assert [one[1] for one in alone] == ["1", "1"]
+    assert alone[0][0] != alone[1][0]
+    assert run("2", "3") == [alone[0][0], alone[1][0], "0"]
+    assert run("3", "2") == [alone[1][0], alone[0][0], "0"]
+
+
 @pytest.mark.parametrize(
     "damage", [lambda item: item[: len(item) // 2], lambda item: b"", lambda item: item[:-1] + b"x"]
 )

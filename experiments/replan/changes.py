@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 from paper.common import between, table
+from robust.common import share
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.stress.statistics import rate
 from replan.common import MARGIN, Config, progress, scenario_of, stated
 
 EVERY = 1 / 30  # s
@@ -51,9 +51,9 @@ def measure(config: Config) -> dict[str, Any]:
                     kept[who].append((world.distance(rollout.states[..., :3]) - scenario.robot.radius).min(axis=1))
     radius = ls.Quadrotor().radius
     return {
-        "goal": {who: shares(np.concatenate(one) <= radius) for who, one in distances.items()},
+        "goal": {who: share(np.concatenate(one) <= radius) for who, one in distances.items()},
         "distance": {who: float(np.median(np.concatenate(one))) for who, one in distances.items()},
-        "pillar": {who: shares(np.concatenate(one) >= 0) for who, one in clearances.items()},
+        "pillar": {who: share(np.concatenate(one) >= 0) for who, one in clearances.items()},
         "clearance": {who: float(np.median(np.concatenate(one))) for who, one in clearances.items()},
         "queries": config.queries, "trials": each,
     }  # fmt: skip
@@ -92,12 +92,6 @@ def sum_of(costs: list[ls.Cost]) -> ls.Cost:
     for cost in rest:
         first = first + cost
     return first
-
-
-def shares(successes: Array) -> list[float]:
-    """In percent, with the exact interval."""
-    one = rate(int(successes.sum()), len(successes))
-    return [100 * one.value, 100 * one.low, 100 * one.high]
 
 
 def report(found: dict[str, Any]) -> list[str]:

@@ -54,6 +54,7 @@ def scenario_of(robot: str, query: int) -> ls.Scenario:
 def stated(scenario: ls.Scenario, way: str) -> ls.Problem:
     """The problem with or without limits and constraints, from exactly its start."""
     problem, robot = scenario.problem, scenario.robot
+    assert problem.start is not None
     problem = replace(problem, initial=ls.FixedState(problem.start))
     if way == "obstacle cost":
         return replace(problem, control_limits=FREE)

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 from paper.common import between, table
+from robust.common import share
 
 import lqrsim as ls
-from lqrsim.stress.statistics import rate
 from replan.common import Config, progress, scenario_of, stated
 
 EVERY = 1 / 30  # s
@@ -36,10 +36,7 @@ def measure(config: Config) -> dict[str, Any]:
             ended[name] += [one == "reached" for one in rollout.outcome]
             used[name] += law.solved
             begun[name] += len(law.records)
-    shares = {}
-    for name, one in ended.items():
-        found = rate(int(np.sum(one)), len(one))
-        shares[name] = [100 * found.value, 100 * found.low, 100 * found.high]
+    shares = {name: share(np.array(one)) for name, one in ended.items()}
     return {
         "reached": shares, "used": {name: 100 * used[name] / begun[name] for name in LAWS},
         "queries": config.queries, "trials": each,

@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 from paper.common import between, table
-from robust.common import ASKED, PRESETS, reach_exactly, reached, share
+from robust.common import ASKED, PRESETS, Reached, reach_exactly, reached, share
 
 import lqrsim as ls
-from lqrsim.errors import Array
 from lqrsim.stress.statistics import compare
 from replan.common import Config, progress
 
@@ -18,8 +17,8 @@ FEWER = 5  # times, for what takes longest
 
 def measure(config: Config) -> dict[str, Any]:
     each = max(config.trials * 20 // config.queries, 2)
-    ended: dict[str, dict[str, list[Array]]] = {preset: {KEPT: [], NEEDED: [], ALWAYS: []} for preset in PRESETS}
-    solved = dict.fromkeys(PRESETS, 0)
+    ended: dict[str, dict[str, list[Reached]]] = {preset: {KEPT: [], NEEDED: [], ALWAYS: []} for preset in PRESETS}
+    solved: dict[str, int] = dict.fromkeys(PRESETS, 0)
     for query in progress(range(config.queries), "with estimates"):
         scenario = ls.scenarios.quadrotor(query)
         plant = scenario.plant()

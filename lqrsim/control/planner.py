@@ -71,9 +71,8 @@ class Planner:
         interpolate: bool = False,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        if deadline is None:
-            deadline = getattr(problem, "dt", 0.0)
-        check_number("Planner: deadline", deadline, above=0.0)
+        given = getattr(problem, "dt", 1.0) if deadline is None else deadline
+        deadline = check_number("Planner: deadline", given, above=0.0)
         self._replanner = Replanner("Planner", problem, solution, every, deadline=deadline, horizon=horizon)
         self._interpolate, self._clock = check_flag("Planner: interpolate", interpolate), clock
         self.problem = problem

@@ -70,7 +70,7 @@ class Replanned:
         """The law from now on is about a new plan, if there is one."""
         law, model, z = run.law, run.model, run.estimates[0]
         n, done = model.n, step - run.first
-        granted = np.where(in_parameters(model) & constants(model), z[n + model.lagging :], 0.0)
+        granted = np.where(np.logical_and(in_parameters(model), constants(model)), z[n + model.lagging :], 0.0)
         changes = model.output[: len(model.parameters)] @ granted
         values = {
             name: float(model.dynamics.parameters[name] + change)

@@ -74,10 +74,19 @@ class Replanning(Controller):
             raise InputError(f'{who}: computing: got {excerpt(computing)}, want seconds, a function or "{MEASURED}"')
         elif not isinstance(computing, str):
             computing = check_number(f"{who}: computing", computing, at_least=0.0)
-        if deadline is None:
-            deadline = computing if isinstance(computing, float) else getattr(problem, "dt", 0.0)
+        period = float(getattr(problem, "dt", 0.0))
+        by_default = computing if isinstance(computing, float) else period
+        deadline = by_default if deadline is None else deadline
         check_function(f"{who}: changes", changes, "a function of the time and the problem", arguments=2)
-        self._replanner = Replanner(who, problem, solution, every, deadline=deadline, horizon=horizon, predict=predict)
+        self._replanner = Replanner(
+            who,
+            problem,
+            solution,
+            every,
+            deadline=deadline,
+            horizon=horizon,
+            predict=predict,
+        )
         self.problem, self.solution = problem, solution
         self.every, self.deadline, self.horizon = self._replanner.every, self._replanner.deadline, horizon
         self.computing, self.changes, self.seed = computing, changes, check_count(f"{who}: seed", seed, at_least=0)
@@ -143,10 +152,9 @@ class Replanning(Controller):
         else:
             # From what this trial is shown, so that it draws the same whatever other trials there are.
             drawn = int.from_bytes(bytes.fromhex(sha256(state)[:16]), "big")
-            assert not isinstance(self.computing, str)
-            took = check_number(
-                "Replanning: computing", self.computing(np.random.default_rng([self.seed, step, drawn])), at_least=0.0
-            )
+            assert callable(self.computing)
+            given = self.computing(np.random.default_rng([self.seed, step, drawn]))
+            took = check_number("Replanning: computing", given, at_least=0.0)
         return took > self._replanner.delay * self.problem.dt + 1e-9
 
     def summary(self) -> str:

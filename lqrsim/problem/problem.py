@@ -117,12 +117,13 @@ class Problem:
           InputError: the state is not one, or no step is left.
         """
         after = check_count("after", after, at_least=0, at_most=self.steps - 1)
-        start = FixedState(check_array("state", state, (len(self.dynamics.state_coordinates),)))
+        here = check_array("state", state, (len(self.dynamics.state_coordinates),))
+        start = FixedState(here)
         if isinstance(self.initial, FixedState):  # a quarter of the time that making the cost anew takes
             term = copy.copy(self._terms["initial"][0])
-            object.__setattr__(term, "data", np.concatenate([start.state, term.data[len(start.state) :]]))
+            object.__setattr__(term, "data", np.concatenate([here, term.data[len(here) :]]))
         else:
-            term = QuadraticCost(np.zeros(len(start.state)), about=start.state).bind(self.dynamics)
+            term = QuadraticCost(np.zeros(len(here)), about=here).bind(self.dynamics)
         changed: dict[str, Any] = {"initial": start, "_terms": self._terms | {"initial": (term,)}}
         if after:
             steps, constraints = self.steps - after, tuple(one.ahead(after) for one in self.constraints)
