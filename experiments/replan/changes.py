@@ -26,6 +26,7 @@ def measure(config: Config) -> dict[str, Any]:
     for query in progress(range(config.queries), "goals and pillars"):
         scenario = scenario_of("quadrotor", query)
         problem = stated(scenario, "clearance")
+        assert problem.goal is not None
         problem = replace(problem, final_cost=ls.QuadraticCost(FIRM * np.ones(12), about=problem.goal))
         solution, plant = ls.smooth(problem), scenario.plant()
         goal = jumped(problem, query)
