@@ -64,7 +64,7 @@ def report(found: dict[str, Any]) -> list[str]:
     rows = [[name, between(share, ".1f"), f"{found['used'][name]:.1f}"] for name, share in found["reached"].items()]
     return [
         f"The quadrotor under the preset light, {found['queries']} queries of {found['trials']} trials, re-planned"
-        " every control period for what is left of the horizon. Its problem has ten times the weight of the goal, a tenth"
-        f" of that of the controls, and a clearance of {ROOM:g} m.",
+        " every control period for what is left of the horizon. Its problem has ten times the weight of the goal, a"
+        f" tenth of that of the controls, and a clearance of {ROOM:g} m.",
         table(("delay", "reached (%)", "plans that were used (%)"), rows),
     ]
