@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Literal
 
-from paper.common import Result, Statement, opening, run
+from paper.common import Result, opening, run
 from replan import changes, common, delay, estimate, times
 
 from lqrsim.results.save_load import replacing
@@ -57,10 +57,5 @@ def report(result: Result) -> str:
     return "\n\n".join(parts)
 
 
-def statements(result: Result) -> list[Statement]:
-    """None: the paper does not re-plan."""
-    return []
-
-
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, lambda result: [], __doc__)  # of the paper's statements, for it does not re-plan
