@@ -26,7 +26,7 @@ GL_PACKAGES = ("libegl1", "libgl1-mesa-dri", "libopengl0")
 
 COMMANDS = {
     "demo": "solve, execute and film both robots: the main job (arguments go to `lqrsim demo`)",
-    "test": "run all tests (arguments go to pytest, for example: test -k solver)",
+    "test": "run the tests; --long: those of whole experiments, too (other arguments go to pytest: test -k solver)",
     "check": "lint, formatting and types",
     "setup": "only set up what the other commands need",
 }
@@ -57,10 +57,11 @@ def main() -> int:
     if options.command == "demo":
         return run([PYTHON, "-m", "lqrsim.cli", "demo", *rest])
     if options.command == "test":
-        # All of them: on every processor, each file on one, so that what its tests share is made once, in the order
+        # On every processor, each file on one, so that what its tests share is made once, in the order
         # that tests/conftest.py puts them in.
         every = ["-n", "auto", "--dist", "loadfile", "--no-loadscope-reorder"]
-        return run([PYTHON, "-m", "pytest", *(rest or every)])
+        every += [] if rest == ["--long"] else ["-m", "not long"]
+        return run([PYTHON, "-m", "pytest", *(every if rest in ([], ["--long"]) else rest)])
     if options.command == "check":
         steps = (["ruff", "check"], ["ruff", "format", "--check"], ["basedpyright", "--pythonpath", str(PYTHON)])
         return max([run([PYTHON, "-m", *step]) for step in steps])

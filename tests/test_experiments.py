@@ -54,6 +54,7 @@ def results() -> dict[str, Any]:
 # Tests have no business with how long anything takes: what is asserted holds on any machine.
 
 
+@pytest.mark.long
 def test_benchmark_of_speed_compares_the_same_iterations(results: dict[str, Any]) -> None:
     assert results["config"]["seed"] == 0
     assert results["versions"]["lqrsim"]
@@ -74,6 +75,7 @@ def test_benchmark_of_speed_compares_the_same_iterations(results: dict[str, Any]
             assert found["cost_difference"] < (1e-4 if solver == "smooth" else 1e-8)
 
 
+@pytest.mark.long
 def test_benchmark_of_peers_recomputes_what_they_claim(results: dict[str, Any]) -> None:
     """Needs the `bench` extra and g++, which few machines have; without them it says so."""
     peers = results["peers"]
@@ -88,6 +90,7 @@ def test_benchmark_of_peers_recomputes_what_they_claim(results: dict[str, Any]) 
     np.testing.assert_allclose(peers["FDDP, hover"]["cost"], peers["ilqr, hover"]["cost"], rtol=1e-3)
 
 
+@pytest.mark.long
 def test_benchmark_of_threads(results: dict[str, Any]) -> None:
     threads = results["threads"]
     if "skipped" in threads:
@@ -96,6 +99,7 @@ def test_benchmark_of_threads(results: dict[str, Any]) -> None:
     assert all(found["same_costs"] for found in threads.values())
 
 
+@pytest.mark.long
 def test_benchmark_of_scaling_and_startup(results: dict[str, Any]) -> None:
     scaling = results["scaling"]
     assert {line["states"] for line in scaling["states"]} == {3}

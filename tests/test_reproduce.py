@@ -142,6 +142,7 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     return folder, same_page(folder)
 
 
+@pytest.mark.long
 def test_all_results_quickly(quick: tuple[Path, dict[str, Any]]) -> None:
     folder, saved = quick
     assert list(saved["results"]) == list(reproduce.SCRIPTS)
@@ -152,6 +153,7 @@ def test_all_results_quickly(quick: tuple[Path, dict[str, Any]]) -> None:
         assert name in drawn
 
 
+@pytest.mark.long
 def test_table_1_claims_what_its_plans_cost(quick: tuple[Path, dict[str, Any]]) -> None:
     """The costs of a fixed start, recomputed by formulas of nobody's; six digits are saved."""
     truth = import_module("peers.truth")
@@ -166,6 +168,7 @@ def test_table_1_claims_what_its_plans_cost(quick: tuple[Path, dict[str, Any]]) 
         assert len(solution.iterations) == found["iterations"][query]
 
 
+@pytest.mark.long
 def test_stress_test_counts_what_simulations_do(quick: tuple[Path, dict[str, Any]]) -> None:
     """The same disturbances and numbers, without a campaign; the outcomes are the rollout's own."""
     result = quick[1]["results"]["stress_test"]["result"]
@@ -189,6 +192,7 @@ def test_stress_test_counts_what_simulations_do(quick: tuple[Path, dict[str, Any
                 assert run.outcome.count("reached") == pytest.approx(rate * robot["trials_alone"])
 
 
+@pytest.mark.long
 def test_robust_policies_counts_what_simulations_do(quick: tuple[Path, dict[str, Any]]) -> None:
     """The policy of the smoother needs none of the script's plans and laws."""
     result = quick[1]["results"]["robust_policies"]["result"]
@@ -202,6 +206,7 @@ def test_robust_policies_counts_what_simulations_do(quick: tuple[Path, dict[str,
     assert all(one["predicted"] <= one["asked"] for one in chances.values())
 
 
+@pytest.mark.long
 def test_minimal_total_cost_states_obey_the_true_dynamics(quick: tuple[Path, dict[str, Any]]) -> None:
     """Statements of the paper that do not depend on how many queries were looked at."""
     said = {
