@@ -44,7 +44,7 @@ FLOORS_WITHIN = {
         ("rollout",),
     ),
     "codegen": (
-        ("arguments", "disk_cache", "foreign", "kernel_source", "pointers"),
+        ("arguments", "disk_cache", "foreign", "isolation", "kernel_source", "pointers"),
         ("fingerprint",),
         ("symbolic", "user_functions"),
         ("jit",),

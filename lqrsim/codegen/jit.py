@@ -6,7 +6,6 @@ calls, and kept under a hash of that text and its own name, so nothing kept can 
 
 import ast
 import contextlib
-import gc
 import inspect
 import logging
 import platform
@@ -14,7 +13,7 @@ import re
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -25,6 +24,7 @@ import numpy as np
 from lqrsim.codegen import disk_cache as disk
 from lqrsim.codegen.arguments import converted, kind_of, leaves, signature_of
 from lqrsim.codegen.fingerprint import fingerprint, note_helpers, stale
+from lqrsim.codegen.isolation import apart, as_one, named, uncollected
 from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import records
@@ -86,7 +86,7 @@ class Core:
         text = self._entry_source(name, kinds)
         key = disk.key(_machine(), self.source, text, repr(kinds))
         namespace: dict[str, Any] = {"__name__": __name__}
-        exec(compile(_named(text, "entry", key), "<lqrsim>", "exec"), namespace)
+        exec(compile(named(text, "entry", key), "<lqrsim>", "exec"), namespace)
         dispatcher: Any = numba.njit(namespace[f"entry_{key}"], nogil=True, **_options())
         stored = disk.load(key)
         if stored is None or not _restore(dispatcher, stored):
@@ -99,7 +99,7 @@ class Core:
             log(f"compiling {what}, once for this kind of problem, {took} ...")
             clock = time.perf_counter()
             namespace.update(self._namespace())
-            with _uncollected(), _as_one():
+            with uncollected(), as_one():
                 dispatcher.compile(signature_of(kinds))
             if name in LONG:
                 disk.note(name, time.perf_counter() - clock)
@@ -202,7 +202,7 @@ def _compile(function: UserFunction) -> tuple[Any, int]:
     names |= {"function": own, "carray": carray, "readonly": readonly, "nan": float("nan"), "__name__": __name__}
     print_of_it = fingerprint(function.function)
     key = disk.key(_machine(), print_of_it or uuid.uuid4().hex, text, repr(function.parameters))
-    exec(compile(_named(text, "adapter", key), "<lqrsim>", "exec"), names)
+    exec(compile(named(text, "adapter", key), "<lqrsim>", "exec"), names)
     dispatcher: Any = numba.njit(names[f"adapter_{key}"], **_options())
     stored = disk.load(key) if print_of_it else None
     if stored is None or not _restore(dispatcher, stored):
@@ -213,7 +213,7 @@ def _compile(function: UserFunction) -> tuple[Any, int]:
         lasting = print_of_it is not None and not stale(function.function)
         pointer = numba.types.CPointer(numba.types.float64)
         try:
-            with _uncollected(), _apart("adapter"):
+            with uncollected(), apart("adapter"):
                 dispatcher.compile((pointer,) * (3 + (len(function.writes) or 1)))
         except Exception as error:  # mostly NumbaError, and whatever else goes wrong within numba
             raise InputError(f"{function.name}: got what numba can not compile, want {_reason(error)}") from error
@@ -280,91 +280,6 @@ _INLINED = (
 )
 
 
-@contextlib.contextmanager
-def _uncollected() -> Iterator[None]:
-    """Without garbage collection, which takes its share of the time to compile."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
-def _named(text: str, name: str, key: str) -> str:
-    """A function with its key in its name: what is compiled is known by that in all that this process ever loads."""
-    return text.replace(f"def {name}(", f"def {name}_{key}(", 1)
-
-
-@contextlib.contextmanager
-def _as_one() -> Iterator[None]:
-    """Optimise and make machine code of the entry alone, into which all is linked that it calls, and not of each part.
-
-    numba does both, which takes far longer.
-    """
-    with _apart("entry", parts=False):
-        yield
-
-
-@contextlib.contextmanager
-def _apart(name: str, *, parts: bool = True) -> Iterator[None]:
-    """Whatever is compiled under a name that begins so keeps to itself the functions that it has of what it calls.
-
-    numba gives each function a number that it counts up within a process, and lets the linker choose among functions of
-    the same name. Two processes count alike: what each keeps on disk has functions of the same name that do something
-    else, and where a third process loads both, one would run those of the other. For the same reason it would be up to
-    the linker which of two copies runs, and the run that compiles and the one that loads could differ in the last bit.
-
-    That is why numba's own class is replaced here, as long as something is compiled, and only where it is as expected.
-
-    Args:
-      parts: whether what is called is made machine code of, too, as numba does.
-    """
-    from numba.core import codegen, registry
-    from numba.core.compiler_lock import global_compiler_lock
-
-    class Library(codegen.JITCodeLibrary):
-        @property
-        def whole(self) -> bool:
-            return self.name.startswith(f"{name}_")
-
-        def _optimize_final_module(self) -> None:
-            if parts or self.whole:
-                super()._optimize_final_module()
-
-        def _finalize_final_module(self) -> None:
-            if self.whole:
-                for function in self._final_module.functions:
-                    # After optimising: how the functions are inlined, and so their bits, is as it was.
-                    if not function.is_declaration and f"{name}_" not in function.name:
-                        function.linkage = "internal"
-            if parts or self.whole:
-                super()._finalize_final_module()
-            else:
-                self._finalize_dynamic_globals()
-                self._verify_declare_only_symbols()
-                self._finalized = True
-
-    target: Any = registry.cpu_target
-    generator = target.target_context.codegen()
-    if not hasattr(generator, "_library_class") or not hasattr(generator, "set_env"):
-        yield  # another numba, arranged otherwise: slower, and not as sure
-        return
-    usual, set_env = generator._library_class, generator.set_env
-
-    def set_env_if_there(name: str, env: Any) -> None:
-        if generator._engine.get_global_value_address(name):  # parts have no memory of their own
-            set_env(name, env)
-
-    with global_compiler_lock:  # so that nothing else is compiled meanwhile
-        generator._library_class, generator.set_env = Library, set_env_if_there
-        try:
-            yield
-        finally:
-            generator._library_class, generator.set_env = usual, set_env
-
-
 @cache
 def _machine() -> str:
     """What compiled code depends on besides its source: the compiler, the processor, and how pointers are compiled."""
@@ -375,7 +290,7 @@ def _machine() -> str:
     target: Any = registry.cpu_target
     parts = [version("numba"), version("llvmlite"), platform.python_version(), *_FAST]
     parts.append(repr(target.target_context.codegen().magic_tuple()))
-    parts.append("functions of their own")  # what was kept before could run those of others: see `_apart`
+    parts.append("functions of their own")  # what was kept before could run those of others: see `isolation.py`
     texts = (Path(str(module.__file__)).read_text(encoding="utf-8") for module in (pointers, foreign, records))
     return "\n".join([*parts, *texts])
 
