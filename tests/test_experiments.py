@@ -328,3 +328,24 @@ def test_the_packaged_quadrotor_by_its_mjcf() -> None:
     assert found["relative"] < 1e-9
     assert found["apart"] < 1e-6
     assert "quadrotor" in script.report(result)
+
+
+@pytest.mark.long
+def test_benchmark_of_replanning(tmp_path: Path) -> None:
+    """Every solve is counted once; and laws that plan again do what those that do not cannot."""
+    script = import_module("benchmark_replanning")
+    found = script.main(script.Config(quick=True, out=tmp_path))
+    assert len(found["times"]["rows"]) == 12
+    for row in found["times"]["rows"]:
+        assert sum(row["ended"].values()) == row["plans"] >= 40
+        assert 0 < row["median"] <= row["p999"] <= row["most"]
+    # Two runs each: the first policy ends at the old goal and runs into the pillar.
+    for what in ("goal", "pillar"):
+        assert found["changes"][what]["re-planning"][0] == 100
+        assert found["changes"][what]["the first policy"][0] == 0
+    used = found["delay"]["used"]
+    assert used["a quarter are late, predicted"] < 90 < used["one period, predicted"]
+    assert set(found["estimate"]["presets"]["light"]["reached"]) == {
+        "the first plan", "a new plan where it is needed", "a new plan each time",
+    }  # fmt: skip
+    assert "### How long re-plans take" in script.report(found)
