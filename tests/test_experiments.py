@@ -129,6 +129,7 @@ def test_benchmark_of_intervals() -> None:
     assert "rare failures, 95 % intervals" in script.report(result)
 
 
+@pytest.mark.long
 def test_benchmark_of_reliability() -> None:
     """On few problems: bad advice breaks the bare method and not the guarded one, which changes nothing elsewhere."""
     script = import_module("benchmark_reliability")
@@ -159,6 +160,7 @@ def quality() -> ModuleType:
     return import_module("benchmark_quality")
 
 
+@pytest.mark.long
 def test_benchmark_of_quality(quality: ModuleType, tmp_path: Path) -> None:
     """On two queries and five worlds, without peers: what solutions claim, recomputed by formulas of nobody's."""
     known = [50.0, 200.0]
@@ -282,6 +284,7 @@ class TestStressTest:
         assert stress.possible(ls.MeasurementLatency(1), (1.0, 1.1, 2.0)) == [1.0, 2.0]
 
 
+@pytest.mark.long
 def test_three_links_go_round_posts(tmp_path: Path) -> None:
     script: Any = import_module("three_link_arm")
     found = script.main(script.Config(quick=True, out=tmp_path))
@@ -319,6 +322,7 @@ def test_numbers_are_fitted_to_a_run_that_failed(monkeypatch: pytest.MonkeyPatch
     assert "slider_damping" in script.report(result)
 
 
+@pytest.mark.long
 def test_the_packaged_quadrotor_by_its_mjcf() -> None:
     """MuJoCo's steps lead to the optimum of the formulas: to 1e-6 of the cost is wanted, what is left is rounding."""
     script: Any = import_module("mjcf_packaged")

@@ -29,8 +29,17 @@ PORT = 19700 + os.getpid() % 1000  # of our own, also where tests run side by si
 FREE = np.zeros(3)  # a metre from all beams: closer to them, what they cost keeps the robot from staying
 
 
+BEFORE: list[threading.Thread] = []  # those of other tests in this process
+
+
+@pytest.fixture(autouse=True)
+def count_from_here() -> None:
+    BEFORE[:] = [thread for thread in threading.enumerate() if thread.name == "lqrsim planner"]
+
+
 def planning() -> list[threading.Thread]:
-    return [thread for thread in threading.enumerate() if thread.name == "lqrsim planner"]
+    threads = [thread for thread in threading.enumerate() if thread.name == "lqrsim planner"]
+    return [thread for thread in threads if thread not in BEFORE]
 
 
 def wait_for(planner: ls.Planner) -> None:
