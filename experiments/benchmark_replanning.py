@@ -10,6 +10,7 @@ times     How long a re-plan takes: both robots, with the obstacle's cost, with 
 changes   A goal that jumps, and a pillar that appears where the plan leads.
 delay     What a delay of one control period costs, predicted or ignored.
 estimate  Output feedback with new plans, made with what is estimated, against the same without.
+peers     Other people's solvers on the same work, run by run in turn: how long a re-plan takes, what the loop costs.
 """
 
 import json
@@ -18,16 +19,17 @@ from types import ModuleType
 from typing import Any, Literal
 
 from paper.common import Result, opening, run
-from replan import changes, common, delay, estimate, times
+from replan import changes, common, delay, estimate, peers, times
 
 from lqrsim.results.save_load import replacing
 
-Section = Literal["times", "changes", "delay", "estimate"]
+Section = Literal["times", "changes", "delay", "estimate", "peers"]
 SECTIONS: dict[Section, tuple[ModuleType, str]] = {
     "times": (times, "How long re-plans take"),
     "changes": (changes, "What changes on the way"),
     "delay": (delay, "What a delay costs"),
     "estimate": (estimate, "Planning again with estimates"),
+    "peers": (peers, "Against other solvers"),
 }
 
 

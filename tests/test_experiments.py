@@ -352,4 +352,12 @@ def test_benchmark_of_replanning(tmp_path: Path) -> None:
     assert set(found["estimate"]["presets"]["light"]["reached"]) == {
         "the first plan", "a new plan where it is needed", "a new plan each time",
     }  # fmt: skip
+    # Two methods, one optimum; the other solvers are there or it is said why not.
+    solvers = found["peers"]["rows"]
+    assert {"lqrsim, prepare", "lqrsim, ilqr"} <= set(solvers)
+    assert len(solvers) + len(found["peers"]["skipped"]) == 5
+    for row in solvers.values():
+        assert row["plans"] == 300
+        assert row["converged"] == 100
+        assert abs(row["more"]) < 1
     assert "### How long re-plans take" in script.report(found)

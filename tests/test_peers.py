@@ -180,6 +180,45 @@ def test_ipopt_keeps_bounds_and_clearance(peers: ModuleType) -> None:
     assert peers.clearance_of(problem, states)[1:].min() > clearance - 1e-6
 
 
+@pytest.mark.parametrize("solver", ["box-FDDP", "Fatrop"])
+@pytest.mark.parametrize("name", ROBOTS)
+def test_solvers_keep_limits_and_find_an_optimum(peers: ModuleType, name: str, solver: str) -> None:
+    """From the controls of the plan without limits, cut off: iLQR has next to nothing to add to what they find."""
+    problem = fixed(name)
+    free, middle = ls.smooth(problem).trajectory.controls, problem.nominal_control
+    low, high = middle + 0.8 * (free.min(axis=0) - middle), middle + 0.8 * (free.max(axis=0) - middle)
+    limited = replace(problem, control_limits=(low, high))
+    try:
+        solve = peers.Crocoddyl(limited, box=True) if solver == "box-FDDP" else peers.Fatrop(limited)
+    except peers.Unavailable as error:
+        pytest.skip(str(error))
+    guess = np.clip(free, low, high)
+    answer = solve.from_trajectory(limited, peers.rollout(limited, guess), guess)
+    assert answer.converged
+    assert (answer.controls >= low).all()
+    assert (answer.controls <= high).all()
+    near = np.minimum(answer.controls - low, high - answer.controls) < 1e-3
+    assert near.mean() > 0.1
+    again = ls.ilqr(limited, start=answer.controls)
+    np.testing.assert_allclose(again.cost, answer.cost, rtol=5e-4)
+    np.testing.assert_allclose(peers.cost_of(problem, answer.controls), answer.cost, rtol=1e-5)
+    np.testing.assert_array_equal(answer.states[0], problem.start)
+
+
+def test_a_run_costs_what_its_parts_cost(peers: ModuleType) -> None:
+    """Of another length than the problem's; states and controls that do not belong together."""
+    problem, rng = fixed("quadrotor"), np.random.default_rng(0)
+    states, controls = rng.standard_normal((8, 12)), rng.standard_normal((7, 4))
+    weight, goal = problem.final_cost.weight, problem.goal
+    wanted = sum(
+        0.5 * (u - problem.nominal_control) @ control_cost(problem).weight @ (u - problem.nominal_control)
+        for u in controls
+    )
+    wanted += sum(obstacle_cost(problem, x)[0] for x in states[1:-1])
+    wanted += 0.5 * (states[-1] - goal) @ weight @ (states[-1] - goal)
+    np.testing.assert_allclose(peers.cost_along(problem, states, controls), wanted, rtol=1e-9)
+
+
 @pytest.fixture(scope="module")
 def flight(peers: ModuleType) -> tuple[ls.Scenario, ls.Quadrotor, ls.Solution]:
     """The quadrotor's query and its plan, where RotorPy can fly it."""

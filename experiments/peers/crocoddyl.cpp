@@ -1,4 +1,4 @@
-// The problems of lqrsim's two robots as action models of Crocoddyl, and its FDDP with the paper's stop test.
+// The problems of lqrsim's two robots as action models of Crocoddyl, and its FDDP and box-FDDP with the paper's stop test.
 // Built and called by fddp.py.
 #include <algorithm>
 #include <cmath>
@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "crocoddyl/core/optctrl/shooting.hpp"
+#include "crocoddyl/core/solvers/box-fddp.hpp"
 #include "crocoddyl/core/solvers/fddp.hpp"
 #include "crocoddyl/core/states/euclidean.hpp"
 #include "obstacles.hpp"
@@ -22,6 +23,7 @@ struct Numbers {
   double dt, radius, sharpness, obstacle_weight;
   Robot robot;
   double control_weight[Robot::M], control_about[Robot::M], final_weight[Robot::N], final_about[Robot::N];
+  double lowest[Robot::M], highest[Robot::M];  // of the controls, for box-FDDP
 };
 
 // A step of the plan; the last one has the final cost alone, and the first no obstacle cost.
@@ -34,7 +36,11 @@ class Action : public crocoddyl::ActionModelAbstract {
   using Data = std::shared_ptr<crocoddyl::ActionDataAbstract>;
 
   Action(std::shared_ptr<crocoddyl::StateAbstract> state, const Numbers<Robot>& numbers, const World& world, bool first)
-      : crocoddyl::ActionModelAbstract(state, M), numbers_(numbers), world_(world), first_(first) {}
+      : crocoddyl::ActionModelAbstract(state, M), numbers_(numbers), world_(world), first_(first) {
+    // Copies, and infinite where there is no limit; FDDP does not look at them.
+    set_u_lb(Eigen::Map<const Control>(numbers.lowest));
+    set_u_ub(Eigen::Map<const Control>(numbers.highest));
+  }
 
   // Crocoddyl can ask a model for itself in another precision; nothing here does.
   std::shared_ptr<crocoddyl::ActionModelBase> cloneAsDouble() const override { return nullptr; }
@@ -93,27 +99,31 @@ class Action : public crocoddyl::ActionModelAbstract {
 };
 
 // FDDP that stops when an accepted step from one feasible trajectory to another changes the cost by less than th_stop,
-// relative to the cost.
-class Solver : public crocoddyl::SolverFDDP {
+// relative to the cost. `Base` is SolverFDDP, or SolverBoxFDDP, which keeps the limits of the controls.
+template <class Base>
+class Solver : public Base {
  public:
-  explicit Solver(std::shared_ptr<crocoddyl::ShootingProblem> problem) : SolverFDDP(problem) {}
-
-  double before = std::numeric_limits<double>::quiet_NaN();  // cost of the last iterate
+  // `before` is the cost of the last iterate.
+  Solver(std::shared_ptr<crocoddyl::ShootingProblem> problem, double& before) : Base(problem), before_(before) {}
 
   double stoppingCriteria() override {
-    const bool accepted = cost_ != before;
-    stop_ = accepted && was_feasible_ && is_feasible_ ? std::abs((before - cost_) / cost_)
-                                                      : std::numeric_limits<double>::infinity();
-    before = cost_;
-    return stop_;
+    const bool accepted = this->cost_ != before_;
+    this->stop_ = accepted && this->was_feasible_ && this->is_feasible_ ? std::abs((before_ - this->cost_) / this->cost_)
+                                                                        : std::numeric_limits<double>::infinity();
+    before_ = this->cost_;
+    return this->stop_;
   }
+
+ private:
+  double& before_;
 };
 
 struct Workspace {
   World world;
   double* goal;  // where the models read it
   std::shared_ptr<crocoddyl::ShootingProblem> problem;
-  std::unique_ptr<Solver> solver;
+  double before;  // the solver's
+  std::unique_ptr<crocoddyl::SolverAbstract> solver;
   std::vector<Eigen::VectorXd> states, controls;
 
   virtual ~Workspace() = default;
@@ -123,7 +133,7 @@ template <class Robot>
 struct WorkspaceOf : Workspace {
   Numbers<Robot> numbers;
 
-  WorkspaceOf(int steps, const double* given, int count, const Obstacle* rows)
+  WorkspaceOf(bool box, int steps, const double* given, int count, const Obstacle* rows)
       : numbers(*reinterpret_cast<const Numbers<Robot>*>(given)) {
     world.radius = numbers.radius;
     world.sharpness = numbers.sharpness;
@@ -136,7 +146,10 @@ struct WorkspaceOf : Workspace {
     auto last = std::make_shared<Action<Robot>>(state, numbers, world, false);
     problem = std::make_shared<crocoddyl::ShootingProblem>(Eigen::VectorXd::Zero(Robot::N), actions, last);
     problem->set_nthreads(1);
-    solver = std::make_unique<Solver>(problem);
+    if (box)
+      solver = std::make_unique<Solver<crocoddyl::SolverBoxFDDP>>(problem, before);
+    else
+      solver = std::make_unique<Solver<crocoddyl::SolverFDDP>>(problem, before);
     states.assign(steps + 1, Eigen::VectorXd::Zero(Robot::N));
     controls.assign(steps, Eigen::VectorXd::Zero(Robot::M));
   }
@@ -154,10 +167,11 @@ double* write(const Matrix& from, double* to) {  // row by row
 extern "C" {
 
 // Everything that does not change from query to query: `numbers` as Numbers has them, and obstacles row by row.
-void* make(int quadrotor, int steps, const double* numbers, int count, const double* obstacles) {
+// With `box` the solver keeps the limits of the controls.
+void* make(int quadrotor, int box, int steps, const double* numbers, int count, const double* obstacles) {
   const auto* rows = reinterpret_cast<const Obstacle*>(obstacles);
-  if (quadrotor) return static_cast<Workspace*>(new WorkspaceOf<Quadrotor>(steps, numbers, count, rows));
-  return static_cast<Workspace*>(new WorkspaceOf<DifferentialDrive>(steps, numbers, count, rows));
+  if (quadrotor) return static_cast<Workspace*>(new WorkspaceOf<Quadrotor>(box != 0, steps, numbers, count, rows));
+  return static_cast<Workspace*>(new WorkspaceOf<DifferentialDrive>(box != 0, steps, numbers, count, rows));
 }
 
 void release(void* workspace) { delete static_cast<Workspace*>(workspace); }
@@ -173,10 +187,10 @@ int solve(void* workspace, const double* goal, double* states, double* controls,
   for (long t = 0; t <= steps; t++) work.states[t] = Eigen::Map<const Eigen::VectorXd>(states + n * t, n);
   for (long t = 0; t < steps; t++) work.controls[t] = Eigen::Map<const Eigen::VectorXd>(controls + m * t, m);
   work.problem->set_x0(work.states[0]);
-  work.solver->before = std::numeric_limits<double>::quiet_NaN();
+  work.before = std::numeric_limits<double>::quiet_NaN();
   if (rolled_out) {
     work.problem->rollout(work.controls, work.states);
-    work.solver->before = work.problem->calc(work.states, work.controls);
+    work.before = work.problem->calc(work.states, work.controls);
   }
   work.solver->set_th_stop(tolerance);
   const bool converged = work.solver->solve(work.states, work.controls, max_iterations, rolled_out != 0);

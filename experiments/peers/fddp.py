@@ -1,4 +1,4 @@
-"""Crocoddyl's FDDP, by the fastest route that its wheel allows.
+"""Crocoddyl's FDDP and box-FDDP, by the fastest route that its wheel allows.
 
 The wheel has the C++ library and its headers, so the model is C++ too (`crocoddyl.cpp` beside this file, derivatives by
 hand in `robots.hpp` and `obstacles.hpp`, compiled with -O3 -march=native when first needed), and nothing calls Python
@@ -34,26 +34,30 @@ class Crocoddyl:
     """FDDP for problems that differ in their start and goal only.
 
     Args:
-      problem: one of them, of either robot and in any world; weights are diagonal. FDDP knows no limits.
+      problem: one of them, of either robot and in any world; weights are diagonal.
+      box: whether to keep the limits of the controls, by box-FDDP; FDDP knows none.
 
     Raises:
       Unavailable: Crocoddyl, Eigen's headers or g++ is not installed, or they do not fit together.
       NotImplementedError: the problem is of another make.
     """
 
-    def __init__(self, problem: ls.Problem) -> None:
+    def __init__(self, problem: ls.Problem, *, box: bool = False) -> None:
         told = parts(problem)
         for weight in (told.control_weight, told.final_weight):
             if np.count_nonzero(weight) > np.count_nonzero(np.diag(weight)):
                 raise NotImplementedError("a weight that is no diagonal")
         scalars = [problem.dt, told.radius, told.sharpness, told.obstacle_weight, *told.parameters.values()]
         weights = [np.diag(told.control_weight), told.nominal, np.diag(told.final_weight), told.goal]
+        space = problem.control_coordinates
+        weights += [space.low, space.high] if box else [np.full(len(space), side) for side in (-np.inf, np.inf)]
         numbers, obstacles = np.concatenate([scalars, *weights]), np.ascontiguousarray(told.world.table)
         self._library = _library()
         self._steps = problem.steps
         self._workspace = ctypes.c_void_p(
             self._library.make(
-                int(told.robot == ls.Quadrotor.name), problem.steps, at(numbers), len(obstacles), at(obstacles)
+                int(told.robot == ls.Quadrotor.name), int(box), problem.steps, at(numbers), len(obstacles),
+                at(obstacles),
             )
         )  # fmt: skip
 

@@ -61,7 +61,9 @@ class Ipopt:
         if clearance is not None:
             # Rows of g, a step at a time: the n gaps of the step, then the obstacles.
             self._limits["ubg"] = np.tile(np.repeat([0.0, np.inf], [n, len(told.world)]), steps)
-        self._solver = _solver(nlp, compile)
+        # Bounds are kept exactly, and not to 1e-8 as IPOPT has them inside.
+        options = {"print_level": 0, "sb": "yes", "max_iter": MAX_ITERATIONS, "honor_original_bounds": "yes"}
+        self._solver = solver("ipopt", nlp, {"ipopt": options}, compile=compile)
 
     def from_hover(self, problem: ls.Problem) -> Answer:
         """Solve from the trajectory of the nominal control."""
@@ -89,7 +91,8 @@ class Ipopt:
 
 
 @cache
-def _casadi() -> Any:
+def casadi() -> Any:
+    """The module. Raises Unavailable where it is not installed."""
     try:
         return importlib.import_module("casadi")
     except ImportError:
@@ -97,7 +100,7 @@ def _casadi() -> Any:
 
 
 def _nlp(problem: ls.Problem, told: Parts, clearance: float | None) -> dict[str, Any]:
-    ca, steps = _casadi(), problem.steps
+    ca, steps = casadi(), problem.steps
     n, m = len(told.goal), len(told.nominal)
     step, effort, obstacles, arrival, apart = functions(problem, told)
     variables = ca.MX.sym("w", m + n, steps)  # of a step: its control, and the state after it
@@ -113,24 +116,23 @@ def _nlp(problem: ls.Problem, told: Parts, clearance: float | None) -> dict[str,
     return {"x": ca.vec(variables), "p": ca.vertcat(start, goal), "f": cost, "g": ca.vec(g)}
 
 
-def _solver(nlp: dict[str, Any], compile: bool) -> Any:
-    ca = _casadi()
-    options: dict[str, Any] = {"print_time": False, "show_eval_warnings": False}
-    # Bounds are kept exactly, and not to 1e-8 as IPOPT has them inside.
-    options["ipopt"] = {"print_level": 0, "sb": "yes", "max_iter": MAX_ITERATIONS, "honor_original_bounds": "yes"}
+def solver(plugin: str, nlp: dict[str, Any], options: dict[str, Any], *, compile: bool) -> Any:
+    """CasADi's function that solves the problem by that plugin; its functions expanded, or compiled from C."""
+    ca = casadi()
+    options = {"print_time": False, "show_eval_warnings": False, **options}
     if not compile:
-        return ca.nlpsol("solver", "ipopt", nlp, {"expand": True, **options})
-    name = "ipopt.c"
+        return ca.nlpsol("solver", plugin, nlp, {"expand": True, **options})
+    name = f"{plugin}.c"
     with tempfile.TemporaryDirectory() as folder:
         # CasADi writes to the current folder only.
         here = Path.cwd()
         os.chdir(folder)
         try:
-            ca.nlpsol("solver", "ipopt", nlp, options).generate_dependencies(name)
+            ca.nlpsol("solver", plugin, nlp, options).generate_dependencies(name)
         finally:
             os.chdir(here)
-        library = compiled("IPOPT's problem (some 15 seconds)", [Path(folder) / name], FLAGS)
-    return ca.nlpsol("solver", "ipopt", str(library), options)
+        library = compiled(f"{plugin}'s problem (some 15 seconds)", [Path(folder) / name], FLAGS)
+    return ca.nlpsol("solver", plugin, str(library), options)
 
 
 def functions(problem: ls.Problem, told: Parts) -> tuple[Any, Any, Any, Any, Any]:
@@ -139,7 +141,7 @@ def functions(problem: ls.Problem, told: Parts) -> tuple[Any, Any, Any, Any, Any
     The next state of (x, u), the cost of u, the cost of the obstacles at x, the final cost of (x, goal), and the
     distances (len(world),) of the robot's surface to the obstacles at x.
     """
-    ca = _casadi()
+    ca = casadi()
     n, m, h = len(told.goal), len(told.nominal), problem.dt
     x, u, goal = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("goal", n)
     rate_of = _quadrotor if told.robot == ls.Quadrotor.name else _drive
@@ -164,18 +166,18 @@ def functions(problem: ls.Problem, told: Parts) -> tuple[Any, Any, Any, Any, Any
 
 
 def _quadratic(weight: Array, off: Any) -> Any:
-    ca = _casadi()
+    ca = casadi()
     return 0.5 * ca.bilin(ca.sparsify(ca.DM(weight)), off, off)
 
 
 def _drive(x: Any, u: Any, p: dict[str, float]) -> Any:
-    ca = _casadi()
+    ca = casadi()
     speed = (u[0] + u[1]) / 2
     return ca.vertcat(speed * ca.cos(x[2]), speed * ca.sin(x[2]), (u[1] - u[0]) / p["axle_length"])
 
 
 def _quadrotor(x: Any, u: Any, p: dict[str, float]) -> Any:
-    ca = _casadi()
+    ca = casadi()
     velocity, r, w = x[3:6], x[6:9], x[9:12]
     sine, cosine, cotangent = _ratios(ca.sumsqr(r))
     up = ca.vertcat(0, 0, 1)
@@ -190,7 +192,7 @@ def _quadrotor(x: Any, u: Any, p: dict[str, float]) -> Any:
 
 def _ratios(s: Any) -> list[Any]:
     """sin t / t, (1 - cos t) / t^2 and (1 - t/2 cot(t/2)) / t^2 at t^2 = s; below 1/4 by their series."""
-    ca = _casadi()
+    ca = casadi()
     t = ca.sqrt(ca.fmax(s, 0.25))  # both cases are always evaluated, so neither may be singular
     sine, cosine = ca.sin(t) / t, (1 - ca.cos(t)) / (t * t)
     large = sine, cosine, (1 - sine / (2 * cosine)) / (t * t)
@@ -211,7 +213,7 @@ def _ratios(s: Any) -> list[Any]:
 
 def _distance(obstacle: ls.Obstacle, place: Any) -> Any:
     """Signed distance in metres; where it has no derivative it has one of zero."""
-    ca = _casadi()
+    ca = casadi()
     local = ca.sparsify(ca.DM(obstacle.rotation.T)) @ (place - obstacle.position)
     side, height = _length(local[:2]), ca.fabs(local[2])
     radius, half, _ = obstacle.size
@@ -232,10 +234,10 @@ def _distance(obstacle: ls.Obstacle, place: Any) -> Any:
 
 def _outside(beyond: Any) -> Any:
     """Distance to a convex body from how far a point is beyond each of its mutually perpendicular faces."""
-    ca = _casadi()
+    ca = casadi()
     return _length(ca.fmax(beyond, 0)) + ca.fmin(ca.mmax(beyond), 0)
 
 
 def _length(vector: Any) -> Any:
-    ca = _casadi()
+    ca = casadi()
     return ca.sqrt(ca.fmax(ca.sumsqr(vector), 1e-24))

@@ -1,4 +1,4 @@
-"""What a plan is worth, whoever made it: recomputed from its controls in NumPy, by formulas of this file alone.
+"""What a plan or a run is worth, whoever made it: recomputed in NumPy, by formulas of this file alone.
 
 It starts exactly at the problem's start, and there is no initial cost.
 """
@@ -50,7 +50,12 @@ def _step(problem: ls.Problem) -> Callable[[Array, Sequence[float]], Array]:
 
 def cost_of(problem: ls.Problem, controls: Array) -> float:
     """What the controls cost from exactly the start."""
-    told, states = parts(problem), rollout(problem, controls)
+    return cost_along(problem, rollout(problem, controls), controls)
+
+
+def cost_along(problem: ls.Problem, states: Array, controls: Array) -> float:
+    """What states (T+1, n) and controls (T, m) cost, of any number of steps, whether or not they belong together."""
+    told = parts(problem)
     effort, miss = controls - told.nominal, states[-1] - told.goal
     place = list(problem.dynamics.state_coordinates.position)
     near = distances(told.world, states[1:-1, place]) - told.radius  # not where the start is given, nor at the end
