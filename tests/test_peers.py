@@ -209,7 +209,7 @@ def test_a_run_costs_what_its_parts_cost(peers: ModuleType) -> None:
     """Of another length than the problem's; states and controls that do not belong together."""
     problem, rng = fixed("quadrotor"), np.random.default_rng(0)
     states, controls = rng.standard_normal((8, 12)), rng.standard_normal((7, 4))
-    weight, goal = problem.final_cost.weight, problem.goal
+    weight, goal = problem.final_cost.weight, problem.goal  # pyright: ignore[reportAttributeAccessIssue]
     wanted = sum(
         0.5 * (u - problem.nominal_control) @ control_cost(problem).weight @ (u - problem.nominal_control)
         for u in controls
