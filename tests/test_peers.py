@@ -209,13 +209,14 @@ def test_a_run_costs_what_its_parts_cost(peers: ModuleType) -> None:
     """Of another length than the problem's; states and controls that do not belong together."""
     problem, rng = fixed("quadrotor"), np.random.default_rng(0)
     states, controls = rng.standard_normal((8, 12)), rng.standard_normal((7, 4))
-    weight, goal = problem.final_cost.weight, problem.goal  # pyright: ignore[reportAttributeAccessIssue]
+    assert isinstance(problem.final_cost, ls.QuadraticCost)
+    off = states[-1] - problem.final_cost.about
     wanted = sum(
         0.5 * (u - problem.nominal_control) @ control_cost(problem).weight @ (u - problem.nominal_control)
         for u in controls
     )
     wanted += sum(obstacle_cost(problem, x)[0] for x in states[1:-1])
-    wanted += 0.5 * (states[-1] - goal) @ weight @ (states[-1] - goal)
+    wanted += 0.5 * off @ problem.final_cost.weight @ off
     np.testing.assert_allclose(peers.cost_along(problem, states, controls), wanted, rtol=1e-9)
 
 

@@ -217,7 +217,7 @@ def report(found: dict[str, Any]) -> list[str]:
         " Solves end at lqrsim's tolerance of 1e-4, FDDP at as small a change of the cost, Fatrop at as small"
         " residuals. The cost of the loop is what the true states and the commanded controls cost: controls and"
         " obstacles along the run, and the final cost at its end,"
-        f" over {compared} runs of each; obstacles do not stop the robot.",
+        f" over {compared} runs of each; obstacles do not stop the robot. All but Fatrop answer with gains, too.",
         table(head, rows),
         *("\n".join(f"- {line}." for line in lines) for lines in (lost, left_out) if lines),
     ]
