@@ -20,7 +20,7 @@ from .control.uncertainty import Unknown as Unknown
 from .errors import InputError as InputError
 from .problem.balls import Balls as Balls
 from .problem.balls import Places as Places
-from .problem.constraints import Clearance as Clearance
+from .problem.clearance import Clearance as Clearance
 from .problem.constraints import Constraint as Constraint
 from .problem.constraints import ConstraintTerm as ConstraintTerm
 from .problem.constraints import GoalState as GoalState

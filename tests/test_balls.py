@@ -271,7 +271,8 @@ class TestCapsule:
             state = np.concatenate([rng.uniform(-np.pi, np.pi, 3), np.zeros(3)])
             data.qpos[:] = state[:3]
             mujoco.mj_forward(model, data)
-            ours = clearances(ARM.balls, ARM.dynamics, scene.world, state).reshape(3, LINK.count).min(axis=1)
+            at = state[None], np.zeros(1)
+            ours = clearances(ARM.balls, ARM.dynamics, scene.world, *at).reshape(3, LINK.count).min(axis=1)
             for link, clearance in zip(links, ours, strict=True):
                 theirs = min(
                     mujoco.mj_geomDistance(model, data, link, model.geom(name).id, 5.0, None)

@@ -58,12 +58,11 @@ class Core:
 
     def __init__(self, source: str, sizes: dict[str, int], what: str) -> None:
         tree = ast.fix_missing_locations(_Specialise(sizes).visit(ast.parse(source)))
-        texts = [(node.name, ast.unparse(node)) for node in tree.body]
-        self.source = "\n\n".join(text for _, text in texts)
-        self._texts = dict(texts)
+        self._texts = {node.name: ast.unparse(node) for node in tree.body}
         self.what = what
         self._entries: dict[tuple[Any, ...], Any] = {}
         self._compilable: dict[str, Any] = {}
+        self._keys: dict[str, str] = {}
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("_"):
@@ -84,7 +83,7 @@ class Core:
         import numba
 
         text = self._entry_source(name, kinds)
-        key = disk.key(_machine(), self.source, text, repr(kinds))
+        key = disk.key(_machine(), self._key_of(name), text, repr(kinds))
         namespace: dict[str, Any] = {"__name__": __name__}
         exec(compile(named(text, "entry", key), "<lqrsim>", "exec"), namespace)
         dispatcher: Any = numba.njit(namespace[f"entry_{key}"], nogil=True, **_options())
@@ -123,23 +122,27 @@ class Core:
     def _namespace(self) -> dict[str, Any]:
         """The functions that the entries call, each made of its text and what it calls."""
         if not self._compilable:
-            keys: dict[str, str] = {}
-
-            def make(name: str) -> str:
-                if name not in keys:
-                    text = self._texts[name]
-                    names = {node.id for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Name)}
-                    callees = sorted(names & self._texts.keys() - {name})
-                    key = disk.key(text, *map(make, callees))
-                    if key not in _parts:
-                        namespace = {**_vocabulary(), **{callee: _parts[keys[callee]] for callee in callees}}
-                        exec(compile(text, "<lqrsim core>", "exec"), namespace)
-                        _parts[key] = namespace[name]
-                    keys[name] = key
-                return keys[name]
-
-            self._compilable.update(_vocabulary(), **{name: _parts[make(name)] for name in self._texts})
+            self._compilable.update(_vocabulary(), **{name: self._part(name) for name in self._texts})
         return self._compilable
+
+    def _part(self, name: str) -> Any:
+        """The function of that name, made once in a process."""
+        key = self._key_of(name)
+        if key not in _parts:
+            namespace = {**_vocabulary(), **{callee: self._part(callee) for callee in self._callees(name)}}
+            exec(compile(self._texts[name], "<lqrsim core>", "exec"), namespace)
+            _parts[key] = namespace[name]
+        return _parts[key]
+
+    def _key_of(self, name: str) -> str:
+        """A hash of the function's text and of all that it calls: what is not called makes no other function of it."""
+        if name not in self._keys:
+            self._keys[name] = disk.key(self._texts[name], *map(self._key_of, self._callees(name)))
+        return self._keys[name]
+
+    def _callees(self, name: str) -> list[str]:
+        names = {node.id for node in ast.walk(ast.parse(self._texts[name])) if isinstance(node, ast.Name)}
+        return sorted(names & self._texts.keys() - {name})
 
 
 # The functions that this process has made, under a hash of their text and of all that they call. Cores share them: the

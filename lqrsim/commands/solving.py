@@ -72,7 +72,7 @@ class Solve:
         """Carry the command out; its exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError
-        from lqrsim.problem.constraints import Clearance
+        from lqrsim.problem.clearance import Clearance
         from lqrsim.results import save_load
         from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
 

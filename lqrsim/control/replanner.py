@@ -208,5 +208,7 @@ class Replanner:
 
     def solve(self, task: Task, time_limit: float | None = None) -> Replan:
         """The answer, to a task that is due."""
-        after = task.first if self.horizon == "shrinking" else 0
-        return self.solver.solve(task.state, task.start, problem=task.problem, after=after, time_limit=time_limit)
+        problem, after = task.problem, task.first
+        if self.horizon == "moving":
+            problem, after = problem.later(task.first * problem.dt), 0
+        return self.solver.solve(task.state, task.start, problem=problem, after=after, time_limit=time_limit)

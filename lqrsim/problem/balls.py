@@ -330,11 +330,14 @@ def _call(places: Places, name: str, states: Array, *outputs: Array) -> None:
             raise error
 
 
-def clearances(balls: Balls, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> Array:
-    """Signed distance of each ball to the nearest obstacle minus its radius, (..., K), at states (..., n)."""
+def clearances(balls: Balls, dynamics: Dynamics, world: World, states: npt.ArrayLike, times: Array) -> Array:
+    """Signed distance of each ball to the nearest obstacle minus its radius, (T, K).
+
+    At states (T, n), and for obstacles that move at the times (T,) in s.
+    """
     places = balls.bind(dynamics)
     seen = places.world_seen(world, dynamics.state_coordinates)
-    return distances.signed_distance(seen, evaluate(places, len(balls), states)) - balls.radii
+    return distances.signed_distance_at(seen, evaluate(places, len(balls), states), times) - balls.radii
 
 
 @functools.cache

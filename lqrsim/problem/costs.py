@@ -90,6 +90,15 @@ class Cost(abc.ABC):
     def bind(self, dynamics: Dynamics) -> Term:
         """This cost for a system. Raises InputError if it does not fit (a weight of the wrong size, say)."""
 
+    @property
+    def moving(self) -> bool:
+        """Whether it changes with time; see `_bind_at`."""
+        return False
+
+    def _bind_at(self, dynamics: Dynamics, times: Array) -> Term:
+        """This cost for a system and the times (T+1,) in s of a problem's knots."""
+        return self.bind(dynamics)
+
     def __add__(self, other: "Cost") -> "CostSum":
         return CostSum((*terms_of(self), *terms_of(other)))
 
@@ -187,16 +196,25 @@ class ObstacleCost(Cost):
         radius = self.radius if self.balls is None else None
         return ObstacleCost(self.world, radius=radius, balls=self.balls, sharpness=self.sharpness, weight=weight)
 
+    @property
+    def moving(self) -> bool:
+        return self.world.moving
+
     def bind(self, dynamics: Dynamics) -> Term:
+        return self._bind_at(dynamics, np.zeros(1))
+
+    def _bind_at(self, dynamics: Dynamics, times: Array) -> Term:
         places, world = bind_outline("ObstacleCost", self.balls, dynamics, self.world)
+        tables = world.tables(times)
         if self.balls is not None and places is not None:
-            return self._bind_balls(self.balls, places, world)
+            return self._bind_balls(self.balls, places, tables)
         position = dynamics.state_coordinates.position
-        data = np.concatenate([[self.radius, self.sharpness, self.weight, len(world)], world.table.ravel()])
+        first = [self.radius, self.sharpness, self.weight, len(world), len(tables)]
+        data = np.concatenate([first, tables.ravel()])
         return Term(source_of(obstacle_cost, AXES=position), data, nonconvex_in=position, factor=2)
 
-    def _bind_balls(self, balls: Balls, places: Places, world: World) -> Term:
-        own = np.concatenate([[self.sharpness, self.weight, len(world)], balls.radii, world.table.ravel()])
+    def _bind_balls(self, balls: Balls, places: Places, tables: Array) -> Term:
+        own = np.concatenate([[self.sharpness, self.weight, tables.shape[1], len(tables)], balls.radii, tables.ravel()])
         count, axes = len(balls), places.depends_on
         kernel = source_of(ball_cost, AT=places.numbers, BALLS=count, PLACES=3 * count, AXES=axes)
         return Term(

@@ -1,7 +1,7 @@
 """Obstacles as primitives, and the world of them; `kernels/signed_distance.py` has the distance to each."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -28,6 +28,8 @@ class Obstacle:
         capsules and cylinders lie along their local z.
       size: (3,) in metres: sphere (radius, 0, 0); capsule and cylinder (radius, half length, 0), the latter infinite if
         the half length is; box half lengths; plane (0, 0, 0).
+      velocity: (3,) in m/s, of an obstacle that moves straight on: `position` is where it is at the time 0. Plans take
+        it into account; the scene that MuJoCo simulates is another matter, and stands still.
     """
 
     name: str
@@ -35,6 +37,7 @@ class Obstacle:
     position: Array
     rotation: Array
     size: Array
+    velocity: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         check_text("obstacle: name", self.name, "a name", at_most=1000)
@@ -49,6 +52,7 @@ class Obstacle:
         if (size[:used] <= 0).any():
             raise InputError(f"obstacle {self.name!r}: size: got {size[:used].tolist()}, want lengths above 0")
         object.__setattr__(self, "size", size)
+        object.__setattr__(self, "velocity", check_array(f"obstacle {self.name!r}: velocity", self.velocity, (3,)))
 
     @property
     def row(self) -> Array:
@@ -76,6 +80,34 @@ class World:
     def table(self) -> Array:
         """The obstacles as numbers, (len(self), ROW)."""
         return np.array([obstacle.row for obstacle in self.obstacles]).reshape(len(self), ROW)
+
+    @cached_property
+    def moving(self) -> bool:
+        """Whether an obstacle of it moves."""
+        return any(obstacle.velocity.any() for obstacle in self.obstacles)
+
+    def displacements(self, times: npt.ArrayLike) -> Array:
+        """How far each obstacle has moved by some times (K,) in s, (K, len(self), 3) in metres."""
+        velocities = np.array([obstacle.velocity for obstacle in self.obstacles]).reshape(len(self), 3)
+        return np.multiply.outer(check_array("times", times, (None,)), velocities)
+
+    def tables(self, times: npt.ArrayLike) -> Array:
+        """The obstacles as numbers at some times (K,) in s, (K, len(self), ROW); only once where none moves."""
+        if not self.moving:
+            return self.table[None]
+        moved = self.displacements(times)
+        tables = np.repeat(self.table[None], len(moved), axis=0)
+        tables[:, :, 1:4] += moved
+        return tables
+
+    def moved(self, seconds: float) -> "World":
+        """The world as it is so much later, or earlier: each obstacle has gone on at its velocity.
+
+        An obstacle that is seen at the time t of a run belongs into its problem as `ls.World([seen]).moved(-t)`.
+        """
+        seconds = check_number("seconds", seconds)
+        moved = [replace(one, position=one.position + seconds * one.velocity) for one in self.obstacles]
+        return World(moved) if self.moving else self
 
     def seen_by(self, plane: str, offset: float | None = None) -> "World":
         """The world of a robot whose position is in that plane, in the plane's coordinates: see `Coordinates`.
@@ -112,7 +144,12 @@ class World:
         origin[across] = 0.0 if offset is None else offset
         return World(
             [
-                replace(obstacle, position=turn @ (obstacle.position - origin), rotation=turn @ obstacle.rotation)
+                replace(
+                    obstacle,
+                    position=turn @ (obstacle.position - origin),
+                    rotation=turn @ obstacle.rotation,
+                    velocity=turn @ obstacle.velocity,
+                )
                 for obstacle in seen
                 if not _parallel(obstacle, across)
             ]
