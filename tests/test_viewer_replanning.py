@@ -115,7 +115,7 @@ def test_the_caption_tells_solves_and_the_law(moved: Run) -> None:
     """Of the last frame: what the planner's own records say, and the law that begins at a multiple of 0.2 s."""
     (planner,) = moved.planners
     _, law, solves, *_ = moved.captions[-1].splitlines()
-    known = planner.records[:-1]  # the last answer came after the last frame
+    known = planner.account.records[:-1]  # the last answer came after the last frame
     took, used = [1e3 * one.seconds for one in known], sum(one.used for one in known)
     assert len(took) == 450 // 6 - 1
     begins = f"solve {took[-1]:.1f} ms, median {np.median(took):.1f} ms; {used} used"

@@ -142,7 +142,7 @@ class OffsetFree(Controller):
             got = f"{every:g} with a latency of {late[0]} and a delay of {late[1]} periods"
             raise InputError(f"OffsetFree: replan_every: got {got}, want None, or an uncertainty without both")
         problem = replace(self.problem, dynamics=self.model.dynamics)
-        return Replanner("OffsetFree", problem, self.solution, every, name="replan_every")
+        return Replanner("OffsetFree", problem, self.solution, every, name="replan_every", deadline=0.0)
 
     def _weights(self, tolerate: PerEntry | None, effort: Array, at_end: float) -> Weights:
         """Of the tolerances, or of those that are chosen."""

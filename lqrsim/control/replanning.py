@@ -74,19 +74,10 @@ class Replanning(Controller):
             raise InputError(f'{who}: computing: got {excerpt(computing)}, want seconds, a function or "{MEASURED}"')
         elif not isinstance(computing, str):
             computing = check_number(f"{who}: computing", computing, at_least=0.0)
-        period = float(getattr(problem, "dt", 0.0))
-        by_default = computing if isinstance(computing, float) else period
-        deadline = by_default if deadline is None else deadline
+        if deadline is None and isinstance(computing, float):
+            deadline = computing
         check_function(f"{who}: changes", changes, "a function of the time and the problem", arguments=2)
-        self._replanner = Replanner(
-            who,
-            problem,
-            solution,
-            every,
-            deadline=deadline,
-            horizon=horizon,
-            predict=predict,
-        )
+        self._replanner = Replanner(who, problem, solution, every, deadline=deadline, horizon=horizon, predict=predict)
         self.problem, self.solution = problem, solution
         self.every, self.deadline, self.horizon = self._replanner.every, self._replanner.deadline, horizon
         self.computing, self.changes, self.seed = computing, changes, check_count(f"{who}: seed", seed, at_least=0)
@@ -159,11 +150,7 @@ class Replanning(Controller):
 
     def summary(self) -> str:
         """How often it solved in the last run, and why where it kept the law before, in a line."""
-        line = self._replanner.account.summary()
-        if self.computing == MEASURED and self.records:
-            took = 1e3 * np.array([one.seconds for one in self.records])
-            line += f"; a solve took {np.median(took):.1f} ms in the median and {took.max():.1f} ms at most"
-        return line
+        return self._replanner.account.summary(times=self.computing == MEASURED)
 
     @property
     def digest(self) -> str:
