@@ -228,7 +228,7 @@ def test_dask_does_the_same(reference: Results, tmp_path: Path) -> None:
 
 
 @LINUX
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.long), signal.SIGKILL])
 def test_a_lost_scheduler_is_one_line_and_what_is_done_stays(
     reference: Results, tmp_path: Path, number: int, capfd: pytest.CaptureFixture[str]
 ) -> None:

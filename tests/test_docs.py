@@ -91,6 +91,7 @@ def test_a_robot_scene_cost_and_disturbance_of_ones_own(
         assert ls.render(rollout, tmp_path / "rink.mp4", size=(320, 240), fps=5).stat().st_size > 1000
 
 
+@pytest.mark.long
 def test_one_system_at_three_levels() -> None:
     names = run_page("stating_a_system.md")
     assert names["solution"].status is names["same"].status is ls.Status.CONVERGED

@@ -217,6 +217,7 @@ def test_the_best_plans_cost_what_is_said_of_them(quality: ModuleType) -> None:
         assert quality.peers.cost_of(problem, controls) == pytest.approx(cost, rel=1e-12)
 
 
+@pytest.mark.long
 def test_benchmark_of_quality_says_what_it_skips(quality: ModuleType, tmp_path: Path) -> None:
     config = quality.Config(
         quick=True, queries=1, sections=("starts",), peers=False, reference=tmp_path, seeds=(7,)

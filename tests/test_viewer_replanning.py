@@ -318,6 +318,7 @@ def arm_problem(arm: PlanarArm) -> ls.Problem:
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_robot_without_a_position_plans_again(tmp_path: Path) -> None:
     """It has no goal to move, and Enter leaves the robot selected; its last ball is drawn where the new plan has it."""
     arm = PlanarArm()
