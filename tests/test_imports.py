@@ -27,6 +27,7 @@ FLOORS = (
     ("scenarios",),
     ("stress",),
     ("view",),
+    ("gym",),
     ("verify",),
     ("reports",),
     ("commands",),
@@ -67,6 +68,7 @@ ALLOWED = {
     "distributed": ("stress",),
     "jinja2": ("reports",),
     "tqdm": ("commands",),
+    "gymnasium": ("gym",),
 }
 
 MODULES = {

@@ -52,6 +52,18 @@ def costs_of(count, steps, plans, model, costs):
         costs[k] += final_value(plans.states[(k + 1) * (steps + 1) - 1], last, steps, model.final)
 
 
+def stage_costs_of(count, t, plans, model, costs):
+    """Stage costs of step t: states (count, N), controls (count, M)."""
+    for k in range(count):
+        costs[k] = stage_value(plans.states[k], plans.controls[k], t, model.stage)
+
+
+def final_costs_of(count, steps, plans, model, costs):
+    """Final costs of trajectories of so many steps that end with these states (count, N) and controls (count, M)."""
+    for k in range(count):
+        costs[k] = final_value(plans.states[k], plans.controls[k], steps, model.final)
+
+
 def differential_pass(steps, plan, model, damping, keep, policy, to_go):
     """The backward pass of iLQR about a feasible trajectory; the policy is relative to it, the cost-to-go is about the
     origin.
