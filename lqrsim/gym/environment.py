@@ -1,7 +1,7 @@
 """One scenario as an environment of Gymnasium."""
 
 import os
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -18,7 +18,7 @@ from lqrsim.view.live_picture import LivePicture
 RENDER_MODES = ("rgb_array",)
 
 
-class Environment(gymnasium.Env[Array, Array]):
+class Environment(gymnasium.Env[Any, Any]):
     """The closed loop of `simulate` with an agent in place of the policy.
 
     An observation is the state that is measured, (n,), angles in the representative nearest the plan, followed by the
@@ -51,7 +51,10 @@ class Environment(gymnasium.Env[Array, Array]):
       InputError: no such scenario, disturbance, camera or mode; or a control without limits.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 30}
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as its base class has it
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 30,
+    }
 
     def __init__(
         self,
@@ -72,7 +75,7 @@ class Environment(gymnasium.Env[Array, Array]):
         self._picture = LivePicture(camera, size)
         self.action_space, self.observation_space = self.task.action_space(), self.task.observation_space()
         fps = max(round(1 / self.task.scenario.problem.dt), 1)
-        self.metadata = {**type(self).metadata, "render_fps": fps}  # pyright: ignore[reportAttributeAccessIssue]
+        self.metadata = {**type(self).metadata, "render_fps": fps}
         self._seed: int | None = None
         self._following = 0
         self._episode: Episode | None = None
@@ -90,6 +93,7 @@ class Environment(gymnasium.Env[Array, Array]):
             self._seed, self._following = seed, 0
         elif self._seed is None:
             self._seed = int(self.np_random.integers(2**63))
+        assert self._seed is not None
         trials = self.task.trials(self._seed, self._following, options)
         self._episode = Episode(self.task, trials, 1, frames=True, threads=1)
         self._following = trials.first + 1

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim.control import law
 from lqrsim.control.controllers import Control, Controller
@@ -20,7 +19,8 @@ class Commanded(Controller):
     """What is commanded from outside: `commands` (K, m), set before each control period."""
 
     def __init__(self, spaces: tuple[Coordinates, Coordinates]) -> None:
-        self._spaces, self.commands = spaces, np.zeros((0, len(spaces[1])))
+        self._spaces = spaces
+        self.commands: Array = np.zeros((0, len(spaces[1])))
 
     def start(self, trials: int) -> Control:
         return lambda step, shown: self.commands
@@ -116,7 +116,9 @@ class Episode:
         self._last[running] = self._observe(lost)[running]
         self.ended |= now
         if now.any():
-            self.outcomes[now] = np.array(self.rollout().outcome, dtype=object)[now]
+            first = loop.collisions.at <= loop.records.time_of(loop.records.lost_since)
+            early = np.where(collided & first, "collided", "diverged").astype(object)
+            self.outcomes[now] = (np.array(self.rollout().outcome, dtype=object) if over else early)[now]
         return Moment(self.observations, rewards, *self._ended_at.copy())
 
     def rollout(self) -> Rollout:
@@ -131,7 +133,7 @@ class Episode:
             seen[lost, :-1] = self._last[lost, :-1]
         return seen
 
-    def _near_plan(self, states: npt.NDArray[np.float64]) -> Array:
+    def _near_plan(self, states: Array) -> Array:
         near = np.array(states, order="C")[None]
         law.turn_to_nearest(self._loop.settings.states, near, self._plan.states[self._loop.step][None])
         return near[0]

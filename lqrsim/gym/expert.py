@@ -45,6 +45,7 @@ class Expert:
         if not ((rows[:, -1] >= 0) & (rows[:, -1] <= 1)).all():
             raise InputError(f"observation: got {excerpt(rows[:, -1])} for the time, want a share of the horizon")
         step = round(float(rows[:, -1].max()) * self._steps)
-        if step == 0 or self._control is None:
-            self._control = self._law.start(len(rows))
-        return self._task.actions_of(self._control(step, rows[:, :-1])).reshape(*seen.shape[:-1], -1)
+        control = self._control
+        if step == 0 or control is None:
+            control = self._control = self._law.start(len(rows))
+        return self._task.actions_of(control(step, rows[:, :-1])).reshape(*seen.shape[:-1], -1)

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from typing import Any, ClassVar, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 
 
-class VectorEnvironment(VectorEnv[Array, Array, Array]):
+class VectorEnvironment(VectorEnv[Array, Array, Any]):
     """K trials of one scenario at once: `Environment` says what actions, observations and rewards are.
 
     All begin together and have the same horizon. One that has ended stands still: its observation and its flags stay
@@ -36,7 +36,7 @@ class VectorEnvironment(VectorEnv[Array, Array, Array]):
       InputError: as `Environment` does.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.DISABLED}
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012 - as its base class has it
 
     def __init__(
         self,
@@ -80,6 +80,7 @@ class VectorEnvironment(VectorEnv[Array, Array, Array]):
             self._seed, self._following = seed, 0
         elif self._seed is None:
             self._seed = int(self.np_random.integers(2**63))
+        assert self._seed is not None
         trials = self.task.trials(self._seed, self._following, options)
         self._episode = Episode(self.task, trials, self.num_envs, frames=self._frames, threads=self._threads)
         self._following = trials.first + self.num_envs
