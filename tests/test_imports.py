@@ -24,7 +24,7 @@ FLOORS = (
     ("solvers",),
     ("control",),
     ("simulation",),
-    ("scenarios",),
+    ("scenarios", "templates"),
     ("stress",),
     ("view",),
     ("gym",),
