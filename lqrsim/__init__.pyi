@@ -37,6 +37,7 @@ from .problem.derivative_check import DerivativeCheck as DerivativeCheck
 from .problem.derivative_check import check_derivatives as check_derivatives
 from .problem.dynamics import Dynamics as Dynamics
 from .problem.linear_quadratic import Stage as Stage
+from .problem.noise import Noise as Noise
 from .problem.problem import FixedState as FixedState
 from .problem.problem import Problem as Problem
 from .reports.page import report as report

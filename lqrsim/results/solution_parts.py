@@ -70,6 +70,7 @@ class Status(enum.StrEnum):
     DIVERGED = "diverged"
     NOT_FINITE = "not finite"
     NOT_POSITIVE_DEFINITE = "not positive definite"
+    RISK_TOO_HIGH = "risk too high"
     NOT_CERTIFIED = "not certified"
 
     @property
@@ -120,6 +121,10 @@ _STATUS_TEXT = {
     Status.NOT_POSITIVE_DEFINITE: (
         "a matrix that must be inverted was not positive definite",
         "raise the control weight, start with an InitialPrior, shorten dt, or try the other solver",
+    ),
+    Status.RISK_TOO_HIGH: (
+        "the expectation of exp(risk * cost) does not exist: the noise is too strong for so much risk aversion",
+        "lower the risk, below the largest that is named; or the noise, or the costs' weights, all alike",
     ),
     Status.NOT_CERTIFIED: (
         "the method converged, but its plan, checked against the problem, is not what it claims",
