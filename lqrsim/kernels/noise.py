@@ -20,7 +20,19 @@ left out. The matrices here are compact: the rows of M that are not zero everywh
 
 from math import inf, log1p, sqrt
 
-from lqrsim.kernels.declarations import N, W, noise_slopes, noise_values, stack
+from lqrsim.kernels.declarations import (
+    M,
+    N,
+    W,
+    final_value,
+    initial_value,
+    noise_slopes,
+    noise_values,
+    stack,
+    stage_value,
+)
+from lqrsim.kernels.linear_algebra import affine, within
+from lqrsim.kernels.runge_kutta import advance
 
 ROWS = (0,)  # the states that noise acts on at once
 COUNT = 1  # how many these are
@@ -77,6 +89,27 @@ def noise_quadratic(x, u, model, ahead, convex, stage):
     slope_ahead(ahead, slope)
     add_risk(theta, ahead, mixed, slopes, slope, convex, stage)
     return total + 0.5 * theta * square_along(mixed, slope)
+
+
+def noisy_costs(count, steps, start, policy, model, draws, costs):
+    """What runs of a policy from a state cost, the noise drawn: draws (count steps, SIZE), run by run."""
+    x, u, ahead, values = stack(N), stack(M), stack(N), stack(COUNT, SIZE)
+    for run in range(count):
+        for i in range(N):
+            x[i] = start[i]
+        total = initial_value(x, u, 0, model.initial)
+        for t in range(steps):
+            affine(policy.gain[t], policy.offset[t], x, u)
+            within(u, model.limits)
+            total += stage_value(x, u, t, model.stage)
+            advance(x, u, model.parameters, model.dt, ahead)
+            noise_values(x, u, model.noise[0], values)
+            for i in range(COUNT):
+                for k in range(SIZE):
+                    ahead[ROWS[i]] += values[i, k] * draws[run * steps + t, k]
+            for i in range(N):
+                x[i] = ahead[i]
+        costs[run] = total + final_value(x, u, steps, model.final)
 
 
 def weigh(S, values, weighed):
