@@ -112,6 +112,7 @@ from .solvers.initial_guess import InitialPrior as InitialPrior
 from .solvers.linear_quadratic import smooth_lq as smooth_lq
 from .solvers.prepared import PreparedSolver as PreparedSolver
 from .solvers.prepared import prepare as prepare
+from .solvers.risk import largest_risk as largest_risk
 from .solvers.sampling import sample_costs as sample_costs
 from .solvers.smoother import smooth as smooth
 from .solvers.smoother import smooth_many as smooth_many

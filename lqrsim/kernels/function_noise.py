@@ -1,6 +1,6 @@
 """Noise that is a user's own function, called at its address. The numba subset; see `noise.py`.
 
-`data` has the address of the function, the strength, then the parameters.
+`data` has the address of the function, the parameters, then the strength.
 """
 
 from math import nan
@@ -8,6 +8,7 @@ from math import nan
 from lqrsim.kernels.declarations import N, invoke, stack
 
 SIZE = 1  # columns of M
+STRENGTH = 1  # where the strength is
 
 
 def noise_values(x, u, data, out):
@@ -19,4 +20,4 @@ def noise_values(x, u, data, out):
     invoke(data[0], x, u, data, given)
     for i in range(N):
         for k in range(SIZE):
-            out[i, k] = data[1] * given[i, k]
+            out[i, k] = data[STRENGTH] * given[i, k]

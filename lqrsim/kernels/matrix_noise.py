@@ -1,6 +1,6 @@
 """Noise whose matrix is always the same. The numba subset; see `noise.py`.
 
-`data` has the strength, then the matrix, row by row.
+`data` has the matrix, row by row, then the strength.
 """
 
 COUNT = 1  # rows
@@ -11,7 +11,7 @@ def noise_values(x, u, data, out):
     """Write the matrix."""
     for i in range(COUNT):
         for k in range(SIZE):
-            out[i, k] = data[0] * data[1 + SIZE * i + k]
+            out[i, k] = data[COUNT * SIZE] * data[SIZE * i + k]
 
 
 def noise_slopes(x, u, data, out, slopes):

@@ -27,8 +27,7 @@ def check_functions(problem: Problem, x: Array, u: Array) -> None:
     parts = (problem.dynamics, *(term for _, term in _terms(problem)), *problem.constraint_terms, *_noise(problem))
     for part in parts:
         for function in part.functions:
-            values = part.data[1:] if isinstance(part, NoiseTerm) else part.data  # the first is the strength
-            parameters = dict(zip(function.parameters, values.tolist(), strict=False))
+            parameters = dict(zip(function.parameters, part.data.tolist(), strict=False))
             values = function.call(x, u, parameters)
             for i, name in function.unused:
                 z = np.concatenate([x, u])

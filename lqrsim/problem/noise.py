@@ -48,7 +48,7 @@ class NoiseTerm:
     Attributes:
       source: defines `noise_values(x, u, data, out)` and `noise_slopes(x, u, data, out, slopes)`; see
         `kernels/declarations.py`.
-      data: (any,) the strength, then the parameters or the matrix.
+      data: (any,) the parameters or the matrix, then the strength.
       rows: the states that noise acts on at once. size: of w.
       active: the entries of (x, u), states before controls, that M depends on.
       functions: what the source calls with `invoke`; their addresses come first in the data that it is given.
@@ -167,12 +167,12 @@ class Noise:
         """The noise for a system. Raises InputError if it does not fit."""
         check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-        numbers = np.array([self.strength, *self.parameters.values()])
+        numbers = np.array([*self.parameters.values(), self.strength])
         if self.matrix is not None:
             if len(self.matrix) != n:
                 raise InputError(f"Noise: function: got a matrix of {len(self.matrix)} rows, want {n}, one a state")
             source = source_of(matrix_noise, COUNT=n, SIZE=self.size)
-            return NoiseTerm(source, np.append(numbers, self.matrix.ravel()), tuple(range(n)), self.size, ())
+            return NoiseTerm(source, np.append(self.matrix.ravel(), numbers), tuple(range(n)), self.size, ())
         if self.level != "symbolic":
             return self._bind_function(dynamics, numbers)
         details = ("noise", n, m, self.size, tuple(self.parameters))
@@ -184,11 +184,10 @@ class Noise:
         def listed(x: Any, u: Any, p: Any) -> list[Any]:
             return [entry for row in self._rows(self.function(x, u, p), n) for entry in row]
 
-        # The strength is p0, and no name that a function could use.
-        entries, x, u = symbolic.trace(listed, n, m, ["0", *self.parameters])
+        entries, x, u = symbolic.trace(listed, n, m, list(self.parameters))
         import sympy
 
-        strength = sympy.Symbol("p0", real=True)
+        strength = sympy.Symbol(f"p{len(self.parameters)}", real=True)  # after the parameters, and without a name
         table = [[strength * entry for entry in entries[i * self.size : (i + 1) * self.size]] for i in range(n)]
         rows = [i for i, row in enumerate(table) if any(entry != 0 for entry in row)] or [0]
         z = [*x, *u]
@@ -232,11 +231,11 @@ class Noise:
         active = tuple(sorted({names.index(check_name("Noise: depends_on", name, names)) for name in wanted}))
         n, m = len(states), len(controls)
         function = UserFunction(
-            function=self.function, level=self.level, states=n, controls=m, parameters=tuple(self.parameters), offset=2,
+            function=self.function, level=self.level, states=n, controls=m, parameters=tuple(self.parameters), offset=1,
             values=n * self.size, entries=states, columns=self.size,
             unused=tuple((i, name) for i, name in enumerate(names) if i not in active),
         )  # fmt: skip
-        source = source_of(function_noise, SIZE=self.size)
+        source = source_of(function_noise, SIZE=self.size, STRENGTH=1 + len(self.parameters))
         source += "\n\n" + source_of(noise_differences, SIZE=self.size, ACTIVE=active, SOME=len(active))
         return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, (function,))
 

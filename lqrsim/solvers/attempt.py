@@ -158,6 +158,18 @@ class Attempt:
         self._loop(*self._damped_arguments(0, 0, log, 1, trial))
         return float(log["optimality"][0])
 
+    def fails_at(self, risk: float) -> int:
+        """The step at which a pass about the plan in the memory fails with another risk, or -1; with noise only.
+
+        The arrays of the passes are written over.
+        """
+        work, log = self.work, np.full(1, np.nan, LOG)
+        trial, own = Plan(np.zeros_like(work.states), np.zeros_like(work.controls)), self.problem.risk
+        work.model.noise[1][0] = risk
+        *_, failed = self._loop(*self._damped_arguments(0, 0, log, 1, trial))
+        work.model.noise[1][0] = own
+        return failed
+
     def rescue(self, found: AttemptResult, *, each: bool, callback: Callback | None = None) -> AttemptResult:
         """The safeguard: iterations from the best plan so far."""
         work, detail = self.work, f"the undamped method failed ({found.detail or found.status.meaning})"

@@ -29,6 +29,7 @@ from lqrsim.solvers.common import (
     solve_all,
 )
 from lqrsim.solvers.initial_guess import InitialPrior, StartLike, resolve
+from lqrsim.solvers.risk import named
 
 
 def ilqr(
@@ -168,6 +169,13 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     )  # fmt: skip
     if wrong:
         status, detail = Status.NOT_CERTIFIED, f"of the plan that converged: {wrong}"
+    if status is Status.RISK_TOO_HIGH:
+
+        def fails(risk: float) -> int:
+            model.noise[1][0] = risk
+            return loop(declarations.ITERATE, 1, 1, options, model, work, log)[3]
+
+        detail = "; ".join(part for part in (named(fails, problem.risk, steps), detail) if part)
     solution = assemble(
         problem, solver="ilqr", options=settings.options(initial_guess), status=status, detail=detail,
         iterations=termination.iterations, states=states, controls=controls, law=(policy.gain, offset),

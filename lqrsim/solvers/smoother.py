@@ -9,6 +9,7 @@ from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Status
 from lqrsim.solvers.assembly import assemble
 from lqrsim.solvers.attempt import Attempt
 from lqrsim.solvers.common import (
@@ -24,6 +25,7 @@ from lqrsim.solvers.common import (
 )
 from lqrsim.solvers.initial_guess import StartLike, resolve
 from lqrsim.solvers.multistart import STARTS, Search, check_starts, guides
+from lqrsim.solvers.risk import name_risk
 
 
 def smooth(
@@ -177,9 +179,10 @@ def _solve(
             search.widen(problem, settings, start, stop, threads)
         chosen, found = search.best
     assert found.certificate is not None
+    detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
     solution = assemble(
         problem, solver="smooth", options=settings.options(chosen.initial_guess), status=found.status,
-        detail=found.detail, iterations=found.iterations, states=found.states, controls=found.controls,
+        detail=detail, iterations=found.iterations, states=found.states, controls=found.controls,
         law=found.law,
         certificate=found.certificate, gap=found.gap, candidates=search.candidates(), multipliers=found.multipliers,
         **found.values,

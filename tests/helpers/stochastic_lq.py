@@ -47,9 +47,7 @@ def linear(x: Any, u: Any, p: Any) -> list[Any]:
 
 def affine(x: Any, u: Any, p: Any) -> list[list[Any]]:
     z = [*x, *u, 1]
-    return [
-        [sum(getattr(p, f"m{k}{i}{j}") * z[j] for j in range(len(z))) for k in range(SIZE)] for i in range(STATES)
-    ]
+    return [[sum(getattr(p, f"m{k}{i}{j}") * z[j] for j in range(len(z))) for k in range(SIZE)] for i in range(STATES)]
 
 
 def parameters_of_noise(numbers: Numbers) -> dict[str, float]:
