@@ -273,7 +273,7 @@ def test_a_run_meets_the_noise_that_it_was_planned_for(drive):
     """The same object: state kicked by M(x, u) w, to rounding, and the cost that is expected, in MuJoCo."""
     plant, problem, solution = drive
     assert solution.success
-    rollout = ls.simulate(plant, solution, disturbances=[SLIPPING], trials=200, seed=3, frames=False)
+    rollout = ls.simulate(plant, solution, disturbances=[SLIPPING], trials=100, seed=3, frames=False)
     assert rollout.disturbances == ("noise on the states, Noise(slipping(x, u, p), size=2)",)
     costs = costs_of(problem, rollout.states, rollout.applied)
     initial = solution.cost_to_come is not None and float(
@@ -283,11 +283,8 @@ def test_a_run_meets_the_noise_that_it_was_planned_for(drive):
     # The same bits, whatever runs beside it, and the stronger the noise the further off.
     alone = ls.simulate(plant, solution, disturbances=[SLIPPING], first_trial=7, seed=3, frames=False)
     np.testing.assert_array_equal(alone.states[0], rollout.states[7])
-    spread = [
-        ls.simulate(plant, solution, disturbances=[SLIPPING.scaled(k)], trials=50, seed=3).states.std(axis=0).max()
-        for k in (0.5, 1.0)
-    ]
-    assert spread[1] == pytest.approx(2 * spread[0], rel=0.2)
+    weak = ls.simulate(plant, solution, disturbances=[SLIPPING.scaled(0.5)], trials=100, seed=3, frames=False)
+    assert weak.states.std(axis=0).max() == pytest.approx(0.5 * rollout.states.std(axis=0).max(), rel=0.1)
 
 
 @pytest.mark.parametrize("robot", ["quadrotor", "differential_drive"])
@@ -311,12 +308,12 @@ def test_a_kick_is_what_it_says(robot):
 def test_limits_and_constraints_under_noise(drive):
     """Plans keep both, as without noise."""
     plant, problem, _ = drive
-    clear = ls.Clearance(plant.world, radius=plant.robot.radius, margin=0.3)
-    limited = dataclasses.replace(problem, control_limits=(0.0, 0.45), constraints=[clear])
+    clear = ls.Clearance(plant.world, radius=plant.robot.radius, margin=0.15)
+    limited = dataclasses.replace(problem, control_limits=(0.0, 0.28), constraints=[clear])
     solution = ls.smooth(limited)
     assert solution.success
     assert solution.violation == 0
-    assert 0.0 <= solution.trajectory.controls.min() <= solution.trajectory.controls.max() <= 0.45
+    assert 0.0 <= solution.trajectory.controls.min() <= solution.trajectory.controls.max() <= 0.28
     assert solution.cost > ls.smooth(dataclasses.replace(limited, noise=None)).cost
 
 
