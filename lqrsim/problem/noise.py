@@ -240,7 +240,8 @@ class Noise:
         return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, (function,))
 
     def matrices(self, dynamics: Dynamics, states: npt.ArrayLike, controls: npt.ArrayLike) -> Array:
-        """M (K, n, k) at states (K, n) and controls (K, m)."""
+        """M (K, n, k) at states (K, n) and controls (K, m). Raises InputError if they do not fit."""
+        check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         x = check_array("states", states, (None, n), infinite=True)
         u = check_array("controls", controls, (len(x), m), infinite=True)

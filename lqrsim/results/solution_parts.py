@@ -124,7 +124,7 @@ _STATUS_TEXT = {
     ),
     Status.RISK_TOO_HIGH: (
         "the expectation of exp(risk * cost) does not exist: the noise is too strong for so much risk aversion",
-        "lower the risk, below the largest that is named; or the noise, or the costs' weights, all alike",
+        "lower the risk, below the largest that is named, or the noise; or begin with start=solution of a lower risk",
     ),
     Status.NOT_CERTIFIED: (
         "the method converged, but its plan, checked against the problem, is not what it claims",
