@@ -326,3 +326,27 @@ def test_solved_again_on_the_way_under_noise(drive):
     assert replan.status.success
     assert replan.cost <= replan.before * (1 + 1e-9)
     np.testing.assert_allclose(replan.trajectory.states, solution.trajectory.states[1:], atol=1e-2)
+
+
+@pytest.mark.parametrize("share", [-2.0, 0.5, 0.9])
+def test_risk_averse_tracking(share):
+    """About a plan that stays at zero the law is LEQG's; and what is said of a risk that is too high is so."""
+    numbers = draw(np.random.default_rng(8), multiplicative=0.0)
+    zero = np.zeros(STATES)
+    tolerate, effort = np.array([0.5, 1.0, 2.0]), np.array([0.7, 1.5])
+    numbers = numbers._replace(
+        f=zero, start=zero, goal=zero, state_weight=np.diag(tolerate**-2), control_weight=np.diag(effort**-2),
+        end_weight=np.diag((0.3 * tolerate) ** -2),
+    )  # fmt: skip
+    problem = problem_of(numbers, noise=ls.Noise(numbers.e.T))
+    solution = ls.smooth(problem)
+    assert np.abs(solution.trajectory.states).max() < 1e-12
+    asked: dict[str, Any] = {"tolerate": tolerate.tolist(), "effort": effort.tolist(), "at_end": 0.3}
+    with pytest.raises(InputError, match=r"^track: risk: got 1000, want at most .*: with more there is no") as caught:
+        ls.track(problem, solution, **asked, risk=1000.0)
+    most = float(str(caught.value).split("at most ")[1].split(":")[0])
+    assert most == pytest.approx(ls.largest_risk(problem, solution), rel=1e-4)
+    law = ls.track(problem, solution, **asked, risk=share * most)
+    assert off(law.gain, riccati(numbers, problem, risk=share * most).gain) < 1e-9
+    with pytest.raises(InputError, match=r"^track: risk: got 1 and a problem without noise, want noise=Noise"):
+        ls.track(dataclasses.replace(problem, noise=None), solution, **asked, risk=1.0)
