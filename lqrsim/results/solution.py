@@ -53,7 +53,7 @@ class Solution:
       iterations: the log.
       clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,);
         None where the problem has no obstacles.
-      solver, options: what was called, with which settings.
+      solver, options: what was called, with which settings; with noise, that in words, and the risk.
       certificate: what the plan is, recomputed from the problem; cost, violation and optimality are read from it.
       gap: of the plan; see `Iteration.gap`. NaN if there is none.
       problem_digest: hash of everything that defined the problem.
@@ -148,7 +148,10 @@ class Solution:
 
     @property
     def cost(self) -> float:
-        """True cost of the plan, start and end included."""
+        """True cost of the plan, start and end included; with noise what runs of the policy are expected to cost.
+
+        With a risk it is (1/risk) log E exp(risk cost) of them. Either is worked out to second order about the plan.
+        """
         return self.certificate.cost
 
     @property
@@ -227,6 +230,13 @@ class Solution:
         if self.status.remedy:
             lines.append(f"  remedy:    {self.status.remedy}")
         lines.append(f"  cost:      {self.cost:.9g}   gap: {self.gap:.1e}   optimality: {self.optimality:.1e}")
+        if "noise" in self.options:
+            meant = f"log E exp(risk cost) / risk, risk {self.options.get('risk')}"
+            if self.cost_to_go is None:
+                meant = "that without noise: there is no cost-to-go to weigh it with"
+            elif not self.options.get("risk"):
+                meant = "an expectation"
+            lines.append(f"  noise:     {self.options['noise']}; the cost is {meant}")
         if self.clearance is not None:
             knot = int(np.argmin(self.clearance))
             verdict = "collides" if self.clearance[knot] < 0 else "clear"

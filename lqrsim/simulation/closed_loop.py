@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from lqrsim.control.controllers import Controller
 from lqrsim.errors import Array, InputError, check_function, excerpt, told
+from lqrsim.problem.noise import Noise
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenes.scene import unlogged
@@ -30,7 +31,7 @@ def simulate(
     plant: Plant,
     solution: Solution,
     *,
-    disturbances: Sequence[Disturbance] = (),
+    disturbances: Sequence[Disturbance | Noise] = (),
     controller: Controller | None = None,
     seed: int = 0,
     trials: int = 1,
@@ -46,7 +47,8 @@ def simulate(
 ) -> Rollout:
     """Execute the solution's policy closed-loop in MuJoCo, from the first state of its plan.
 
-    In each control period: read the true state, measure it, ask the policy, disturb its command, saturate, push, step.
+    In each control period: read the true state, measure it, ask the policy, disturb its command, saturate, push, step,
+    kick.
 
     A trial ends with the first collision, as `collisions.py` defines it, when it becomes unstable, when the filter of
     its controller diverges, or when the controller fails: raises an exception, which ends all the trials that it was
@@ -54,7 +56,8 @@ def simulate(
     others it is NaN.
 
     Args:
-      disturbances: what goes wrong, in the order in which it happens. Each has its own stream of random numbers.
+      disturbances: what goes wrong, in the order in which it happens. Each has its own stream of random numbers. A
+        `Noise`, as problems are stated with, is one, too.
       controller: what decides on the controls; by default the solution's policy.
       seed: of all random numbers. trials: how many runs. first_trial: number of the first; trial `i` of a seed is the
         same to the last bit whatever runs beside it.
@@ -166,11 +169,15 @@ class Loop:
     def advance(self, step: int, controls: Array, wrench: Array) -> None:
         """Take the physics to the next knot; obstacles stop who collides, from this period on."""
         physics, over = self.physics, self.records.over(step)
-        period = physics.advance(controls, wrench)
+        period, kick = physics.advance(controls, wrench), self.effects.kick(step, self.states, controls)
+        if kick is not None:
+            physics.kick(period, kick)
         collided = self.collisions.detect(step, period, ignored=over)
         if self.settings.contacts:
             if len(collided):
                 physics.rerun_with_contacts(collided, period)
+                if kick is not None:
+                    physics.kick(period, kick, collided)
                 self.collisions.relocate(period.states[-1])
             self.records.contacts += physics.touched(period) & ~over
         self.states = period.states[-1]

@@ -261,6 +261,21 @@ class Search:
             other = found.rank < best.rank and (not best.success or found.cost < best.cost - 1e-3 * abs(best.cost))
             self._finished.insert(0 if other else len(self._finished), (attempt, found))
 
+    def calm(self, problem: Problem, settings: SmootherSettings, start: Array, stop: Stop) -> None:
+        """Where the risk is too high on the way: the plan without a risk, from which it may be not."""
+        chosen = self.best[0]
+        without = Attempt(dataclasses.replace(problem, risk=0.0), settings, chosen.initial_guess, start, stop)
+        calm = finish(without, each=self._each)
+        if not calm.success or stop.due:
+            return
+        initial_guess = InitialGuess(
+            calm.law[0].copy(), calm.law[1].copy(), calm.values["cost_to_go"], None, "the plan without a risk",
+            multipliers=calm.multipliers,
+        )  # fmt: skip
+        attempt = Attempt(problem, settings, initial_guess, start, stop)
+        self._named.append(("the plan without a risk", attempt))
+        self._finished.insert(0, (attempt, finish(attempt, each=self._each, callback=self._callback)))
+
     def candidates(self) -> tuple[Candidate, ...]:
         """What was tried, where it was more than one."""
         results = {id(attempt): found for attempt, found in self._finished}

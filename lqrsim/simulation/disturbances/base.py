@@ -22,6 +22,7 @@ from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.plant import Plant
 
 Hook = Callable[[int, Array], Array]
+Kick = Callable[[int, Array, Array], Array]
 Numbers = float | Sequence[float]
 
 
@@ -39,6 +40,8 @@ class Effect:
       actuate: (step, controls (K, m)) -> the controls on their way to the actuators, (K, m), which then saturate.
       force: (step, true states (K, n)) -> force at the robot's centre of mass in N, world axes, (K, 3).
       torque: (step, true states (K, n)) -> torque on the robot in N m, world axes, (K, 3).
+      kick: (step, true states (K, n), controls (K, m) as the actuators get them) -> by how much the states jump at the
+        end of the control period, (K, n).
       displaced: (K, obstacles, 3), by how much each of the plant's obstacles is away from where the scene has it, in m.
     """
 
@@ -48,6 +51,7 @@ class Effect:
     actuate: Hook | None = None
     force: Hook | None = None
     torque: Hook | None = None
+    kick: Kick | None = None
     displaced: Array | None = None
 
     def __post_init__(self) -> None:
@@ -56,6 +60,8 @@ class Effect:
         for name in ("measure", "actuate", "force", "torque"):
             wanted = "a function of the step and an array, or None"
             check_function(f"Effect: {name}", getattr(self, name), wanted, arguments=2)
+        wanted = "a function of the step, states and controls, or None"
+        check_function("Effect: kick", self.kick, wanted, arguments=3)
         if self.displaced is not None:
             displaced = shaped("Effect: displaced", self.displaced, (None, None, 3))
             object.__setattr__(self, "displaced", displaced)
