@@ -32,7 +32,7 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
 
     A `Clearance` with a margin of `missed` keeps the capsule itself clear.
 
-    Args:
+    Attributes:
       length: of its segment, without the round ends, in metres; 0 for a ball.
       radius: in metres, of the capsule and of each ball.
       tolerance: by how much the capsule may stick out of the balls, in metres, more than 0.

@@ -30,6 +30,15 @@ def run_page(name: str) -> dict[str, Any]:
     return namespace
 
 
+def test_getting_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_page("getting_started.md")
+    packaged = ls.scenarios.differential_drive().problem
+    assert names["problem"].digest == packaged.digest  # the page says that the scenario has this problem
+    assert names["rollout"].outcome == ("reached",) * 5
+    assert names["control"].shape == (2,)
+
+
 def test_a_robot_from_an_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names = run_page("mjcf_robots.md")

@@ -41,7 +41,8 @@ class Planner:
     the deadline. What is not ready then is not used, and the law before goes on. All is compiled before the first step.
 
     Args:
-      problem: that was solved. solution: its solution.
+      problem: that was solved.
+      solution: its solution.
       every: seconds between two solves, rounded to control periods.
       deadline: seconds until an answer comes into force, rounded up to control periods; by default one period.
       horizon: "moving", always as long as the first plan's, or "shrinking", to its end.
@@ -50,7 +51,8 @@ class Planner:
       clock: what time it is, in seconds, for deadlines; for tests.
 
     Attributes:
-      law: in force, with the step that it begins at. account: how the solves went, one record each.
+      law: in force, with the step that it begins at.
+      account: how the solves went, one record each.
 
     Raises:
       InputError: as `Replanning`.

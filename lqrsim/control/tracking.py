@@ -31,7 +31,8 @@ def track(
     drawn as any other.
 
     Args:
-      problem: that was solved. solution: its solution, or any with a plan of the same system.
+      problem: that was solved.
+      solution: its solution, or any with a plan of the same system.
       tolerate: how far each state may be off, by unit or name: {"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s": 0.2}. Only
         the ratios to one another and to `effort` matter. By default those under which the robot is least likely to fail
         under the uncertainty; see `tolerances.py`.

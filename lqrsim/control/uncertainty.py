@@ -104,9 +104,11 @@ class Uncertainty:
     Attributes:
       unknowns: parameters, winds, forces, actuators' gains and offsets.
       start: standard deviation of where a run begins, of each state.
-      control: of white noise on each control. measurement: of white noise on each state that is measured.
+      control: of white noise on each control.
+      measurement: of white noise on each state that is measured.
       lag: time constant in s with which the actuators follow their commands.
-      delay: control periods by which commands come late. latency: by which measurements do.
+      delay: control periods by which commands come late.
+      latency: by which measurements do.
       loss: share of the measurements that get lost.
       obstacles: standard deviation in m, along each of the world's axes, of where an obstacle is; planes stay.
       left_out: what was stated besides and no linear model has; for the record.

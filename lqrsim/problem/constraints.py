@@ -229,7 +229,8 @@ class StateBounds(Constraint):
     Nor at the end on a state that a GoalState fixes there, which may be at its bound.
 
     Args:
-      low, high: name of a state -> the least and the most it may be, in its unit.
+      low: name of a state -> its lower bound, in its unit.
+      high: name of a state -> its upper bound, in its unit.
     """
 
     def __init__(self, low: Mapping[str, float] | None = None, high: Mapping[str, float] | None = None) -> None:

@@ -170,9 +170,11 @@ class ObstacleCost(Cost):
 
     Args:
       world: the obstacles.
-      radius: of the robot at its position, in metres. balls: the robot in its place, as `robot.balls`; one of the two.
-        With balls the attribute `radius` is that of the largest.
-      sharpness: in 1/m. weight: cost of touching one obstacle, with one ball, for one step.
+      radius: of the robot at its position, in metres.
+      balls: the robot in its place, as `robot.balls`; one of the two. With balls the attribute `radius` is that of the
+        largest.
+      sharpness: in 1/m.
+      weight: cost of touching one obstacle, with one ball, for one step.
     """
 
     def __init__(

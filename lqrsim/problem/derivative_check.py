@@ -130,7 +130,8 @@ class DerivativeCheck:
     Attributes:
       what: which derivative: `df/dx of ...`, say.
       error: largest difference over entries and samples, relative to the entry and the differences' own rounding.
-      row, column: the names at that entry.
+      row: the name of the output at that entry.
+      column: the name of the input at that entry.
       stated, difference: the two values there. state (n,), control (m,): where that was.
       tolerance: what the error must not exceed.
     """
@@ -179,8 +180,10 @@ def check_derivatives(
 
     Args:
       subject: dynamics, looked at around zero, or a problem, around its start and nominal control.
-      samples: how many points. spread: their standard deviation, in the units of states and controls.
-      tolerance: of the error, relative to each entry. seed: of the points.
+      samples: how many points.
+      spread: their standard deviation, in the units of states and controls.
+      tolerance: of the error, relative to each entry.
+      seed: of the points.
 
     Returns:
       One check a matrix of derivatives, with the worst entry by row and column; print it. `check.good` is the verdict.

@@ -56,7 +56,8 @@ class Dynamics:
     Args:
       f: `f(x, u, p)`; returns one entry a state. x (n,) and u (m,) must not be changed; p has the parameters as
         attributes.
-      states, controls: name -> unit, in order.
+      states: name -> unit, in order; n of them.
+      controls: name -> unit, in order; m of them.
       parameters: name -> value. Values are data: changing one compiles nothing.
       disturbances: what is unknown when planning, as a wind or the share of its force that a motor has left: name ->
         the value that the plan takes for granted, mostly 0 or 1. To f they are parameters. Plans know them as constants
@@ -64,8 +65,9 @@ class Dynamics:
         knows: wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; in the world's axes.
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
         x, y and z, in this order.
-      plane, offset: in which plane a position of 2 states is, as "xz", and where that is along the third axis, in
-        metres: see `Coordinates`. By default the plane is that of the names, if they say two of x, y and z.
+      plane: in which plane a position of 2 states is, as "xz"; see `Coordinates`. By default that of the names, if they
+        are two of x, y and z.
+      offset: where the plane is along the third axis, in metres.
       angles: names of the states that are angles in radians, equal up to whole turns.
       rotation_vectors: names, by threes, of the states that are rotation vectors.
       control_limits: lowest and highest control, numbers or (m,); what the actuators can do, for execution.

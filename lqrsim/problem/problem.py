@@ -48,7 +48,8 @@ class Problem:
 
     Attributes:
       dynamics: whose Runge-Kutta step over `dt`, control held, is g.
-      dt: the control period in seconds. steps: T, the number of them.
+      dt: the control period in seconds.
+      steps: T, the number of them.
       initial: c_0, the cost of starting elsewhere than wished (the paper's soft start); or `FixedState(x)`.
       stage_cost: c, per step: it is *not* multiplied by dt.
       final_cost: c_T.

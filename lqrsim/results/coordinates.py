@@ -43,7 +43,8 @@ class Coordinates:
         `World.seen_by`.
       angles: indices of the entries that are angles in radians, equal up to whole turns.
       rotation_vectors: index of the first of each three entries that are a rotation vector, axis times angle in rad.
-      low, high: limits of each entry, (len(names),); infinite where there is none.
+      low: lower limit of each entry, (len(names),); -inf where there is none.
+      high: upper limit of each entry, (len(names),); inf where there is none.
     """
 
     names: tuple[str, ...]
@@ -184,7 +185,8 @@ class Coordinates:
         """The representative of `vector` nearest to `near`; angles and rotation vectors are equal up to whole turns.
 
         Args:
-          vector, near: (..., n); leading dimensions broadcast.
+          vector: (..., n).
+          near: (..., n); leading dimensions broadcast.
 
         Raises:
           InputError: not numbers of such shapes.

@@ -53,7 +53,8 @@ class Solution:
       iterations: the log.
       clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,);
         None where the problem has no obstacles.
-      solver, options: what was called, with which settings; with noise, that in words, and the risk.
+      solver: name of the function that was called.
+      options: its settings; with noise, that in words, and the risk.
       certificate: what the plan is, recomputed from the problem; cost, violation and optimality are read from it.
       gap: of the plan; see `Iteration.gap`. NaN if there is none.
       problem_digest: hash of everything that defined the problem.

@@ -55,7 +55,9 @@ class MjcfRobot(Robot):
       floors: whether level planes are for standing on.
 
     Attributes:
-      scene: what it moves in. dynamics: MuJoCo's steps. balls: its outline, or None for one ball of `radius`.
+      scene: what it moves in.
+      dynamics: MuJoCo's steps.
+      balls: its outline, or None for one ball of `radius`.
 
     Raises:
       InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not

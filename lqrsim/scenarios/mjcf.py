@@ -41,8 +41,11 @@ def mjcf(
       weights: of what misses the goal at the end: of all states, by name, or by unit, as {"m": 100, "rad": 100}; what
         is not named then has none.
       effort: of the controls, a number, by name or by unit; by default 1 for a control at its limit, or at 1.
-      dt: seconds of a control period, by default about 0.02. steps: how many.
-      body, floors: as in `MjcfRobot`. obstacles: whether to keep clear of them.
+      dt: seconds of a control period, by default about 0.02.
+      steps: how many.
+      body: as in `MjcfRobot`.
+      floors: as in `MjcfRobot`.
+      obstacles: whether to keep clear of them.
       parameters: other numbers of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
 
     Raises:

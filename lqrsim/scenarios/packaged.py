@@ -26,7 +26,8 @@ class Scenario:
     """A robot in a scene with something to do.
 
     Attributes:
-      name: what the command line calls it. summary: what it is, in a line.
+      name: what the command line calls it.
+      summary: what it is, in a line.
       problem: what to solve; ready to change with `dataclasses.replace(scenario.problem, ...)`.
       tracking_bound: how far in metres an undisturbed run may be from its plan, at any time.
       disturbances: what the demo's disturbed run meets: plain to see, and no more than the policy copes with.
@@ -129,7 +130,8 @@ def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
     """The quadrotor through a cage of twelve beams, from one edge to the antipode: Fig. 3.
 
     Args:
-      query, seed: which of the random starts and goals; see `quadrotor_queries`.
+      query: which of the random starts and goals, from 0; see `quadrotor_queries`.
+      seed: from which the starts and goals are drawn.
     """
     starts, goals = quadrotor_queries(check_count("query", query, at_least=0, at_most=999_999) + 1, seed=seed)
     robot, scene = Quadrotor(), load_scene("cage")

@@ -24,8 +24,9 @@ class Obstacle:
 
     Attributes:
       kind: one of `KINDS`.
-      position: (3,) in metres. rotation: (3, 3), whose columns are the local axes; a plane's free side is its local +z,
-        capsules and cylinders lie along their local z.
+      position: (3,) in metres.
+      rotation: (3, 3), whose columns are the local axes; a plane's free side is its local +z, capsules and cylinders
+        lie along their local z.
       size: (3,) in metres: sphere (radius, 0, 0); capsule and cylinder (radius, half length, 0), the latter infinite if
         the half length is; box half lengths; plane (0, 0, 0).
       velocity: (3,) in m/s, of an obstacle that moves straight on: `position` is where it is at the time 0. Plans take

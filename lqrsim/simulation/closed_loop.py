@@ -59,8 +59,9 @@ def simulate(
       disturbances: what goes wrong, in the order in which it happens. Each has its own stream of random numbers. A
         `Noise`, as problems are stated with, is one, too.
       controller: what decides on the controls; by default the solution's policy.
-      seed: of all random numbers. trials: how many runs. first_trial: number of the first; trial `i` of a seed is the
-        same to the last bit whatever runs beside it.
+      seed: of all random numbers.
+      trials: how many runs.
+      first_trial: number of the first; trial `i` of a seed is the same to the last bit whatever runs beside it.
       goal_radius: how near the goal counts as having reached it, in metres; by default the robot's radius.
       goal_tolerance: the same for goals without a position, relative to the plan's range; 0.1 by default.
         `results/goal.py` says of what.

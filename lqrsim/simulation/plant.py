@@ -27,14 +27,16 @@ class Plant:
     """A robot in a scene, ready to run.
 
     Attributes:
-      robot, scene: what it is made of.
+      robot: whose dynamics and limits the plant has.
+      scene: whose MJCF is simulated, with its obstacles.
       balls, places: the robot's balls, and where they are; None where it is one ball at its position.
       world: the obstacles that bound the robot's position, or its balls; none without either.
       obstacles: names of what the robot can collide with: those; without a position all that the MJCF lets it touch,
         but level planes if a free joint, or a slide that is not level, lets the robot stand on them. For balls in space
         it is the same.
       model: the compiled scene, with a contact sensor for each obstacle.
-      body: id of the robot's body. qpos, qvel, ctrl: where its joints' and actuators' numbers are in MuJoCo's arrays.
+      body: id of the robot's body.
+      qpos, qvel, ctrl: where its joints' and actuators' numbers are in MuJoCo's arrays.
       contact: where the contact sensors are in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
       timestep: of the physics, in seconds.
 

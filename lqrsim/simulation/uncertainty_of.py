@@ -20,7 +20,8 @@ def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) ->
     small, not lasting or not linear, as a push, narrower limits or the loss of an actuator.
 
     Args:
-      plant: what is run. disturbances: as in `simulate`; those of one's own have a method `uncertainty`.
+      plant: what is run.
+      disturbances: as in `simulate`; those of one's own have a method `uncertainty`.
 
     Raises:
       InputError: a disturbance does not fit the plant.

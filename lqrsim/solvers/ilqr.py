@@ -51,8 +51,11 @@ def ilqr(
     the controls are kept; constraints are not for this solver.
 
     Args:
-      stop, tolerance, max_iterations, time_limit, callback: as in `smooth`; the gap is zero here, for every iterate is
-        feasible.
+      stop: as in `smooth`; the gap is zero here, for every iterate is feasible.
+      tolerance: as in `smooth`; the gap is zero here, for every iterate is feasible.
+      max_iterations: as in `smooth`; the gap is zero here, for every iterate is feasible.
+      time_limit: as in `smooth`; the gap is zero here, for every iterate is feasible.
+      callback: as in `smooth`; the gap is zero here, for every iterate is feasible.
       start: what the first trajectory applies: controls (m,) or (T, m), by default the problem's nominal control; the
         controls of a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
       noise, risk: as in `smooth`; with noise this is iLQG.

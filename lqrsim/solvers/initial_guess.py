@@ -22,7 +22,8 @@ class InitialPrior:
     local optimum is found.
 
     Args:
-      weight: (n,) not negative. iterations: how many it acts in.
+      weight: (n,) not negative.
+      iterations: how many it acts in.
       about: where it is zero: (n,), or (T+1, n) for a trajectory to be drawn to.
       obstacles: the shares of the obstacle costs that the first iterations see, one an iteration; then it is all.
       controls: what the first pass applies, (m,) or (T, m); by default the problem's nominal control.

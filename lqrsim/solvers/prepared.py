@@ -34,7 +34,10 @@ def prepare(
 
     Args:
       problem: what is to be solved again and again, with other states, goals, obstacles and parameters.
-      tolerance, gap_tolerance, constraint_tolerance, max_iterations: as in `smooth`.
+      tolerance: as in `smooth`.
+      gap_tolerance: as in `smooth`.
+      constraint_tolerance: as in `smooth`.
+      max_iterations: as in `smooth`.
 
     Raises:
       InputError: an argument is not as described.
@@ -51,7 +54,8 @@ class PreparedSolver:
     """Solves problems of one structure, from one state after the other; `prepare` makes it.
 
     Attributes:
-      problem: what is solved by default. settings: as `prepare` was told.
+      problem: what is solved by default.
+      settings: as `prepare` was told.
     """
 
     def __init__(self, problem: Problem, settings: SmootherSettings) -> None:

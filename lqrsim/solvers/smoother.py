@@ -134,8 +134,19 @@ def smooth_many(
     Args:
       problems: of one structure or of many; each structure is compiled once.
       threads: how many to use; by default all processors that this process may run on.
-      form, first_pass, safeguard, stop, tolerance, gap_tolerance, max_iterations, time_limit, start, starts,
-        constraint_tolerance, noise, risk: as in `smooth`, for all.
+      form: as in `smooth`, for all.
+      first_pass: as in `smooth`, for all.
+      safeguard: as in `smooth`, for all.
+      stop: as in `smooth`, for all.
+      tolerance: as in `smooth`, for all.
+      gap_tolerance: as in `smooth`, for all.
+      max_iterations: as in `smooth`, for all.
+      time_limit: as in `smooth`, for all.
+      start: as in `smooth`, for all.
+      starts: as in `smooth`, for all.
+      constraint_tolerance: as in `smooth`, for all.
+      noise: as in `smooth`, for all.
+      risk: as in `smooth`, for all.
       progress: called with how many are done, of how many, as each one ends.
 
     Returns:

@@ -83,7 +83,9 @@ def split(
 
     Args:
       score: of vectors (K, size), (K,); positive is failure.
-      particles: N of each repetition. keep: share that exceeds the next level. moves: of each particle at a level.
+      particles: N of each repetition.
+      keep: share that exceeds the next level.
+      moves: of each particle at a level.
       repetitions: independent ones; the interval is made of how much they differ.
       most_levels: with as many the pilot run gives up.
       level: called with each level as the pilot run finds it.

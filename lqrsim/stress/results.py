@@ -35,7 +35,8 @@ class Results:
       scenario: the campaign's, where it is a function of yours: a file is data, and never chooses code to run.
 
     Attributes:
-      manifest: what the folder says of itself. cells: of the campaign.
+      manifest: what the folder says of itself.
+      cells: of the campaign.
 
     Raises:
       InputError: it is not a campaign's, damaged, or of another version.

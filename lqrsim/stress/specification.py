@@ -91,17 +91,20 @@ class Campaign:
 
     Attributes:
       scenario: what is run, as `lqrsim solve` takes it.
-      sweeps: name -> disturbances at strength 1. strengths: what they are multiplied by.
+      sweeps: name -> disturbances at strength 1.
+      strengths: what they are multiplied by.
       policies: which of POLICIES: "smooth" is lqrsim.smooth's, "ilqr" that of lqrsim.ilqr; "open_loop" is the plan of
         smooth without feedback; "replan" solves again and again as it goes; "track" and "offset_free" keep to the plan
         of smooth, by lqrsim.track and lqrsim.OffsetFree. By default the first four.
       stated: the disturbances that "track" and "offset_free" are made for, whatever they then meet; by default those of
         the preset "moderate", for one policy has to do for all strengths, and that is in the middle.
-      trials: of each cell. seed: of all random numbers.
+      trials: of each cell.
+      seed: of all random numbers.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
-      goal_radius, goal_tolerance: how near the goal counts as having reached it, as in `simulate`; by default as the
-        scenario has it.
-      shard: trials of a file. time_limit: seconds that a shard may take before it counts as hung.
+      goal_radius: in metres, within which the goal counts as reached, as in `simulate`; by default the scenario's.
+      goal_tolerance: the same as a scaled error, for robots without a position; by default the scenario's.
+      shard: trials of a file.
+      time_limit: seconds that a shard may take before it counts as hung.
 
     Raises:
       InputError: something is not as described.

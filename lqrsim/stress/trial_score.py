@@ -144,11 +144,15 @@ class TrialScore:
     A trial fails if its score is positive. Numbers that are standard normal give the trials that `simulate` gives.
 
     Args:
-      failure: scores a rollout's trials, (K,). goal_radius, goal_tolerance, contacts: as in `simulate`.
+      failure: scores a rollout's trials, (K,).
+      goal_radius: as in `simulate`.
+      goal_tolerance: as in `simulate`.
+      contacts: as in `simulate`.
       batch: how many trials are run at once.
 
     Attributes:
-      sizes: how many numbers each disturbance draws. simulations: how many trials have been run.
+      sizes: how many numbers each disturbance draws.
+      simulations: how many trials have been run.
     """
 
     plant: Plant

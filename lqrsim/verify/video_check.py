@@ -49,7 +49,8 @@ def verify_video(
       path: what `lqrsim render` wrote with the camera `top`, for robots in a vertical plane `side`, and for those that
         move in space both, whatever else is in the picture.
       trial: row of the rollout; by default the first that the video shows.
-      solution, progress: as for `verify_run`.
+      solution: as for `verify_run`.
+      progress: as for `verify_run`.
 
     Raises:
       InputError: the file is not lqrsim's, or has not the panes that it takes.

@@ -34,7 +34,8 @@ def plot_policy(
     robot in space is seen from above and from the side. Of one without a position, the plan's states are there instead.
 
     Args:
-      world: the obstacles, as the scene has them. radius: of the robot, in metres.
+      world: the obstacles, as the scene has them.
+      radius: of the robot, in metres.
       tube: what `predict_tube` says of the solution and what runs it.
 
     Raises:

@@ -109,7 +109,8 @@ class Saturation(Disturbance):
     """Limits of the controls that are narrower than the robot's own.
 
     Args:
-      lowest, highest: in the control's unit, within the robot's limits; one number, or one a control; None keeps it.
+      lowest: in the control's unit, within the robot's limits: a number, or one per control; None keeps the robot's.
+      highest: likewise.
       share: instead of them, share of the robot's own limits that is left, 0 to 1.
       strength: how far the limits go from the robot's own (0) to these (1), and beyond, until they meet.
     """

@@ -85,8 +85,10 @@ class GilbertElliott:
     """A link that loses in bursts: it is good or bad, and begins in its stationary state.
 
     Args:
-      to_bad, to_good: probability a control period of turning bad while good, and good while bad.
-      lost_when_good, lost_when_bad: share that is lost in each.
+      to_bad: probability per control period of turning bad while good.
+      to_good: probability per control period of turning good while bad.
+      lost_when_good: share that is lost while good.
+      lost_when_bad: share that is lost while bad.
     """
 
     to_bad: float
