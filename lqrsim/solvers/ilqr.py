@@ -58,7 +58,8 @@ def ilqr(
       callback: as in `smooth`; the gap is zero here, for every iterate is feasible.
       start: what the first trajectory applies: controls (m,) or (T, m), by default the problem's nominal control; the
         controls of a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
-      noise, risk: as in `smooth`; with noise this is iLQG.
+      noise: as in `smooth`; with noise this is iLQG.
+      risk: as in `smooth`.
 
     Returns:
       The same Solution as `smooth`, without cost-to-come and inverse policy. A hard problem does not raise.

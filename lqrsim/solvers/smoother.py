@@ -81,8 +81,9 @@ def smooth(
       constraint_tolerance: how closely the problem's constraints are solved for, in their unit: for a clearance it is
         metres. So much to spare is aimed at; a plan that has converged keeps the constraints themselves, and equalities
         to 1e-6, or to this where it is smaller.
-      noise, risk: in place of the problem's own: what drives the dynamics besides, and how much that is shunned; see
-        `Problem`. The cost is then an expectation, in the log, in line searches and in the choice among starts.
+      noise: replaces the problem's own; see `Noise`. The cost is then an expectation, in the log, in line searches and in
+        the choice among starts.
+      risk: replaces the problem's own; see `Problem`.
       threads: how many starts to run at once; by default as many as there are processors.
       callback: called with each `Iteration` as it ends; of a search, those of the starts that are run to their end.
         What it raises ends the solve, as Ctrl-C does, and is raised again with the best plan so far as its `solution`.
