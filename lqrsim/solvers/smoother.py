@@ -81,7 +81,7 @@ def smooth(
       constraint_tolerance: how closely the problem's constraints are solved for, in their unit: for a clearance it is
         metres. So much to spare is aimed at; a plan that has converged keeps the constraints themselves, and equalities
         to 1e-6, or to this where it is smaller.
-      noise: replaces the problem's own; see `Noise`. The cost is then an expectation, in the log, in line searches and in
+      noise: replaces the problem's own; see `Noise`. The cost is then an expectation, in the log, line searches and
         the choice among starts.
       risk: replaces the problem's own; see `Problem`.
       threads: how many starts to run at once; by default as many as there are processors.
