@@ -82,8 +82,8 @@ def noise_quadratic(x, u, model, ahead, convex, stage):
         return inf
     mixed, slope = stack(COUNT, SIZE), stack(COUNT)
     mix(theta, factor, root, values, mixed)
-    weigh(ahead.hessian, mixed, weighed)
     if SOME:
+        weigh(ahead.hessian, mixed, weighed)
         mix_slopes(theta, factor, root, slopes)
         add_weighed(ahead.hessian, weighed, slopes, stage)
     slope_ahead(ahead, slope)
@@ -227,27 +227,17 @@ def add_risk(theta, ahead, mixed, slopes, slope, convex, stage):
     the sum with the cost-to-go's own curvature stays positive semidefinite.
     """
     S, jacobian, row = ahead.hessian, ahead.jacobian, stack(W)
-    worst, pulled, steered = stack(COUNT), stack(COUNT), stack(N)
-    along = stack(SIZE)
-    for i in range(COUNT):
-        worst[i] = 0.0
+    pulled, steered, along = stack(COUNT), stack(N), stack(SIZE)
     for k in range(SIZE):
         along[k] = 0.0
         for i in range(COUNT):
             along[k] += mixed[i, k] * slope[i]
+    if SOME:  # the slope at g + y
         for i in range(COUNT):
-            worst[i] += theta * along[k] * mixed[i, k]
-    for i in range(COUNT):
-        pulled[i] = slope[i]
-        for j in range(COUNT):
-            pulled[i] += S[ROWS[i], ROWS[j]] * worst[j]
-    for j in range(N):
-        steered[j] = 0.0
-        for i in range(COUNT):
-            steered[j] += S[j, ROWS[i]] * worst[i]
-    for a in range(W):
-        for j in range(N):
-            stage.gradient[a] += jacobian[j, a] * steered[j]
+            pulled[i] = slope[i]
+            for k in range(SIZE):
+                for j in range(COUNT):
+                    pulled[i] += theta * along[k] * S[ROWS[i], ROWS[j]] * mixed[j, k]
     for k in range(SIZE):
         for j in range(N):
             steered[j] = 0.0
@@ -255,8 +245,11 @@ def add_risk(theta, ahead, mixed, slopes, slope, convex, stage):
                 steered[j] += S[j, ROWS[i]] * mixed[i, k]
         for a in range(W):
             row[a] = 0.0
-            for j in range(N):
+        for j in range(N):
+            for a in range(W):
                 row[a] += jacobian[j, a] * steered[j]
+        for a in range(W):
+            stage.gradient[a] += theta * along[k] * row[a]
         if SOME:
             for a in range(SOME):
                 pull = 0.0
