@@ -250,6 +250,10 @@ def test_what_is_refused(make, message):
         make()
 
 
+def soft() -> ls.Problem:
+    return problem_of(draw(np.random.default_rng(0)), fixed=False)
+
+
 def of(noise: Any, *, risk: float = 0.0) -> ls.Problem:
     problem = problem_of(draw(np.random.default_rng(0)))
     return dataclasses.replace(problem, noise=noise, risk=risk)
