@@ -238,12 +238,20 @@ def test_a_file_says_what_the_noise_was(tmp_path):
         (lambda: of("white"), "^noise: got 'white', want a Noise, or None$"),
         (lambda: of(None, risk=1.0), "^risk: got 1 for a problem without noise, want noise=Noise"),
         (lambda: ls.smooth(of(None), noise="white"), "^noise: got 'white', want a Noise"),  # pyright: ignore[reportArgumentType]
+        (
+            lambda: ls.smooth_continuous(problem_of(draw(np.random.default_rng(0)), fixed=False)),
+            "^noise: got some, which is per control period, want",
+        ),
         (lambda: ls.sample_costs(of(None), None), "^problem: got one without noise, want"),  # pyright: ignore[reportArgumentType]
     ],
 )
 def test_what_is_refused(make, message):
     with pytest.raises(InputError, match=message):
         make()
+
+
+def soft() -> ls.Problem:
+    return problem_of(draw(np.random.default_rng(0)), fixed=False)
 
 
 def of(noise: Any, *, risk: float = 0.0) -> ls.Problem:

@@ -36,9 +36,11 @@ from lqrsim.kernels.runge_kutta import advance
 
 ROWS = (0,)  # the states that noise acts on at once
 COUNT = 1  # how many these are
+FIRST = 0  # whether these are the first ones, in their order
 SIZE = 1  # independent normal numbers in w
 ACTIVE = (0,)  # entries of (x, u) that M depends on
 SOME = 1  # how many these are
+WIDE = 4  # the same, rounded up to vectors of four
 
 # The numba subset
 
@@ -47,8 +49,10 @@ def noise_value(x, u, model, ahead):
     """What it is expected to cost; infinite where the risk is too high."""
     values, mixed, slope = stack(COUNT, SIZE), stack(COUNT, SIZE), stack(COUNT)
     factor, root, weighed = stack(SIZE, SIZE), stack(SIZE), stack(COUNT, SIZE)
+    S = stack(COUNT, COUNT)
     noise_values(x, u, model.noise[0], values)
-    weigh(ahead.hessian, values, weighed)
+    gather(ahead.hessian, S)
+    weigh(S, values, weighed)
     theta = model.noise[1][0]
     if theta == 0:
         return half_trace(values, weighed)
@@ -66,14 +70,20 @@ def noise_quadratic(x, u, model, ahead, convex, stage):
     With `convex` what is added is positive semidefinite, with a negative risk, too. Where the risk is too high the
     Hessian is spoilt, so that the pass fails, and `model.noise[1][1]` is 1.
     """
-    values, slopes = stack(COUNT, SIZE), stack(SIZE, COUNT, SOME)
+    values, slopes = stack(COUNT, SIZE), stack(SIZE, COUNT, WIDE)
     weighed, factor, root = stack(COUNT, SIZE), stack(SIZE, SIZE), stack(SIZE)
+    S = stack(COUNT, COUNT)
+    for k in range(SIZE):
+        for i in range(COUNT):
+            for a in range(SOME, WIDE):
+                slopes[k, i, a] = 0.0
     noise_slopes(x, u, model.noise[0], values, slopes)
-    weigh(ahead.hessian, values, weighed)
+    gather(ahead.hessian, S)
+    weigh(S, values, weighed)
     theta = model.noise[1][0]
     if theta == 0:
         if SOME:
-            add_weighed(ahead.hessian, weighed, slopes, stage)
+            add_weighed(S, weighed, slopes, stage)
         return half_trace(values, weighed)
     total, good = factor_of_risk(theta, values, weighed, factor, root)
     model.noise[1][1] = 0.0 if good else 1.0
@@ -82,10 +92,10 @@ def noise_quadratic(x, u, model, ahead, convex, stage):
         return inf
     mixed, slope = stack(COUNT, SIZE), stack(COUNT)
     mix(theta, factor, root, values, mixed)
-    weigh(ahead.hessian, mixed, weighed)
     if SOME:
+        weigh(S, mixed, weighed)
         mix_slopes(theta, factor, root, slopes)
-        add_weighed(ahead.hessian, weighed, slopes, stage)
+        add_weighed(S, weighed, slopes, stage)
     slope_ahead(ahead, slope)
     add_risk(theta, ahead, mixed, slopes, slope, convex, stage)
     return total + 0.5 * theta * square_along(mixed, slope)
@@ -106,20 +116,28 @@ def noisy_costs(count, steps, start, policy, model, draws, costs):
             noise_values(x, u, model.noise[0], values)
             for i in range(COUNT):
                 for k in range(SIZE):
-                    ahead[ROWS[i]] += values[i, k] * draws[run * steps + t, k]
+                    ahead[i if FIRST else ROWS[i]] += values[i, k] * draws[run * steps + t, k]
             for i in range(N):
                 x[i] = ahead[i]
         costs[run] = total + final_value(x, u, steps, model.final)
+
+
+def gather(S, compact):
+    """Write the rows and columns of S that noise acts on; looked up once, for that takes longer than the sums."""
+    for i in range(COUNT):
+        row = i if FIRST else ROWS[i]
+        for j in range(COUNT):
+            compact[i, j] = S[row, j if FIRST else ROWS[j]]
 
 
 def weigh(S, values, weighed):
     """Write S M."""
     for i in range(COUNT):
         for k in range(SIZE):
-            total = 0.0
-            for j in range(COUNT):
-                total += S[ROWS[i], ROWS[j]] * values[j, k]
-            weighed[i, k] = total
+            weighed[i, k] = 0.0
+        for j in range(COUNT):
+            for k in range(SIZE):
+                weighed[i, k] += S[i, j] * values[j, k]
 
 
 def half_trace(values, weighed):
@@ -133,22 +151,30 @@ def half_trace(values, weighed):
 
 def add_weighed(S, weighed, slopes, stage):
     """Add 1/2 tr M'SM linearised: with columns m_i ~ J_i z, the sums of J_i'S J_i and of J_i'S m_i, given S M."""
-    row = stack(COUNT)
-    for k in range(SIZE):
+    line, curve, slope = stack(WIDE), stack(SOME, WIDE), stack(WIDE)
+    for b in range(WIDE):
+        slope[b] = 0.0
         for a in range(SOME):
-            total = 0.0
-            for i in range(COUNT):
-                total += slopes[k, i, a] * weighed[i, k]
-                moved = 0.0
-                for j in range(COUNT):
-                    moved += S[ROWS[i], ROWS[j]] * slopes[k, j, a]
-                row[i] = moved
-            stage.gradient[ACTIVE[a]] += total
-            for b in range(SOME):
-                curved = 0.0
-                for i in range(COUNT):
-                    curved += row[i] * slopes[k, i, b]
-                stage.hessian[ACTIVE[a], ACTIVE[b]] += curved
+            curve[a, b] = 0.0
+    for k in range(SIZE):
+        for i in range(COUNT):  # line by line, which stays in registers
+            factor = weighed[i, k]
+            for b in range(WIDE):
+                line[b] = 0.0
+                slope[b] += slopes[k, i, b] * factor
+            for j in range(COUNT):
+                factor = S[i, j]
+                for b in range(WIDE):
+                    line[b] += factor * slopes[k, j, b]
+            for a in range(SOME):
+                factor = slopes[k, i, a]
+                for b in range(WIDE):
+                    curve[a, b] += factor * line[b]
+    for a in range(SOME):
+        entry = ACTIVE[a]
+        stage.gradient[entry] += slope[a]
+        for b in range(SOME):
+            stage.hessian[entry, ACTIVE[b]] += curve[a, b]
 
 
 def factor_of_risk(theta, values, weighed, factor, root):
@@ -193,20 +219,22 @@ def mix_slopes(theta, factor, root, slopes):
     for k in range(SIZE):
         for j in range(k):
             for i in range(COUNT):
-                for a in range(SOME):
+                for a in range(WIDE):
                     slopes[k, i, a] += factor[k, j] * slopes[j, i, a]
     for k in range(SIZE):
         for i in range(COUNT):
-            for a in range(SOME):
+            for a in range(WIDE):
                 slopes[k, i, a] *= root[k]
 
 
 def slope_ahead(ahead, slope):
     """Write the slope of the cost-to-go where the step leads, in the states that noise acts on."""
     for i in range(COUNT):
-        slope[i] = ahead.gradient[ROWS[i]]
+        row = i if FIRST else ROWS[i]
+        total = ahead.gradient[row]
         for j in range(N):
-            slope[i] += ahead.hessian[ROWS[i], j] * ahead.arrived[j]
+            total += ahead.hessian[row, j] * ahead.arrived[j]
+        slope[i] = total
 
 
 def square_along(mixed, slope):
@@ -226,46 +254,50 @@ def add_risk(theta, ahead, mixed, slopes, slope, convex, stage):
     D'D is seen about the worst noise y, which M moves by J_y z. With a negative risk D is that of M as it is, so that
     the sum with the cost-to-go's own curvature stays positive semidefinite.
     """
-    S, jacobian, row = ahead.hessian, ahead.jacobian, stack(W)
-    worst, pulled, steered = stack(COUNT), stack(COUNT), stack(N)
-    along = stack(SIZE)
-    for i in range(COUNT):
-        worst[i] = 0.0
+    S, jacobian, slopes_along, line = ahead.hessian, ahead.jacobian, stack(SIZE, W), stack(W)
+    pulled, steered, along, compact = stack(COUNT), stack(N), stack(SIZE), stack(COUNT, COUNT)
     for k in range(SIZE):
-        along[k] = 0.0
+        total = 0.0
         for i in range(COUNT):
-            along[k] += mixed[i, k] * slope[i]
-        for i in range(COUNT):
-            worst[i] += theta * along[k] * mixed[i, k]
-    for i in range(COUNT):
-        pulled[i] = slope[i]
-        for j in range(COUNT):
-            pulled[i] += S[ROWS[i], ROWS[j]] * worst[j]
-    for j in range(N):
-        steered[j] = 0.0
-        for i in range(COUNT):
-            steered[j] += S[j, ROWS[i]] * worst[i]
-    for a in range(W):
-        for j in range(N):
-            stage.gradient[a] += jacobian[j, a] * steered[j]
-    for k in range(SIZE):
+            total += mixed[i, k] * slope[i]
+        along[k] = total
         for j in range(N):
             steered[j] = 0.0
-            for i in range(COUNT):
-                steered[j] += S[j, ROWS[i]] * mixed[i, k]
-        for a in range(W):
-            row[a] = 0.0
+        for i in range(COUNT):
+            state, factor = i if FIRST else ROWS[i], mixed[i, k]
             for j in range(N):
-                row[a] += jacobian[j, a] * steered[j]
-        if SOME:
+                steered[j] += S[state, j] * factor
+        for a in range(W):
+            line[a] = 0.0
+        for j in range(N):
+            factor = steered[j]
+            for a in range(W):
+                line[a] += jacobian[j, a] * factor
+        for a in range(W):
+            slopes_along[k, a] = line[a]
+            stage.gradient[a] += theta * total * line[a]
+    if SOME:
+        gather(S, compact)
+        for i in range(COUNT):  # the slope at g + y
+            pulled[i] = slope[i]
+            for j in range(COUNT):
+                for k in range(SIZE):
+                    pulled[i] += theta * along[k] * compact[i, j] * mixed[j, k]
+        for k in range(SIZE):
             for a in range(SOME):
-                pull = 0.0
+                pull, entry = 0.0, ACTIVE[a]
                 for i in range(COUNT):
                     pull += slopes[k, i, a] * pulled[i]
-                stage.gradient[ACTIVE[a]] += theta * along[k] * pull
+                stage.gradient[entry] += theta * along[k] * pull
                 if theta > 0:
-                    row[ACTIVE[a]] += pull
-        if theta > 0 or not convex:
-            for a in range(W):
+                    slopes_along[k, entry] += pull
+    if theta > 0 or not convex:
+        for a in range(W):  # line by line, which stays in registers
+            for b in range(W):
+                line[b] = 0.0
+            for k in range(SIZE):
+                factor = theta * slopes_along[k, a]
                 for b in range(W):
-                    stage.hessian[a, b] += theta * row[a] * row[b]
+                    line[b] += factor * slopes_along[k, b]
+            for b in range(W):
+                stage.hessian[a, b] += line[b]

@@ -64,9 +64,10 @@ class NoiseTerm:
     @property
     def filled(self) -> dict[str, Any]:
         """The constants that the kernels leave open."""
+        some = len(self.active)
         return {
-            "ROWS": self.rows, "COUNT": len(self.rows), "SIZE": self.size, "ACTIVE": self.active,
-            "SOME": len(self.active),
+            "ROWS": self.rows, "COUNT": len(self.rows), "FIRST": int(self.rows == tuple(range(len(self.rows)))),
+            "SIZE": self.size, "ACTIVE": self.active, "SOME": some, "WIDE": -4 * (some // -4),
         }  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.scenes.scene import unlogged
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance
+from lqrsim.simulation.disturbances.state_noise import as_disturbances
 from lqrsim.simulation.effects import Effects
 from lqrsim.simulation.physics import Physics
 from lqrsim.simulation.plant import Plant
@@ -77,8 +78,9 @@ def simulate(
       InputError: the policy is for another robot, or its plan is not finite; the control period is no multiple of the
         physics step; a disturbance does not fit; or an option is out of range.
     """
+    stated = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
     settings = RunSettings(
-        plant=plant, solution=solution, disturbances=disturbances, controller=controller, seed=seed, trials=trials,
+        plant=plant, solution=solution, disturbances=stated, controller=controller, seed=seed, trials=trials,
         first_trial=first_trial, goal_radius=goal_radius, goal_tolerance=goal_tolerance, frames=frames,
         contacts=contacts, threads=threads, generators=generators, progress=progress, watch=watch,
     )  # fmt: skip

@@ -24,7 +24,6 @@ from lqrsim.results.goal import Target
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.disturbances.state_noise import as_disturbances
 from lqrsim.simulation.effects import MakeGenerator, seeded
 from lqrsim.simulation.physics import part_of
 from lqrsim.simulation.plant import MOST_STEPS, Plant
@@ -75,7 +74,7 @@ class RunSettings:
         kinds = (Controller, type(None))
         check_kind("controller", self.controller, kinds, "a Controller, such as Feedback(solution.policy), or None")
         wanted = "disturbances, such as ControlNoise(0.05)"
-        self.disturbances = as_disturbances(self.disturbances, wanted)
+        self.disturbances = check_items("disturbances", self.disturbances, Disturbance, wanted)
         self.seed, self.first_trial = check_seed("seed", self.seed), check_seed("first_trial", self.first_trial)
         self.trials, self.threads = check_count("trials", self.trials), check_threads(self.threads)
         self.frames, self.contacts = check_flag("frames", self.frames), check_flag("contacts", self.contacts)

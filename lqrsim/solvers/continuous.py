@@ -167,6 +167,8 @@ def smooth_continuous(
         )
     if problem.constraints:
         raise InputError("constraints: got some, want none in continuous time; smooth keeps them")
+    if problem.noise is not None:
+        raise InputError("noise: got some, which is per control period, want none in continuous time; smooth has it")
     if problem.dynamics.discrete:
         raise InputError(f"dynamics: got {problem.dynamics.name}, whose steps have no rate, want `smooth` for it")
     limits = _Limits(

@@ -189,8 +189,8 @@ def _solve(
         default = settings.start is None and settings.starts is None and settings.safeguard
         if default and not stop.due and search.poor(problem):
             search.widen(problem, settings, start, stop, threads)
-        if search.best[1].status is Status.RISK_TOO_HIGH and settings.safeguard and not stop.due:
-            search.calm(problem, settings, start, stop)
+        if problem.risk > 0 and settings.safeguard and not stop.due:
+            search.calm(problem, settings, start, stop, threads)
         chosen, found = search.best
     assert found.certificate is not None
     detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
