@@ -273,7 +273,7 @@ class SymbolicCost(Cost):
 
 
 class FunctionCost(Cost):
-    """A cost given as a numba or a plain Python function, for what `SymbolicCost` can not express.
+    """A cost given as a numba or a plain Python function, for what `SymbolicCost` cannot express.
 
     Args:
       function: `function(x, u, p)` of NumPy arrays x (n,) and u (m,), which must not be changed; returns the cost.

@@ -164,7 +164,7 @@ class Dynamics:
         self.functions = self._functions()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what is derived and can not be pickled."""
+        """Without what is derived and cannot be pickled."""
         return {name: value for name, value in vars(self).items() if name not in ("_plain", "disturbed")}
 
     @property

@@ -207,7 +207,7 @@ class Solution:
             clearance=None if self.clearance is None else moved(self.clearance),
             candidates=(),
             multipliers=tuple(replace(one, values=moved(one.values)) for one in self.multipliers),
-            detail=f"what is left of a solution after {steps} steps; {self.detail}".removesuffix("; "),
+            detail=f"the rest of a solution after {steps} steps; {self.detail}".removesuffix("; "),
         )
 
     def open_loop(self) -> "Solution":

@@ -316,7 +316,7 @@ class SmallestFailure:
         """The distance, FORM's estimate, each disturbance's share, and what each is at its largest, a line each."""
         point = self.point
         lines = [
-            f"smallest failure: {point.distance:.3g} standard deviations from none, found with"
+            f"smallest failure: {point.distance:.3g} standard deviations from the undisturbed trial, found with"
             f" {self.simulations:,} trials"
         ]
         if not point.converged:
