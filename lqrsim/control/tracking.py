@@ -39,6 +39,9 @@ def track(
       at_end: the tolerances of the position at the plan's end, relative to before; of all states where there is none.
       uncertainty: what runs will meet, as `uncertainty_of` makes it; only for choosing tolerances.
 
+    Returns:
+      The policy.
+
     Raises:
       InputError: the solution is of another system; tolerances or uncertainty do not fit it, or neither is given.
     """

@@ -39,8 +39,13 @@ def report(
     """Writes one HTML page of a campaign, with everything in it; returns its path.
 
     Args:
+      results: the campaign.
+      out: FILE.html.
       videos: number of the worst trials to repeat and render. Without OpenGL the page says that there are none.
       progress: called with the parts that are done, and all of them.
+
+    Returns:
+      The path of the page.
 
     Raises:
       InputError: nothing has been run yet; something is damaged; the scenario is one of yours, and `results` was not

@@ -64,11 +64,15 @@ def run_campaign(
     """Run what is asked and not there yet; the same call goes on where it was stopped, and what is done stays.
 
     Args:
+      campaign: what to run.
       folder: takes everything.
       workers: processes on this machine; by default one a processor. 0: do it in this process.
       batch: how many trials a worker simulates together; changes nothing but time and memory.
       scheduler: address of a dask cluster that does the work in place of processes on this machine.
       progress: called with the number of trials that there are and of all: first, and after each shard.
+
+    Returns:
+      The Results.
 
     Raises:
       InputError: something that is asked cannot be run; the folder is another campaign's, no campaign's, being
