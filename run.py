@@ -69,7 +69,9 @@ def main() -> int:
     if options.command == "docs":
         os.environ["NO_MKDOCS_2_WARNING"] = "1"  # an announcement of the theme's authors
         code = run([PYTHON, "-m", "mkdocs", "build", "--strict"])
-        say(f"The site is {ROOT / 'build' / 'site' / 'index.html'}" if code == 0 else "The site was not built")
+        if code == 0:
+            # Browsers do not let pages that are opened as files load the search index.
+            say("The site is in build/site. To read it: python3 -m http.server --directory build/site")
         return code
     print(f"Ready. The command line is {PYTHON.parent / 'lqrsim'}")
     return 0

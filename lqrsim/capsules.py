@@ -80,6 +80,13 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
     def between(self, start: Sequence[Any], end: Sequence[Any]) -> list[list[Any]]:
         """The middle of each ball, where the segment is from `start` to `end`: expressions of SymPy, or numbers.
 
+        Args:
+          start: one end of the segment, 2 or 3 coordinates in metres.
+          end: the other end, as many coordinates.
+
+        Returns:
+          `count` lists of as many coordinates.
+
         Raises:
           InputError: they are no two points of the same size.
         """

@@ -12,7 +12,7 @@ from lqrsim.results.solution_parts import Status
 
 
 def cubic(*, effort: float = 1.0, constant: float = 0.0) -> ls.Problem:
-    """A scalar that runs away by itself: the nominal control can not even be rolled out."""
+    """A scalar that runs away by itself: the nominal control cannot even be rolled out."""
     return ls.Problem(
         dynamics=systems.scalar(cubic=1.0), dt=0.1, steps=40, initial=ls.QuadraticCost([10.0], about=[1.0]),
         stage_cost=systems.scalar_cost(effort, weight=0.1, constant=constant),

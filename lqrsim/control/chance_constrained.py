@@ -103,6 +103,9 @@ def smooth_chance_constrained(
       rounds: plans to solve for, at most.
       progress: called with the rounds that are done, and all of them.
 
+    Returns:
+      The SafePlan.
+
     Raises:
       InputError: there are no obstacles, an option is out of range, or something does not fit the system.
     """

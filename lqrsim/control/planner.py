@@ -102,10 +102,13 @@ class Planner:
         return self.account.summary(times=True)
 
     def change(self, **parts: Any) -> None:
-        """Plan for another problem from the next solve on: `planner.change(final_cost=...)`; see `dataclasses.replace`.
+        """Change the problem from the next solve on: `planner.change(final_cost=...)`; see `dataclasses.replace`.
 
         Goals, weights, obstacles, parameters and limits can change. So that a new estimate of what disturbs the robot
         can, plan with `dynamics.disturbed` from the beginning.
+
+        Args:
+          **parts: field of `Problem` -> new value.
 
         Raises:
           InputError: the problem is none, or would have to be compiled.
@@ -119,6 +122,13 @@ class Planner:
 
     def step(self, state: npt.ArrayLike, t: float) -> Array:
         """The control (m,) to apply in a measured state (n,), `t` seconds after the start.
+
+        Args:
+          state: (n,), measured.
+          t: seconds since the start, 0 or more.
+
+        Returns:
+          (m,).
 
         Raises:
           InputError: the state is not finite, the time is negative, or the thread does not run.

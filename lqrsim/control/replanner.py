@@ -53,7 +53,8 @@ class ReplanRecord:
       status: how the solve ended.
       iterations: how many it took.
       seconds: how long it took.
-      cost, before: of the new plan, and of where the law in force led from there.
+      cost: of the new plan.
+      before: cost of continuing with the law in force.
       used: whether its plan came into force.
       reason: why not, or why it is no better; empty if all went well.
     """

@@ -42,6 +42,9 @@ def track(
       risk: theta: minimise (1/theta) log E exp(theta/2 the sum of squares) under the problem's noise, as that is along
         the plan; above 0 large deviations are dreaded. Tolerances must then be given.
 
+    Returns:
+      The policy.
+
     Raises:
       InputError: the solution is of another system; tolerances or uncertainty do not fit it, or neither is given.
     """

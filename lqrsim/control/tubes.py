@@ -79,6 +79,12 @@ class Tube:
     def added_to(self, rollout: Rollout) -> Rollout:
         """The rollout with the covariance of the position and the chance of collision, for its figures and videos.
 
+        Args:
+          rollout: of the same plan.
+
+        Returns:
+          The rollout with its `tube` and `collision_chance`.
+
         Raises:
           InputError: it is a run of another plan, or of a robot without a position.
         """
@@ -100,6 +106,9 @@ def predict_tube(
       solution: with the plan.
       uncertainty: what the run meets.
       controller: what runs it: an OffsetFree, a Feedback or a policy; by default the solution's policy.
+
+    Returns:
+      The Tube.
 
     Raises:
       InputError: something does not fit the system; the controller is of another kind; or the uncertainty has a latency

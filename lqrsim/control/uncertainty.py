@@ -141,7 +141,14 @@ class Uncertainty:
         object.__setattr__(self, "left_out", left_out)
 
     def check(self, dynamics: Dynamics) -> None:
-        """Raise InputError unless all of it fits the dynamics; the field is named, and what there is to choose from."""
+        """Check that it fits a system.
+
+        Args:
+          dynamics: of the system.
+
+        Raises:
+          InputError: something does not fit.
+        """
         states, controls = dynamics.state_coordinates, dynamics.control_coordinates
         per_entry("Uncertainty: start", self.start, states)
         per_entry("Uncertainty: measurement", self.measurement, states)
@@ -159,6 +166,9 @@ class Uncertainty:
         Args:
           memory: seconds in which a constant may wander by its standard deviation.
           share: of what varies, the standard deviation of its mean, relative to its own.
+
+        Returns:
+          An Uncertainty.
 
         Raises:
           InputError: a number is out of range.

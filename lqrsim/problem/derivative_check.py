@@ -132,7 +132,10 @@ class DerivativeCheck:
       error: largest difference over entries and samples, relative to the entry and the differences' own rounding.
       row: the name of the output at that entry.
       column: the name of the input at that entry.
-      stated, difference: the two values there. state (n,), control (m,): where that was.
+      stated: the stated derivative there.
+      difference: the difference quotient there.
+      state: (n,), where that was.
+      control: (m,), where that was.
       tolerance: what the error must not exceed.
     """
 

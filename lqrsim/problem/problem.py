@@ -31,7 +31,14 @@ from lqrsim.results.hashing import sha256
 
 @dataclass(frozen=True)
 class FixedState:
-    """An initial state (n,) that is given exactly, in place of an initial cost."""
+    """An initial state (n,) that is given exactly, in place of an initial cost.
+
+    Attributes:
+      state: (n,).
+
+    Raises:
+      InputError: not finite numbers (n,).
+    """
 
     state: npt.ArrayLike
 
@@ -143,9 +150,16 @@ class Problem:
         )
 
     def from_state(self, state: npt.ArrayLike, *, after: int = 0) -> "Problem":
-        """What is left of it after so many steps, from a state (n,) that is given exactly.
+        """The rest of the problem after some steps, from a state that is given exactly.
 
         It may begin within an obstacle, unlike a problem that is stated: there a plan is to find out of it.
+
+        Args:
+          state: (n,).
+          after: how many steps are over.
+
+        Returns:
+          A Problem.
 
         Raises:
           InputError: the state is not one, or no step is left.
@@ -244,7 +258,14 @@ class Problem:
         return tuple(cost for cost in terms_of(self.stage_cost) if isinstance(cost, ObstacleCost))
 
     def terms(self, which: str) -> tuple[Term, ...]:
-        """The bound terms of `initial`, `stage_cost` or `final_cost`."""
+        """The bound terms of `initial`, `stage_cost` or `final_cost`.
+
+        Args:
+          which: "initial", "stage_cost" or "final_cost".
+
+        Returns:
+          The terms, one for each cost that was added.
+        """
         return self._terms[check_name("which", which, self._terms)]
 
     @property

@@ -62,7 +62,15 @@ class Replan:
         return self.status.success
 
     def shifted(self, steps: int, *, horizon: str = "moving") -> "Replan":
-        """What is left of it after so many steps; see `Solution.shifted`."""
+        """The rest of it after `steps` steps; see `Solution.shifted`.
+
+        Args:
+          steps: how many steps are over.
+          horizon: "moving" or "shrinking", as in `Solution.shifted`.
+
+        Returns:
+          A Replan.
+        """
         policy = self.policy.shifted(steps, horizon=horizon)
         plan, value, filled = self.trajectory, self.cost_to_go, horizon == "moving"
 

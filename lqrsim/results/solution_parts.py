@@ -21,7 +21,12 @@ def left_after(steps: int, array: npt.ArrayLike, *, filled: bool) -> Array:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """States (T+1, n) and the controls (T, m) held between them, `dt` seconds apart.
+    """States and the controls held between them.
+
+    Attributes:
+      states: (T+1, n).
+      controls: (T, m).
+      dt: seconds between two states.
 
     Raises:
       InputError: they do not fit together, there is no step, or dt is not above 0. NaN is what a failed solve has.
@@ -180,7 +185,14 @@ class Iteration:
     )
 
     def row(self, number: int) -> str:
-        """This iteration as a line under `HEADER`."""
+        """This iteration as a line under `HEADER`.
+
+        Args:
+          number: of the iteration, from 1.
+
+        Returns:
+          A line of text.
+        """
         number = check_count("number", number, at_least=0)
         optimality = "-" if np.isnan(self.optimality) else f"{self.optimality:.1e}"
         improvement = "-" if np.isinf(self.improvement) else f"{self.improvement:.2e}"

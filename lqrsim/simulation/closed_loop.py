@@ -57,8 +57,10 @@ def simulate(
     others it is NaN.
 
     Args:
-      disturbances: what goes wrong, in the order in which it happens. Each has its own stream of random numbers. A
-        `Noise`, as problems are stated with, is one, too.
+      plant: robot and scene to run.
+      solution: whose policy runs, or about whose plan the controller runs.
+      disturbances: what goes wrong, in the order in which it happens. Each has its own stream of random numbers.
+        A `Noise`, with which problems are stated, is one, too.
       controller: what decides on the controls; by default the solution's policy.
       seed: of all random numbers.
       trials: how many runs.
@@ -73,6 +75,9 @@ def simulate(
       generators: (trial, number of the disturbance) -> where its numbers come from, in place of the seed.
       progress: called after each control period with the number of periods done and of all.
       watch: called with each frame as it comes: its time, MuJoCo's qpos (K, nq), and who has become unstable (K,).
+
+    Returns:
+      A Rollout of the trials.
 
     Raises:
       InputError: the policy is for another robot, or its plan is not finite; the control period is no multiple of the

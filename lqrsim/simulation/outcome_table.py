@@ -80,9 +80,13 @@ def outcomes(
     """The outcomes of a rollout's trials.
 
     Args:
+      rollout: what `simulate` returned.
       problem: whose cost to work out; NaN without one.
       goal_radius: in metres, replaces the rollout's; see `simulate`.
       goal_tolerance: a scaled error, replaces the rollout's; see `simulate`.
+
+    Returns:
+      The Outcomes, one row per trial.
 
     Raises:
       InputError: one of these is out of range, or not what this rollout's goal is judged by.

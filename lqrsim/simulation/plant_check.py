@@ -43,6 +43,7 @@ class PlantCheck:
       simulated: (n,), the change of the state in MuJoCo there.
       predicted: (n,), the change by the dynamics there.
       tolerance: what `relative` must not exceed.
+      samples: how many random states were compared.
       contacts: pairs of geoms that touched, and in how many of the `samples`, most often first: contacts that were not
         taken away, which the dynamics may know nothing of.
     """
@@ -138,6 +139,8 @@ def check_plant(
     other, are in the result, by the names of the geoms.
 
     Args:
+      robot: whose dynamics are compared.
+      scene: with the robot in its MJCF.
       period: in seconds, a multiple of the physics step; by default that nearest to 0.02 s.
       around: (n,) the middle of the random states, zero by default.
       spread: their standard deviation in each unit.
@@ -147,6 +150,9 @@ def check_plant(
       samples: how many states.
       tolerance: of an error, relative to the largest change of that state.
       seed: of all.
+
+    Returns:
+      The PlantCheck.
 
     Raises:
       InputError: the robot is not in the scene, an argument is not as described, the controls have no limits, or the

@@ -23,6 +23,9 @@ def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) ->
       plant: what is run.
       disturbances: as in `simulate`; those of one's own have a method `uncertainty`.
 
+    Returns:
+      The Uncertainty.
+
     Raises:
       InputError: a disturbance does not fit the plant.
     """

@@ -306,7 +306,7 @@ def workers(threads: int, functions: Iterable[UserFunction]) -> Iterator[ThreadP
 
 
 def check_callback(callback: Callback | None) -> None:
-    """Raises InputError for what can not be called."""
+    """Raises InputError for what cannot be called."""
     check_function("callback", callback, "a function of an Iteration", arguments=1)
 
 

@@ -61,7 +61,7 @@ FORMS = {"dual": cost_to_come_dual, "primal": cost_to_come_primal}
 
 def core(problem: Problem, form: str = "dual") -> Core:
     """The compiled passes for problems of this structure; `kernels/` has what it offers."""
-    with compiling:  # not only against doing it twice: Python 3.11 can not parse in two threads at once
+    with compiling:  # not only against doing it twice: Python 3.11 cannot parse in two threads at once
         return _core(form, *_structure(problem))
 
 

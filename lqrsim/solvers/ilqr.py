@@ -51,13 +51,14 @@ def ilqr(
     the controls are kept; constraints are not for this solver.
 
     Args:
+      problem: with a start that is given exactly, or by the initial cost.
       stop: as in `smooth`; the gap is zero here, for every iterate is feasible.
       tolerance: as in `smooth`; the gap is zero here, for every iterate is feasible.
       max_iterations: as in `smooth`; the gap is zero here, for every iterate is feasible.
       time_limit: as in `smooth`; the gap is zero here, for every iterate is feasible.
-      callback: as in `smooth`; the gap is zero here, for every iterate is feasible.
       start: what the first trajectory applies: controls (m,) or (T, m), by default the problem's nominal control; the
         controls of a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
+      callback: as in `smooth`; the gap is zero here, for every iterate is feasible.
       noise: as in `smooth`; with noise this is iLQG.
       risk: as in `smooth`.
 
@@ -92,6 +93,19 @@ def ilqr_many(
     progress: Callable[[int, int], object] | None = None,
 ) -> list[Solution]:
     """Solve many problems as `ilqr` does, on several threads; see `smooth_many`.
+
+    Args:
+      problems: of one structure or of many; each structure is compiled once.
+      threads: how many to use; by default all processors that this process may run on.
+      stop: as in `ilqr`, for all.
+      tolerance: as in `ilqr`, for all.
+      max_iterations: as in `ilqr`, for all.
+      time_limit: as in `ilqr`, for all.
+      start: as in `ilqr`, for all.
+      progress: called with the numbers of solved and of all problems, as each solve ends.
+
+    Returns:
+      One Solution per problem, in their order.
 
     Raises:
       InputError: an argument is not as described; a problem that is refused is named by its place in the list.

@@ -151,6 +151,9 @@ class ReliabilityProblem:
           report: called with the summary, and with a line for each level as the pilot run finds it.
           progress: called with the repetitions that are done, and all of them.
 
+        Returns:
+          The probability with its interval, and the failures that were seen.
+
         Raises:
           InputError: an option is out of range, or as `score` does.
           NoFailure: none was found.
@@ -180,6 +183,9 @@ class ReliabilityProblem:
           seed: of all random numbers.
           report: called with the summary, and with a line for each level of the splitting that finds first failures.
           progress: called with the rounds that are done, and all of them.
+
+        Returns:
+          The failure, its distance and its parts.
 
         Raises:
           InputError: an option is out of range, the policy fails with nothing random, or as `score` does.
@@ -316,7 +322,7 @@ class SmallestFailure:
         """The distance, FORM's estimate, each disturbance's share, and what each is at its largest, a line each."""
         point = self.point
         lines = [
-            f"smallest failure: {point.distance:.3g} standard deviations from none, found with"
+            f"smallest failure: {point.distance:.3g} standard deviations from the undisturbed trial, found with"
             f" {self.simulations:,} trials"
         ]
         if not point.converged:

@@ -9,7 +9,7 @@ from lqrsim.verify.diagnosis import diagnose
 
 HIDDEN = 0.05  # of the frames that may not show what is tracked
 SCALE = 0.002
-VERDICTS = {True: "passed", False: "FAILED", None: "untold"}
+VERDICTS = {True: "passed", False: "FAILED", None: "not checked"}
 
 
 @dataclass(frozen=True)

@@ -71,11 +71,24 @@ class Disturbance(abc.ABC):
     """Base class of all disturbances."""
 
     def describe(self, plant: Plant) -> str:
-        """In words and units, for the record; unless it is overridden, how the object is made."""
+        """The disturbance in words and units, for the record. By default, how the object is made.
+
+        Args:
+          plant: what is run.
+
+        Returns:
+          A line of text.
+        """
         return repr(self)
 
     def scaled(self, strength: float) -> "Disturbance":
-        """The same, so many times as strong: 0 has no effect, 1 is itself. For a sweep over strengths.
+        """The same disturbance with `strength` times its effect, for a sweep over strengths.
+
+        Args:
+          strength: factor; 0 has no effect, 1 is the disturbance itself.
+
+        Returns:
+          A Disturbance.
 
         Raises:
           InputError: nothing says what this is, or that much of it means nothing.
@@ -85,15 +98,37 @@ class Disturbance(abc.ABC):
         )
 
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
-        """Raise InputError if the plant cannot have this disturbance."""
+        """Check that the plant can have this disturbance.
+
+        Args:
+          plant: what is run.
+
+        Raises:
+          InputError: it cannot.
+        """
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """What it is in numbers, for `uncertainty_of`; unless it is overridden, it is left out, which is said."""
+        """The disturbance in numbers, for `uncertainty_of`. By default it is left out, and the result says so.
+
+        Args:
+          plant: what is run.
+
+        Returns:
+          An Uncertainty.
+        """
         return left_out(self, plant, f"{type(self).__name__} does not override `uncertainty`")
 
     @abc.abstractmethod
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        """Begin a run of one trial a generator. A trial's numbers may come from its own generator only.
+        """Begin a run with one trial per generator. A trial's random numbers must come from its own generator.
+
+        Args:
+          plant: what is run.
+          plan: the plan that the policy follows.
+          generators: K of them, one per trial.
+
+        Returns:
+          The Effect on the K trials.
 
         Raises:
           InputError: the disturbance does not fit the plant or the plan.
