@@ -1,4 +1,4 @@
-"""Campaigns: the same bits whatever happens on the way, and one line for what can not be."""
+"""Campaigns: the same bits whatever happens on the way, and one line for what cannot be."""
 
 import errno
 import multiprocessing
@@ -560,7 +560,7 @@ def test_stress_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     collided = int(np.flatnonzero(results.outcomes(cell).outcome == "collided")[0])
     for name in ("1", str(cell)):
         assert main(["replay", str(folder), "--cell", name, "--trial", str(collided), "--out", str(rollout)]) == 0
-        assert "the same to the bit" in capsys.readouterr().out
+        assert "identical to the table" in capsys.readouterr().out
     again = ls.load_rollout(rollout)
     assert (again.first_trial, again.outcome) == (collided, ("collided",))
     assert again.frames.shape[1] > 100

@@ -345,7 +345,7 @@ def test_benchmark_of_replanning(tmp_path: Path) -> None:
         assert sum(row["ended"].values()) == row["plans"] >= 40
         assert 0 < row["median"] <= row["p999"] <= row["most"]
     # Two runs each: the first policy ends at the old goal and runs into the pillar.
-    for what in ("goal", "pillar"):
+    for what in ("goal", "pillar", "moving"):
         assert found["changes"][what]["re-planning"][0] == 100
         assert found["changes"][what]["the first policy"][0] == 0
     used = found["delay"]["used"]
@@ -372,3 +372,14 @@ def test_a_learner_that_sees_the_state_does_as_its_expert_does_and_one_that_sees
     assert reached["learnt, with the state"] >= 18
     assert reached["learnt, time alone"] <= 10
     assert "| the policy | 20 of 20 |" in script.report(result)
+
+
+@pytest.mark.long
+def test_board_of_realaigym() -> None:
+    """Two of the runs: one whose model is right but for a motor's inertia, of zero, and one of velocity noise."""
+    script = import_module("realaigym_board")
+    result = script.main(script.Config(quick=True, robots=("pendubot",), versions=(1,)))
+    (board,) = result["boards"]
+    assert board["trials"] == 2
+    assert board["columns"] == {"model": 1.0, "velocity noise": 1.0, "score": 1.0}
+    assert "| pendubot, version 1 | 100.0 | 100.0 |" in script.report(result)

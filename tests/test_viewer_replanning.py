@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import pytest
 from planar_arm import LENGTH, LINK, PlanarArm
-from viewers import Recorder, said, viewing
+from viewers import Recorder, said, said_after, viewing
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -383,11 +383,14 @@ viewer_base.Viewer.move_goal, viewer_base.Viewer.press = moved, pressed"""
         assert "plans again every 0.03333 s, 30 times a second" in text
         with browsing.browser(f"http://127.0.0.1:{PORT}/", tmp_path / "profile", size=(500, 400)) as page:
             next(page.pictures())
-            page.press("Enter", 13)
-            page.press("ArrowRight", 39)
-            assert "mouse moved it" not in said(process, "key moved it")
-            page.drag((350, 140), (350, 80))
-            said(process, "mouse moved it")
+
+            def press(i: int) -> None:
+                if i % 4 == 0:
+                    page.press("Enter", 13)
+                page.press("ArrowRight", 39)
+
+            assert "mouse moved it" not in said_after(process, "key moved it", press)
+            said_after(process, "mouse moved it", lambda i: page.drag((350, 140), (350, 80 + i % 2)))
         process.send_signal(signal.SIGINT)
         said(process, "solved again")
         assert process.wait(20) == 0

@@ -187,7 +187,7 @@ def _compile(function: UserFunction) -> tuple[Any, int]:
     """A numba function behind C's calling convention: what must be kept alive, and its address.
 
     Raises:
-      InputError: numba can not compile it.
+      InputError: numba cannot compile it.
     """
     import numba
     from numba import carray  # pyright: ignore[reportPrivateImportUsage]
@@ -200,7 +200,7 @@ def _compile(function: UserFunction) -> tuple[Any, int]:
     try:
         own: Any = numba.njit(**{name: value for name, value in options.items() if name != "nopython"})(plain)
     except Exception as error:
-        raise InputError(f"{function.name}: got what numba can not compile ({error}), want a function") from error
+        raise InputError(f"{function.name}: got code that numba cannot compile ({error}), want a function") from error
     text, names = function.adapter()
     names |= {"function": own, "carray": carray, "readonly": readonly, "nan": float("nan"), "__name__": __name__}
     print_of_it = fingerprint(function.function)
@@ -219,7 +219,7 @@ def _compile(function: UserFunction) -> tuple[Any, int]:
             with uncollected(), apart("adapter"):
                 dispatcher.compile((pointer,) * (3 + (len(function.writes) or 1)))
         except Exception as error:  # mostly NumbaError, and whatever else goes wrong within numba
-            raise InputError(f"{function.name}: got what numba can not compile, want {_reason(error)}") from error
+            raise InputError(f"{function.name}: got code that numba cannot compile, want {_reason(error)}") from error
         # The same holds of the functions it calls, which are as they were: what was made of them is not kept then.
         if print_of_it and lasting and _lasting(dispatcher):
             _keep(key, dispatcher, what)
@@ -308,7 +308,7 @@ def _keep(key: str, dispatcher: Any, what: str) -> None:
     from numba.core import serialize
 
     (result,) = dispatcher.overloads.values()
-    with contextlib.suppress(Exception):  # what can not be kept is made again; a Ctrl-C within LLVM can be the cause
+    with contextlib.suppress(Exception):  # what cannot be kept is made again; a Ctrl-C within LLVM can be the cause
         disk.save(key, serialize.dumps(result._reduce()), what)
 
 

@@ -41,7 +41,8 @@ class Planner:
     the deadline. What is not ready then is not used, and the law before goes on. All is compiled before the first step.
 
     Args:
-      problem: that was solved. solution: its solution.
+      problem: that was solved.
+      solution: its solution.
       every: seconds between two solves, rounded to control periods.
       deadline: seconds until an answer comes into force, rounded up to control periods; by default one period.
       horizon: "moving", always as long as the first plan's, or "shrinking", to its end.
@@ -50,7 +51,8 @@ class Planner:
       clock: what time it is, in seconds, for deadlines; for tests.
 
     Attributes:
-      law: in force, with the step that it begins at. account: how the solves went, one record each.
+      law: in force, with the step that it begins at.
+      account: how the solves went, one record each.
 
     Raises:
       InputError: as `Replanning`.
@@ -100,10 +102,13 @@ class Planner:
         return self.account.summary(times=True)
 
     def change(self, **parts: Any) -> None:
-        """Plan for another problem from the next solve on: `planner.change(final_cost=...)`; see `dataclasses.replace`.
+        """Change the problem from the next solve on: `planner.change(final_cost=...)`; see `dataclasses.replace`.
 
         Goals, weights, obstacles, parameters and limits can change. So that a new estimate of what disturbs the robot
         can, plan with `dynamics.disturbed` from the beginning.
+
+        Args:
+          **parts: field of `Problem` -> new value.
 
         Raises:
           InputError: the problem is none, or would have to be compiled.
@@ -117,6 +122,13 @@ class Planner:
 
     def step(self, state: npt.ArrayLike, t: float) -> Array:
         """The control (m,) to apply in a measured state (n,), `t` seconds after the start.
+
+        Args:
+          state: (n,), measured.
+          t: seconds since the start, 0 or more.
+
+        Returns:
+          (m,).
 
         Raises:
           InputError: the state is not finite, the time is negative, or the thread does not run.

@@ -48,10 +48,15 @@ class ReplanRecord:
     """How one solve went.
 
     Attributes:
-      step: the control period in which it began. trial: of a simulation, else 0.
-      status: how the solve ended. iterations: how many it took. seconds: how long it took.
-      cost, before: of the new plan, and of where the law in force led from there.
-      used: whether its plan came into force. reason: why not, or why it is no better; empty if all went well.
+      step: the control period in which it began.
+      trial: of a simulation, else 0.
+      status: how the solve ended.
+      iterations: how many it took.
+      seconds: how long it took.
+      cost: of the new plan.
+      before: cost of continuing with the law in force.
+      used: whether its plan came into force.
+      reason: why not, or why it is no better; empty if all went well.
     """
 
     step: int

@@ -32,7 +32,8 @@ class Replanning(Controller):
     the last bit wherever they are computed; "measured" is as fast as this machine is. On a robot, use `Planner`.
 
     Args:
-      problem: that was solved. solution: its solution.
+      problem: that was solved.
+      solution: its solution.
       every: seconds between two solves, rounded to control periods.
       deadline: seconds until an answer comes into force, rounded up to control periods, and no more than `every`. By
         default as long as `computing` takes, where that is a number, and else one control period.
@@ -47,8 +48,8 @@ class Replanning(Controller):
 
     Attributes:
       records: a `ReplanRecord` of each solve of the last run.
-      solved: how many of them were used, of all trials. kept: why others were not, and the law before went on: reason
-        -> how many. `summary()` says both in a line.
+      solved: how many of them were used, of all trials.
+      kept: why others were not, and the law before went on: reason -> how many. `summary()` says both in a line.
 
     Raises:
       InputError: `every` is shorter than a control period or the deadline, or the solution is of another problem.

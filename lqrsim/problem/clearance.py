@@ -13,19 +13,17 @@ from lqrsim.scenes.world import World
 
 
 class Clearance(Constraint):
-    """At least `margin` between the robot and each obstacle, at the steps; walls are obstacles too.
+    """A distance of at least `margin` between the robot and each obstacle, walls included, at the steps.
 
-    An ObstacleCost keeps away from obstacles as far as that pays, and can end inside one; this does not. Only at a
-    start that is given exactly, about which nothing can be done, it does not act. Between two steps a plan can come a
-    little nearer, by `v^2 dt^2 / 8 r` at the speed v along an obstacle of radius r, and what is thinner than a step is
-    long it can step over. Which way round is better only a cost says: have an ObstacleCost, too, if only of a small
-    weight, and the search has something to go by.
+    It does not act at a start that is given exactly. Between two steps a plan can come nearer, by `v^2 dt^2 / 8 r` at
+    the speed v along an obstacle of radius r, and it can step over obstacles thinner than a step. Add an ObstacleCost,
+    if only of a small weight: it tells the search which way round is better.
 
     Args:
       world: the obstacles; a robot in the plane sees them as for an ObstacleCost.
-      radius, balls: of the robot, one of the two, as for an ObstacleCost.
-      margin: what is to be left beyond that, in metres; a number, or one for each of the T + 1 knots, or (T + 1, O),
-        one for each knot and obstacle, as the robot sees the world.
+      radius: of the robot in metres, as for an ObstacleCost; either this or `balls`.
+      balls: the robot's balls, as for an ObstacleCost; either this or `radius`.
+      margin: in metres; a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).
     """
 
     def __init__(

@@ -84,7 +84,17 @@ class Constraint(abc.ABC):
 
     @abc.abstractmethod
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        """This constraint for a system. Raises InputError if it does not fit."""
+        """Bind the constraint to a system.
+
+        Args:
+          dynamics: of the system.
+
+        Returns:
+          The ConstraintTerm that solvers use.
+
+        Raises:
+          InputError: it does not fit the system.
+        """
 
     @property
     def moving(self) -> bool:
@@ -96,7 +106,14 @@ class Constraint(abc.ABC):
         return self.bind(dynamics)
 
     def ahead(self, steps: int) -> "Constraint":
-        """What is left of it after so many steps: itself, unless it says something else of each."""
+        """The constraint after `steps` steps are over: itself, unless it differs from step to step.
+
+        Args:
+          steps: how many steps are over.
+
+        Returns:
+          A Constraint.
+        """
         check_count("steps", steps, at_least=0)
         return self
 
@@ -229,7 +246,8 @@ class StateBounds(Constraint):
     Nor at the end on a state that a GoalState fixes there, which may be at its bound.
 
     Args:
-      low, high: name of a state -> the least and the most it may be, in its unit.
+      low: name of a state -> its lower bound, in its unit.
+      high: name of a state -> its upper bound, in its unit.
     """
 
     def __init__(self, low: Mapping[str, float] | None = None, high: Mapping[str, float] | None = None) -> None:

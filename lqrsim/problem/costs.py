@@ -88,7 +88,17 @@ class Cost(abc.ABC):
 
     @abc.abstractmethod
     def bind(self, dynamics: Dynamics) -> Term:
-        """This cost for a system. Raises InputError if it does not fit (a weight of the wrong size, say)."""
+        """Bind the cost to a system.
+
+        Args:
+          dynamics: of the system.
+
+        Returns:
+          The Term that solvers use.
+
+        Raises:
+          InputError: it does not fit the system.
+        """
 
     @property
     def moving(self) -> bool:
@@ -170,9 +180,11 @@ class ObstacleCost(Cost):
 
     Args:
       world: the obstacles.
-      radius: of the robot at its position, in metres. balls: the robot in its place, as `robot.balls`; one of the two.
-        With balls the attribute `radius` is that of the largest.
-      sharpness: in 1/m. weight: cost of touching one obstacle, with one ball, for one step.
+      radius: of the robot at its position, in metres.
+      balls: the robot in its place, as `robot.balls`; one of the two. With balls the attribute `radius` is that of the
+        largest.
+      sharpness: in 1/m.
+      weight: cost of touching one obstacle, with one ball, for one step.
     """
 
     def __init__(
@@ -192,7 +204,14 @@ class ObstacleCost(Cost):
         self.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
 
     def weighing(self, weight: float) -> "ObstacleCost":
-        """The same with another weight."""
+        """The same cost with another weight.
+
+        Args:
+          weight: cost of touching one obstacle, with one ball, for one step.
+
+        Returns:
+          An ObstacleCost.
+        """
         radius = self.radius if self.balls is None else None
         return ObstacleCost(self.world, radius=radius, balls=self.balls, sharpness=self.sharpness, weight=weight)
 
@@ -289,7 +308,7 @@ class SymbolicCost(Cost):
 
 
 class FunctionCost(Cost):
-    """A cost given as a numba or a plain Python function, for what `SymbolicCost` can not express.
+    """A cost given as a numba or a plain Python function, for what `SymbolicCost` cannot express.
 
     Args:
       function: `function(x, u, p)` of NumPy arrays x (n,) and u (m,), which must not be changed; returns the cost.

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,13 +24,21 @@ from lqrsim.problem.balls import evaluate
 from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, goals_of
 from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost, Term, terms_of
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 
 
 @dataclass(frozen=True)
 class FixedState:
-    """An initial state (n,) that is given exactly, in place of an initial cost."""
+    """An initial state (n,) that is given exactly, in place of an initial cost.
+
+    Attributes:
+      state: (n,).
+
+    Raises:
+      InputError: not finite numbers (n,).
+    """
 
     state: npt.ArrayLike
 
@@ -47,7 +55,8 @@ class Problem:
 
     Attributes:
       dynamics: whose Runge-Kutta step over `dt`, control held, is g.
-      dt: the control period in seconds. steps: T, the number of them.
+      dt: the control period in seconds.
+      steps: T, the number of them.
       initial: c_0, the cost of starting elsewhere than wished (the paper's soft start); or `FixedState(x)`.
       stage_cost: c, per step: it is *not* multiplied by dt.
       final_cost: c_T.
@@ -56,6 +65,10 @@ class Problem:
       constraints: what the plan must keep to at the steps; see `SymbolicConstraint`, `GoalState`, `StateBounds` and
         `Clearance`.
       begin: the time in s at which it begins, for obstacles that move: where they are at 0, their positions say.
+      noise: what drives the dynamics besides: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation,
+        worked out to second order about the plan. None for none.
+      risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it shuns
+        runs that cost much, below 0 it hopes for those that cost little; 0 is the expectation.
 
     Raises:
       InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
@@ -72,8 +85,11 @@ class Problem:
     control_limits: tuple[npt.ArrayLike, npt.ArrayLike] | None = None
     constraints: Sequence[Constraint] = ()
     begin: float = 0.0
+    noise: Noise | None = None
+    risk: float = 0.0
     _terms: dict[str, tuple[Term, ...]] = field(init=False, repr=False, compare=False)
     _constraint_terms: tuple[ConstraintTerm, ...] = field(init=False, repr=False, compare=False)
+    _noise_term: NoiseTerm | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dt", check_number("dt", self.dt, above=0.0))
@@ -99,6 +115,11 @@ class Problem:
         object.__setattr__(self, "constraints", check_items("constraints", self.constraints, Constraint, wanted))
         terms = bind_all(self.constraints, self.dynamics, self.times)
         object.__setattr__(self, "_constraint_terms", terms)
+        check_kind("noise", self.noise, (Noise, type(None)), "a Noise, or None")
+        object.__setattr__(self, "_noise_term", None if self.noise is None else self.noise.bind(self.dynamics))
+        object.__setattr__(self, "risk", check_number("risk", self.risk))
+        if self.risk and self.noise is None:
+            raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
         if self.control_limits is not None:
             try:
                 low, high = self.control_limits
@@ -129,9 +150,16 @@ class Problem:
         )
 
     def from_state(self, state: npt.ArrayLike, *, after: int = 0) -> "Problem":
-        """What is left of it after so many steps, from a state (n,) that is given exactly.
+        """The rest of the problem after some steps, from a state that is given exactly.
 
         It may begin within an obstacle, unlike a problem that is stated: there a plan is to find out of it.
+
+        Args:
+          state: (n,).
+          after: how many steps are over.
+
+        Returns:
+          A Problem.
 
         Raises:
           InputError: the state is not one, or no step is left.
@@ -230,13 +258,30 @@ class Problem:
         return tuple(cost for cost in terms_of(self.stage_cost) if isinstance(cost, ObstacleCost))
 
     def terms(self, which: str) -> tuple[Term, ...]:
-        """The bound terms of `initial`, `stage_cost` or `final_cost`."""
+        """The bound terms of `initial`, `stage_cost` or `final_cost`.
+
+        Args:
+          which: "initial", "stage_cost" or "final_cost".
+
+        Returns:
+          The terms, one for each cost that was added.
+        """
         return self._terms[check_name("which", which, self._terms)]
 
     @property
     def constraint_terms(self) -> tuple[ConstraintTerm, ...]:
         """The bound constraints."""
         return self._constraint_terms
+
+    @property
+    def noise_term(self) -> NoiseTerm | None:
+        """The bound noise."""
+        return self._noise_term
+
+    def driven_by(self, noise: Noise | None, risk: float | None) -> "Problem":
+        """The same under other noise, or another risk; of what is None, its own."""
+        changed = {name: value for name, value in (("noise", noise), ("risk", risk)) if value is not None}
+        return replace(self, **changed) if changed else self
 
     @property
     def digest(self) -> str:
@@ -257,6 +302,9 @@ class Problem:
             functions += term.functions
             if term.equality or term.final_only:
                 parts.append(repr((term.equality, term.final_only)))
+        if self._noise_term is not None:
+            parts += [self._noise_term.source, self._noise_term.data, repr((self._noise_term.filled, self.risk))]
+            functions += self._noise_term.functions
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
 
     def _check_start_clear(self) -> None:

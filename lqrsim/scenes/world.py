@@ -23,9 +23,11 @@ class Obstacle:
     """One primitive; sizes and axes as MuJoCo has them.
 
     Attributes:
+      name: of the geom in the MJCF.
       kind: one of `KINDS`.
-      position: (3,) in metres. rotation: (3, 3), whose columns are the local axes; a plane's free side is its local +z,
-        capsules and cylinders lie along their local z.
+      position: (3,) in metres.
+      rotation: (3, 3), whose columns are the local axes; a plane's free side is its local +z, capsules and cylinders
+        lie along their local z.
       size: (3,) in metres: sphere (radius, 0, 0); capsule and cylinder (radius, half length, 0), the latter infinite if
         the half length is; box half lengths; plane (0, 0, 0).
       velocity: (3,) in m/s, of an obstacle that moves straight on: `position` is where it is at the time 0. Plans take
@@ -62,7 +64,11 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class World:
-    """The obstacles that a robot must stay clear of."""
+    """A set of obstacles.
+
+    Attributes:
+      obstacles: in the order in which they are numbered.
+    """
 
     obstacles: Sequence[Obstacle] = ()
 
@@ -120,6 +126,13 @@ class World:
         the sky, and a sphere counts with its equator. Either way planes parallel to the robot's bound nothing: in the
         horizontal one that is the floor.
 
+        Args:
+          plane: as in `Coordinates`.
+          offset: as in `Coordinates`, in metres.
+
+        Returns:
+          A World in the plane's coordinates.
+
         Raises:
           InputError: there is no such plane, a vertical one has no offset; or, seen from above, an obstacle is tilted,
             so that it has no outline among the primitives.
@@ -159,19 +172,42 @@ class World:
         """Signed distances in metres to each obstacle, (len(self),), of one point (2,) or (3,); negative inside.
 
         Points (2,) are for a world that is seen by a robot in the plane, and in its coordinates.
+
+        Args:
+          point: (3,), or (2,) in a plane, in metres.
+
+        Returns:
+          One signed distance per obstacle, in metres.
         """
         x, y, z = (*_places("point", point, one=True).tolist(), 0.0)[:3]
         data = self.table.ravel()
         return np.array([signed_distance(data, ROW * i, x, y, z) for i in range(len(self))])
 
     def distance(self, points: npt.ArrayLike) -> Array:
-        """Signed distance in metres to the nearest obstacle, (...), of points (..., 2 or 3); infinite without any."""
+        """Signed distance in metres to the nearest obstacle, (...), of points (..., 2 or 3); infinite without any.
+
+        Args:
+          points: (..., 3), or (..., 2) in a plane, in metres.
+
+        Returns:
+          (...), in metres; infinite without obstacles.
+        """
         points = _places("points", points)
         flat = [self.distances(point).min(initial=np.inf) for point in points.reshape(-1, points.shape[-1])]
         return np.array(flat).reshape(points.shape[:-1])
 
     def nearest(self, points: npt.ArrayLike) -> npt.NDArray[np.int64]:
-        """Which obstacle is nearest, (...), at points (..., 2 or 3). Raises InputError in an empty world."""
+        """Which obstacle is nearest, (...), at points (..., 2 or 3).
+
+        Args:
+          points: (..., 3), or (..., 2) in a plane, in metres.
+
+        Returns:
+          (...), indices of obstacles.
+
+        Raises:
+          InputError: there are no obstacles.
+        """
         if not self.obstacles:
             raise InputError("nearest: got a world without obstacles, want at least one")
         points = _places("points", points)

@@ -35,6 +35,8 @@ def assemble(
     candidates: tuple[Candidate, ...] = (),
 ) -> Solution:
     """The Solution of what a solver found."""
+    if problem.noise is not None:
+        options = options | {"noise": repr(problem.noise), "risk": problem.risk}
 
     def policy(gain: Array, offset: Array, nominal: Array) -> AffinePolicy:
         return AffinePolicy(
