@@ -21,10 +21,10 @@ import numpy as np
 from board.double_pendulum import Robot
 from board.law import SwingUp
 from board.trials import Trial, columns, simulate, trials
+from numpy.typing import NDArray
 from paper.common import Result, Settings, opening, run, table
 from tqdm import tqdm
 
-from lqrsim.errors import Array
 from lqrsim.machine import processors
 
 # The best scores on the board, with what they are of.
@@ -33,6 +33,9 @@ PUBLISHED = {
     ("acrobot", 2): (0.751, "a learnt policy"), ("pendubot", 2): (0.913, "a learnt policy"),
 }  # fmt: skip
 BATCH = 24  # trials that a process runs at once
+
+# Trials that run side by side, with the robot, the version of the board and the seed.
+Job = tuple[list[Trial], Robot, int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +58,8 @@ def main(config: Config) -> Result:
             chosen = few(trials(version), config.every)
             if config.quick:
                 chosen = chosen[:: len(chosen) // 2]
-            jobs = [(chosen[i : i + BATCH], robot, version, config.seed) for i in range(0, len(chosen), BATCH)]
+            parts = [chosen[i : i + BATCH] for i in range(0, len(chosen), BATCH)]
+            jobs: list[Job] = [(part, robot, version, config.seed) for part in parts]
             if len(jobs) == 1:
                 done = [outcomes(jobs[0])]
             else:
@@ -78,7 +82,7 @@ def few(all_of_them: list[Trial], every: int) -> list[Trial]:
     return [one for one in all_of_them if levels[one.column].index(one.level) % every == every // 2]
 
 
-def outcomes(job: tuple[list[Trial], Robot, int, int]) -> Array:
+def outcomes(job: Job) -> NDArray[np.bool_]:
     """Which of some trials succeed."""
     chosen, robot, version, seed = job
     return simulate(chosen, SwingUp(robot, version, len(chosen)), robot, version, seed)

@@ -364,5 +364,6 @@ def test_a_constraint_that_is_kept_anyway_changes_nothing() -> None:
     bare = problem(weight=10.0)
     kept = dataclasses.replace(bare, constraints=[ls.SymbolicConstraint(past, parameters={"least": -5.0})])
     one, other = ls.smooth(bare), ls.smooth(kept)
-    np.testing.assert_array_equal(one.trajectory.states, other.trajectory.states)
+    # Not to the bit: the two are compiled apart, and a compiler may add in another order.
+    np.testing.assert_allclose(one.trajectory.states, other.trajectory.states, rtol=1e-12, atol=1e-14)
     assert other.multipliers == ()

@@ -101,7 +101,9 @@ class SwingUp:
 
     def _missed(self, law: ls.Solution | ls.Replan, turns: tuple[int, int]) -> float:
         off = law.trajectory.states[-1] - _upright(turns)
-        return float(off @ self._end @ off)
+        with np.errstate(over="ignore"):  # a plan that is no good may end anywhere; what it misses is then infinite
+            missed = float(off @ self._end @ off)
+        return missed if np.isfinite(missed) else np.inf
 
     def _problem(self, steps: int, turns: tuple[int, int]) -> ls.Problem:
         if (steps, turns) not in self._problems:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from board.double_pendulum import ACTUATED, LIMIT, UNKNOWN, VERSIONS, Robot, advance, off_upright
 from lqrsim.errors import Array
@@ -72,7 +73,7 @@ def trials(version: int) -> list[Trial]:
     return found
 
 
-def simulate(chosen: list[Trial], law: Law, robot: Robot, version: int, seed: int) -> Array:
+def simulate(chosen: list[Trial], law: Law, robot: Robot, version: int, seed: int) -> NDArray[np.bool_]:
     """Which of the trials succeed, (K,). Each has random numbers of its own, whatever others there are."""
     count, motor = len(chosen), ACTUATED[robot]
     rngs = [np.random.default_rng([seed, version, one.number]) for one in chosen]
@@ -100,7 +101,7 @@ def simulate(chosen: list[Trial], law: Law, robot: Robot, version: int, seed: in
         seen = [*seen[-LONGEST:], x]
         close = (off_upright(x) < CLOSE[version]).all(axis=1)
         has_been |= close
-    return has_been if version == 1 else close
+    return np.where(version == 1, has_been, close)
 
 
 def _pushes(rng: np.random.Generator) -> Array:
@@ -116,7 +117,7 @@ def _pushes(rng: np.random.Generator) -> Array:
     return (heights * np.exp(-((t - times) ** 2) / (2 * widths**2))).reshape(STEPS, 2, count).sum(axis=2)
 
 
-def columns(chosen: list[Trial], succeeded: Array) -> dict[str, float]:
+def columns(chosen: list[Trial], succeeded: NDArray[np.bool_]) -> dict[str, float]:
     """The board's columns, each a share, and the score, their mean."""
     shares: dict[str, list[float]] = {}
     levels: dict[tuple[str, float], list[bool]] = {}

@@ -39,6 +39,7 @@ def report(found: dict[str, Any]) -> list[str]:
     return [
         "Noise that is always the same changes no plan, only what it is expected to cost: to second order about a plan"
         " it costs the same whatever the control. Noise that grows with the controls makes them smaller in the"
-        " mean square, and the feedback weaker; whether the plan then keeps farther from obstacles depends on where it goes.",
+        " mean square, and the feedback weaker; whether the plan then keeps farther from obstacles depends on where it"
+        " goes.",
         table(("noise", "clearance, m", "controls, rms", "from, to", "mean gain"), rows),
     ]
