@@ -53,10 +53,11 @@ def test_a_new_robot_solves_runs_renders_and_passes_by_the_printed_commands(
         assert video.stat().st_size > 1000
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["", "my-robot", "my robot", "../robot", "MyRobot", "3d", "_robot", "class", "numpy", "lqrsim", "röbot", "a" * 61],
-)
+NO_NAMES = ["", "my-robot", "my robot", "../robot", "MyRobot", "3d", "_robot", "class", "röbot", "a" * 61]
+TAKEN = ["numpy", "lqrsim", "any", "path", "world", "conftest"]
+
+
+@pytest.mark.parametrize("name", [*NO_NAMES, *TAKEN])
 def test_what_can_be_no_module_of_its_own_is_refused(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,6 +11,8 @@ from tyro.conf import Positional, arg
 
 TEMPLATE, CLASS = "my_robot", "MyRobot"
 TEMPLATES = Path(__file__).parent.parent / "templates" / TEMPLATE
+# Names that mean something else in what is written: two classes of Python's, MuJoCo's first body, pytest's own file.
+TAKEN = ("any", "path", "world", "conftest")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +20,7 @@ class New:
     """Write a robot of your own to start from: a folder with its MJCF, its dynamics, a scenario and a test.
 
     It works as it is: a disc that is pushed round a crate. Prints the commands that solve it, run it, film it and test
-    it. docs/adding_a_robot.md says what to change.
+    it. docs/new_robot.md says what to change.
     """
 
     name: Annotated[Positional[str], arg(metavar="NAME")]
@@ -61,6 +63,8 @@ def check_robot_name(name: str) -> None:
     plain = name.isascii() and name.isidentifier() and name == name.lower() and name[0] != "_" and len(name) <= 60
     if not plain or keyword.iskeyword(name):
         raise InputError(f"name: got {excerpt(name)}, want {wanted}")
+    if name in TAKEN:
+        raise InputError(f"name: got {name!r}, want another: {', '.join(TAKEN)} have a meaning in what is written")
     found = importlib.util.find_spec(name)
     if found is not None and found.origin is not None:  # a folder without a module in it is no module of that name
         raise InputError(f"name: got {name!r}, which is a module of Python's or of a package, want another name")
