@@ -17,10 +17,10 @@ TAKEN = ("any", "path", "world", "conftest")
 
 @dataclass(frozen=True, kw_only=True)
 class New:
-    """Write a robot of your own to start from: a folder with its MJCF, its dynamics, a scenario and a test.
+    """Write a robot of your own to start from.
 
-    It works as it is: a disc that is pushed round a crate. Prints the commands that solve it, run it, film it and test
-    it. docs/new_robot.md says what to change.
+    The folder has its MJCF, its dynamics, a scenario and a test. It works as it is: a disc is pushed round a crate.
+    Prints the commands that solve it, run it, film it and test it. docs/new_robot.md says what to change.
     """
 
     name: Annotated[Positional[str], arg(metavar="NAME")]
@@ -48,7 +48,7 @@ class New:
         for template in sorted(TEMPLATES.glob("*.*")):
             path = folder / _named(template.name, self.name)
             path.write_text(_named(template.read_text(encoding="utf-8"), self.name), encoding="utf-8", newline="\n")
-            console.say(f"wrote {path}")
+            console.wrote(path)
         console.say("\nnext:")
         for command in next_commands(self.name, folder):
             console.say(f"  {shlex.join(command)}")
