@@ -40,7 +40,7 @@ FLOORS_WITHIN = {
     "scenes": (("world",),),
     "results": (
         ("schema", "hashing", "ball_record", "coordinates", "solution_parts", "trial_outcome", "value_functions"),
-        ("archive", "goal", "policy"),
+        ("archive", "goal", "notebook", "policy"),
         ("solution",),
         ("rollout",),
     ),
