@@ -69,6 +69,7 @@ ALLOWED = {
     "jinja2": ("reports",),
     "tqdm": ("commands",),
     "gymnasium": ("gym",),
+    "rerun": ("view",),
 }
 
 MODULES = {

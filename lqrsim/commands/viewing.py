@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -32,12 +32,14 @@ class Render:
       lqrsim render CALM.npz SEVERE.npz --title calm severe --out both.mp4
       lqrsim render RUN.npz --out RUN.gif --speed 2
       lqrsim render RUN.npz --out RUN.png --every 0.5 --quality publication
+      lqrsim render RUN.npz --out RUN.rrd             # a recording for Rerun's viewer; needs lqrsim[rerun]
     """
 
     rollouts: Annotated[Positional[tuple[Path, ...]], arg(metavar="ROLLOUT ...", help_behavior_hint="")]
     """Files from `lqrsim simulate`."""
     out: Annotated[Path | None, optional("FILE")] = None
-    """Output: FILE.mp4 (h264), FILE.gif, or FILE.png for a still. By default the rollout's path with .mp4."""
+    """Output: FILE.mp4 (h264), FILE.gif, FILE.png for a still, or FILE.rrd for Rerun. By default the rollout's path
+    with .mp4."""
     trial: Annotated[tuple[int, ...], arg(metavar="N ...")] = (0,)
     """Row of the rollout, from 0; several rows of one rollout, or one for each of several rollouts."""
     camera: Annotated[str, arg(metavar="NAME")] = "overview"
@@ -74,9 +76,11 @@ class Render:
         if not self.rollouts:
             raise InputError("ROLLOUT: got none, want at least one that `lqrsim simulate` wrote")
         out = self.out or self.rollouts[0].with_suffix(".mp4")
+        if out.suffix.lower() == ".rrd":
+            return self._record(out)
         is_still = out.suffix.lower() == ".png"
         if out.suffix.lower() not in (".mp4", ".gif", ".png"):
-            raise InputError(f"--out: got {out}, want a name that ends in .mp4, .gif or .png")
+            raise InputError(f"--out: got {out}, want a name that ends in .mp4, .gif, .png or .rrd")
         if not is_still and (self.time is not None or self.every is not None):
             raise InputError(f"--time, --every: got them for {out.name}, want --out FILE.png: they are of stills")
         console.check_output("--out", out.parent, out.name)
@@ -97,6 +101,24 @@ class Render:
         else:
             with console.progress("rendering", "frame") as progress:
                 render(shown, out, fps=self.fps, speed=self.speed, progress=progress, **options)
+        console.wrote(out)
+        return 0
+
+    def _record(self, out: Path) -> int:
+        """Write one trial for Rerun's viewer, which chooses by itself how it looks."""
+        from lqrsim.commands import console
+        from lqrsim.errors import InputError
+        from lqrsim.results import save_load
+        from lqrsim.view import rerun_file
+
+        own = ("rollouts", "out", "trial")
+        given = [one.name for one in fields(self) if one.name not in own and getattr(self, one.name) != one.default]
+        if given or len(self.rollouts) > 1 or len(self.trial) > 1:
+            got = ", ".join(f"--{name}" for name in given) or "several runs"
+            raise InputError(f"--out: got {out.name} with {got}, want it with one run, one --trial and nothing else")
+        console.check_output("--out", out.parent, out.name)
+        for name in rerun_file.write(save_load.load_rollout(self.rollouts[0]), out, trial=self.trial[0]):
+            console.say(f"left out: {name}, of a kind that Rerun has no shape for")
         console.wrote(out)
         return 0
 

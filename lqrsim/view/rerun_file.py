@@ -1,0 +1,196 @@
+"""A trial as a recording of Rerun's viewer: geometry, plan, tube and numbers over one timeline, in seconds.
+
+Rerun is a package of its own, `rerun-sdk`, in the extra `rerun`. Nothing here speaks to the network.
+"""
+
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco import mjtGeom as Geom
+
+from lqrsim.errors import Array, InputError, check_path
+from lqrsim.results.hashing import sha256
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.save_load import replacing
+from lqrsim.view.decorative_geoms import PLAN_RGB
+from lqrsim.view.ellipsoids import Ellipsoids
+from lqrsim.view.overlays import FORCE, TUBE
+from lqrsim.view.recorded_trial import RecordedTrial
+
+TIMELINE = "time"
+DRIVEN = (0.0, 0.45, 0.7)
+SHOWN_GROUPS = 3  # of MuJoCo's groups of geoms, those that its own pictures show
+FLAT = 1e-4  # m: half the depth of what has none
+ARROW = 0.2  # of the scene's extent: the longest force
+
+
+def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0) -> list[str]:
+    """Write a trial as FILE.rrd.
+
+    Args:
+      rollout: what `simulate` returned, with frames.
+      path: of the file.
+      trial: row of the rollout.
+
+    Returns:
+      The names of the geoms that are left out, because Rerun has no such shape.
+
+    Raises:
+      InputError: no such trial, nothing of it to draw, a file that cannot be written, or the package is missing.
+    """
+    path = check_path("path", path, "the path of a file")
+    rerun, recorded = _package(path), RecordedTrial(rollout, trial)
+    with replacing(path) as unfinished:
+        name = f"{rollout.robot} in {rollout.scene}, trial {rollout.first_trial + trial}"
+        stream = rerun.RecordingStream("lqrsim", recording_id=sha256(rollout.states[trial].tobytes())[:32])
+        stream.save(unfinished)
+        stream.send_recording_name(name)
+        left_out = _draw_model(rerun, stream, recorded)
+        _draw_plan(rerun, stream, recorded)
+        _draw_numbers(rerun, stream, recorded)
+        stream.disconnect()
+    return left_out
+
+
+def _package(path: Path) -> Any:
+    try:
+        return importlib.import_module("rerun")
+    except ImportError as error:
+        wanted = "the package rerun-sdk: pip install 'lqrsim[rerun]'"
+        raise InputError(f"path: got {path.name}, want for it {wanted} ({error})") from None
+
+
+def _draw_model(rerun: Any, stream: Any, recorded: RecordedTrial) -> list[str]:
+    """The geoms of the model: what stands still once, what moves at each recorded frame."""
+    model, left_out = recorded.model, []
+    data = mujoco.MjData(model)
+    frames, places, turns = recorded.frame_times, [], []
+    for time in frames:
+        recorded.pose(data, float(time))
+        places.append(data.geom_xpos.copy())
+        turns.append(np.array([_quaternion(matrix.reshape(3, 3)) for matrix in data.geom_xmat]))
+    for geom in range(model.ngeom):
+        colour = _colour(model, geom)
+        if model.geom_group[geom] >= SHOWN_GROUPS or colour[3] == 0:
+            continue
+        name = model.geom(geom).name or f"geom {geom}"
+        shape = _shape(rerun, model, geom, colour)
+        if shape is None:
+            left_out.append(name)
+            continue
+        entity = ["world", "model", f"{geom} {name}"]
+        stream.log(entity, shape, static=True)
+        if model.body_weldid[model.geom_bodyid[geom]] == 0:
+            pose = rerun.Transform3D(translation=places[0][geom], quaternion=turns[0][geom])
+            stream.log(entity, pose, static=True)
+        else:
+            moved = [place[geom] for place in places], [turn[geom] for turn in turns]
+            columns = rerun.Transform3D.columns(translation=moved[0], quaternion=moved[1])
+            _send(rerun, stream, entity, frames, columns)
+    return left_out
+
+
+def _shape(rerun: Any, model: mujoco.MjModel, geom: int, colour: Array) -> Any:
+    """What Rerun draws for a geom, in the geom's own axes; None for what it has no shape for."""
+    size, kind, colours = model.geom_size[geom], Geom(int(model.geom_type[geom])), [_bytes(colour)]
+    solid = {"colors": colours, "fill_mode": "solid"}
+    if kind == Geom.mjGEOM_PLANE:
+        wide = np.where(size[:2] > 0, size[:2], 2 * model.stat.extent)
+        return rerun.Boxes3D(half_sizes=[[*wide, FLAT]], centers=[[0, 0, -FLAT]], **solid)
+    if kind == Geom.mjGEOM_BOX:
+        return rerun.Boxes3D(half_sizes=[size], **solid)
+    if kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_ELLIPSOID):
+        return rerun.Ellipsoids3D(half_sizes=[size if kind == Geom.mjGEOM_ELLIPSOID else [size[0]] * 3], **solid)
+    if kind == Geom.mjGEOM_CYLINDER:
+        return rerun.Cylinders3D(lengths=[2 * size[1]], radii=[size[0]], **solid)
+    if kind == Geom.mjGEOM_CAPSULE:  # Rerun's begins at its origin
+        lower = [[0, 0, -size[1]]]
+        return rerun.Capsules3D(lengths=[2 * size[1]], radii=[size[0]], translations=lower, **solid)
+    if kind == Geom.mjGEOM_MESH:
+        mesh = model.mesh(model.geom_dataid[geom])
+        vertices = model.mesh_vert[int(mesh.vertadr[0]) :][: int(mesh.vertnum[0])]
+        faces = model.mesh_face[int(mesh.faceadr[0]) :][: int(mesh.facenum[0])]
+        return rerun.Mesh3D(vertex_positions=vertices, triangle_indices=faces, albedo_factor=colours[0])
+    return None
+
+
+def _draw_plan(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
+    """The plan and the path as lines; where the robot should be, the tube and the force at their times."""
+    run = recorded.rollout
+    plan, driven = recorded.planned(run.times), recorded.driven(recorded.times)
+    thin = 0.002 * recorded.model.stat.extent
+    for name, line, colour in (("plan", plan, PLAN_RGB), ("path", driven, DRIVEN)):
+        shape = rerun.LineStrips3D([line], colors=[_bytes(np.array(colour))], radii=[thin])
+        stream.log(["world", name], shape, static=True)
+    count = len(plan)
+    ball = rerun.Points3D.columns(
+        positions=plan, colors=[_bytes(np.array([*PLAN_RGB, 0.6]))] * count, radii=[run.radius] * count
+    )
+    _send(rerun, stream, ["world", "planned"], run.times, ball)
+    if run.tube is not None and run.state_coordinates.position:
+        axes = run.in_world(np.eye(run.tube.shape[1])) - run.in_world(np.zeros(run.tube.shape[1]))
+        half_axes, turns = Ellipsoids(plan, axes.T @ run.tube @ axes).axes()
+        tube = rerun.Ellipsoids3D.columns(
+            half_sizes=np.maximum(half_axes, FLAT),
+            centers=plan,
+            quaternions=[_quaternion(turn) for turn in turns],
+            colors=[_bytes(np.array(TUBE))] * count,
+        )
+        _send(rerun, stream, ["world", "tube"], run.times, tube)
+    if (largest := float(np.linalg.norm(recorded.force, axis=1).max())) > 0:
+        times = recorded.times[recorded.times < run.times[-1]]
+        forces = np.array([recorded.force_at(float(time)) for time in times])
+        arrows = rerun.Arrows3D.columns(
+            vectors=forces * ARROW * recorded.model.stat.extent / largest,
+            origins=recorded.driven(times),
+            colors=[_bytes(np.array(FORCE))] * len(times),
+        )
+        _send(rerun, stream, ["world", "force"], times, arrows)
+
+
+def _draw_numbers(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
+    """States, controls, tracking error, clearance and the chance of collision, each over time."""
+    run, trial, begun = recorded.rollout, recorded.trial, len(recorded.times)
+    numbers = {("error", f"tracking error, {run.tracking_unit}"): recorded.error}
+    if np.isfinite(recorded.clearance).all():
+        numbers["clearance", "clearance, m"] = recorded.clearance
+    if run.collision_chance is not None:
+        numbers["chance", "chance of collision"] = run.collision_chance[:begun]
+    for which, label in enumerate(run.state_coordinates.labels):
+        numbers["states", label] = recorded.states[:, which]
+        numbers["plan", label] = run.plan.states[:begun, which]
+    for which, label in enumerate(run.control_coordinates.labels):
+        numbers["commanded", label] = run.commanded[trial, : begun - 1, which]
+        numbers["applied", label] = run.applied[trial, : begun - 1, which]
+    for path, values in numbers.items():
+        known = np.isfinite(values)
+        times = recorded.times[: len(values)][known]
+        if known.any():
+            _send(rerun, stream, ["numbers", *path], times, rerun.Scalars.columns(scalars=values[known]))
+
+
+def _send(rerun: Any, stream: Any, entity: list[str], times: Array, columns: Any) -> None:
+    path = rerun.new_entity_path(entity)
+    rerun.send_columns(path, [rerun.TimeColumn(TIMELINE, duration=times.tolist())], columns, recording=stream)
+
+
+def _colour(model: mujoco.MjModel, geom: int) -> Array:
+    """(4,): of its material, if it has one."""
+    material = int(model.geom_matid[geom])
+    return np.array(model.geom_rgba[geom] if material < 0 else model.mat_rgba[material], dtype=np.float64)
+
+
+def _bytes(colour: Array) -> list[int]:
+    """A colour of numbers from 0 to 1."""
+    return np.round(255 * np.clip(colour, 0, 1)).astype(int).tolist()
+
+
+def _quaternion(matrix: Array) -> Array:
+    """Of a rotation (3, 3), scalar last, as Rerun has it."""
+    found = np.empty(4)
+    mujoco.mju_mat2Quat(found, np.ascontiguousarray(matrix).ravel())
+    return np.roll(found, -1)
