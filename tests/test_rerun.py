@@ -135,7 +135,7 @@ def test_without_the_package_it_says_what_to_install(
 
 @pytest.mark.parametrize(
     ("options", "named"),
-    [(["--camera", "top", "--fps", "5"], "--camera, --fps"), (["--trial", "0", "1"], "several runs")],
+    [(["--camera", "top", "--fps", "5"], "--camera, --fps"), (["--trial", "0", "1"], "several runs or none")],
 )
 def test_what_the_viewer_decides_is_refused(
     options: list[str], named: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -111,13 +111,13 @@ class Render:
         from lqrsim.results import save_load
         from lqrsim.view import rerun_file
 
-        own = ("rollouts", "out", "trial")
+        own, paths, trials = ("rollouts", "out", "trial"), list(self.rollouts), list(self.trial)
         given = [one.name for one in fields(self) if one.name not in own and getattr(self, one.name) != one.default]
-        if given or len(self.rollouts) > 1 or len(self.trial) > 1:
-            got = ", ".join(f"--{name}" for name in given) or "several runs"
+        if given or len(paths) > 1 or len(trials) != 1:
+            got = ", ".join(f"--{name}" for name in given) or "several runs or none"
             raise InputError(f"--out: got {out.name} with {got}, want it with one run, one --trial and nothing else")
         console.check_output("--out", out.parent, out.name)
-        for name in rerun_file.write(save_load.load_rollout(self.rollouts[0]), out, trial=self.trial[0]):
+        for name in rerun_file.write(save_load.load_rollout(paths[0]), out, trial=trials[0]):
             console.say(f"left out: {name}, of a kind that Rerun has no shape for")
         console.wrote(out)
         return 0
