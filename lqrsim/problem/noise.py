@@ -143,7 +143,13 @@ class Noise:
         return f"Noise({self.name}, size={self.size}{times})"
 
     def scaled(self, strength: float) -> "Noise":
-        """The same, so many times as strong. Nothing compiles again.
+        """The same noise with M multiplied by a number. Nothing is compiled again.
+
+        Args:
+          strength: the number, at least 0; strengths of several calls multiply.
+
+        Returns:
+          Another Noise; this one does not change.
 
         Raises:
           InputError: the strength is negative or not finite.
@@ -153,7 +159,13 @@ class Noise:
         return other
 
     def with_parameters(self, **values: float) -> "Noise":
-        """The same with other values of some parameters. Nothing compiles again.
+        """The same noise with other values of some parameters. Nothing is compiled again.
+
+        Args:
+          **values: name of a parameter -> its value.
+
+        Returns:
+          Another Noise; this one does not change.
 
         Raises:
           InputError: there is no such parameter, or the value is not finite.
@@ -165,7 +177,17 @@ class Noise:
         return other
 
     def bind(self, dynamics: Dynamics) -> NoiseTerm:
-        """The noise for a system. Raises InputError if it does not fit."""
+        """The noise for a system.
+
+        Args:
+          dynamics: of the system, with its states and controls.
+
+        Returns:
+          What gets compiled, and the numbers that it reads.
+
+        Raises:
+          InputError: the noise does not fit the system.
+        """
         check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         numbers = np.array([*self.parameters.values(), self.strength])
@@ -241,7 +263,19 @@ class Noise:
         return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, (function,))
 
     def matrices(self, dynamics: Dynamics, states: npt.ArrayLike, controls: npt.ArrayLike) -> Array:
-        """M (K, n, k) at states (K, n) and controls (K, m). Raises InputError if they do not fit."""
+        """M at given states and controls.
+
+        Args:
+          dynamics: of the system, with its states and controls.
+          states: (K, n).
+          controls: (K, m).
+
+        Returns:
+          (K, n, k), in the states' units, for each.
+
+        Raises:
+          InputError: the noise, the states or the controls do not fit the system.
+        """
         check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         x = check_array("states", states, (None, n), infinite=True)
