@@ -57,7 +57,7 @@ def render(
         now. trace: the path so far, coloured by tracking error. forces: arrows of forces and wind, means over the last
         fifth of a second. measured: the last measured states, where they differ from the true ones. tube: the states
         predicted under the disturbances, within 2 standard deviations, where there is a `rollout.tube` and it is not
-        too wide. cost_tube: ellipsoids of low total cost. caption: time, tracking error, clearance, disturbances, a legend.
+        too wide. cost_tube: ellipsoids of low total cost. caption: time, tracking error, clearance, disturbances.
       solution: of which the run is, for cost_tube; one for all, or one each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and how much the video is compressed.
       size: width and height in pixels, both even; by default the quality's, or half for a GIF (at least 480 x 270).
