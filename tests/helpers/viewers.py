@@ -57,7 +57,7 @@ def viewing(folder: Path, *arguments: str, before: str = "") -> Iterator[subproc
         finally:
             process.send_signal(signal.SIGINT)
             try:
-                process.wait(60)
+                process.communicate(timeout=60)  # reads on, for a process that cannot write cannot end
             except subprocess.TimeoutExpired:
                 process.send_signal(signal.SIGABRT)  # where it hangs is then in what it wrote
                 raise AssertionError(f"it did not end with Ctrl-C:\n{process.communicate()[0]}") from None
