@@ -21,7 +21,8 @@ commands:
 
 `lqrsim COMMAND --help` documents each command, `lqrsim --version` prints the
 version. Exit codes: 0 done, 1 not converged or a check failed, 2 bad input,
-130 stopped with Ctrl-C, 141 output pipe closed."""
+130 stopped with Ctrl-C, 141 output pipe closed. With --json a command prints
+one JSON object, and everything else goes to stderr."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -81,6 +82,7 @@ def _run(arguments: list[str]) -> int:
     with process.printing():
         command = tyro.cli(Command, prog="lqrsim", args=arguments)
 
+    from lqrsim.commands import console
     from lqrsim.errors import InputError
 
     notices = logging.StreamHandler()  # on stderr: what takes its time, such as compiling for a new kind of problem
@@ -89,7 +91,7 @@ def _run(arguments: list[str]) -> int:
     logger.setLevel(logging.INFO)
     try:
         with process.interruptible():
-            return command.run()
+            return console.run(command)
     except InputError as error:
         process.print_error(f"lqrsim: error: {error}")
         return 2

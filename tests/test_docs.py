@@ -101,6 +101,14 @@ def test_a_robot_scene_cost_and_disturbance_of_ones_own(
         assert ls.render(rollout, tmp_path / "rink.mp4", size=(320, 240), fps=5).stat().st_size > 1000
 
 
+def test_environments_of_gymnasium(capsys: pytest.CaptureFixture[str]) -> None:
+    """The blocks hold what they assert, and print what they say."""
+    names = run_page("gymnasium.md")
+    single, many = capsys.readouterr().out.split("\n", 1)
+    assert single == "reached"
+    assert many.count("reached") == len(names["ended"]) == 16
+
+
 @pytest.mark.long
 def test_one_system_at_three_levels() -> None:
     names = run_page("stating_a_system.md")

@@ -364,6 +364,16 @@ def test_benchmark_of_replanning(tmp_path: Path) -> None:
     assert "### How long re-plans take" in script.report(found)
 
 
+def test_a_learner_that_sees_the_state_does_as_its_expert_does_and_one_that_sees_the_time_does_not() -> None:
+    script = import_module("gym_imitation")
+    result = script.main(script.Config(quick=True))
+    reached = {name: one["reached"] for name, one in result["agents"].items()}
+    assert reached["the policy"] == 20
+    assert reached["learnt, with the state"] >= 18
+    assert reached["learnt, time alone"] <= 10
+    assert "| the policy | 20 of 20 |" in script.report(result)
+
+
 @pytest.mark.long
 def test_board_of_realaigym() -> None:
     """Two of the runs: one whose model is right but for a motor's inertia, of zero, and one of velocity noise."""

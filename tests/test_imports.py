@@ -24,9 +24,10 @@ FLOORS = (
     ("solvers",),
     ("control",),
     ("simulation",),
-    ("scenarios",),
+    ("scenarios", "templates"),
     ("stress",),
     ("view",),
+    ("gym",),
     ("verify",),
     ("reports",),
     ("commands",),
@@ -39,7 +40,7 @@ FLOORS_WITHIN = {
     "scenes": (("world",),),
     "results": (
         ("schema", "hashing", "ball_record", "coordinates", "solution_parts", "trial_outcome", "value_functions"),
-        ("archive", "goal", "policy"),
+        ("archive", "goal", "notebook", "policy"),
         ("solution",),
         ("rollout",),
     ),
@@ -67,6 +68,7 @@ ALLOWED = {
     "distributed": ("stress",),
     "jinja2": ("reports",),
     "tqdm": ("commands",),
+    "gymnasium": ("gym",),
 }
 
 MODULES = {

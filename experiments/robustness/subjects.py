@@ -1,7 +1,8 @@
 """Every public callable of lqrsim with arguments that it accepts, small and cheap, for `api.py` to spoil.
 
-`public()` finds them by introspection: what `lqrsim.__all__` lists, the functions of its modules, the public methods of
-its classes that take arguments. `subjects()` has arguments for each; a test fails where one has none.
+`public()` finds them by introspection: what `lqrsim.__all__` and `lqrsim.gym.__all__` list, the functions of its
+modules, the public methods of its classes that take arguments. `subjects()` has arguments for each; a test fails where
+one has none.
 """
 
 import enum
@@ -14,7 +15,9 @@ from types import ModuleType
 from typing import Any
 
 import lqrsim as ls
+from lqrsim import gym
 from lqrsim.stress.trial_tables import Damaged
+from robustness.of_gym import environments
 from robustness.of_policies import policies
 from robustness.of_problems import problems, results, solving
 from robustness.of_runs import campaigns, pictures, running
@@ -45,8 +48,9 @@ class Subject:
 
 def public() -> Iterator[tuple[str, Any]]:
     """Each public callable by its name: `smooth`, `Problem`, `AffinePolicy.control`, `rotations.rotate`."""
-    for name in ls.__all__:
-        item = getattr(ls, name)
+    offered = {name: getattr(ls, name) for name in ls.__all__}
+    offered |= {f"gym.{name}": getattr(gym, name) for name in gym.__all__}
+    for name, item in offered.items():
         if isinstance(item, ModuleType):
             for key in getattr(item, "__all__", vars(item)):
                 one = getattr(item, key)
@@ -80,7 +84,7 @@ def subjects(folder: Path) -> dict[str, Subject]:
     logging.getLogger("lqrsim").setLevel(logging.ERROR)
     place = Place(folder)
     found: dict[str, Subject] = {}
-    for make in (problems, solving, results, policies, running, campaigns, pictures):
+    for make in (problems, solving, results, policies, running, campaigns, pictures, environments):
         for name, (arguments, *weight) in make(place).items():
             owner, _, method = name.partition(".")
             if "call" in arguments:

@@ -6,6 +6,7 @@ Heavy modules are imported inside `run`, so that `--help` answers at once.
 import inspect
 from typing import get_args
 
+from lqrsim.commands.creating import New
 from lqrsim.commands.failures import Break, Rare
 from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
 from lqrsim.commands.solving import List, Simulate, Solve
@@ -15,6 +16,7 @@ from lqrsim.commands.viewing import Render, View
 
 Command = (
     List
+    | New
     | Solve
     | Simulate
     | Render

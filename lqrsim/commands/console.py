@@ -1,4 +1,4 @@
-"""What the commands share: progress on the terminal, and an early look at whether the outputs can be written."""
+"""What the commands share: what they print, progress, and an early look at whether the outputs can be written."""
 
 import contextlib
 import os
@@ -6,11 +6,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from lqrsim import process
+from lqrsim.commands import as_json
 from lqrsim.errors import InputError
 from lqrsim.results.archive import excerpt_of
 
@@ -18,6 +20,59 @@ if TYPE_CHECKING:
     from lqrsim.problem.problem import Problem
     from lqrsim.results.solution import Solution
     from lqrsim.results.solution_parts import Iteration
+
+# What the command that runs has to print with `--json`; None without.
+_RESULT: ContextVar[dict[str, Any] | None] = ContextVar("result", default=None)
+
+
+class Runnable(Protocol):
+    """A command."""
+
+    def run(self) -> int: ...
+
+
+def run(command: Runnable) -> int:
+    """Run a command; with `--json` its result is all that is printed, and everything else goes to stderr.
+
+    Returns:
+      The exit code.
+
+    Raises:
+      InputError: the command's. Nothing is printed then.
+      process.Unprintable: it cannot be written.
+    """
+    if not getattr(command, "json", False):
+        return command.run()
+    result: dict[str, Any] = {"format": f"lqrsim {type(command).__name__.lower()}", "version": 1}
+    token = _RESULT.set(result)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            result["exit_code"] = command.run()
+    finally:
+        _RESULT.reset(token)
+    with process.printing():
+        print(as_json.text_of(result), flush=True)
+    return result["exit_code"]
+
+
+def result(**parts: object) -> None:
+    """Add to what `--json` prints; nothing without it."""
+    found = _RESULT.get()
+    if found is not None:
+        found.update(parts)
+
+
+def wants_result() -> bool:
+    """Whether it is asked for, where it takes time to make."""
+    return _RESULT.get() is not None
+
+
+def wrote(path: Path) -> None:
+    """Say that a file or folder was written."""
+    say(f"wrote {path}")
+    found = _RESULT.get()
+    if found is not None:
+        found.setdefault("wrote", []).append(path)
 
 
 def say(text: str = "") -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lqrsim.commands import console
+from lqrsim.commands import as_json, console
 from lqrsim.control.tubes import Tube
 from lqrsim.errors import InputError
 from lqrsim.results import save_load
@@ -48,18 +48,19 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
     rows: list[str] = []
     failures: list[str] = []
     misses: list[str] = []
+    results: list[as_json.Object] = []
     for reference, scenario in scenarios.items():
         folder = out / folder_name(scenario)
         console.say(f"\n== {reference}: {scenario.summary}")
         solved = console.solve(scenario.problem, "smooth", reach=scenario.target_radius())
         solution = replace(solved, scenario=from_anywhere(reference))
-        console.say(f"wrote {save_load.save(solution, folder / 'solution.npz')}")
+        console.wrote(save_load.save(solution, folder / "solution.npz"))
         tube, remark = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)
         if remark:
             console.say(remark)
         if solution.cost_to_go is not None:
             world, radius = scenario.scene.world, scenario.robot.radius
-            console.say(f"wrote {plot_policy(solution, folder / 'policy.png', world=world, radius=radius, tube=tube)}")
+            console.wrote(plot_policy(solution, folder / "policy.png", world=world, radius=radius, tube=tube))
         if not solution.success:
             failures.append(f"{reference}: the plan did not converge ({solution.status.name})")
         runs = {
@@ -71,17 +72,21 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
             bound = f"want <= {scenario.tracking_bound:g} {unit}"
             failures.append(f"{reference}: undisturbed up to {worst:.3g} {unit} off its plan, {bound}")
         figure = plot_run(solution, runs, folder / "figure.png", world=scenario.scene.world)
-        console.say(f"wrote {figure}")
+        console.wrote(figure)
         plan, reach = runs["undisturbed"].target, runs["undisturbed"].goal_radius
         misses += [f"{reference}: {line}" for line in plan.of_plan(reach)[1:]]
         if video:
             _render_video(runs["disturbed"], folder / "video.mp4", quick=quick)
         rows += [_row(reference, name, solution, rollout) for name, rollout in runs.items()]
+        if console.wants_result():
+            shown = {name: as_json.of_rollout(run, scenario.problem) for name, run in runs.items()}
+            results.append({"solution": as_json.of_solution(solution), "runs": shown})
     console.say("\n" + "\n".join([TABLE, *rows]))
     for miss in misses:
         console.say(miss)
     for failure in failures:
         console.say(f"FAILED {failure}")
+    console.result(scenarios=results, misses=misses, failures=failures)
     return 1 if failures else 0
 
 
@@ -110,7 +115,7 @@ def _execute(
         )  # fmt: skip
     console.say(rollout.summary())
     rollout = rollout if tube is None else tube.added_to(rollout)
-    console.say(f"wrote {save_load.save(rollout, path)}")
+    console.wrote(save_load.save(rollout, path))
     return rollout
 
 
@@ -123,7 +128,7 @@ def _render_video(rollout: Rollout, path: Path, *, quick: bool) -> None:
     quality, fps = ("draft", 5) if quick else ("standard", 30)
     with console.progress("rendering", "frame") as progress:
         render(rollout, path, insets=insets, quality=quality, fps=fps, progress=progress)
-    console.say(f"wrote {path}")
+    console.wrote(path)
 
 
 def _row(reference: str, run: str, solution: Solution, rollout: Rollout) -> str:

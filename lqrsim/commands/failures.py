@@ -1,12 +1,13 @@
 """Commands that look for failures that random trials would seldom show."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Folder, Policy, optional
+from lqrsim.commands.options import Folder, Json, Policy, optional
 
 if TYPE_CHECKING:
     from lqrsim.results.rollout import Rollout
@@ -35,6 +36,8 @@ class Search:
     """The same for goals without a position, relative to each state's range along the plan. By default 0.1."""
     seed: int = 0
     """Seed of all random numbers. The same seed gives the same output."""
+    json: Json = False
+    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def _problem(self) -> "ReliabilityProblem":
         from lqrsim.stress.failure_search import ReliabilityProblem
@@ -89,6 +92,7 @@ class Rare(Search):
                 rare = problem.rare_failures(report=console.say, progress=progress, **options)
         except NoFailure as none:
             console.say(f"no failure was found ({none})")
+            console.result(found=None, reason=str(none))
             return 1
         console.say(rare.summary())
         rollout = rare.save(folder, shown=self.shown)
@@ -131,6 +135,7 @@ class Break(Search):
                 )
         except NoFailure as none:
             console.say(f"no failure was found ({none})")
+            console.result(found=None, reason=str(none))
             return 1
         console.say(smallest.summary())
         _say_written(smallest.save(folder), folder, "break.json")
@@ -138,9 +143,10 @@ class Break(Search):
 
 
 def _say_written(rollout: "Rollout", folder: Path, name: str) -> None:
-    """The trials that were written, and where they are."""
+    """The trials that were written, and where they are; the result is that of the file."""
     from lqrsim.commands import console
 
     console.say(rollout.summary())
-    console.say(f"wrote {folder / 'rollout.npz'}")
-    console.say(f"wrote {folder / name}")
+    console.wrote(folder / "rollout.npz")
+    console.wrote(folder / name)
+    console.result(**json.loads((folder / name).read_text(encoding="utf-8")))

@@ -8,6 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from lqrsim.commands.options import Json
+
 
 @dataclass(frozen=True, kw_only=True)
 class Demo:
@@ -29,6 +31,8 @@ class Demo:
     """--no-video skips the videos."""
     quick: bool = False
     """Smaller videos with fewer frames, for a first look."""
+    json: Json = False
+    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
@@ -54,6 +58,8 @@ class Reproduce:
     """Output folder."""
     quick: bool = False
     """Run a small part of each, for a first look."""
+    json: Json = False
+    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
@@ -74,6 +80,8 @@ class Cache:
 
     clear: bool = False
     """Remove everything in it."""
+    json: Json = False
+    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
@@ -83,7 +91,9 @@ class Cache:
 
         if self.clear:
             try:
-                console.say(f"removed {disk_cache.clear()} items from {disk_cache.folder()}")
+                removed = disk_cache.clear()
+                console.say(f"removed {removed} items from {disk_cache.folder()}")
+                console.result(removed=removed, folder=disk_cache.folder())
             except OSError as error:
                 raise InputError(
                     f"--clear: got {disk_cache.folder()}, want files that can be removed ({error})"
@@ -99,4 +109,6 @@ class Cache:
         console.say(
             f"{len(items)} items, {total:.1f} of at most {disk_cache.LIMIT / 1e6:.0f} MB, in {disk_cache.folder()}"
         )
+        listed = [{"what": item.what, "size": item.size, "used": item.used} for item in items]
+        console.result(items=listed, limit=disk_cache.LIMIT, folder=disk_cache.folder())
         return 0

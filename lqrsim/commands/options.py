@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import arg
+from tyro.conf import FlagCreatePairsOff, arg
 
 
 def optional(metavar: str) -> object:
@@ -13,4 +13,5 @@ def optional(metavar: str) -> object:
 
 Policy = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
 ControllerName = Literal["feedback", "track", "offset_free", "replan"]
+Json = FlagCreatePairsOff[bool]
 Folder = Annotated[Path | None, optional("FOLDER")]

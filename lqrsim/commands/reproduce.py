@@ -88,9 +88,13 @@ def reproduce(scripts: Sequence[str], *, out: Path, quick: bool) -> int:
         with replacing(out / "results.md") as unfinished:
             unfinished.write_text(results_page(saved), encoding="utf-8")
         console.say("\n" + "\n".join(verdicts(results, out)))
-        console.say(f"\nwrote {out / 'results.md'} and {out / 'results.json'} in {time.monotonic() - begun:.0f} s")
+        console.say(f"\ntook {time.monotonic() - begun:.0f} s")
+        console.wrote(out / "results.md")
+        console.wrote(out / "results.json")
+        console.result(**saved)
     for failure in failures:
         console.say(f"FAILED {failure.script}: exit code {failure.code}")
+    console.result(failures=failures)
     return 1 if failures else 0
 
 

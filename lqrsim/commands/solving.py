@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import ControllerName, Folder, optional
+from lqrsim.commands.options import ControllerName, Folder, Json, optional
 
 if TYPE_CHECKING:
     from lqrsim.simulation.disturbances import Disturbance
@@ -16,20 +16,24 @@ if TYPE_CHECKING:
 class List:
     """Print the scenarios: robot, scene, states and controls with units."""
 
+    json: Json = False
+    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
+
     def run(self) -> int:
         """Run the command. Returns the exit code."""
         from lqrsim import scenarios
-        from lqrsim.commands import console
+        from lqrsim.commands import as_json, console
         from lqrsim.scenarios.references import resolve
 
-        for name in scenarios.names():
-            scenario = resolve(name)
+        found = {name: resolve(name) for name in scenarios.names()}
+        for name, scenario in found.items():
             problem = scenario.problem
             console.say(f"{name}: {scenario.summary}")
             console.say(f"  robot:    {scenario.robot.name} in scene {scenario.scene.name}")
             console.say(f"  horizon:  {problem.steps} steps of {problem.dt:.4g} s")
             console.say(f"  states:   {', '.join(problem.dynamics.state_coordinates.labels)}")
             console.say(f"  controls: {', '.join(problem.dynamics.control_coordinates.labels)}")
+        console.result(scenarios=[as_json.of_scenario(name, scenario) for name, scenario in found.items()])
         return 0
 
 
@@ -67,10 +71,12 @@ class Solve:
     figure: Annotated[Path | None, optional("FILE")] = None
     """Also plot the policy to FILE.png, .pdf or .svg: the predicted tube under the scenario's disturbances, the
     cost-to-go along the plan, and the gains over time."""
+    json: Json = False
+    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
-        from lqrsim.commands import console
+        from lqrsim.commands import as_json, console
         from lqrsim.errors import InputError
         from lqrsim.problem.clearance import Clearance
         from lqrsim.results import save_load
@@ -102,7 +108,8 @@ class Solve:
             options["start"] = scenario.paper_start
         solved = console.solve(problem, self.solver, reach=scenario.target_radius(), **options)
         solution = replace(solved, scenario=from_anywhere(self.scenario))
-        console.say(f"wrote {save_load.save(solution, folder / 'solution.npz')}")
+        console.wrote(save_load.save(solution, folder / "solution.npz"))
+        console.result(solution=as_json.of_solution(solution))
         if self.figure is not None:
             from lqrsim.simulation.tube_under import tube_under
             from lqrsim.view.policy_plot import plot_policy
@@ -111,7 +118,7 @@ class Solve:
             if remark:
                 console.say(remark)
             world, radius = scenario.scene.world, scenario.robot.radius
-            console.say(f"wrote {plot_policy(solution, self.figure, world=world, radius=radius, tube=tube)}")
+            console.wrote(plot_policy(solution, self.figure, world=world, radius=radius, tube=tube))
         return 0 if solution.success else 1
 
 
@@ -167,10 +174,12 @@ class Simulate:
     """Distance from the goal within which it counts as reached. By default the robot's radius."""
     goal_tolerance: Annotated[float | None, optional("SHARE")] = None
     """The same for goals without a position, relative to each state's range along the plan. By default 0.1."""
+    json: Json = False
+    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
-        from lqrsim.commands import console
+        from lqrsim.commands import as_json, console
         from lqrsim.errors import InputError
         from lqrsim.results import save_load
         from lqrsim.scenarios.references import resolve
@@ -211,8 +220,10 @@ class Simulate:
         if remark:
             console.say(remark)
         rollout = rollout if tube is None else tube.added_to(rollout)
-        console.say(f"wrote {save_load.save(rollout, folder / 'rollout.npz')}")
+        console.wrote(save_load.save(rollout, folder / "rollout.npz"))
         console.say(rollout.tally())
+        if console.wants_result():
+            console.result(run=as_json.of_rollout(rollout, scenario.problem), tube_leaves_out=remark)
         return 0
 
     def _single_disturbances(self) -> "list[Disturbance]":

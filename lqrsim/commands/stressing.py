@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Folder, Policy, optional
+from lqrsim.commands.options import Folder, Json, Policy, optional
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,10 +58,12 @@ class Stress:
     """Trials that a worker simulates together; affects only time and memory."""
     scheduler: Annotated[str | None, optional("ADDRESS")] = None
     """Address of a dask cluster that does the work instead of this machine, such as tcp://10.0.0.1:8786."""
+    json: Json = False
+    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
-        from lqrsim.commands import console
+        from lqrsim.commands import as_json, console
         from lqrsim.scenarios.references import folder_name, resolve
         from lqrsim.stress.campaign import USUAL, Campaign, run_campaign
         from lqrsim.stress.results import Results
@@ -91,7 +93,9 @@ class Stress:
         with console.long_progress("stressing", "trial") as progress:
             results = run_campaign(campaign, folder, progress=progress, **options)
         console.say(results.summary())
-        console.say(f"wrote {folder}")
+        console.wrote(folder)
+        if console.wants_result():
+            console.result(campaign=as_json.of_campaign(results))
         return 1 if any(results.tally(cell)["error"] for cell in results.cells) else 0
 
 
@@ -114,10 +118,12 @@ class Replay:
     """The campaign's scenario if it is your own function: files never choose code to run."""
     out: Annotated[Path, arg(metavar="FILE.npz")] = Path("rollout.npz")
     """File to write."""
+    json: Json = False
+    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
-        from lqrsim.commands import console
+        from lqrsim.commands import as_json, console
         from lqrsim.results import save_load
         from lqrsim.stress.results import Results, differences, replay
         from lqrsim.stress.specification import Cell
@@ -137,7 +143,10 @@ class Replay:
             console.say(f"NOT as in the table: {one}")
         if not different:
             console.say("identical to the table")
-        console.say(f"wrote {save_load.save(rollout, self.out)}")
+        console.wrote(save_load.save(rollout, self.out))
+        if console.wants_result():
+            run = as_json.of_rollout(rollout, results.trials.scenario.problem)
+            console.result(cell=cell, run=run, differences=different)
         return 1 if different else 0
 
 
@@ -157,10 +166,12 @@ class Report:
     """Number of the worst trials to repeat and render."""
     scenario: Annotated[str | None, optional("SCENARIO")] = None
     """The campaign's scenario if it is your own function: files never choose code to run."""
+    json: Json = False
+    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
-        from lqrsim.commands import console
+        from lqrsim.commands import as_json, console
         from lqrsim.errors import InputError
         from lqrsim.reports.page import report
         from lqrsim.stress.results import Results
@@ -172,5 +183,7 @@ class Report:
         results = Results(self.folder, scenario=self.scenario)
         with console.progress("reporting", "part") as progress:
             report(results, page, videos=self.videos, progress=progress)
-        console.say(f"wrote {page}")
+        console.wrote(page)
+        if console.wants_result():
+            console.result(campaign=as_json.of_campaign(results))
         return 0

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import optional
+from lqrsim.commands.options import Json, optional
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,10 +29,12 @@ class Verify:
     """Row of the rollout, from 0. By default 0, or the first that the video shows."""
     solution: Annotated[Path | None, optional("SOLUTION.npz")] = None
     """Solution of the run, to check the recorded plan. By default solution.npz beside the run."""
+    json: Json = False
+    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code: 1 if a test failed."""
-        from lqrsim.commands import console
+        from lqrsim.commands import as_json, console
         from lqrsim.results import save_load
         from lqrsim.verify.ground_truth import ran_policy_of
         from lqrsim.verify.rollout_check import verify_run
@@ -52,4 +54,5 @@ class Verify:
             else:
                 found = verify_video(self.file, rollout, trial=self.trial, solution=solution, progress=progress)
         console.say(found.summary())
+        console.result(verification=as_json.of_verification(found))
         return 0 if found.passed else 1

@@ -97,7 +97,7 @@ class Render:
         else:
             with console.progress("rendering", "frame") as progress:
                 render(shown, out, fps=self.fps, speed=self.speed, progress=progress, **options)
-        console.say(f"wrote {out}")
+        console.wrote(out)
         return 0
 
 

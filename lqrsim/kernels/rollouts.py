@@ -55,6 +55,18 @@ def costs_of(count, steps, plans, model, costs):
         costs[k] += final_value(plans.states[(k + 1) * (steps + 1) - 1], last, steps, model.final)
 
 
+def stage_costs_of(count, t, plans, model, costs):
+    """Stage costs of step t: states (count, N), controls (count, M)."""
+    for k in range(count):
+        costs[k] = stage_value(plans.states[k], plans.controls[k], t, model.stage)
+
+
+def final_costs_of(count, steps, plans, model, costs):
+    """Final costs of trajectories of so many steps that end with these states (count, N) and controls (count, M)."""
+    for k in range(count):
+        costs[k] = final_value(plans.states[k], plans.controls[k], steps, model.final)
+
+
 def noise_cost(steps, plan, model, to_go):
     """What noise is expected to cost along a trajectory, with the cost-to-go of the policy that makes it."""
     total, none = 0.0, stack(N, W)

@@ -23,6 +23,7 @@ from lqrsim.errors import (
     shaped,
     vectors_of,
 )
+from lqrsim.results import notebook
 from lqrsim.results.ball_record import BallRecord
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.goal import Target, tracking_error, tracking_unit
@@ -393,3 +394,6 @@ class Rollout:
         )
 
     __str__ = summary
+
+    def _repr_html_(self) -> str:
+        return notebook.of_rollout(self)

@@ -22,6 +22,7 @@ from lqrsim.errors import (
     excerpt,
     real,
 )
+from lqrsim.results import notebook
 from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution_parts import (
@@ -290,3 +291,6 @@ class Solution:
 
     def __str__(self) -> str:
         return f"{self.iteration_table()}\n{self.summary()}"
+
+    def _repr_html_(self) -> str:
+        return notebook.of_solution(self)

@@ -5,6 +5,7 @@ them is in `effects.py`, MuJoCo's part in `physics.py`, what counts as a collisi
 in `recorder.py`.
 """
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -98,7 +99,11 @@ def simulate(
 class Loop:
     """The closed loop of K trials: what happens in a control period, phase by phase.
 
-    The states (K, n) and what is recorded of them are those of all trials at once.
+    The states (K, n) and what is recorded of them are those of all trials at once. `run` runs all of it; `begin` and
+    `period` run it step by step.
+
+    Attributes:
+      step: number of the control period that comes next. shown: (K, n) what the controller is shown then.
     """
 
     def __init__(self, settings: RunSettings) -> None:
@@ -119,23 +124,32 @@ class Loop:
         self.collisions = Collisions(plant, self.states, self.effects.displaced, plan.dt)
         space = plant.robot.dynamics.control_coordinates
         self._names, self._low, self._high = space.names, np.array(space.low), np.array(space.high)
+        self.step, self.shown = 0, self.states
 
     def run(self) -> None:
         """All control periods; fewer if no trial is left."""
         settings, steps = self.settings, self.settings.plan.steps
-        for step in range(steps):
-            shown = self.measure(step)
-            commands = self.decide(step, shown)
-            controls = self.actuate(step, commands)
-            wrench = self.push(step)
-            if self.records.over(step).all():
-                break
-            self.advance(step, controls, wrench)
+        self.begin()
+        while self.step < steps and self.period():
             if settings.progress is not None:
-                settings.progress(step + 1, steps)
-        else:
-            self.measure(steps)
+                settings.progress(self.step, steps)
         self.detect_contacts_at_end()
+
+    def begin(self) -> None:
+        """Measure the states at the first knot."""
+        self.step, self.shown = 0, self.measure(0)
+
+    def period(self) -> bool:
+        """One control period, to the measurement at its end; False, and nothing moves, if no trial is left."""
+        step = self.step
+        commands = self.decide(step, self.shown)
+        controls = self.actuate(step, commands)
+        wrench = self.push(step)
+        if self.records.over(step).all():
+            return False
+        self.advance(step, controls, wrench)
+        self.step, self.shown = step + 1, self.measure(step + 1)
+        return True
 
     def measure(self, step: int) -> Array:
         """The states (K, n) that the controller is shown."""
@@ -209,6 +223,15 @@ class Loop:
         never_lost = self.records.lost_since > plan.steps
         for row in np.flatnonzero(touching.any(axis=1) & np.isinf(self.collisions.at) & never_lost):
             self.collisions.touch(int(row), plan.horizon, touching[row])
+
+    def so_far(self) -> Rollout:
+        """What was recorded up to now; NaN after it, with a controller that failed. The loop can go on."""
+        twin = copy.copy(self)
+        twin.records = copy.deepcopy(self.records)
+        if self.step < self.settings.plan.steps:
+            trials = self.settings.trials
+            twin.records.fail(self.step, np.ones(trials, dtype=bool), ["went no further"] * trials)
+        return twin.rollout()
 
     def rollout(self) -> Rollout:
         """All that was recorded."""

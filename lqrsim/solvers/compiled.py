@@ -140,6 +140,27 @@ def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
     return costs
 
 
+class CostsByStep:
+    """The parts of `costs_of` of a problem, one step at a time."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._core, self._steps, self._model = core(problem), problem.steps, arguments(problem)
+
+    def stage(self, t: int, states: Array, controls: Array) -> Array:
+        """Stage costs (K,) of step t in states (K, n) under controls (K, m)."""
+        costs = np.empty(len(states))
+        plans = Plan(in_c_order(states), in_c_order(controls))
+        self._core.stage_costs_of(len(states), t, plans, self._model, costs)
+        return costs
+
+    def final(self, states: Array, controls: Array) -> Array:
+        """Final costs (K,) of states (K, n) that controls (K, m) led to."""
+        costs = np.empty(len(states))
+        plans = Plan(in_c_order(states), in_c_order(controls))
+        self._core.final_costs_of(len(states), self._steps, plans, self._model, costs)
+        return costs
+
+
 def rollout(
     problem: Problem, gain: Array, offset: Array, state: Array, *, dt: float | None = None
 ) -> tuple[Array, Array]:

@@ -1,0 +1,1 @@
+"""The benchmark problems of Altro.jl, rebuilt from their published specification."""

@@ -1,0 +1,343 @@
+"""The benchmark problems of Altro.jl, rebuilt from their published specification: our iterations beside theirs.
+
+    python experiments/altro_problems.py                       # all nine, two minutes, most of them compiling
+    python experiments/altro_problems.py --problems acrobot    # some of them
+    python experiments/altro_problems.py --quick               # the first two
+
+Altro.jl is an augmented Lagrangian method about iLQR, finished by projected Newton steps. Its tests say how many
+iterations each problem takes until constraints are violated by less than 1e-6: those of commit d1b57ce of November
+2020, and those of the last commit, 4864df2. Altro.jl is not run here. The models are those of RobotZoo.jl. A solve
+begins with the controls that Altro.jl begins with, and for `escape` with its states.
+
+There are two counts of ours. "default" is of `ls.smooth` with its default settings, which first solves the problem
+without its constraints. "tuned" is with tolerances of 1 % and a gap of 10 %, and settings of each problem: a penalty to
+begin with, so that the constraints count from the first iteration, and the pass that comes first. They are the best of
+what was tried, up to nine penalties with either pass, so they say what the method can do, and not what to expect of a
+new problem. Altro.jl's tests have a penalty, its growth and tolerances for each problem, too. An iteration of ours is a
+forward pass, a backward pass and a rollout; one of theirs is a backward pass and the rollouts of a line search, or a
+projected Newton step.
+
+What differs from the specification: the circles of `escape` are kept as distances, and its guess is made of splines
+without a bend at the ends; tuned, it has an ObstacleCost besides, of the best of four weights and widths, without which
+no way round is found from there. `cartpole` is integrated by RK4, not RK3. `barrel_roll` has limits in place of clamps
+of the controls, and of its final quaternion the vector alone is fixed, for the scalar follows from its length.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from altro import models
+from altro.airplane import TRIM_CONTROLS, airplane, unclamped
+from numpy.typing import NDArray
+from paper.common import Result, Settings, Statement, opening, run, table
+from scipy.interpolate import CubicSpline
+from tqdm import tqdm
+
+import lqrsim as ls
+from lqrsim.errors import check_name
+from lqrsim.results.solution_parts import Multipliers
+
+VIOLATION = 1e-6  # what counts as kept, theirs and ours
+ROUGHLY: dict[str, Any] = {"tolerance": 1e-2, "gap_tolerance": 0.1}
+Start = NDArray[np.float64] | ls.Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A problem.
+
+    Attributes:
+      make: the problem and what a solve begins with.
+      theirs: iterations that the tests of November 2020 want. newest: those of the last commit, in words.
+      penalty: of all constraints, to begin with; None to solve without them first. first_pass: as in `ls.smooth`.
+      obstacle_cost: what is added to the stage cost. All three are of the tuned solve.
+    """
+
+    make: Callable[[], tuple[ls.Problem, Start]]
+    theirs: int
+    newest: str
+    penalty: float | None = None
+    first_pass: str = "forward"
+    obstacle_cost: Callable[[], ls.ObstacleCost] | None = None
+
+
+def problem(
+    dynamics: ls.Dynamics,
+    seconds: float,
+    knots: int,
+    start: Any,
+    goal: Any,
+    weights: tuple[Any, Any, Any],
+    **options: Any,
+) -> ls.Problem:
+    """What most of them are: quadratic costs about the goal, which is to be reached exactly.
+
+    Args:
+      weights: of a state and of a control, for a second, and of the end's state.
+    """
+    dt = seconds / (knots - 1)
+    n, m = len(start), len(dynamics.control_coordinates)
+    state, control, end = (np.broadcast_to(one, size) for one, size in zip(weights, (n, m, n), strict=True))
+    kept = options.pop("constraints", ())
+    return ls.Problem(
+        dynamics=dynamics,
+        dt=dt,
+        steps=knots - 1,
+        initial=ls.FixedState(start),
+        stage_cost=ls.ControlCost(control * dt, about=options.pop("about", np.zeros(m)))
+        + ls.QuadraticCost(state * dt, about=goal),
+        final_cost=ls.QuadraticCost(end, about=goal),
+        constraints=[*kept, *options.pop("end", [ls.GoalState(goal)])],
+        **options,
+    )
+
+
+def same(problem: ls.Problem, *controls: float) -> NDArray[np.float64]:
+    """The same controls at every step."""
+    return np.tile(controls, (problem.steps, 1))
+
+
+def double_integrator() -> tuple[ls.Problem, Start]:
+    bounds = ls.StateBounds(low={"v": -0.6}, high={"v": 0.6})
+    made = problem(
+        models.double_integrator(), 2.0, 21, (0, 0), (1, 0), (1.0, 0.1, 1.0), control_limits=(-3, 3),
+        constraints=[bounds],
+    )  # fmt: skip
+    return made, same(made, 0.0)
+
+
+def pendulum() -> tuple[ls.Problem, Start]:
+    made = problem(
+        models.pendulum(), 3.0, 51, (0, 0), (np.pi, 0), (1e-3, 1e-3, 1.0), control_limits=(-3, 3)
+    )  # fmt: skip
+    return made, same(made, 0.1)
+
+
+def cartpole() -> tuple[ls.Problem, Start]:
+    weights = (1e-2, 1e-1, 100.0)
+    made = problem(models.cartpole(), 5.0, 101, (0, 0, 0, 0), (0, np.pi, 0, 0), weights, control_limits=(-3, 3))
+    return made, same(made, 0.01)
+
+
+def acrobot() -> tuple[ls.Problem, Start]:
+    begin, goal, weights = (-np.pi / 2, 0, 0, 0), (np.pi / 2, 0, 0, 0), (1.0, 0.01, 100.0)
+    made = problem(models.acrobot(), 5.0, 101, begin, goal, weights, control_limits=(-15, 15))
+    return made, same(made, 0.0)
+
+
+def parallel_park() -> tuple[ls.Problem, Start]:
+    bounds = ls.StateBounds(low={"x": -0.25, "y": -0.001}, high={"x": 0.25, "y": 1.501})
+    made = problem(
+        models.car(), 3.0, 101, (0, 0, 0), (0, 1.5, 0), (0.01, 0.01, 100.0), control_limits=(-2, 2),
+        constraints=[bounds],
+    )  # fmt: skip
+    return made, same(made, 0.1, 0.1)
+
+
+def outside(x: Any, u: Any, p: Any) -> list[Any]:
+    """Circles: the square of the distance from each centre less that of the radius."""
+    return [(x[0] - at) ** 2 + (x[1] - at) ** 2 - p.radius**2 for at in (p.first, p.second, p.third)]
+
+
+def three_obstacles() -> tuple[ls.Problem, Start]:
+    places = {"first": 0.75, "second": 1.5, "third": 2.25}
+    kept = ls.SymbolicConstraint(outside, parameters={**places, "radius": 0.25 + 0.175})
+    made = problem(
+        models.car(), 5.0, 101, (0, 0, 0), (3, 3, 0), (1.0, 0.5, 10.0), control_limits=((0, -3), (3, 3)),
+        constraints=[kept],
+    )  # fmt: skip
+    return made, same(made, 0.01, 0.01)
+
+
+CAR = 0.25  # m: of the radius of 0.5 m of the circles in `escape`, what is the car's
+
+
+def walls() -> ls.World:
+    """Rows of circles."""
+    places = [(x, y) for x in (0.0, 5.0, 10.0) for y in np.linspace(0, 5, 30)]
+    places += [(x, 0.0) for x in np.linspace(0, 10, 50)]
+    places += [(x, 5.0) for first in (0, 5) for x in np.linspace(first, first + 3, 15)]
+    size = np.array([0.5 - CAR, np.inf, 0])
+    return ls.World(
+        [ls.Obstacle(f"{i}", "cylinder", np.array([*at, 0]), np.eye(3), size) for i, at in enumerate(places)]
+    )
+
+
+def escape() -> tuple[ls.Problem, Start]:
+    made = problem(
+        models.car(), 3.0, 101, (2.5, 2.5, 0), (7.5, 2.5, 0), (1e-3, 1e-2, 100.0), control_limits=(-5, 5),
+        constraints=[ls.Clearance(walls(), radius=CAR)],
+    )  # fmt: skip
+    guess = [(2.5, 2.5, 0), (4, 5, 0.785), (5, 6.25, 0), (7.5, 6.25, -0.261), (9, 5, -1.57), (7.5, 2.5, 0)]
+    states = CubicSpline(np.linspace(0, 3, 6), guess, bc_type="natural")(np.linspace(0, 3, 101))
+    return made, ls.Trajectory(states, same(made, 1.0, 1.0), made.dt)
+
+
+def keep_away() -> ls.ObstacleCost:
+    return ls.ObstacleCost(walls(), radius=CAR, weight=0.01, sharpness=10)
+
+
+KNOTS, WAYPOINTS = 101, {32: (10.0, 0.0, 1.0), 65: (-10.0, 0.0, 1.0)}  # numbers of knots, from 0
+
+
+def passing(x: Any, u: Any, p: Any) -> Any:
+    """What is paid at the knots of the waypoints, where it stands in place of what is paid at the others."""
+    from sympy import Piecewise
+
+    effort = 1e-4 * sum(entry**2 for entry in u) / 2
+
+    def away(place: tuple[float, ...], position: float, turned: float) -> Any:
+        off = sum((x[i] - place[i]) ** 2 for i in range(3))
+        tilt = (x[3] - 1) ** 2 + sum(entry**2 for entry in x[4:7])
+        return p.dt * (position * off + turned * tilt + 1e-3 * sum(entry**2 for entry in x[7:13])) / 2
+
+    cases = [
+        (away(place, 1.0, 1e-3) + effort, (x[13] > knot - 0.5) & (x[13] < knot + 0.5))
+        for knot, place in WAYPOINTS.items()
+    ]
+    return Piecewise(*cases, (away((0, 0, 0), 1e-5, 1e-5) + p.dt * effort, True))
+
+
+def zigzag() -> tuple[ls.Problem, Start]:
+    dt = 5.0 / (KNOTS - 1)
+    goal = (0, 10, 1, 1, *[0] * 9, 0)
+    made = ls.Problem(
+        dynamics=models.quadrotor(dt),
+        dt=dt,
+        steps=KNOTS - 1,
+        initial=ls.FixedState((0, -10, 1, 1, *[0] * 9, 0)),
+        stage_cost=ls.SymbolicCost(passing, parameters={"dt": dt}, convex=True),
+        final_cost=ls.QuadraticCost((10, 10, 10, 100, 100, 100, 100, *[10] * 6, 0), about=goal),
+        control_limits=(0, 12),
+    )
+    return made, same(made, *[0.5 * models.GRAVITY / 4] * 4)
+
+
+def quaternion(a: float, b: float, c: float) -> list[float]:
+    """Of modified Rodrigues parameters, scalar first."""
+    square = a * a + b * b + c * c
+    return [(1 - square) / (1 + square), *(2 * entry / (1 + square) for entry in (a, b, c))]
+
+
+def barrel_roll() -> tuple[ls.Problem, Start]:
+    begin = (-3, 0, 1.5, *quaternion(0.997156, 0, 0.075366), 5, 0, 0, 0, 0, 0)
+    goal = np.array((3, 0, 1.5, *quaternion(0, -0.0366076, 0), 5, 0, 0, 0, 0, 0))
+    end = (*[100.0] * 3, *[500.0] * 4, *[100.0] * 6)
+    dynamics = airplane()
+    # Of the quaternion its vector: the scalar follows, for it keeps its length.
+    rest = [name for name in dynamics.state_coordinates.names if name != "q0"]
+    made = problem(
+        dynamics, 1.25, 101, begin, goal, (0.1, 1e-3, end), about=TRIM_CONTROLS,
+        end=[ls.GoalState(np.delete(goal, 3), states=rest)],
+    )  # fmt: skip
+    return made, same(made, *TRIM_CONTROLS)
+
+
+CASES = {
+    "double_integrator": Case(make=double_integrator, theirs=8, newest="8 or 9", penalty=100.0),
+    "pendulum": Case(make=pendulum, theirs=19, newest="18", penalty=10.0, first_pass="backward"),
+    "cartpole": Case(make=cartpole, theirs=40, newest="41", penalty=30.0),
+    "acrobot": Case(make=acrobot, theirs=50, newest="50", penalty=0.1),
+    "parallel_park": Case(make=parallel_park, theirs=13, newest="13", penalty=1000.0, first_pass="backward"),
+    "three_obstacles": Case(make=three_obstacles, theirs=20, newest="20", penalty=30.0),
+    "escape": Case(make=escape, theirs=13, newest="14", obstacle_cost=keep_away),
+    "zigzag": Case(make=zigzag, theirs=15, newest="14"),
+    "barrel_roll": Case(make=barrel_roll, theirs=18, newest="20, of another cost"),
+}
+
+
+def begun(problem: ls.Problem, start: Start, penalty: float | None) -> Start | ls.Solution:
+    """What a solve begins with: a solution with these controls, no multipliers yet, and the penalty."""
+    if penalty is None or isinstance(start, ls.Trajectory):
+        return start
+    empty = ls.smooth(problem, start=start, max_iterations=1)  # of which nothing is left
+    rows = [np.zeros((problem.steps + 1, term.rows)) for term in problem.constraint_terms]
+    return replace(
+        empty,
+        policy=replace(empty.policy, gain=np.zeros_like(empty.policy.gain), offset=start),
+        inverse_policy=None,
+        cost_to_go=None,
+        cost_to_come=None,
+        multipliers=tuple(Multipliers(zeros, penalty) for zeros in rows),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(Settings):
+    problems: tuple[str, ...] = tuple(CASES)
+    """Which of them."""
+
+
+def main(config: Config) -> Result:
+    result = opening(config)
+    result["problems"] = {}
+    chosen = config.problems[:2] if config.quick else config.problems
+    for name in chosen:
+        check_name("--problems", name, CASES)
+    for name in tqdm(chosen, "solving", unit="problem", leave=False, disable=None):
+        case = CASES[name]
+        made, start = case.make()
+        plain = ls.smooth(made, start=start)
+        if case.obstacle_cost is not None:
+            made = replace(made, stage_cost=made.stage_cost + case.obstacle_cost())
+        tuned = ls.smooth(made, start=begun(made, start, case.penalty), first_pass=case.first_pass, **ROUGHLY)
+        if name == "barrel_roll" and not all(unclamped(one.trajectory) for one in (plain, tuned)):
+            raise ls.InputError("barrel_roll: got an angle of attack beyond a right angle, want none: no clamp is here")
+        result["problems"][name] = {
+            "theirs": case.theirs, "newest": case.newest, "default": outcome(plain), "tuned": outcome(tuned),
+            "penalty": case.penalty, "first_pass": case.first_pass,
+        }  # fmt: skip
+    return result
+
+
+def outcome(solution: ls.Solution) -> Result:
+    """What came of a solve, as JSON."""
+    return {
+        "status": solution.status.name,
+        "iterations": len(solution.iterations),
+        "violation": solution.violation,
+        "cost": solution.cost,
+        "milliseconds": 1e3 * sum(one.seconds for one in solution.iterations),
+    }
+
+
+def good(found: Result, theirs: int) -> bool:
+    """Whether a solve succeeded within so many iterations."""
+    return found["status"] == "CONVERGED" and found["violation"] < VIOLATION and found["iterations"] <= theirs
+
+
+def report(result: Result) -> str:
+    def ours(found: Result) -> list[object]:
+        count = found["iterations"] if found["status"] == "CONVERGED" else found["status"].lower().replace("_", " ")
+        return [count, f"{found['cost']:.4g}", f"{found['violation']:.1e}"]
+
+    head = (
+        "problem",
+        "Altro.jl",
+        "its last commit",
+        "default",
+        "cost",
+        "violation",
+        "tuned",
+        "cost",
+        "violation",
+    )
+    rows = [
+        (name, one["theirs"], one["newest"], *ours(one["default"]), *ours(one["tuned"]))
+        for name, one in result["problems"].items()
+    ]
+    lines = [table(head, rows), ""]
+    for kind, said in (("default", "the default settings"), ("tuned", "settings of each problem")):
+        count = sum(good(one[kind], one["theirs"]) for one in result["problems"].values())
+        lines.append(f"As many iterations as Altro.jl or fewer, with {said}: in {count} of {len(rows)} problems.")
+    return "\n".join(lines)
+
+
+def statements(result: Result) -> list[Statement]:
+    return []  # of the paper's
+
+
+if __name__ == "__main__":
+    run(Config, main, report, statements, __doc__)

@@ -1,0 +1,164 @@
+"""What commands print with `--json`, each part of it as plain dictionaries. docs/json.md describes them."""
+
+import dataclasses
+import enum
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from lqrsim.problem.problem import Problem
+    from lqrsim.results.coordinates import Coordinates
+    from lqrsim.results.rollout import Rollout
+    from lqrsim.results.solution import Solution
+    from lqrsim.scenarios.packaged import Scenario
+    from lqrsim.stress.results import Results
+    from lqrsim.verify.verdict import Verification
+
+Object = dict[str, Any]
+
+
+def text_of(value: object) -> str:
+    """The JSON text of anything that results are made of, in one line; numbers as Python's `repr` has them."""
+    return json.dumps(_plain(value), allow_nan=False)
+
+
+def of_scenario(name: str, scenario: "Scenario") -> Object:
+    """What `lqrsim list` says of a scenario."""
+    problem = scenario.problem
+    return {
+        "name": name,
+        "summary": scenario.summary,
+        "robot": scenario.robot.name,
+        "scene": scenario.scene.name,
+        "steps": problem.steps,
+        "dt": problem.dt,
+        "states": _named(problem.dynamics.state_coordinates),
+        "controls": _named(problem.dynamics.control_coordinates),
+    }
+
+
+def of_solution(solution: "Solution") -> Object:
+    """Status, log and certificate; not the arrays, which its file has."""
+    plan, target = solution.trajectory, solution.target
+    clearance = None
+    if solution.clearance is not None:
+        knot = int(np.argmin(solution.clearance))
+        clearance = {"least": solution.clearance[knot], "time": plan.times[knot]}
+    return {
+        "scenario": solution.scenario,
+        "solver": solution.solver,
+        "options": solution.options,
+        "status": solution.status.name,
+        "success": solution.success,
+        "detail": solution.detail,
+        "remedy": solution.status.remedy,
+        "steps": plan.steps,
+        "dt": plan.dt,
+        "cost": solution.cost,
+        "gap": solution.gap,
+        "optimality": solution.optimality,
+        "violation": solution.violation,
+        "certificate": solution.certificate,
+        "clearance": clearance,
+        "goal": {
+            "is": target.name,
+            "distance": target.distance(plan.states[-1]),
+            "radius": solution.goal_radius,
+            "unit": target.unit,
+        },
+        "iterations": solution.iterations,
+        "candidates": [
+            {"start": one.start, "cost": one.cost, "iterations": one.iterations, "status": one.status}
+            for one in solution.candidates
+        ],
+        "problem_digest": solution.problem_digest,
+        "versions": solution.versions,
+    }
+
+
+def of_rollout(rollout: "Rollout", problem: "Problem | None" = None) -> Object:
+    """The trials as a stress test has them in its tables.
+
+    Args:
+      problem: whose cost the trials have; none is worked out without one, or where it has another horizon.
+    """
+    from lqrsim.simulation.outcome_table import outcomes
+
+    if problem is not None and (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
+        problem = None
+    columns: Mapping[str, Any] = {**outcomes(rollout, problem).columns(), "reason": rollout.reasons}
+    target, chance = rollout.target, rollout.collision_chance
+    return {
+        "robot": rollout.robot,
+        "scene": rollout.scene,
+        "disturbances": rollout.disturbances,
+        "seed": rollout.seed,
+        "tracking_unit": rollout.tracking_unit,
+        "goal": {"is": target.name, "radius": rollout.goal_radius, "unit": target.unit},
+        "tube": rollout.tube is not None,
+        "collision_chance": None if chance is None else chance.max(),
+        "reached": rollout.reached.sum(),
+        "trials": [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)],
+        "versions": rollout.versions,
+    }
+
+
+def of_verification(found: "Verification") -> Object:
+    """All that it has, the positions in every frame too."""
+    return {field.name: getattr(found, field.name) for field in dataclasses.fields(found)} | {"passed": found.passed}
+
+
+def of_campaign(results: "Results") -> Object:
+    """How the trials of each cell ended so far."""
+    from lqrsim.results.trial_outcome import OUTCOMES
+    from lqrsim.stress.analysis import success
+
+    cells = []
+    for cell in results.cells:
+        ends = results.tally(cell, partial=True)
+        row: Object = {"policy": cell.policy, "sweep": cell.sweep, "strength": cell.strength, "trials": ends.total()}
+        if ends.total():
+            rate = success(cell, results.outcomes(cell, partial=True))
+            row |= {
+                "outcomes": {name: ends[name] for name in OUTCOMES},
+                "reached": rate.exact,
+                "deterministic": rate.alike,
+            }
+        cells.append(row)
+    return {
+        "folder": results.folder,
+        "complete": results.complete,
+        "cells": cells,
+        "left_out": results.manifest["left_out"],
+        "plans": results.plans(),
+        "came_to_nothing": results.came_to_nothing(),
+        "versions": results.manifest["versions"],
+    }
+
+
+def _named(space: "Coordinates") -> list[Object]:
+    return [{"name": name, "unit": unit} for name, unit in zip(space.names, space.units, strict=True)]
+
+
+def _plain(value: object) -> Any:
+    """The same of what JSON has; null for numbers that are not finite, which it has not."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, enum.Enum):
+        return value.name
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(name): _plain(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(one) for one in value]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return value

@@ -1,0 +1,86 @@
+"""The command that writes a robot to start from."""
+
+import importlib.util
+import keyword
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+TEMPLATE, CLASS = "my_robot", "MyRobot"
+TEMPLATES = Path(__file__).parent.parent / "templates" / TEMPLATE
+# Names that mean something else in what is written: two classes of Python's, MuJoCo's first body, pytest's own file.
+TAKEN = ("any", "path", "world", "conftest")
+
+
+@dataclass(frozen=True, kw_only=True)
+class New:
+    """Write a robot of your own to start from.
+
+    The folder has its MJCF, its dynamics, a scenario and a test. It works as it is: a disc is pushed round a crate.
+    Prints the commands that solve it, run it, film it and test it. docs/new_robot.md says what to change.
+    """
+
+    name: Annotated[Positional[str], arg(metavar="NAME")]
+    """Of the robot, as Python can import it: small letters, digits and underscores."""
+    out: Annotated[Path, arg(metavar="FOLDER")] = Path(".")
+    """Where the robot's folder is made."""
+
+    def run(self) -> int:
+        """Carry the command out; its exit code."""
+        from lqrsim.commands import console
+        from lqrsim.errors import InputError
+        from lqrsim.results.archive import excerpt_of
+
+        check_robot_name(self.name)
+        folder = self.out / self.name
+        console.check_output("--out", self.out)
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            raise InputError(f"name: got {self.name!r}, want one without a folder {excerpt_of(folder)}") from None
+        except OSError as error:
+            raise InputError(
+                f"--out: got {excerpt_of(self.out)}, want a folder that can be written ({error})"
+            ) from None
+        for template in sorted(TEMPLATES.glob("*.*")):
+            path = folder / _named(template.name, self.name)
+            path.write_text(_named(template.read_text(encoding="utf-8"), self.name), encoding="utf-8", newline="\n")
+            console.wrote(path)
+        console.say("\nnext:")
+        for command in next_commands(self.name, folder):
+            console.say(f"  {shlex.join(command)}")
+        return 0
+
+
+def check_robot_name(name: str) -> None:
+    """Raises InputError for what cannot be a module of its own."""
+    from lqrsim.errors import InputError, excerpt
+
+    wanted = "small letters, digits and underscores, a letter first, such as my_robot"
+    plain = name.isascii() and name.isidentifier() and name == name.lower() and name[0] != "_" and len(name) <= 60
+    if not plain or keyword.iskeyword(name):
+        raise InputError(f"name: got {excerpt(name)}, want {wanted}")
+    if name in TAKEN:
+        raise InputError(f"name: got {name!r}, want another: {', '.join(TAKEN)} have a meaning in what is written")
+    found = importlib.util.find_spec(name)
+    if found is not None and found.origin is not None:  # a folder without a module in it is no module of that name
+        raise InputError(f"name: got {name!r}, which is a module of Python's or of a package, want another name")
+
+
+def next_commands(name: str, folder: Path) -> list[list[str]]:
+    """What to do with the robot in that folder: solve, run, film and test it."""
+    scenario, runs = f"{(folder / name).as_posix()}.py:scenario", f"runs/{name}"
+    return [
+        ["lqrsim", "solve", scenario],
+        ["lqrsim", "simulate", f"{runs}/solution.npz", "--scenario", scenario, "--disturbances", "scenario"],
+        ["lqrsim", "render", f"{runs}/rollout.npz"],
+        ["python", "-m", "pytest", folder.as_posix()],
+    ]
+
+
+def _named(text: str, name: str) -> str:
+    """The text of a template, for the robot of that name."""
+    return text.replace(TEMPLATE, name).replace(CLASS, "".join(part.capitalize() for part in name.split("_")))

@@ -1,0 +1,139 @@
+"""The closed loop of `simulate`, a control period at a time, with whoever acts from outside as its controller."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lqrsim.control import law
+from lqrsim.control.controllers import Control, Controller
+from lqrsim.errors import Array
+from lqrsim.gym.task import Flags, Task, Trials
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.rollout import Rollout
+from lqrsim.scenes.scene import unlogged
+from lqrsim.simulation.closed_loop import Loop
+from lqrsim.simulation.run_settings import RunSettings
+
+
+class Commanded(Controller):
+    """What is commanded from outside: `commands` (K, m), set before each control period."""
+
+    def __init__(self, spaces: tuple[Coordinates, Coordinates]) -> None:
+        self._spaces = spaces
+        self.commands: Array = np.zeros((0, len(spaces[1])))
+
+    def start(self, trials: int) -> Control:
+        return lambda step, shown: self.commands
+
+    @property
+    def digest(self) -> str:
+        return "commanded from outside"
+
+    @property
+    def spaces(self) -> tuple[Coordinates, Coordinates]:
+        return self._spaces
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What a control period came to, of K trials: observations (K, n+1), rewards (K,), and who ended by what (K,)."""
+
+    observations: Array
+    rewards: Array
+    terminated: Flags
+    truncated: Flags
+
+
+class Episode:
+    """One run of K trials of a task. Who has ended stays as it is, without a reward, until all have.
+
+    Attributes:
+      ended: (K,) whose episode is over. outcomes: (K,) how; empty for those that go on.
+    """
+
+    def __init__(self, task: Task, trials: Trials, count: int, *, frames: bool, threads: int | None) -> None:
+        self.task, self.trials = task, trials
+        dynamics = task.plant.robot.dynamics
+        self._law = Commanded((dynamics.state_coordinates, dynamics.control_coordinates))
+        settings = RunSettings(
+            plant=task.plant, solution=task.solution, disturbances=trials.disturbances, controller=self._law,
+            seed=trials.seed, trials=count, first_trial=trials.first, frames=frames, contacts=True, threads=threads,
+            generators=None, progress=None, watch=None, **task.scenario.near_enough(),
+        )  # fmt: skip
+        self._costs, self._plan = task.costs, settings.plan
+        self._loop = Loop(settings)
+        self._loop.begin()
+        self.ended = np.zeros(count, dtype=bool)
+        self.outcomes = np.full(count, "", dtype=object)
+        self._last, self._ended_at = self._observe(), np.zeros((2, count), dtype=bool)
+
+    @property
+    def observations(self) -> Array:
+        """What is observed now, (K, n+1)."""
+        return self._last.copy()
+
+    @property
+    def time(self) -> float:
+        """Seconds since it began."""
+        return self._loop.step * self._plan.dt
+
+    @property
+    def states(self) -> Array:
+        """The true states now, (K, n), angles in the representative nearest the plan."""
+        return self._near_plan(self._loop.states)
+
+    @property
+    def clearance(self) -> Array:
+        """Signed distance to the nearest obstacle less the robot's radius now, (K,), in metres."""
+        return self._loop.collisions.clearance.copy()
+
+    @property
+    def frames(self) -> Array:
+        """MuJoCo's qpos now, (K, nq)."""
+        return self._loop.physics.frame()
+
+    def advance(self, controls: Array) -> Moment:
+        """One control period under controls (K, m)."""
+        loop, step, before = self._loop, self._loop.step, self.states
+        self._law.commands = controls
+        with unlogged():
+            loop.period()
+            if loop.step == self._plan.steps:
+                loop.detect_contacts_at_end()
+        running = ~self.ended
+        lost = loop.records.over(loop.step)
+        collided = np.isfinite(loop.collisions.at)
+        over = loop.step == self._plan.steps
+        self._ended_at[0, running] = (lost | collided)[running]
+        self._ended_at[1, running] = over & ~(lost | collided)[running]
+        rewards = np.zeros(len(running))
+        rewards[running] = -self._costs.stage(step, before, loop.records.applied[:, step])[running]
+        now = self._ended_at.any(axis=0) & running
+        if now.any():
+            # What is lost has no state any more, but the one before.
+            last = np.where(lost[:, None], before, self.states)
+            rewards[now] -= self._costs.final(last, loop.records.applied[:, step])[now]
+        self._last[running] = self._observe(lost)[running]
+        self.ended |= now
+        if now.any():
+            first = loop.collisions.at <= loop.records.time_of(loop.records.lost_since)
+            early = np.where(collided & first, "collided", "diverged").astype(object)
+            self.outcomes[now] = (np.array(self.rollout().outcome, dtype=object) if over else early)[now]
+        return Moment(self.observations, rewards, *self._ended_at.copy())
+
+    def rollout(self) -> Rollout:
+        """What was recorded until now, as `simulate` has it; NaN after it."""
+        return self._loop.so_far()
+
+    def _observe(self, lost: Flags | None = None) -> Array:
+        """The states that are shown, with the time as a share of the horizon; what it was, of those who are lost."""
+        loop, plan = self._loop, self._plan
+        seen = np.column_stack([self._near_plan(loop.shown), np.full(len(loop.shown), loop.step / plan.steps)])
+        if lost is not None:
+            seen[lost, :-1] = self._last[lost, :-1]
+        return seen
+
+    def _near_plan(self, states: Array) -> Array:
+        near = np.array(states, order="C")[None]
+        law.turn_to_nearest(self._loop.settings.states, near, self._plan.states[self._loop.step][None])
+        return near[0]

@@ -1,0 +1,150 @@
+"""How results show themselves in a notebook: a heading, a table and a drawing, as HTML. NumPy only.
+
+All text is escaped: names come from files, which anyone may have written.
+"""
+
+from collections.abc import Iterable, Sequence
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lqrsim.errors import Array
+from lqrsim.results.coordinates import Coordinates
+
+if TYPE_CHECKING:
+    from lqrsim.results.rollout import Rollout
+    from lqrsim.results.solution import Solution
+
+WIDTH, HEIGHT, MARGIN = 360, 240, 12  # of a drawing, in pixels
+POINTS = 300  # of a line at most
+MOST = 10  # rows of trials that are shown; and lines
+COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#17becf", "#bcbd22", "#7f7f7f")
+
+
+def of_solution(solution: "Solution") -> str:
+    """Status, numbers, and the plan."""
+    plan = solution.trajectory
+    rows = [("cost", _number(solution.cost)), ("iterations", str(len(solution.iterations)))]
+    rows += [(name, _number(getattr(solution, name))) for name in ("gap", "optimality", "violation")]
+    if solution.clearance is not None:
+        rows.append(("clearance", f"{_number(solution.clearance.min())} m"))
+    if np.isfinite(plan.states[-1]).all():
+        away = float(solution.target.distance(plan.states[-1]))
+        rows.append((f"from the {solution.target.name}", f"{_number(away)} {solution.target.unit}"))
+    rows.append(("horizon", f"{plan.steps} steps of {_number(plan.dt)} s"))
+    remarks = [text for text in (solution.status.meaning, solution.detail, solution.status.remedy) if text]
+    none = np.empty((0, *plan.states.shape))
+    picture = _drawing(solution.policy.state_coordinates, plan.times, plan.states, none)
+    return _page(f"{solution.status.name}, {solution.solver}", remarks, rows, picture, head=False)
+
+
+def of_rollout(rollout: "Rollout") -> str:
+    """How the first trials ended, and their paths about the plan."""
+    target, least, away = rollout.target, rollout.least_clearance(), rollout.goal_distance
+    rows = [
+        ("trial", "outcome", "ended", f"largest error, {rollout.tracking_unit}", f"from the {target.name}", "clearance")
+    ]
+    for k in range(min(rollout.trials, MOST)):
+        worst = float(np.max(rollout.tracking_error[k], where=rollout.counts[k], initial=0.0))
+        ended, near = f"{_number(rollout.ended[k])} s", f"{_number(least[k])} m"
+        apart = f"{_number(away[k])} {target.unit}"
+        rows.append((str(rollout.first_trial + k), rollout.outcome[k], ended, _number(worst), apart, near))
+    remarks = ["; ".join(rollout.disturbances) or "undisturbed", rollout.tally()]
+    if rollout.trials > MOST:
+        remarks.append(f"the first {MOST} of {rollout.trials} trials are shown")
+    picture = _drawing(rollout.state_coordinates, rollout.times, rollout.plan.states, rollout.states)
+    return _page(f"{rollout.robot} in {rollout.scene}, seed {rollout.seed}", remarks, rows, picture, head=True)
+
+
+def _number(value: float) -> str:
+    """Four digits of it; a dash where there is none."""
+    return f"{value:.4g}" if np.isfinite(value) else "-"
+
+
+def _page(heading: str, remarks: Iterable[str], rows: Sequence[Sequence[str]], picture: str, *, head: bool) -> str:
+    """A heading, remarks, a table and a picture side by side.
+
+    Args:
+      rows: of the table; with `head` the first one names the columns, else the first column names the rows.
+    """
+    lines = "".join(f"<div>{escape(remark)}</div>" for remark in remarks)
+    table = "".join(
+        "<tr>" + "".join(_cell(text, named=(i if head else j) == 0) for j, text in enumerate(row)) + "</tr>"
+        for i, row in enumerate(rows)
+    )
+    beside = "display:flex;flex-wrap:wrap;gap:1em;align-items:flex-start"
+    return (
+        f'<div class="lqrsim"><div><strong>{escape(heading)}</strong></div>{lines}'
+        f'<div style="{beside}"><table>{table}</table>{picture}</div></div>'
+    )
+
+
+def _drawing(space: Coordinates, times: Array, plan: Array, runs: Array) -> str:
+    """The plan (T+1, n) and runs (K, T+1, n) as SVG: the first two axes of a position, else each state over time.
+
+    The first MOST runs are drawn; of states over time, each to its own scale, the first.
+    """
+    dashes = "4 3" if len(runs) else ""
+    if space.position:
+        place = list(space.position[:2])
+        lines = [(plan[:, place], "currentColor", "plan", dashes)]
+        lines += [(run[:, place], COLOURS[k], f"run {k}", "") for k, run in enumerate(runs[:MOST])]
+        names = [space.labels[i] for i in place]
+        return _svg(lines, f"{names[0]} to the right, {names[1]} up", equal=True)
+    low, high = _range(plan)
+    lines = []
+    for states, name, dashed in [(plan, "plan", dashes), *((run, "run 0", "") for run in runs[:1])]:
+        scaled = (states - low) / (high - low)
+        for i, label in enumerate(space.labels):
+            line = np.stack([times, scaled[:, i]], axis=1)
+            lines.append((line, COLOURS[i % len(COLOURS)], f"{label}, {name}", dashed))
+    return _svg(lines, f"{', '.join(space.labels)} over time, each to its own scale", equal=False)
+
+
+def _cell(text: str, *, named: bool) -> str:
+    tag = "th" if named else "td"
+    return f'<{tag} style="text-align:left">{escape(text)}</{tag}>'
+
+
+def _range(values: Array) -> tuple[Array, Array]:
+    """The least and the largest finite value of each column, apart at least by a little."""
+    finite = np.where(np.isfinite(values), values, np.nan)
+    known = np.isfinite(finite).any(axis=0)
+    finite = np.where(known, finite, 0.0)
+    low, high = np.nanmin(finite, axis=0), np.nanmax(finite, axis=0)
+    wide = np.maximum(high - low, 1e-9 * np.maximum(np.abs(low), 1.0))
+    return low, low + wide
+
+
+def _svg(lines: list[tuple[Array, str, str, str]], title: str, *, equal: bool) -> str:
+    """Lines (N, 2) with a colour, a title and dashes, to one scale if `equal`; what is not finite is left out."""
+    low, high = _range(np.concatenate([line for line, *_ in lines]))
+    room = np.array([WIDTH, HEIGHT]) - 2 * MARGIN
+    scale = room / (high - low)
+    if equal:
+        scale = np.full(2, scale.min())
+    middle = (low + high) / 2
+
+    def places(line: Array) -> Array:
+        chosen = line[np.unique(np.linspace(0, len(line) - 1, POINTS).round().astype(int))]
+        chosen = chosen[np.isfinite(chosen).all(axis=1)]
+        return np.array([WIDTH, HEIGHT]) / 2 + (chosen - middle) * scale * np.array([1, -1])
+
+    drawn = []
+    for line, colour, name, dashes in lines:
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in places(line))
+        style = f' stroke-dasharray="{dashes}"' if dashes else ""
+        drawn.append(
+            f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.5"{style}>'
+            f"<title>{escape(name)}</title></polyline>"
+        )
+    plan = places(lines[0][0])
+    for place, name, fill in ((plan[:1], "start", "none"), (plan[-1:], "the plan's end", "currentColor")):
+        for x, y in place if equal else ():
+            circle = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" stroke="currentColor" fill="{fill}">'
+            drawn.append(f"{circle}<title>{escape(name)}</title></circle>")
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{HEIGHT}" viewBox="0 0 {WIDTH} {HEIGHT}" '
+        f'role="img"><title>{escape(title)}</title>{"".join(drawn)}</svg>'
+    )

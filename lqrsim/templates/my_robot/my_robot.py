@@ -1,0 +1,81 @@
+"""The robot my_robot: a disc that two motors push over a table, and what it is to do.
+
+Change the MJCF, the dynamics and the scenario to those of your robot; `test_my_robot.py` tells whether they agree.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import lqrsim as ls
+
+MJCF = Path(__file__).parent / "my_robot.xml"
+
+
+@dataclass(frozen=True)
+class MyRobot(ls.Robot):
+    """Its constants, its dynamics, and its names in the MJCF.
+
+    Args:
+      mass: in kg. damping: of the joints, in N s/m. radius: of its collision circle, in m.
+    """
+
+    mass: float = 0.5
+    damping: float = 0.2
+    radius: float = 0.1
+
+    name = "my_robot"
+    body = "my_robot"
+    joints = ("slide_x", "slide_y")
+    actuators = ("push_x", "push_y")
+
+    @property
+    def dynamics(self) -> ls.Dynamics:
+        """The rate of the state under a control; lqrsim derives the derivatives."""
+
+        def rate(x: Any, u: Any, p: Any) -> list[Any]:
+            _, _, vx, vy = x
+            return [vx, vy, (u[0] - p.damping * vx) / p.mass, (u[1] - p.damping * vy) / p.mass]
+
+        return ls.Dynamics(
+            rate,
+            states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"},
+            controls={"push_x": "N", "push_y": "N"},
+            parameters={"mass": self.mass, "damping": self.damping},
+            position=("x", "y"),
+            control_limits=(-2.0, 2.0),
+        )
+
+    def state(self, qpos: Any, qvel: Any, near: Any = None) -> np.ndarray:
+        """The state (..., 4) of MuJoCo's joint positions (..., 2) and velocities (..., 2)."""
+        return np.concatenate([qpos, qvel], axis=-1)
+
+    def configuration(self, state: Any) -> tuple[np.ndarray, np.ndarray]:
+        """MuJoCo's joint positions (..., 2) and velocities (..., 2) of the state (..., 4)."""
+        state = np.asarray(state, dtype=np.float64)
+        return state[..., :2], state[..., 2:]
+
+
+def scenario(goal_x: float = 1.2, goal_y: float = 0.3) -> ls.Scenario:
+    """From the left of the crate to a goal on its right, in metres."""
+    robot, scene = MyRobot(), ls.load_scene(MJCF)
+    problem = ls.Problem(
+        dynamics=robot.dynamics,
+        dt=0.05,
+        steps=80,
+        initial=ls.FixedState((-1.0, 0.0, 0.0, 0.0)),
+        stage_cost=ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(scene.world, radius=robot.radius),
+        final_cost=ls.QuadraticCost((500.0, 500.0, 500.0, 500.0), about=(goal_x, goal_y, 0.0, 0.0)),
+        constraints=[ls.Clearance(scene.world, radius=robot.radius, margin=0.02)],
+    )
+    return ls.Scenario(
+        name="my_robot",
+        summary="a disc round a crate",
+        robot=robot,
+        scene=scene,
+        problem=problem,
+        tracking_bound=1e-3,
+        disturbances=(ls.ControlNoise(0.05), ls.ForceNoise(0.05), ls.MeasurementNoise((0.005, 0.005, 0.02, 0.02))),
+    )

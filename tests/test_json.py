@@ -1,0 +1,201 @@
+"""`--json`: one object on stdout and nothing else there, with the numbers that Python has, to the last bit."""
+
+import json
+import math
+import subprocess
+import sys
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lqrsim as ls
+from lqrsim.cli import main
+from lqrsim.codegen import disk_cache
+from lqrsim.stress.statistics import rate
+from lqrsim.view import gl
+
+OWN = """
+import dataclasses
+
+import lqrsim as ls
+
+
+def noisy(std: float = 0.05) -> ls.Scenario:
+    print("this is not the result")
+    given = ls.scenarios.differential_drive()
+    return dataclasses.replace(given, name="noisy", disturbances=(ls.ControlNoise(std),))
+
+
+def shifted(std: float = 0.1) -> ls.Scenario:
+    given = ls.scenarios.differential_drive()
+    here = ls.QuadraticCost((5000.0, 5000.0, 50.0), about=given.problem.start)
+    problem = dataclasses.replace(given.problem, steps=3, final_cost=here)
+    error = ls.InitialStateError((0.0, std, 0.0))
+    return dataclasses.replace(given, name="shifted", problem=problem, disturbances=(error,))
+"""
+
+
+def refuse(text: str) -> None:
+    raise AssertionError(f"{text} is not JSON")
+
+
+@pytest.fixture
+def printed(capsys: pytest.CaptureFixture[str]) -> Any:
+    """Runs a command with --json; what it prints, which must be one line, and its exit code."""
+
+    def run(*arguments: str, code: int = 0) -> dict[str, Any]:
+        capsys.readouterr()
+        assert main([*arguments, "--json"]) == code
+        out = capsys.readouterr().out
+        assert out.count("\n") == 1
+        found = json.loads(out, parse_constant=refuse)
+        assert (found["format"], found["exit_code"]) == (f"lqrsim {arguments[0]}", code)
+        return found
+
+    return run
+
+
+def same(found: object, meant: object) -> None:
+    """Equal to the last bit; null is what is not finite."""
+    if isinstance(meant, float) and not math.isfinite(meant):
+        meant = None
+    assert found == meant
+
+
+def test_solve_and_simulate(printed: Any, tmp_path: Path) -> None:
+    found = printed("solve", "differential_drive", "--out", str(tmp_path))
+    assert found["wrote"] == [str(tmp_path / "solution.npz")]
+    solution, shown = ls.load_solution(tmp_path / "solution.npz"), found["solution"]
+    for name in ("cost", "gap", "optimality", "violation", "detail", "solver", "scenario", "problem_digest", "success"):
+        same(shown[name], getattr(solution, name))
+    assert shown["status"] == "CONVERGED"
+    assert shown["certificate"] == asdict(solution.certificate)
+    assert len(shown["iterations"]) == len(solution.iterations) > 3
+    for row, iteration in zip(shown["iterations"], solution.iterations, strict=True):
+        for field in fields(iteration):
+            same(row[field.name], getattr(iteration, field.name))
+    assert [one["start"] for one in shown["candidates"]] == [one.start for one in solution.candidates]
+    assert solution.clearance is not None
+    assert shown["clearance"]["least"] == solution.clearance.min()
+    end = solution.trajectory.states[-1]
+    assert shown["goal"]["distance"] == solution.target.distance(end)
+
+    noise = ["--control-noise", "0.05", "--trials", "3", "--seed", "2", "--first-trial", "4"]
+    found = printed("simulate", found["wrote"][0], *noise)
+    rollout, run = ls.load_rollout(found["wrote"][0]), found["run"]
+    table = ls.outcomes(rollout, ls.scenarios.differential_drive().problem)
+    assert [row["trial"] for row in run["trials"]] == [4, 5, 6]
+    for name, column in table.columns().items():
+        for row, value in zip(run["trials"], column.tolist(), strict=True):
+            same(row[name], value)
+    assert run["reached"] == rollout.reached.sum()
+    assert rollout.collision_chance is not None
+    assert run["collision_chance"] == rollout.collision_chance.max()
+    assert found["tube_leaves_out"] == ""
+
+
+def test_not_converged_and_bad_input(printed: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ilqr = ["--solver", "ilqr", "--max-iterations", "1", "--out", str(tmp_path)]
+    found = printed("solve", "quadrotor", *ilqr, code=1)
+    assert found["solution"]["status"] == "MAX_ITERATIONS"
+    assert found["solution"]["remedy"]
+    assert main(["solve", "no_such_robot", "--json"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+
+
+def test_in_a_process_of_its_own_stdout_has_nothing_else(tmp_path: Path) -> None:
+    """With a scenario that prints."""
+    (tmp_path / "own.py").write_text(OWN, encoding="utf-8")
+    command = [sys.executable, "-m", "lqrsim.cli", "solve", f"{tmp_path / 'own.py'}:noisy", "--json"]
+    done = subprocess.run([*command, "--out", str(tmp_path)], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout)["solution"]["cost"] == ls.load_solution(tmp_path / "solution.npz").cost
+    assert "this is not the result" in done.stderr
+    assert "CONVERGED" in done.stderr
+
+
+def test_list_and_cache(printed: Any) -> None:
+    found = {one["name"]: one for one in printed("list")["scenarios"]}
+    assert sorted(found) == sorted(ls.scenarios.names())
+    assert found["differential_drive"]["states"][2] == {"name": "heading", "unit": "rad"}
+    assert found["quadrotor"]["dt"] == ls.scenarios.quadrotor().problem.dt
+    found = printed("cache")
+    assert found["folder"] == str(disk_cache.folder())
+    assert {item["what"] for item in found["items"]} <= {item.what for item in disk_cache.items()}
+
+
+def test_verify(printed: Any, tmp_path: Path) -> None:
+    if not gl.available():
+        pytest.skip("no OpenGL here")
+    printed("solve", "differential_drive", "--out", str(tmp_path))
+    printed("simulate", str(tmp_path / "solution.npz"))
+    shown = printed("verify", str(tmp_path / "rollout.npz"))["verification"]
+    solution, rollout = ls.load_solution(tmp_path / "solution.npz"), ls.load_rollout(tmp_path / "rollout.npz")
+    again = ls.verify_run(rollout, solution=solution)
+    assert (shown["passed"], shown["rms"], shown["worst"]) == (True, again.rms, again.worst)
+    assert shown["tests"] == [asdict(test) for test in again.tests]
+    np.testing.assert_array_equal(np.array(shown["seen"], dtype=float), again.seen)
+
+
+def test_stress_report_and_replay(printed: Any, tmp_path: Path) -> None:
+    folder = tmp_path / "campaign"
+    asked = ["--policies", "smooth", "open_loop", "--strengths", "0", "2", "--trials", "6", "--workers", "1"]
+    campaign = printed("stress", "differential_drive", *asked, "--out", str(folder))["campaign"]
+    results = ls.Results(folder)
+    assert campaign["complete"] is True
+    assert len(campaign["cells"]) == len(results.cells) == 4
+    for row, cell in zip(campaign["cells"], results.cells, strict=True):
+        assert (row["policy"], row["sweep"], row["strength"]) == (cell.policy, cell.sweep, cell.strength)
+        assert {name: count for name, count in row["outcomes"].items() if count} == dict(results.tally(cell))
+        assert row["reached"]["value"] == results.tally(cell)["reached"] / 6
+        assert row["deterministic"] == (cell.strength == 0)
+        if cell.strength:
+            assert row["reached"] == asdict(rate(results.tally(cell)["reached"], 6))
+    report = printed("report", str(folder), "--videos", "0")
+    assert report["campaign"] == campaign
+    assert report["wrote"] == [str(folder / "report.html")]
+    again = printed("replay", str(folder), "--cell", "smooth,light,2", "--trial", "3", "--out", str(tmp_path / "r.npz"))
+    assert again["differences"] == []
+    assert again["cell"] == {"policy": "smooth", "sweep": "light", "strength": 2.0}
+    (row,) = again["run"]["trials"]
+    table = results.outcomes(next(cell for cell in results.cells if (cell.policy, cell.strength) == ("smooth", 2)))
+    assert {name: row[name] for name in ("trial", "worst", "cost")} == {
+        "trial": 3, "worst": table.worst[3], "cost": table.cost[3],
+    }  # fmt: skip
+
+
+def test_rare_and_break_print_their_files(printed: Any, tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(OWN, encoding="utf-8")
+    reference = f"{tmp_path / 'own.py'}:shifted"
+    small = {"rare": ["--particles", "60", "--repetitions", "2", "--shown", "1"], "break": []}
+    for name, options in small.items():
+        found = printed(name, reference, "--policy", "open_loop", *options, "--out", str(tmp_path / name))
+        file = json.loads((tmp_path / name / f"{name}.json").read_text(encoding="utf-8"))
+        assert {key: found[key] for key in file} == file
+        assert set(found) - set(file) == {"exit_code", "wrote"}
+    found = printed("rare", f"{reference},std=0.0001", "--policy", "open_loop", "--out", str(tmp_path / "none"), code=1)
+    assert found["found"] is None
+    assert "wrote" not in found
+
+
+def test_demo(printed: Any, tmp_path: Path) -> None:
+    found = printed("demo", "--robots", "differential_drive", "--no-video", "--out", str(tmp_path))
+    (one,) = found["scenarios"]
+    folder = tmp_path / "differential_drive"
+    assert one["solution"]["cost"] == ls.load_solution(folder / "solution.npz").cost
+    for name, run in one["runs"].items():
+        rollout = ls.load_rollout(folder / f"{name}.npz")
+        assert run["trials"][0]["goal"] == rollout.goal_distance[0]
+    assert found["failures"] == []
+    assert all(Path(path).is_file() for path in found["wrote"])
+
+
+def test_reproduce(printed: Any, tmp_path: Path) -> None:
+    found = printed("reproduce", "figure_3", "--quick", "--out", str(tmp_path))
+    file = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
+    assert {key: found[key] for key in file} == file
+    assert found["failures"] == []
