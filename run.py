@@ -58,9 +58,9 @@ def main() -> int:
     if options.command == "demo":
         return run([PYTHON, "-m", "lqrsim.cli", "demo", *rest])
     if options.command == "test":
-        # On every processor, each file on one, so that what its tests share is made once, in the order
-        # that tests/conftest.py puts them in.
-        every = ["-n", "auto", "--dist", "loadfile", "--no-loadscope-reorder"]
+        # One process more than there are processors, for some tests wait for others; each file in one, so that what its
+        # tests share is made once, in the order that tests/conftest.py puts them in.
+        every = ["-n", str((os.cpu_count() or 1) + 1), "--dist", "loadfile", "--no-loadscope-reorder"]
         every += [] if rest == ["--long"] else ["-m", "not long"]
         return run([PYTHON, "-m", "pytest", *(every if rest in ([], ["--long"]) else rest)])
     if options.command == "check":

@@ -212,7 +212,8 @@ class TestLevels:
         found = balls.centres(ARM.dynamics, np.array([state, 2 * state]))
         np.testing.assert_allclose(found, [in_numpy(state), in_numpy(2 * state)], rtol=0, atol=1e-12)
 
-    @pytest.mark.parametrize("level", [pytest.param("compiled", marks=pytest.mark.long), "plain"])
+    @pytest.mark.parametrize("level", ["compiled", "plain"])
+    @pytest.mark.long
     def test_plans(self, level: str) -> None:
         """The same plan, which the balls' clearance and cost shape, whoever says where they are."""
         world = ls.World(

@@ -95,6 +95,27 @@ def test_what_two_processes_have_kept_does_not_run_each_other(tmp_path: Path) ->
     assert run("3", "2") == [alone[1][0], alone[0][0], "0"]
 
 
+# A solve with one of two dynamics, with all parts kept, however short a time they take to compile.
+OTHER = SYSTEM.replace("import sys\n", "import sys\nfrom lqrsim.codegen import kept_parts\nkept_parts.WORTH = 0.0\n", 1)
+
+
+def test_another_problem_compiles_only_what_is_new_and_has_the_same_bits(tmp_path: Path) -> None:
+    def solve(system: str, folder: str) -> tuple[str, int]:
+        before = len(list((tmp_path / folder).glob("*.item")))
+        environment = {**os.environ, "LQRSIM_CACHE_DIR": str(tmp_path / folder)}
+        (tmp_path / "system.py").write_text(system)  # formulas are traced from a file
+        command = [sys.executable, str(tmp_path / "system.py")]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=120)
+        return done.stdout.split()[0], len(list((tmp_path / folder).glob("*.item"))) - before
+
+    other = OTHER.replace("x[0] * exp(-x[0])", "x[0] ** 3")
+    _, all_of_it = solve(OTHER, "shared")
+    cost, new = solve(other, "shared")
+    alone, as_many = solve(other, "empty")
+    assert cost == alone
+    assert 2 * new < min(all_of_it, as_many)
+
+
 @pytest.mark.parametrize(
     "damage", [lambda item: item[: len(item) // 2], lambda item: b"", lambda item: item[:-1] + b"x"]
 )

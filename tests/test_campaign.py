@@ -148,13 +148,14 @@ def test_rows_are_those_of_one_rollout(reference: Results, quadrotor: ls.Scenari
     assert reference.campaign == CAMPAIGN
 
 
-@pytest.mark.parametrize(("workers", "batch"), [(0, 7), (0, 256), (1, 256), (2, 7)])
+@pytest.mark.parametrize(("workers", "batch"), [(0, 7), (0, 256), pytest.param(1, 256, marks=pytest.mark.long), (2, 7)])
 def test_workers_and_batches_do_not_matter(reference: Results, tmp_path: Path, workers: int, batch: int) -> None:
     run_campaign(CAMPAIGN, tmp_path, workers=workers, batch=batch)
     same_bits(tmp_path, reference)
 
 
 @LINUX
+@pytest.mark.long
 def test_a_killed_worker_is_replaced(reference: Results, tmp_path: Path) -> None:
     killed = []
 
@@ -228,7 +229,8 @@ def test_dask_does_the_same(reference: Results, tmp_path: Path) -> None:
 
 
 @LINUX
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.long), signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.long
 def test_a_lost_scheduler_is_one_line_and_what_is_done_stays(
     reference: Results, tmp_path: Path, number: int, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -128,6 +128,7 @@ class TestLimits:
         if not solution.success:
             assert solution.status in (Status.MAX_ITERATIONS, Status.INFEASIBLE)
 
+    @pytest.mark.long
     def test_a_slack_constraint_behind_a_solve_that_fails_ends(self) -> None:
         """Once it called itself until Python gave up."""
         scenario = ls.scenarios.differential_drive()

@@ -343,11 +343,16 @@ def test_cache_shows_and_clears(
 ) -> None:
     monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
     disk_cache.save("kept", bytes(10_000), "smoother for pendulum (2 states, 1 controls)")
+    for name in ("part 1", "part 2"):
+        disk_cache.save(name, bytes(10_000), "parts")
     assert main(["cache"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("    0.01 MB  last used 20")
-    assert lines[0].endswith("smoother for pendulum (2 states, 1 controls)")
-    assert lines[1] == f"1 items, 0.0 of at most 268 MB, in {tmp_path}"
+    *lines, last = capsys.readouterr().out.splitlines()
+    kept, parts = sorted(lines)
+    assert kept.startswith("    0.01 MB  last used 20")
+    assert kept.endswith("smoother for pendulum (2 states, 1 controls)")
+    assert parts.startswith("    0.02 MB  last used 20")
+    assert parts.endswith("parts (2 items)")
+    assert last == f"3 items, 0.0 of at most 537 MB, in {tmp_path}"
     assert main(["cache", "--clear"]) == 0
-    assert capsys.readouterr().out == f"removed 1 items from {tmp_path}\n"
+    assert capsys.readouterr().out == f"removed 3 items from {tmp_path}\n"
     assert list(tmp_path.iterdir()) == []

@@ -39,6 +39,7 @@ def test_getting_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert names["control"].shape == (2,)
 
 
+@pytest.mark.long
 def test_a_robot_from_an_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names = run_page("mjcf_robots.md")
@@ -140,6 +141,7 @@ def test_a_policy_is_loaded_with_numpy_alone(
         np.testing.assert_allclose(control(state, t), drive_solution.policy(state, t), rtol=0, atol=1e-12)
 
 
+@pytest.mark.long
 def test_forms_starts_and_endings() -> None:
     names = run_page("solving.md")
     np.testing.assert_allclose(names["least"], names["solution"].cost, rtol=1e-3)
@@ -147,6 +149,7 @@ def test_forms_starts_and_endings() -> None:
     assert names["control"].shape == (2,)
 
 
+@pytest.mark.long
 def test_robust_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names = run_page("robust_policies.md")
@@ -202,6 +205,7 @@ def test_replanning_in_simulations_and_on_a_robot() -> None:
     assert names["planner"].problem.dynamics.parameters["wind_x"] == 2.0
 
 
+@pytest.mark.long
 def test_noise_in_the_plan() -> None:
     names = run_page("noise.md")
     problem, solution, costs = names["problem"], names["solution"], names["costs"]

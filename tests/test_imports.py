@@ -46,7 +46,7 @@ FLOORS_WITHIN = {
     ),
     "codegen": (
         ("arguments", "disk_cache", "foreign", "isolation", "kernel_source", "pointers"),
-        ("fingerprint",),
+        ("fingerprint", "kept_parts"),
         ("symbolic", "user_functions"),
         ("jit",),
     ),

@@ -94,7 +94,7 @@ PAIRS = [
     ("compiled", "compiled"),
     ("compiled here", "compiled"),
     ("plain", "compiled"),
-    ("compiled with Jacobian", "plain with derivatives"),
+    pytest.param("compiled with Jacobian", "plain with derivatives", marks=pytest.mark.long),
     ("plain with Jacobian", "plain with derivatives"),
 ]
 
@@ -217,6 +217,7 @@ def test_a_problem_can_be_copied_and_sent_to_another_process(level: str) -> None
         np.testing.assert_array_equal(ls.ilqr(other, max_iterations=2).policy.gain, want.policy.gain)
 
 
+@pytest.mark.long
 def test_what_a_plain_function_raises_ends_the_solve_with_its_words() -> None:
     calls = []
 
@@ -355,7 +356,7 @@ def test_bad_functions_get_one_line(level: str, function, fields: dict, message:
 
 
 def test_what_numba_can_not_compile_gets_one_line() -> None:
-    with pytest.raises(ls.InputError, match=r"_writes\(x, u, p\): got what numba cannot compile, want .*readonly"):
+    with pytest.raises(ls.InputError, match=r"_writes\(x, u, p\): got code that numba cannot compile, want .*readonly"):
         ls.ilqr(swing(ls.Dynamics(_writes, level="compiled", **FIELDS), COSTS["compiled"]))
     with pytest.raises(ls.InputError, match="jacobian: got one for symbolic, which is symbolic, want none"):
         ls.Dynamics(symbolic, jacobian=pendulum_jacobian, **FIELDS)
@@ -369,6 +370,7 @@ def test_what_numba_can_not_compile_gets_one_line() -> None:
         swing(DYNAMICS["symbolic"], COSTS["symbolic"], final_cost=ls.FunctionCost(bump))
 
 
+@pytest.mark.long
 def test_kinks_and_jumps_have_derivatives_almost_everywhere() -> None:
     def hinge(x, u, p):
         import sympy

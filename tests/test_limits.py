@@ -80,7 +80,7 @@ class TestLinearQuadratic:
             np.testing.assert_allclose(gain[t], np.array(found[1:]).T - found[0][:, None], rtol=0, atol=1e-9)
             np.testing.assert_allclose(~held[t] * plan.controls[t], found[0], rtol=0, atol=1e-8)
 
-    @pytest.mark.parametrize("form", ["dual", "primal"])
+    @pytest.mark.parametrize("form", ["dual", pytest.param("primal", marks=pytest.mark.long)])
     def test_the_value_functions_count_what_held_controls_cost(self, form: str) -> None:
         """Eq. (20): the least total cost is the cost at every step. The primal form's inverse step is O(dt^5) off.
 

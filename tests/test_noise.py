@@ -19,7 +19,7 @@ from lqrsim.errors import InputError
 from lqrsim.kernels import noise as kernel
 from lqrsim.solvers.compiled import costs_of
 
-FORMS = [(True, "dual"), (False, "dual"), (False, "primal")]
+FORMS = [(True, "dual"), (False, "dual"), pytest.param(False, "primal", marks=pytest.mark.long)]
 
 
 def off(found: Any, wanted: Any) -> float:
@@ -46,13 +46,14 @@ def assert_is_oracles(solution: ls.Solution, numbers: Any, problem: ls.Problem, 
 
 
 @pytest.mark.timeout(300)  # on a machine that has compiled nothing yet
-@settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), strength=st.floats(0.0, 0.3), each=st.sampled_from(FORMS))
-def test_a_linear_quadratic_problem_with_multiplicative_noise(seed, strength, each):
+@pytest.mark.parametrize(("fixed", "form"), FORMS)
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), strength=st.floats(0.0, 0.3))
+def test_a_linear_quadratic_problem_with_multiplicative_noise(fixed, form, seed, strength):
     """The stochastic Riccati recursion to 1e-9: cost-to-go, policy, start, expected cost; in both forms."""
     numbers = draw(np.random.default_rng(seed), multiplicative=strength)
-    problem = problem_of(numbers, fixed=each[0])
-    assert_is_oracles(ls.smooth(problem, form=each[1]), numbers, problem)
+    problem = problem_of(numbers, fixed=fixed)
+    assert_is_oracles(ls.smooth(problem, form=form), numbers, problem)
 
 
 def test_ilqr_with_noise_is_the_same_there():
@@ -188,6 +189,7 @@ def plain_shaken(x, u, p):
     return [[0.0, 0.0], [p.a * x[0] * u[0], p.b], [0.0, p.a * u[1]]]
 
 
+@pytest.mark.long
 def test_the_same_noise_at_three_levels():
     """Formulas, a numba function and a plain one: derivatives by differences are good to some eight digits."""
     numbers, values = draw(np.random.default_rng(4)), {"a": 0.2, "b": 0.1}

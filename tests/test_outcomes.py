@@ -133,6 +133,7 @@ class TestReplanning:
             costs.append(outcomes(run, scenario.problem).cost)
         np.testing.assert_allclose(costs[1], costs[0], rtol=0.03)
 
+    @pytest.mark.long
     def test_where_no_solve_succeeds_the_law_goes_on(
         self, plant: Plant, quadrotor: ls.Scenario, quadrotor_solution
     ) -> None:

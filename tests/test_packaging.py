@@ -69,6 +69,7 @@ def test_sdist_is_complete(built: Path) -> None:
     } <= inside
 
 
+@pytest.mark.long
 def test_wheel_solves_from_an_empty_environment(built: Path, tmp_path: Path) -> None:
     """Installs for real, with the dependencies that the wheel names and no others: 15 s where pip has them cached."""
     (wheel,) = built.glob("*.whl")

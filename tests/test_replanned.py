@@ -236,6 +236,7 @@ def test_where_the_law_leads_to_the_goal_nothing_is_solved() -> None:
 # What fails, and what does not fit.
 
 
+@pytest.mark.long
 def test_where_no_solve_succeeds_the_law_goes_on() -> None:
     """Within an obstacle whose cost is beyond numbers: bit by bit the law that never solves again."""
     ball = ls.World([ls.Obstacle("ball", "sphere", np.zeros(3), np.eye(3), np.array([1.0, 0.0, 0.0]))])

@@ -134,6 +134,7 @@ def test_tables_hold_what_was_measured(page: Page, results: Results) -> None:
     assert row[3].startswith(f"{rms:.3g} (")
 
 
+@pytest.mark.long
 def test_worst_trials_are_run_again_and_filmed(
     results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -78,7 +78,9 @@ class TestCandidates:
         assert len(calls) == limit
         assert solution.cost == min(one.cost for one in solution.candidates)
 
-    @pytest.mark.parametrize(("form", "first_pass"), [("dual", "backward"), ("primal", "forward")])
+    @pytest.mark.parametrize(
+        ("form", "first_pass"), [("dual", "backward"), pytest.param("primal", "forward", marks=pytest.mark.long)]
+    )
     def test_in_the_other_form_and_order(self, differential_drive, form: str, first_pass: str) -> None:
         calls: list[Iteration] = []
         solution = ls.smooth(differential_drive.problem, form=form, first_pass=first_pass, callback=calls.append)
@@ -177,6 +179,7 @@ def arcs(x: Array, u: Array, p: Any) -> list[float]:
 
 
 class TestWithoutAWay:
+    @pytest.mark.long
     def test_plain_functions_are_searched_with_too(self) -> None:
         """One thread, two, and formulas: all the same."""
         problem = in_the_plane(plain=True)

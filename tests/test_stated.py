@@ -47,7 +47,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory, differential_drive: ls.Scen
 # Campaigns.
 
 
-@pytest.mark.parametrize(("workers", "batch"), [(1, 3), (2, 1)])
+@pytest.mark.parametrize(("workers", "batch"), [pytest.param(1, 3, marks=pytest.mark.long), (2, 1)])
 def test_all_six_have_the_same_bits_in_other_processes_and_in_any_batch(
     results: ls.Results, tmp_path: Path, workers: int, batch: int
 ) -> None:

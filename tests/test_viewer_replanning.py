@@ -364,6 +364,7 @@ needs_browser = pytest.mark.skipif(not browsing.CHROMIUM, reason="there is no br
 
 
 @needs_browser
+@pytest.mark.long
 def test_keys_and_the_mouse_move_the_goal(tmp_path: Path) -> None:
     """In the browser: after Enter an arrow key moves it, and Ctrl with the right mouse button drags it."""
     before = """import lqrsim.view.viewer_base as viewer_base

@@ -21,7 +21,7 @@ from lqrsim.errors import InputError
 from lqrsim.results.hashing import sha256
 from lqrsim.results.save_load import replacing
 
-LIMIT = 256 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about one megabyte
+LIMIT = 512 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about one megabyte, and four with its parts
 _SUFFIX = ".item"
 _DURATIONS = "durations.json"
 
@@ -63,13 +63,18 @@ def load(name: str) -> bytes | None:
     return contents
 
 
-def save(name: str, contents: bytes, what: str) -> None:
-    """Keep an item if that is possible; two processes that keep the same one do not disturb each other."""
+def save(name: str, contents: bytes, what: str, *, shrink: bool = True) -> None:
+    """Keep an item if that is possible; two processes that keep the same one do not disturb each other.
+
+    Args:
+      shrink: whether to look if there is too much by now, which takes longer than keeping a small item.
+    """
     header = json.dumps({"what": what, "sha256": sha256(contents)}).encode()
     with contextlib.suppress(OSError, InputError):
         with replacing(folder() / f"{name}{_SUFFIX}") as unfinished:
             unfinished.write_bytes(header + b"\n" + contents)
-        _shrink()
+        if shrink:
+            _shrink()
 
 
 def note(name: str, seconds: float) -> None:

@@ -127,11 +127,15 @@ class Core:
 
     def _part(self, name: str) -> Any:
         """The function of that name, made once in a process."""
+        from lqrsim.codegen.kept_parts import KeptPart
+
         key = self._key_of(name)
         if key not in _parts:
             namespace = {**_vocabulary(), **{callee: self._part(callee) for callee in self._callees(name)}}
-            exec(compile(self._texts[name], "<lqrsim core>", "exec"), namespace)
-            _parts[key] = namespace[name]
+            exec(compile(named(self._texts[name], name, key), "<lqrsim core>", "exec"), namespace)
+            part = namespace[f"{name}_{key}"]
+            part._cache = KeptPart(key, _machine())
+            _parts[key] = part
         return _parts[key]
 
     def _key_of(self, name: str) -> str:
@@ -145,8 +149,9 @@ class Core:
         return sorted(names & self._texts.keys() - {name})
 
 
-# The functions that this process has made, under a hash of their text and of all that they call. Cores share them: the
-# second problem with the same dynamics, or only with as many states and controls, takes less time to compile.
+# The functions that this process has made, under a hash of their text and of all that they call. Cores share them, and
+# processes do, by `kept_parts.py`: the second problem with the same dynamics, or only with as many states and controls,
+# takes less time to compile.
 _parts: dict[str, Any] = {}
 
 

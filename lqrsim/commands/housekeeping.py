@@ -1,5 +1,6 @@
 """Commands that run everything, and that manage the cache."""
 
+import itertools
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,9 +100,11 @@ class Cache:
                 ) from None
             return 0
         items = disk_cache.items()
-        for item in items:
-            used = time.strftime("%Y-%m-%d %H:%M", time.localtime(item.used))
-            console.say(f"{item.size / 1e6:8.2f} MB  last used {used}  {item.what}")
+        together = itertools.groupby(sorted(items, key=lambda item: item.what), key=lambda item: item.what)
+        for what, alike in sorted(((what, list(some)) for what, some in together), key=lambda one: -one[1][0].used):
+            used = time.strftime("%Y-%m-%d %H:%M", time.localtime(alike[0].used))
+            count = f" ({len(alike)} items)" if len(alike) > 1 else ""
+            console.say(f"{sum(item.size for item in alike) / 1e6:8.2f} MB  last used {used}  {what}{count}")
         total = sum(item.size for item in items) / 1e6
         console.say(
             f"{len(items)} items, {total:.1f} of at most {disk_cache.LIMIT / 1e6:.0f} MB, in {disk_cache.folder()}"

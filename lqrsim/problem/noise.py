@@ -72,9 +72,9 @@ class NoiseTerm:
 
 
 class Noise:
-    """White noise on the states: in each control period they get M(x, u) w more, w (k,) standard normal.
+    """White noise on the states: each control period adds M(x, u) w to them, with w (k,) standard normal.
 
-    Thrust that varies by 5 % of itself, each rotor on its own, and gusts that are the stronger the faster a drone is:
+    Gusts that grow with the speed of a drone:
 
         def shaken(x, u, p):
             speed = sqrt(x[3] ** 2 + x[4] ** 2 + 1e-6)
@@ -82,17 +82,17 @@ class Noise:
 
         ls.Noise(shaken, size=2, parameters={"gust": 0.02})
 
-    M is in the state's unit, per control period, and not per second: what a disturbance that is white in time does to
-    the state in a period grows with the square root of dt. Who halves dt divides M by sqrt(2).
+    M is in the units of the state, per control period, not per second. The effect of white noise in a period grows with
+    the square root of dt: with half the dt, divide M by sqrt(2).
 
     Args:
       function: `function(x, u, p)` as in `Dynamics`: returns n rows of k entries, formulas of SymPy symbols, whose
         derivatives follow; or numbers, of a numba or (level="plain") any Python function of arrays, whose derivatives
-        are central differences. Or the matrix itself, (n, k), where it is always the same.
-      size: k; of a matrix it is not asked for.
+        are central differences. Or the matrix itself, (n, k), if it is constant.
+      size: k; not with a matrix.
       parameters: name -> value, as in `Dynamics`: to the function p has them as attributes. Values are data.
       depends_on: names of the states and controls that M depends on, for numba and plain functions; all by default.
-        The fewer, the faster. Of formulas it is found out.
+        Fewer are faster. For formulas they are found automatically.
       level: "symbolic", "compiled" or "plain"; by default compiled if it is a numba function, and symbolic otherwise.
 
     Raises:
@@ -143,7 +143,13 @@ class Noise:
         return f"Noise({self.name}, size={self.size}{times})"
 
     def scaled(self, strength: float) -> "Noise":
-        """The same, so many times as strong. Nothing compiles again.
+        """The same noise with M multiplied by a number. Nothing is compiled again.
+
+        Args:
+          strength: the number, at least 0; strengths of several calls multiply.
+
+        Returns:
+          Another Noise; this one does not change.
 
         Raises:
           InputError: the strength is negative or not finite.
@@ -153,7 +159,13 @@ class Noise:
         return other
 
     def with_parameters(self, **values: float) -> "Noise":
-        """The same with other values of some parameters. Nothing compiles again.
+        """The same noise with other values of some parameters. Nothing is compiled again.
+
+        Args:
+          **values: name of a parameter -> its value.
+
+        Returns:
+          Another Noise; this one does not change.
 
         Raises:
           InputError: there is no such parameter, or the value is not finite.
@@ -165,7 +177,17 @@ class Noise:
         return other
 
     def bind(self, dynamics: Dynamics) -> NoiseTerm:
-        """The noise for a system. Raises InputError if it does not fit."""
+        """The noise for a system.
+
+        Args:
+          dynamics: of the system, with its states and controls.
+
+        Returns:
+          What gets compiled, and the numbers that it reads.
+
+        Raises:
+          InputError: the noise does not fit the system.
+        """
         check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         numbers = np.array([*self.parameters.values(), self.strength])
@@ -241,7 +263,19 @@ class Noise:
         return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, (function,))
 
     def matrices(self, dynamics: Dynamics, states: npt.ArrayLike, controls: npt.ArrayLike) -> Array:
-        """M (K, n, k) at states (K, n) and controls (K, m). Raises InputError if they do not fit."""
+        """M at given states and controls.
+
+        Args:
+          dynamics: of the system, with its states and controls.
+          states: (K, n).
+          controls: (K, m).
+
+        Returns:
+          (K, n, k), in the states' units, for each.
+
+        Raises:
+          InputError: the noise, the states or the controls do not fit the system.
+        """
         check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         x = check_array("states", states, (None, n), infinite=True)

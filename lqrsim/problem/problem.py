@@ -179,7 +179,14 @@ class Problem:
         return other._with(steps=self.steps - after, begin=begin, constraints=left)._bound_anew()
 
     def later(self, seconds: float) -> "Problem":
-        """The same with a later begin, by when obstacles that move have gone on."""
+        """The same problem with a later begin: moving obstacles are where they are then.
+
+        Args:
+          seconds: how much later, in seconds.
+
+        Returns:
+          Another Problem; this one does not change.
+        """
         other = self._with(begin=self.begin + check_number("seconds", seconds))
         return other._bound_anew() if self.moving else other
 
@@ -279,7 +286,15 @@ class Problem:
         return self._noise_term
 
     def driven_by(self, noise: Noise | None, risk: float | None) -> "Problem":
-        """The same under other noise, or another risk; of what is None, its own."""
+        """The same problem under other noise or with another risk.
+
+        Args:
+          noise: the noise; None keeps the problem's own.
+          risk: the risk, in units of 1/cost; None keeps the problem's own.
+
+        Returns:
+          Another Problem; this one does not change.
+        """
         changed = {name: value for name, value in (("noise", noise), ("risk", risk)) if value is not None}
         return replace(self, **changed) if changed else self
 

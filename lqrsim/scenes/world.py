@@ -93,12 +93,26 @@ class World:
         return any(obstacle.velocity.any() for obstacle in self.obstacles)
 
     def displacements(self, times: npt.ArrayLike) -> Array:
-        """How far each obstacle has moved by some times (K,) in s, (K, len(self), 3) in metres."""
+        """Displacements of the obstacles since the time 0 of the run.
+
+        Args:
+          times: (K,) in s.
+
+        Returns:
+          (K, len(self), 3) in metres.
+        """
         velocities = np.array([obstacle.velocity for obstacle in self.obstacles]).reshape(len(self), 3)
         return np.multiply.outer(check_array("times", times, (None,)), velocities)
 
     def tables(self, times: npt.ArrayLike) -> Array:
-        """The obstacles as numbers at some times (K,) in s, (K, len(self), ROW); only once where none moves."""
+        """The obstacles as the numbers that compiled code reads, at given times.
+
+        Args:
+          times: (K,) in s.
+
+        Returns:
+          (K, len(self), ROW); (1, len(self), ROW) where no obstacle moves.
+        """
         if not self.moving:
             return self.table[None]
         moved = self.displacements(times)
@@ -107,9 +121,15 @@ class World:
         return tables
 
     def moved(self, seconds: float) -> "World":
-        """The world as it is so much later, or earlier: each obstacle has gone on at its velocity.
+        """The world some time later: each obstacle has moved at its velocity.
 
-        An obstacle that is seen at the time t of a run belongs into its problem as `ls.World([seen]).moved(-t)`.
+        An obstacle that is seen at the time t of a run goes into its problem as `ls.World([seen]).moved(-t)`.
+
+        Args:
+          seconds: how much later; a negative number is earlier.
+
+        Returns:
+          Another World; this one where nothing moves.
         """
         seconds = check_number("seconds", seconds)
         moved = [replace(one, position=one.position + seconds * one.velocity) for one in self.obstacles]

@@ -102,6 +102,8 @@ def ilqr_many(
       max_iterations: as in `ilqr`, for all.
       time_limit: as in `ilqr`, for all.
       start: as in `ilqr`, for all.
+      noise: as in `ilqr`, for all.
+      risk: as in `ilqr`, for all.
       progress: called with the numbers of solved and of all problems, as each solve ends.
 
     Returns:

@@ -23,7 +23,11 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
     is too high, as where the noise costs nothing.
 
     Args:
-      problem: with noise; its own risk does not count. solution: any of it.
+      problem: with noise; its own risk does not count.
+      solution: any solution of it.
+
+    Returns:
+      The risk, in units of 1/cost; infinite where none is too high.
 
     Raises:
       InputError: the problem has no noise, the solution is not of such a problem, or the pass fails at no risk, too.

@@ -14,13 +14,19 @@ MOST_TRIALS = 10_000_000
 
 
 def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, seed: int = 0) -> Array:
-    """What so many runs of a solution's policy cost (K,), from the first state of its plan, the noise drawn.
+    """Costs of simulated runs of a solution's policy from the first state of its plan, with noise drawn at random.
 
     The robot moves by the formulas of the problem, x' = g(x, u) + M(x, u) w, not in MuJoCo, and obstacles do not stop
     it. The same seed draws the same noise whatever the solution: costs of two are compared trial by trial.
 
     Args:
-      problem: with noise. solution: of it, or of another problem with as many states, controls and steps.
+      problem: with noise.
+      solution: of that problem, or of another one with as many states, controls and steps.
+      trials: number of runs K.
+      seed: of the noise.
+
+    Returns:
+      (K,) the costs.
 
     Raises:
       InputError: the problem has no noise, the solution does not fit it, or an argument is not as described.

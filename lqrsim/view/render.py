@@ -53,17 +53,14 @@ def render(
       camera: `overview`, `chase`, or the calibrated `top` and `side`, in any scene; or another of the model's.
       insets: more cameras, in panes of their own beside the first. In panes of `top` and `side` robots wear a marker.
       titles: of the runs, in the place of robot and scene.
-      overlays: what is drawn over the scene, of plan, ghost: the planned path, and a disc or ball where the robot
-        should be now; trace: what was driven so far, coloured by tracking error; forces: what pushes the robot, wind
-        too, as an arrow: the mean over the last fifth of a second; measured: the last states that the policy was shown,
-        where they differ from the true ones; tube: where the run was predicted to be under its disturbances, 2 standard
-        deviations about the plan, as far as that is not too wide to be shown; where there is a `rollout.tube`;
-        cost_tube: ellipsoids in which the total cost is near its least, whatever disturbs; only where it is asked for;
-        caption: time, tracking error, clearance, what disturbs, and a legend.
+      overlays: what is drawn over the scene. plan. ghost: the planned path, and a disc or ball where it should be
+        now. trace: the path so far, coloured by tracking error. forces: arrows of forces and wind, means over the last
+        fifth of a second. measured: the last measured states, where they differ from the true ones. tube: the states
+        predicted under the disturbances, within 2 standard deviations, where there is a `rollout.tube` and it is not
+        too wide. cost_tube: ellipsoids of low total cost. caption: time, tracking error, clearance, disturbances.
       solution: of which the run is, for cost_tube; one for all, or one each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and how much the video is compressed.
-      size: width and height in pixels, both even; that of the quality by default, and half of it for a GIF, but not
-        less than 480 x 270.
+      size: width and height in pixels, both even; by default the quality's, or half for a GIF (at least 480 x 270).
       fps: frames a second, whatever the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
       speed: seconds of the run in a second of the video.
       progress: called after each frame with the number of frames done and of all frames.

@@ -49,6 +49,7 @@ def viewing(folder: Path, *arguments: str, before: str = "") -> Iterator[subproc
     command = [sys.executable, "-c", code, "view", *arguments, "--viewer", "browser", "--seconds", "200"]
     # MuJoCo keeps the layout of its panels in the home; what is compiled stays where it is.
     environment = {**os.environ, "HOME": str(folder), "LQRSIM_CACHE_DIR": str(disk_cache.folder())}
+    environment["PYTHONFAULTHANDLER"] = "1"
     outside = {"cwd": folder, "env": environment}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **outside) as process:
         try:
@@ -56,10 +57,10 @@ def viewing(folder: Path, *arguments: str, before: str = "") -> Iterator[subproc
         finally:
             process.send_signal(signal.SIGINT)
             try:
-                process.wait(20)
+                process.communicate(timeout=60)  # reads on, for a process that cannot write cannot end
             except subprocess.TimeoutExpired:
-                process.kill()
-                raise
+                process.send_signal(signal.SIGABRT)  # where it hangs is then in what it wrote
+                raise AssertionError(f"it did not end with Ctrl-C:\n{process.communicate()[0]}") from None
 
 
 def said(process: subprocess.Popen[str], text: str) -> str:
