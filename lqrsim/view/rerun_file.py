@@ -1,6 +1,6 @@
 """A trial as a recording of Rerun's viewer: geometry, plan, tube and numbers over one timeline, in seconds.
 
-Rerun is a package of its own, `rerun-sdk`, in the extra `rerun`. Nothing here speaks to the network.
+Rerun is a package of its own, `rerun-sdk`, in the extra `rerun`.
 """
 
 import importlib
