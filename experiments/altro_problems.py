@@ -31,7 +31,7 @@ import numpy as np
 from altro import models
 from altro.airplane import TRIM_CONTROLS, airplane, unclamped
 from numpy.typing import NDArray
-from paper.common import Result, Settings, Statement, opening, run, table
+from paper.common import Result, Settings, opening, run, table
 from scipy.interpolate import CubicSpline
 from tqdm import tqdm
 
@@ -335,9 +335,5 @@ def report(result: Result) -> str:
     return "\n".join(lines)
 
 
-def statements(result: Result) -> list[Statement]:
-    return []  # of the paper's
-
-
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, lambda result: [], __doc__)  # of the paper's statements, for it has none of this

@@ -115,6 +115,7 @@ def test_waypoints_cost_at_their_knots_alone() -> None:
         assert value == pytest.approx(0.05 * states / 2 + effort * 1e-4 * (u @ u) / 2, rel=1e-12)
 
 
+@pytest.mark.long
 def test_quick_run_counts_what_keeps_the_constraints_at_least_cost() -> None:
     done = subprocess.run([sys.executable, SCRIPT, "--quick", "--json"], capture_output=True, text=True, check=True)
     said = json.loads(done.stdout)

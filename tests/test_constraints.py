@@ -15,7 +15,7 @@ from lqrsim.results.solution_parts import Iteration, Status
 TIGHT: dict[str, Any] = {"tolerance": 1e-7, "gap_tolerance": 1e-4, "constraint_tolerance": 1e-5}
 
 
-@pytest.mark.parametrize("form", ["dual", "primal"])
+@pytest.mark.parametrize("form", ["dual", pytest.param("primal", marks=pytest.mark.long)])
 @pytest.mark.parametrize("weight", [0.0, 0.5], ids=["constraint alone", "cost, too"])
 def test_past_a_ball(form: str, weight: float) -> None:
     case = problem(weight=weight, soft=form == "primal")

@@ -364,6 +364,7 @@ def test_benchmark_of_replanning(tmp_path: Path) -> None:
     assert "### How long re-plans take" in script.report(found)
 
 
+@pytest.mark.long
 def test_a_learner_that_sees_the_state_does_as_its_expert_does_and_one_that_sees_the_time_does_not() -> None:
     script = import_module("gym_imitation")
     result = script.main(script.Config(quick=True))

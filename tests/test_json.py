@@ -168,6 +168,7 @@ def test_stress_report_and_replay(printed: Any, tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+@pytest.mark.long
 def test_rare_and_break_print_their_files(printed: Any, tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(OWN, encoding="utf-8")
     reference = f"{tmp_path / 'own.py'}:shifted"

@@ -279,6 +279,7 @@ def drive():
     return scenario.plant(), problem, ls.smooth(problem)
 
 
+@pytest.mark.long
 def test_a_run_meets_the_noise_that_it_was_planned_for(drive):
     """The same object: state kicked by M(x, u) w, to rounding, and the cost that is expected, in MuJoCo."""
     plant, problem, solution = drive
@@ -315,6 +316,7 @@ def test_a_kick_is_what_it_says(robot):
             np.testing.assert_array_equal(kicked.frames[trial, each, 7:], calm.frames[trial, each, 7:])
 
 
+@pytest.mark.long
 def test_limits_and_constraints_under_noise(drive):
     """Plans keep both, as without noise."""
     plant, problem, _ = drive

@@ -76,7 +76,7 @@ class Dense:
 
 
 class TestGoalState:
-    @pytest.mark.parametrize("soft", [False, True])
+    @pytest.mark.parametrize("soft", [False, pytest.param(True, marks=pytest.mark.long)])
     def test_is_the_dense_kkt_solution(self, soft: bool) -> None:
         case = problem(ls.GoalState([1, -0.5]), soft=soft, weight=0.3)
         solution, dense = ls.smooth(case, **EXACT), Dense(case)
@@ -148,7 +148,7 @@ class TestEquality:
         np.testing.assert_allclose(solution.multipliers[0].values[-1], multipliers, rtol=1e-4)
         assert contradictions(case, solution) == []
 
-    @pytest.mark.parametrize("soft", [False, True])
+    @pytest.mark.parametrize("soft", [False, pytest.param(True, marks=pytest.mark.long)])
     def test_of_state_and_control_is_the_dense_kkt_solution(self, soft: bool) -> None:
         """At all steps but the last, which has no control. From a given start it leaves nothing free."""
         constraint = ls.SymbolicConstraint(steered, parameters={"gain": 0.4}, equality=True)
@@ -175,7 +175,9 @@ def past(x, u, p):
 
 
 class TestInequality:
-    @pytest.mark.parametrize(("soft", "most", "room"), [(False, 1.35, 0.35), (True, 1.1, 0.25)])
+    @pytest.mark.parametrize(
+        ("soft", "most", "room"), [(False, 1.35, 0.35), pytest.param(True, 1.1, 0.25, marks=pytest.mark.long)]
+    )
     def test_of_state_and_control_with_a_goal(self, soft: bool, most: float, room: float) -> None:
         kept = [
             ls.GoalState([1, 0]),
@@ -209,7 +211,7 @@ class TestInequality:
 
 
 class TestStateBounds:
-    @pytest.mark.parametrize("soft", [False, True])
+    @pytest.mark.parametrize("soft", [False, pytest.param(True, marks=pytest.mark.long)])
     def test_are_kept_at_every_step(self, soft: bool) -> None:
         case = problem(ls.GoalState([1, 0]), ls.StateBounds(low={"v": -0.1}, high={"v": 0.55}), soft=soft)
         solution, dense = ls.smooth(case, tolerance=1e-8, constraint_tolerance=1e-6), Dense(case)
