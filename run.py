@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The commands of this project. Each sets up what it needs first; `python3 run.py --help` lists them."""
+"""The commands of this project. Each first sets up what it needs; `python3 run.py --help` lists them."""
 
 import sys
 
@@ -25,9 +25,10 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 GL_PACKAGES = ("libegl1", "libgl1-mesa-dri", "libopengl0")
 
 COMMANDS = {
-    "demo": "solve, execute and film both robots: the main job (arguments go to `lqrsim demo`)",
-    "test": "run the tests; --long: those of whole experiments, too (other arguments go to pytest: test -k solver)",
-    "check": "lint, formatting and types",
+    "demo": "solve, simulate and render both robots (arguments go to `lqrsim demo`)",
+    "test": "run the tests; --long includes whole experiments (other arguments go to pytest: test -k solver)",
+    "check": "check lint, formatting and types",
+    "docs": "build the documentation site into build/site; warnings are errors",
     "setup": "only set up what the other commands need",
 }
 
@@ -37,20 +38,20 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="run.py",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="The commands of this project; each sets up what it needs first.",
+        description="The commands of this project. Each first sets up what it needs.",
         epilog="commands:\n" + "\n".join(f"  {name:6} {text}" for name, text in COMMANDS.items()),
     )
     parser.add_argument("command", choices=COMMANDS, metavar="command", help=" | ".join(COMMANDS))
-    parser.add_argument("arguments", nargs=argparse.REMAINDER, help="are passed on")
+    parser.add_argument("arguments", nargs=argparse.REMAINDER, help="passed on to the command")
     options = parser.parse_args()
     rest: list[str] = options.arguments
-    if options.command in ("check", "setup") and rest:
+    if options.command in ("check", "docs", "setup") and rest:
         asked_for_help = rest[0] in ("-h", "--help")
         print(f"run.py {options.command}: {COMMANDS[options.command]}; it takes no arguments")
         return 0 if asked_for_help else 2
 
     set_up_python()
-    if options.command != "check":
+    if options.command not in ("check", "docs"):
         set_up_graphics()
     if options.command == "test":
         set_up_browser()
@@ -65,6 +66,13 @@ def main() -> int:
     if options.command == "check":
         steps = (["ruff", "check"], ["ruff", "format", "--check"], ["basedpyright", "--pythonpath", str(PYTHON)])
         return max([run([PYTHON, "-m", *step]) for step in steps])
+    if options.command == "docs":
+        os.environ["NO_MKDOCS_2_WARNING"] = "1"  # an announcement of the theme's authors
+        code = run([PYTHON, "-m", "mkdocs", "build", "--strict"])
+        if code == 0:
+            # Browsers do not let pages that are opened as files load the search index.
+            say("The site is in build/site. To read it: python3 -m http.server --directory build/site")
+        return code
     print(f"Ready. The command line is {PYTHON.parent / 'lqrsim'}")
     return 0
 
@@ -81,7 +89,7 @@ def set_up_python() -> None:
     STAMP.write_text(UNFINISHED, encoding="utf-8")
     say("Installing lqrsim and what it depends on into .venv (a minute or two the first time) ...")
     pip = [PYTHON, "-m", "pip", "install", "--disable-pip-version-check"]
-    code = run([*pip, *([] if sys.stdout.isatty() else ["--quiet"]), "--editable", ".[dev]"])
+    code = run([*pip, *([] if sys.stdout.isatty() else ["--quiet"]), "--editable", ".[dev,docs]"])
     if code:
         sys.exit("run.py: the installation failed for the reason above; the next run starts it again")
     STAMP.write_text(wanted, encoding="utf-8")

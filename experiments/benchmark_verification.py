@@ -117,7 +117,7 @@ def verdict(found: ls.Verification) -> dict[str, Any]:
 def report(result: dict[str, Any]) -> str:
     robots = result["robots"]
     heads = [head for name in robots for head in (f"{name.replace('_', ' ')} rms", "worst")]
-    rows = [f"| | {' | '.join(heads)} | verdict | said to be likely |", "|---" * (3 + len(heads)) + "|"]
+    rows = [f"| | {' | '.join(heads)} | verdict | likely cause given |", "|---" * (3 + len(heads)) + "|"]
     labels = list(dict.fromkeys(label for found in robots.values() for label in found))
     for label in labels:
         found = [one[label] for one in robots.values() if label in one]

@@ -20,7 +20,7 @@ from .control.uncertainty import Unknown as Unknown
 from .errors import InputError as InputError
 from .problem.balls import Balls as Balls
 from .problem.balls import Places as Places
-from .problem.constraints import Clearance as Clearance
+from .problem.clearance import Clearance as Clearance
 from .problem.constraints import Constraint as Constraint
 from .problem.constraints import ConstraintTerm as ConstraintTerm
 from .problem.constraints import GoalState as GoalState
@@ -37,6 +37,7 @@ from .problem.derivative_check import DerivativeCheck as DerivativeCheck
 from .problem.derivative_check import check_derivatives as check_derivatives
 from .problem.dynamics import Dynamics as Dynamics
 from .problem.linear_quadratic import Stage as Stage
+from .problem.noise import Noise as Noise
 from .problem.problem import FixedState as FixedState
 from .problem.problem import Problem as Problem
 from .reports.page import report as report
@@ -111,6 +112,8 @@ from .solvers.initial_guess import InitialPrior as InitialPrior
 from .solvers.linear_quadratic import smooth_lq as smooth_lq
 from .solvers.prepared import PreparedSolver as PreparedSolver
 from .solvers.prepared import prepare as prepare
+from .solvers.risk import largest_risk as largest_risk
+from .solvers.sampling import sample_costs as sample_costs
 from .solvers.smoother import smooth as smooth
 from .solvers.smoother import smooth_many as smooth_many
 from .stress.campaign import run_campaign as run_campaign

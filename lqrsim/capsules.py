@@ -32,7 +32,7 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
 
     A `Clearance` with a margin of `missed` keeps the capsule itself clear.
 
-    Args:
+    Attributes:
       length: of its segment, without the round ends, in metres; 0 for a ball.
       radius: in metres, of the capsule and of each ball.
       tolerance: by how much the capsule may stick out of the balls, in metres, more than 0.
@@ -79,6 +79,13 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
 
     def between(self, start: Sequence[Any], end: Sequence[Any]) -> list[list[Any]]:
         """The middle of each ball, where the segment is from `start` to `end`: expressions of SymPy, or numbers.
+
+        Args:
+          start: one end of the segment, 2 or 3 coordinates in metres.
+          end: the other end, as many coordinates.
+
+        Returns:
+          `count` lists of as many coordinates.
 
         Raises:
           InputError: they are no two points of the same size.

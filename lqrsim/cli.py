@@ -9,8 +9,8 @@ from lqrsim import process
 DESCRIPTION = """Feedback policies by iterated LQR smoothing, executed in MuJoCo under
 disturbances and shown on video.
 
-The whole chain, for both robots, is `lqrsim demo`. Step by step, each command
-reading what the one before wrote:
+`lqrsim demo` runs the whole chain for both robots. Step by step, each command
+reads what the one before wrote:
   lqrsim solve quadrotor --out runs/quadrotor
   lqrsim simulate runs/quadrotor/solution.npz --force-noise 0.1 --seed 1
   lqrsim render runs/quadrotor/rollout.npz
@@ -19,9 +19,9 @@ reading what the one before wrote:
 commands:
 {commands}
 
-`lqrsim COMMAND --help` documents each, `lqrsim --version` prints the version.
-Exit codes: 0 done, 1 not converged or out of bounds, 2 bad input, 130 stopped
-with Ctrl-C, 141 nobody reads what is printed."""
+`lqrsim COMMAND --help` documents each command, `lqrsim --version` prints the
+version. Exit codes: 0 done, 1 not converged or a check failed, 2 bad input,
+130 stopped with Ctrl-C, 141 output pipe closed."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         try:
             code = _run(list(sys.argv[1:] if arguments is None else arguments))
-        except SystemExit:  # of --help, and of what can not be understood
+        except SystemExit:  # of --help, and of arguments that cannot be parsed
             process.flush()
             raise
         process.flush()

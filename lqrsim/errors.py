@@ -58,7 +58,7 @@ def numbers_of(field: str, value: object, want: str = "numbers") -> Array:
     try:
         given = np.asarray(value)
         if given.size > _LARGE:
-            check_memory(field, given.size, 32, "what is made of which")
+            check_memory(field, given.size, 32, "arrays made from it")
         if given.dtype.kind not in "biufO":  # text, complex numbers, dates, records
             raise TypeError
         if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):  # a number that is not there
@@ -86,7 +86,7 @@ def real(field: str, value: npt.ArrayLike, want: str = "numbers") -> Array:
     done = type(value) is np.ndarray and value.dtype == np.float64
     if done and value.size > _LARGE:  # pyright: ignore[reportAttributeAccessIssue]
         # It may be there once for many places, as NumPy broadcasts, and what is made of it will not be.
-        check_memory(field, value.size, 32, "what is made of which")  # pyright: ignore[reportAttributeAccessIssue]
+        check_memory(field, value.size, 32, "arrays made from it")  # pyright: ignore[reportAttributeAccessIssue]
     return value if done else numbers_of(field, value, want)  # pyright: ignore[reportReturnType]
 
 
@@ -224,7 +224,7 @@ def check_path(field: str, value: object, want: str = "the path of a file") -> P
         name = os.fspath(value)
         good = isinstance(name, str) and name and "\0" not in name
         good = good and all(len(part.encode()) <= 255 for part in Path(name).parts) and len(name.encode()) < 4096
-    except Exception:  # no path, or what can not be written as bytes
+    except Exception:  # no path, or what cannot be written as bytes
         good, name = False, value
     if not good:
         raise InputError(f"{field}: got {excerpt(name)}, want {want}, of names of at most 255 bytes")

@@ -21,7 +21,7 @@ GRACE = 2.0  # s after a signal in which another one means the same, and does no
 
 
 class Unprintable(Exception):
-    """What is printed can not be written. No OSError, which is what cannot be written of a command's results."""
+    """What is printed cannot be written. No OSError, which is what cannot be written of a command's results."""
 
 
 class _Signals:

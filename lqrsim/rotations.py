@@ -29,7 +29,15 @@ RATIOS = ("sine_ratio", "cosine_ratio", "cotangent_ratio")
 
 
 def rotate(r: Vector, v: Vector) -> list[Any]:
-    """The vector `exp([r]) v`: v turned by the rotation vector r; three expressions of SymPy, or three numbers."""
+    """The vector `exp([r]) v`: v turned by the rotation vector r; three expressions of SymPy, or three numbers.
+
+    Args:
+      r: rotation vector, 3 entries.
+      v: vector, 3 entries.
+
+    Returns:
+      3 entries.
+    """
     r, v = _three("r", r), _three("v", v)
     sine, cosine, _ = (_ratio(name, _dot(r, r)) for name in RATIOS)
     once = _cross(r, v)
@@ -43,6 +51,13 @@ def vector_rate(r: Vector, w: Vector) -> list[Any]:
     Three expressions of SymPy, or three numbers if r and w are numbers.
 
     Paper: Sec. VI-B, `rdot = w + 1/2 [r] w + (1 - 1/2 |r| / tan(1/2 |r|)) [r]^2 w / |r|^2`.
+
+    Args:
+      r: rotation vector, 3 entries.
+      w: angular velocity in rad/s, 3 entries, in body axes.
+
+    Returns:
+      3 entries.
     """
     r, w = _three("r", r), _three("w", w)
     cotangent = _ratio("cotangent_ratio", _dot(r, r))
@@ -53,6 +68,12 @@ def vector_rate(r: Vector, w: Vector) -> list[Any]:
 
 def quaternion(rotation_vector: npt.ArrayLike) -> Array:
     """Unit quaternions (..., 4), scalar first as MuJoCo has them, of rotation vectors (..., 3).
+
+    Args:
+      rotation_vector: (..., 3), in radians.
+
+    Returns:
+      (..., 4).
 
     Raises:
       InputError: not numbers of that shape.
@@ -65,6 +86,12 @@ def quaternion(rotation_vector: npt.ArrayLike) -> Array:
 
 def rotation_vector(quaternion: npt.ArrayLike) -> Array:
     """Rotation vectors (..., 3) of at most half a turn, of quaternions (..., 4), scalar first, of any length and sign.
+
+    Args:
+      quaternion: (..., 4), scalar first.
+
+    Returns:
+      (..., 3), in radians.
 
     Raises:
       InputError: not numbers of that shape.

@@ -165,6 +165,7 @@ class TestOneBallAtThePosition:
             ):
                 np.testing.assert_allclose(theirs, mine, rtol=1e-12, atol=1e-12)
 
+    @pytest.mark.long
     def test_plans(self, pair: tuple[ls.Problem, ls.Problem]) -> None:
         """To what the iterations leave open."""
         one, other = (ls.smooth(problem) for problem in pair)
@@ -211,7 +212,7 @@ class TestLevels:
         found = balls.centres(ARM.dynamics, np.array([state, 2 * state]))
         np.testing.assert_allclose(found, [in_numpy(state), in_numpy(2 * state)], rtol=0, atol=1e-12)
 
-    @pytest.mark.parametrize("level", ["compiled", "plain"])
+    @pytest.mark.parametrize("level", [pytest.param("compiled", marks=pytest.mark.long), "plain"])
     def test_plans(self, level: str) -> None:
         """The same plan, which the balls' clearance and cost shape, whoever says where they are."""
         world = ls.World(
@@ -271,7 +272,8 @@ class TestCapsule:
             state = np.concatenate([rng.uniform(-np.pi, np.pi, 3), np.zeros(3)])
             data.qpos[:] = state[:3]
             mujoco.mj_forward(model, data)
-            ours = clearances(ARM.balls, ARM.dynamics, scene.world, state).reshape(3, LINK.count).min(axis=1)
+            at = state[None], np.zeros(1)
+            ours = clearances(ARM.balls, ARM.dynamics, scene.world, *at).reshape(3, LINK.count).min(axis=1)
             for link, clearance in zip(links, ours, strict=True):
                 theirs = min(
                     mujoco.mj_geomDistance(model, data, link, model.geom(name).id, 5.0, None)

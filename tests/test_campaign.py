@@ -1,4 +1,4 @@
-"""Campaigns: the same bits whatever happens on the way, and one line for what can not be."""
+"""Campaigns: the same bits whatever happens on the way, and one line for what cannot be."""
 
 import errno
 import multiprocessing
@@ -228,7 +228,7 @@ def test_dask_does_the_same(reference: Results, tmp_path: Path) -> None:
 
 
 @LINUX
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.long), signal.SIGKILL])
 def test_a_lost_scheduler_is_one_line_and_what_is_done_stays(
     reference: Results, tmp_path: Path, number: int, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -560,7 +560,7 @@ def test_stress_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     collided = int(np.flatnonzero(results.outcomes(cell).outcome == "collided")[0])
     for name in ("1", str(cell)):
         assert main(["replay", str(folder), "--cell", name, "--trial", str(collided), "--out", str(rollout)]) == 0
-        assert "the same to the bit" in capsys.readouterr().out
+        assert "identical to the table" in capsys.readouterr().out
     again = ls.load_rollout(rollout)
     assert (again.first_trial, again.outcome) == (collided, ("collided",))
     assert again.frames.shape[1] > 100

@@ -159,7 +159,7 @@ def test_simulate_with_another_seed_is_another_run(solved: Path, tmp_path: Path)
     assert not np.array_equal(runs[0].states, runs[2].states)
 
 
-def test_render_films_a_rollout(solved: Path, tmp_path: Path) -> None:
+def test_render_writes_a_video_of_a_rollout(solved: Path, tmp_path: Path) -> None:
     if not gl.available():
         pytest.skip("no OpenGL here")
     rollout = simulate(solved, tmp_path)

@@ -30,6 +30,15 @@ def run_page(name: str) -> dict[str, Any]:
     return namespace
 
 
+def test_getting_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_page("getting_started.md")
+    packaged = ls.scenarios.differential_drive().problem
+    assert names["problem"].digest == packaged.digest  # the page says that the scenario has this problem
+    assert names["rollout"].outcome == ("reached",) * 5
+    assert names["control"].shape == (2,)
+
+
 def test_a_robot_from_an_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names = run_page("mjcf_robots.md")
@@ -91,6 +100,7 @@ def test_a_robot_scene_cost_and_disturbance_of_ones_own(
         assert ls.render(rollout, tmp_path / "rink.mp4", size=(320, 240), fps=5).stat().st_size > 1000
 
 
+@pytest.mark.long
 def test_one_system_at_three_levels() -> None:
     names = run_page("stating_a_system.md")
     assert names["solution"].status is names["same"].status is ls.Status.CONVERGED
@@ -182,3 +192,17 @@ def test_replanning_in_simulations_and_on_a_robot() -> None:
     assert names["replan"].trajectory.steps == 150
     assert names["law"].solved > 40
     assert names["planner"].problem.dynamics.parameters["wind_x"] == 2.0
+
+
+def test_noise_in_the_plan() -> None:
+    names = run_page("noise.md")
+    problem, solution, costs = names["problem"], names["solution"], names["costs"]
+    assert solution.status is ls.Status.CONVERGED
+    assert solution.cost == pytest.approx(costs.mean(), rel=0.03)
+    assert names["extra"].mean() > 2 * names["extra"].std() / len(costs) ** 0.5
+    assert problem.digest != names["scenario"].problem.digest
+    assert names["spreads"][1] < names["spreads"][0]
+    assert "is too high at step" in names["beyond"].detail
+    # Noise that is always the same changes the expectation and nothing else.
+    np.testing.assert_allclose(names["calm"].trajectory.states, names["plain"].trajectory.states, atol=1e-3)
+    assert names["calm"].cost > names["plain"].cost

@@ -237,7 +237,7 @@ FIELDS = {
         (lambda x, u, p: [x[1], x[0] / (u[0] - u[0])], {}, "as entry 1, want a finite real expression"),
         (lambda x, u, p: [x[1], x[0] > 0], {}, "got x0 > 0 as entry 1, want an expression"),
         (lambda x, u, p: [x[1], x[0] * (-1) ** 0.5], {}, "as entry 1, want a finite real expression"),
-        (_tangled, {}, r"_tangled\(x, u, p\): got what can not be compiled .*besselj.*, want elementary functions"),
+        (_tangled, {}, r"_tangled\(x, u, p\): got what cannot be compiled .*besselj.*, want elementary functions"),
         (_piece, {}, r"_piece\(x, u, p\): got Piecewise.* in entry 1, want its last case to be \(expression, True\)"),
         (_pendulum, {"parameters": {"_k": 1.0}}, "got the name '_k', want a Python name without a leading underscore"),
         (_pendulum, {"parameters": {1: 1.0}}, "parameters: got the name 1, want a Python name"),

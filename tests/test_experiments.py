@@ -217,6 +217,7 @@ def test_the_best_plans_cost_what_is_said_of_them(quality: ModuleType) -> None:
         assert quality.peers.cost_of(problem, controls) == pytest.approx(cost, rel=1e-12)
 
 
+@pytest.mark.long
 def test_benchmark_of_quality_says_what_it_skips(quality: ModuleType, tmp_path: Path) -> None:
     config = quality.Config(
         quick=True, queries=1, sections=("starts",), peers=False, reference=tmp_path, seeds=(7,)
@@ -344,7 +345,7 @@ def test_benchmark_of_replanning(tmp_path: Path) -> None:
         assert sum(row["ended"].values()) == row["plans"] >= 40
         assert 0 < row["median"] <= row["p999"] <= row["most"]
     # Two runs each: the first policy ends at the old goal and runs into the pillar.
-    for what in ("goal", "pillar"):
+    for what in ("goal", "pillar", "moving"):
         assert found["changes"][what]["re-planning"][0] == 100
         assert found["changes"][what]["the first policy"][0] == 0
     used = found["delay"]["used"]
@@ -361,3 +362,14 @@ def test_benchmark_of_replanning(tmp_path: Path) -> None:
         assert row["converged"] == 100
         assert abs(row["more"]) < 1
     assert "### How long re-plans take" in script.report(found)
+
+
+@pytest.mark.long
+def test_board_of_realaigym() -> None:
+    """Two of the runs: one whose model is right but for a motor's inertia, of zero, and one of velocity noise."""
+    script = import_module("realaigym_board")
+    result = script.main(script.Config(quick=True, robots=("pendubot",), versions=(1,)))
+    (board,) = result["boards"]
+    assert board["trials"] == 2
+    assert board["columns"] == {"model": 1.0, "velocity noise": 1.0, "score": 1.0}
+    assert "| pendubot, version 1 | 100.0 | 100.0 |" in script.report(result)

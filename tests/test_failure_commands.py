@@ -127,7 +127,7 @@ def test_break_finds_a_distance_that_is_known(own: str, tmp_path: Path, capsys: 
     assert distance < numbers["distance"] < 1.001 * distance
     assert numbers["first_order_probability"] == pytest.approx(stats.norm.sf(numbers["distance"]))
     assert numbers["numbers"] == pytest.approx([numbers["distance"]])
-    assert f"{numbers['distance']:.3g} standard deviations from none" in printed
+    assert f"{numbers['distance']:.3g} standard deviations from the undisturbed trial" in printed
     assert "100.0 % of its square: shifted to the south, std 0.08 m (1 of the numbers)" in printed
     rollout = ls.load_rollout(tmp_path / "rollout.npz")
     assert rollout.outcome == ("collided",)

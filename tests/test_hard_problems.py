@@ -12,7 +12,7 @@ from lqrsim.results.solution_parts import Status
 
 
 def cubic(*, effort: float = 1.0, constant: float = 0.0) -> ls.Problem:
-    """A scalar that runs away by itself: the nominal control can not even be rolled out."""
+    """A scalar that runs away by itself: the nominal control cannot even be rolled out."""
     return ls.Problem(
         dynamics=systems.scalar(cubic=1.0), dt=0.1, steps=40, initial=ls.QuadraticCost([10.0], about=[1.0]),
         stage_cost=systems.scalar_cost(effort, weight=0.1, constant=constant),
@@ -90,7 +90,7 @@ def test_far_from_the_origin_converged_means_what_it_does_near(offset: float) ->
 EFFORT = systems.stage_cost(ls.ControlCost([1.0], about=[0.0]), ls.QuadraticCost([0.0, 0.0], about=[0.0, 0.0]))
 
 
-@pytest.mark.parametrize("form", ["dual", "primal"])
+@pytest.mark.parametrize("form", ["dual", pytest.param("primal", marks=pytest.mark.long)])
 @pytest.mark.parametrize("weights", [(1e8, 1e-3), (1e12, 1.0), (1.0, 1e-12)])
 def test_weights_of_a_soft_start_may_differ_by_any_factor(form: str, weights: tuple[float, float]) -> None:
     """A linear-quadratic problem is solved by one iteration, and the second sees it; the cost is the closed form's."""

@@ -49,7 +49,7 @@ FLOORS_WITHIN = {
         ("symbolic", "user_functions"),
         ("jit",),
     ),
-    "problem": (("dynamics", "linear_quadratic"), ("balls",), ("costs",), ("constraints",), ("problem",)),
+    "problem": (("dynamics", "linear_quadratic"), ("balls", "noise"), ("costs",), ("constraints",), ("problem",)),
     "solvers": (("compiled", "initial_guess"), ("common", "certify"), ("workspace",), ("attempt",)),
     "simulation": (("plant_validation", "plant"), ("physics",), ("disturbances",)),
 }

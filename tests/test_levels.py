@@ -1,4 +1,4 @@
-"""One system at every level of statement: the same numbers, and one line for what can not be right."""
+"""One system at every level of statement: the same numbers, and one line for what cannot be right."""
 
 import copy
 import dataclasses
@@ -355,7 +355,7 @@ def test_bad_functions_get_one_line(level: str, function, fields: dict, message:
 
 
 def test_what_numba_can_not_compile_gets_one_line() -> None:
-    with pytest.raises(ls.InputError, match=r"_writes\(x, u, p\): got what numba can not compile, want .*readonly"):
+    with pytest.raises(ls.InputError, match=r"_writes\(x, u, p\): got what numba cannot compile, want .*readonly"):
         ls.ilqr(swing(ls.Dynamics(_writes, level="compiled", **FIELDS), COSTS["compiled"]))
     with pytest.raises(ls.InputError, match="jacobian: got one for symbolic, which is symbolic, want none"):
         ls.Dynamics(symbolic, jacobian=pendulum_jacobian, **FIELDS)

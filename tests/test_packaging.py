@@ -1,8 +1,10 @@
 """What people install works: the built wheel, in an environment that holds it and its dependencies alone."""
 
+import re
 import subprocess
 import sys
 import tarfile
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
@@ -56,7 +58,15 @@ def test_sdist_is_complete(built: Path) -> None:
     (sdist,) = built.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
         inside = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"README.md", "LICENSE", "CHANGELOG.md", "pyproject.toml", "run.py", "tests/test_packaging.py"} <= inside
+    assert {
+        "README.md",
+        "LICENSE",
+        "CHANGELOG.md",
+        "CITATION.cff",
+        "pyproject.toml",
+        "run.py",
+        "tests/test_packaging.py",
+    } <= inside
 
 
 def test_wheel_solves_from_an_empty_environment(built: Path, tmp_path: Path) -> None:
@@ -70,3 +80,16 @@ def test_wheel_solves_from_an_empty_environment(built: Path, tmp_path: Path) -> 
     run(binaries / "lqrsim", "reproduce", "--quick", "figure_3", cwd=tmp_path)
     assert (tmp_path / "runs" / "paper" / "figures" / "figure_3.pdf").stat().st_size > 0
     assert run(binaries / "lqrsim", "--version", cwd=tmp_path).split() == ["lqrsim", wheel.name.split("-")[1]]
+
+
+def test_citation_is_of_this_version_and_has_the_fields_of_its_format() -> None:
+    """https://citation-file-format.github.io, version 1.2.0: the required keys, and what a reference needs."""
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    keys = set(re.findall(r"^([a-z-]+):", citation, re.MULTILINE))
+    assert {"cff-version", "message", "title", "authors"} <= keys
+    assert keys <= {"cff-version", "message", "type", "title", "abstract", "authors", "version", "license", "keywords",
+                    "references"}  # fmt: skip
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert f"\nversion: {project['version']}\n" in citation
+    assert f"\nlicense: {project['license']}\n" in citation
+    assert {"type", "title", "authors"} <= set(re.findall(r"^  [- ] ([a-z-]+):", citation, re.MULTILINE))

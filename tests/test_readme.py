@@ -16,7 +16,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 def test_code_blocks_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # they write files
-    # The README films 25 s in 720p, which takes over a minute; small and coarse it is the same code.
+    # The README renders 25 s in 720p, which takes over a minute; small and coarse it is the same code.
     monkeypatch.setattr(ls, "render", partial(ls.render, size=(320, 180), fps=5), raising=False)
     text = README.read_text(encoding="utf-8")
     blocks = list(BLOCK.finditer(text))
@@ -31,6 +31,7 @@ def test_code_blocks_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 def test_commands_exist() -> None:
     """Every `python3 run.py X` and `lqrsim X` that it shows is a command."""
     text = README.read_text(encoding="utf-8")
-    assert {"demo", "test"} <= set(re.findall(r"python3 run\.py (\w+)", text)) <= {"demo", "test", "check", "setup"}
+    shown = set(re.findall(r"python3 run\.py (\w+)", text))
+    assert {"demo", "test"} <= shown <= {"demo", "test", "check", "docs", "setup"}
     commands = {command.__name__.lower() for command in get_args(Command)}
     assert set(re.findall(r"^\$? ?lqrsim (\w+)", text, re.MULTILINE)) <= commands

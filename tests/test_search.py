@@ -249,6 +249,7 @@ class TestWithoutAWay:
                 ls.ilqr(in_the_plane(), start=start)
 
 
+@pytest.mark.long
 def test_where_no_control_helps_by_itself_some_do_together() -> None:
     """Sideways is only reached by turns of both controls: at rest the cost is flat, and to do nothing is stationary."""
 

@@ -230,6 +230,7 @@ def test_what_is_not_rare_needs_no_levels() -> None:
     assert found.probability.low < stats.norm.sf(0.5) < found.probability.high
 
 
+@pytest.mark.long
 def test_a_quadrotor_against_plain_monte_carlo(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """Wind in which 1 to 2 % of the trials collide: the two agree within four standard errors of their difference."""
     trials = TrialScore(quadrotor.plant(), quadrotor_solution, [ls.ForceNoise(0.19)])

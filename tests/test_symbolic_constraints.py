@@ -135,7 +135,9 @@ def line(x, u, p):
 
 
 class TestEquality:
-    @pytest.mark.parametrize(("form", "soft"), [("dual", False), ("dual", True), ("primal", True)])
+    @pytest.mark.parametrize(
+        ("form", "soft"), [("dual", False), ("dual", True), pytest.param("primal", True, marks=pytest.mark.long)]
+    )
     def test_at_the_end_is_the_dense_kkt_solution(self, form: str, soft: bool) -> None:
         constraint = ls.SymbolicConstraint(line, parameters={"slope": -0.3}, equality=True, at="final")
         case = problem(constraint, soft=soft, weight=20.0)
@@ -238,6 +240,7 @@ def swing(x, u, p):
     return [x[1], u[0] - p.gravity * sin(x[0])]
 
 
+@pytest.mark.long
 def test_a_pendulum_up_within_its_power() -> None:
     """Not linear, and far from the goal where it begins: SLSQP finds nothing better from there."""
 

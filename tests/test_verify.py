@@ -141,14 +141,14 @@ def test_a_plan_that_is_not_the_runs_is_told(case: Case) -> None:
     found = ls.verify_run(changed, solution=case.solution)
     assert failed(found) == {"plan"}
     assert "plan" in found.likely
-    # With the solution that the plan is of it is untold: that solution's policy was not run.
+    # With the solution that the plan is of it is not checked: that solution's policy was not run.
     policy = dataclasses.replace(case.solution.policy, nominal=plan.states[:-1])
     its_own = dataclasses.replace(case.solution, trajectory=plan, policy=policy)
-    assert "untold  plan" in ls.verify_run(changed, solution=its_own).summary()
+    assert "not checked  plan" in ls.verify_run(changed, solution=its_own).summary()
     assert failed(ls.verify_video(case.video, dataclasses.replace(case.run, plan=plan))) == {"run"}
-    untold = ls.verify_run(case.beginning())
-    assert untold.passed
-    assert "untold  plan" in untold.summary()
+    unchecked = ls.verify_run(case.beginning())
+    assert unchecked.passed
+    assert "not checked  plan" in unchecked.summary()
 
 
 def test_a_controllers_run_is_about_the_solutions_plan(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:

@@ -13,7 +13,7 @@ import browsing
 import mujoco
 import numpy as np
 import pytest
-from viewers import Recorder, said, viewing
+from viewers import Recorder, said, said_after, viewing
 from websockets import Origin
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -346,7 +346,5 @@ viewer_base.Viewer.push, viewer_base.Viewer.drag = pushed, pulled"""
         said(process, "Ctrl-C ends it")
         with browsing.browser(f"http://127.0.0.1:{PORT + 3}/", tmp_path / "profile", size=(500, 400)) as page:
             next(page.pictures())
-            page.press("ArrowRight", 39)
-            said(process, "pushed 1.0 0.0 0.0")
-            page.drag((350, 140), (350, 80))
-            said(process, "pulled")
+            said_after(process, "pushed 1.0 0.0 0.0", lambda i: page.press("ArrowRight", 39))
+            said_after(process, "pulled", lambda i: page.drag((350, 140), (350, 80)))

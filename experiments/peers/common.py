@@ -26,7 +26,7 @@ FLAGS = (
 
 
 class Unavailable(Exception):
-    """A solver that can not be had here; the message says in a line what is missing."""
+    """A solver that cannot be had here; the message says in a line what is missing."""
 
 
 @dataclass(frozen=True)

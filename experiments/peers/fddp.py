@@ -115,7 +115,7 @@ def _library() -> ctypes.CDLL:
     try:
         library = ctypes.CDLL(str(target))
     except OSError as error:
-        raise Unavailable(f"Crocoddyl's model can not be loaded: {error}") from None
+        raise Unavailable(f"Crocoddyl's model cannot be loaded: {error}") from None
     library.make.restype = ctypes.c_void_p
     library.solve.restype = ctypes.c_int
     library.release.restype = library.look.restype = None

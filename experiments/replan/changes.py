@@ -1,5 +1,6 @@
-"""What changes on the way: a goal that jumps, and a pillar that appears where the plan leads."""
+"""What changes on the way: a goal that jumps, and pillars that appear where the plan leads, one of which moves."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -17,47 +18,68 @@ FIRM = 5000.0  # the weight of the goal, ten times the scenario's: at that a met
 ROOM = 0.1  # m, between the robot at the new goal and obstacles, at least
 AHEAD, SEEN_AT, PILLAR = 1.5, 1.0, 0.1  # s, s, m: where and when a pillar appears, and its radius
 ASIDE = 0.05  # m, that its axis is beside the plan at most
+SPEED = 0.5  # m/s, of one that moves
+AGAIN, STILL, FIRST = "re-planning", "re-planning, as if it stood still", "the first policy"
+
+Known = Callable[[float, ls.Problem], ls.Problem]
 
 
 def measure(config: Config) -> dict[str, Any]:
     each = max(config.trials // config.queries, 1)
-    distances: dict[str, list[Array]] = {"re-planning": [], "the first policy": []}
-    clearances: dict[str, list[Array]] = {"re-planning": [], "the first policy": []}
+    distances: dict[str, list[Array]] = {AGAIN: [], FIRST: []}
+    standing: dict[str, list[Array]] = {AGAIN: [], FIRST: []}
+    crossing: dict[str, list[Array]] = {AGAIN: [], STILL: [], FIRST: []}
     for query in progress(range(config.queries), "goals and pillars"):
         scenario = scenario_of("quadrotor", query)
         problem = stated(scenario, "clearance")
         assert problem.goal is not None
         problem = replace(problem, final_cost=ls.QuadraticCost(FIRM * np.ones(12), about=problem.goal))
         solution, plant = ls.smooth(problem), scenario.plant()
-        goal = jumped(problem, query)
-        world, with_pillar = pillar(problem, solution, query)
+        goal, one = jumped(problem, query), pillar(solution, query)
+        moving = crossed(one, query)
 
-        def known(t: float, problem: ls.Problem, goal: ls.QuadraticCost = goal) -> ls.Problem:
-            return replace(problem, final_cost=goal) if t >= JUMPS_AT else problem
+        def run(changes: Known | None, query: int = query, problem: ls.Problem = problem, plant: ls.Plant = plant,
+                solution: ls.Solution = solution, scenario: ls.Scenario = scenario) -> Array:  # fmt: skip
+            """Where the trials went, by a law that plans again for what it knows; without any, by the first policy."""
+            law = ls.Replanning(problem, solution, every=EVERY, computing=EVERY, changes=changes) if changes else None
+            return ls.simulate(
+                plant, solution, controller=law, disturbances=scenario.disturbances, frames=False, contacts=False,
+                trials=each, first_trial=query * each, seed=config.seed,
+            ).states  # fmt: skip
 
-        def seen(t: float, problem: ls.Problem, after: ls.Problem = with_pillar) -> ls.Problem:
-            return after if t >= SEEN_AT else problem
-
-        trials = {"trials": each, "first_trial": query * each, "seed": config.seed}
-        for name, changes, kept in (("goal", known, distances), ("pillar", seen, clearances)):
-            law = ls.Replanning(problem, solution, every=EVERY, computing=EVERY, changes=changes)
-            for who, controller in (("re-planning", law), ("the first policy", None)):
-                rollout = ls.simulate(
-                    plant, solution, controller=controller, disturbances=scenario.disturbances, frames=False,
-                    contacts=False, **trials,
-                )  # fmt: skip
-                if name == "goal":
-                    kept[who].append(np.linalg.norm(rollout.states[:, -1, :3] - goal.about[:3], axis=1))
-                else:
-                    kept[who].append((world.distance(rollout.states[..., :3]) - scenario.robot.radius).min(axis=1))
-    radius = ls.Quadrotor().radius
+        first, radius = run(None), scenario.robot.radius
+        for who, states in ((AGAIN, run(after_the_jump(goal))), (FIRST, first)):
+            distances[who].append(np.linalg.norm(states[:, -1, :3] - goal.about[:3], axis=1))
+        for who, states in ((AGAIN, run(seen(one))), (FIRST, first)):
+            standing[who].append(clearance(one, states, problem.dt) - radius)
+        for who, states in (
+            (AGAIN, run(seen(moving))), (STILL, run(seen(moving, still=True))), (FIRST, first),
+        ):  # fmt: skip
+            crossing[who].append(clearance(moving, states, problem.dt) - radius)
     return {
-        "goal": {who: share(np.concatenate(one) <= radius) for who, one in distances.items()},
+        "goal": {who: share(np.concatenate(one) <= ls.Quadrotor().radius) for who, one in distances.items()},
         "distance": {who: float(np.median(np.concatenate(one))) for who, one in distances.items()},
-        "pillar": {who: share(np.concatenate(one) >= 0) for who, one in clearances.items()},
-        "clearance": {who: float(np.median(np.concatenate(one))) for who, one in clearances.items()},
+        "pillar": {who: share(np.concatenate(one) >= 0) for who, one in standing.items()},
+        "moving": {who: share(np.concatenate(one) >= 0) for who, one in crossing.items()},
         "queries": config.queries, "trials": each,
     }  # fmt: skip
+
+
+def after_the_jump(goal: ls.QuadraticCost) -> Known:
+    """The goal as it is known."""
+    return lambda t, problem: replace(problem, final_cost=goal) if t >= JUMPS_AT else problem
+
+
+def seen(one: ls.Obstacle, *, still: bool = False) -> Known:
+    """The pillar as it is seen: with its velocity, or as if it stood still where it is at the time."""
+
+    def changes(t: float, problem: ls.Problem) -> ls.Problem:
+        if t < SEEN_AT:
+            return problem
+        here = replace(one, position=one.position + t * one.velocity, velocity=np.zeros(3))
+        return beside(problem, here if still else one)
+
+    return changes
 
 
 def jumped(problem: ls.Problem, query: int) -> ls.QuadraticCost:
@@ -73,19 +95,36 @@ def jumped(problem: ls.Problem, query: int) -> ls.QuadraticCost:
             return ls.QuadraticCost(problem.final_cost.weight, about=about)
 
 
-def pillar(problem: ls.Problem, solution: ls.Solution, query: int) -> tuple[ls.World, ls.Problem]:
-    """The pillar alone, upright where the plan will be, and the problem with it."""
+def pillar(solution: ls.Solution, query: int) -> ls.Obstacle:
+    """Upright where the plan will be."""
     plan, rng = solution.trajectory, np.random.default_rng([query, 2])
-    (clearance,) = (one for one in problem.constraints if isinstance(one, ls.Clearance))
     place = plan.states[round((SEEN_AT + AHEAD) / plan.dt), :3].copy()
     place[:2] += rng.uniform(-ASIDE, ASIDE, 2)
-    one = ls.Obstacle("pillar", "cylinder", place, np.eye(3), np.array([PILLAR, np.inf, 0.0]))
-    world = ls.World([*clearance.world.obstacles, one])
+    return ls.Obstacle("pillar", "cylinder", place, np.eye(3), np.array([PILLAR, np.inf, 0.0]))
+
+
+def crossed(one: ls.Obstacle, query: int) -> ls.Obstacle:
+    """The same pillar, there at the same time as the plan, but on its way."""
+    angle = np.random.default_rng([query, 3]).uniform(0, 2 * np.pi)
+    velocity = SPEED * np.array([np.cos(angle), np.sin(angle), 0.0])
+    return replace(one, position=one.position - (SEEN_AT + AHEAD) * velocity, velocity=velocity)
+
+
+def clearance(one: ls.Obstacle, states: Array, dt: float) -> Array:
+    """The least distance of each trial's positions from an obstacle from when it is seen on, (K,)."""
+    world, begun = ls.World([one]), round(SEEN_AT / dt)
+    steps = range(begun, states.shape[1])
+    return np.min([world.moved(t * dt).distance(states[:, t, :3]) for t in steps], axis=0)
+
+
+def beside(problem: ls.Problem, one: ls.Obstacle) -> ls.Problem:
+    """The problem with one obstacle more."""
+    (kept,) = (one for one in problem.constraints if isinstance(one, ls.Clearance))
+    world = ls.World([*kept.world.obstacles, one])
     (cost,) = problem.obstacle_costs
     others = [term for term in problem.stage_cost.terms if term is not cost]  # pyright: ignore[reportAttributeAccessIssue]
     stage = sum_of([*others, ls.ObstacleCost(world, radius=cost.radius, sharpness=cost.sharpness, weight=cost.weight)])
-    kept = ls.Clearance(world, radius=clearance.radius, margin=MARGIN)
-    return ls.World([one]), replace(problem, stage_cost=stage, constraints=[kept])
+    return replace(problem, stage_cost=stage, constraints=[ls.Clearance(world, radius=kept.radius, margin=MARGIN)])
 
 
 def sum_of(costs: list[ls.Cost]) -> ls.Cost:
@@ -96,19 +135,20 @@ def sum_of(costs: list[ls.Cost]) -> ls.Cost:
 
 
 def report(found: dict[str, Any]) -> list[str]:
+    laws = list(found["moving"])
     rows = [
-        [who, between(found["goal"][who], ".0f"), f"{100 * found['distance'][who]:.0f}",
-         between(found["pillar"][who], ".0f"), f"{100 * found['clearance'][who]:.0f}"]
-        for who in found["goal"]
-    ]  # fmt: skip
-    head = (
-        "law", "at the new goal (%)", "distance, median (cm)", "past the pillar (%)", "clearance to it, median (cm)",
-    )  # fmt: skip
+        [
+            who,
+            *(between(found[what][who], ".0f") if who in found[what] else "" for what in ("goal", "pillar", "moving")),
+        ]
+        for who in laws
+    ]
     return [
         f"The quadrotor, {found['queries']} queries of {found['trials']} trials each under the scenario's noise,"
         f" planned with a clearance and again every {1000 * EVERY:.0f} ms, with as long a delay. The goal jumps"
         f" {JUMP:g} m at {JUMPS_AT:g} s of 5; reached is within the robot's radius. The pillar, {100 * PILLAR:g} cm in"
         f" radius, appears at {SEEN_AT:g} s where the plan will be {AHEAD:g} s later, its axis at most"
-        f" {100 * ASIDE:g} cm aside. In brackets exact intervals of 95 %.",
-        table(head, rows),
+        f" {100 * ASIDE:g} cm aside. A moving one gets there at the same time, at {SPEED:g} m/s in a random horizontal"
+        " direction. In brackets exact intervals of 95 %.",
+        table(("law", "at the new goal (%)", "past the pillar (%)", "past the moving pillar (%)"), rows),
     ]

@@ -76,6 +76,7 @@ def replanning(place: Place) -> dict[str, tuple[Any, ...]]:
         "Replan.shifted": ({"self": replan, "steps": 1, "horizon": "moving"},),
         "ReplanRecord": (record,),
         "AffinePolicy.shifted": ({"self": place.solution.policy, "steps": 1, "horizon": "moving"},),
+        "Problem.later": ({"self": place.problem, "seconds": 0.5},),
         "Problem.from_state": ({"self": place.problem, "state": state, "after": 1},),
         "Dynamics.period_near": ({"self": place.problem.dynamics, "dt": 0.1},),
         "Planner": (planner | {"deadline": 1 / 3, "horizon": "moving", "interpolate": True}, 0.3),

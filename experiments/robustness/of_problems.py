@@ -25,6 +25,10 @@ def slope(x: Any, u: Any, p: Any, gradient: Any, hessian: Any) -> None:
     gradient[0], gradient[2], hessian[0, 0], hessian[2, 2] = 2 * x[0], 0.2 * u[0], 2.0, 0.2
 
 
+def shaken(x: Any, u: Any, p: Any) -> list[list[Any]]:
+    return [[0.0], [p.share * u[0]]]
+
+
 def reach(x: Any, p: Any) -> list[list[Any]]:
     return [[x[0], 0.0, 1.0]]
 
@@ -89,6 +93,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
     file = place.folder / "cart.xml"
     file.write_text(CART, encoding="utf-8")
     slider = ls.MjcfRobot(file)
+    noise = ls.Noise(shaken, size=1, parameters={"share": 0.1}, level="plain")
     known: dict[str, ls.Robot] = {
         "Robot": ls.Quadrotor(), "Quadrotor": ls.Quadrotor(), "DifferentialDrive": ls.DifferentialDrive(),
         "MjcfRobot": slider,
@@ -170,7 +175,17 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "GoalState": ({"goal": [0.0, 1.0], "states": ("x", "v")},),
         "StateBounds": ({"low": {"x": -1.0}, "high": {"v": 1.0}},),
         "FixedState": ({"state": [0.0, 1.0]},),
-        "Problem": (stated | {"control_limits": (-0.4, 0.4), "constraints": []},),
+        "Problem": (stated | {
+            "control_limits": (-0.4, 0.4), "constraints": [], "noise": ls.Noise(np.eye(3)), "risk": 0.1,
+        },),
+        "Problem.driven_by": ({"self": place.problem, "noise": ls.Noise(np.eye(3)), "risk": 0.1},),
+        "Noise": ({
+            "function": shaken, "size": 1, "parameters": {"share": 0.1}, "depends_on": ("force",), "level": "plain",
+        },),
+        "Noise of a matrix": ({"call": ls.Noise, "function": [[0.1], [0.2]]},),
+        "Noise.scaled": ({"self": noise, "strength": 2.0},),
+        "Noise.with_parameters": ({"self": noise, "share": 0.2},),
+        "Noise.matrices": ({"self": noise, "dynamics": cart, "states": [[0.1, 0.2]], "controls": [[0.3]]},),
         "smooth of a Problem": (stated | {"call": smooth_stated, "control_limits": (-0.4, 0.4)},),
         "ilqr of a Problem": (stated | {"call": ilqr_stated, "control_limits": (-0.4, 0.4)},),
         "check_derivatives of functions": ({
@@ -183,6 +198,9 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         },),
         "World": ({"obstacles": [box]},),
         "World.seen_by": ({"self": world, "plane": "xz", "offset": 0.5},),
+        "World.moved": ({"self": world, "seconds": 0.5},),
+        "World.displacements": ({"self": world, "times": [0.0, 0.5]},),
+        "World.tables": ({"self": world, "times": [0.0, 0.5]},),
         "World.distances": ({"self": world, "point": [0.0, 1.0, 2.0]},),
         "World.distance": ({"self": world, "points": [[0.0, 1.0, 2.0]]},),
         "World.nearest": ({"self": world, "points": [[0.0, 1.0, 2.0]]},),
@@ -223,14 +241,17 @@ def solving(place: Place) -> dict[str, tuple[Any, ...]]:
     tests = {"stop": "cost", "tolerance": 1e-3, "max_iterations": 2}
     both = tests | {
         "form": "dual", "first_pass": "forward", "safeguard": False, "gap_tolerance": 1e-3, "starts": 1,
-        "constraint_tolerance": 1e-3, "threads": 1,
+        "constraint_tolerance": 1e-3, "threads": 1, "noise": ls.Noise(0.01 * np.eye(3)), "risk": 0.01,
     }  # fmt: skip
+    noisy = place.problem.driven_by(both["noise"], 0.01)
     prior = ls.InitialPrior(np.ones(n), about=np.zeros(n))
     made: dict[str, tuple[Any, ...]] = {
         "smooth": ({"problem": place.problem, **both, "callback": print_nothing}, 2.0),
         "smooth_many": ({"problems": [place.problem, place.second], **both, "progress": print_nothing}, 2.0),
-        "ilqr": ({"problem": place.problem, **tests, "callback": print_nothing}, 2.0),
+        "ilqr": ({"problem": place.problem, **tests, "callback": print_nothing, "noise": None, "risk": None}, 2.0),
         "ilqr_many": ({"problems": [place.problem], "threads": 1, **tests, "progress": print_nothing}, 2.0),
+        "sample_costs": ({"problem": noisy, "solution": place.solution, "trials": 2, "seed": 0},),
+        "largest_risk": ({"problem": noisy, "solution": place.solution}, 0.2),
         "smooth_lq": ({"stage": stages, "initial": end, "final": end, "form": "dual", "dt": 0.1},),
         "smooth_lq_continuous": (
             {"stage": stage, "horizon": 0.1, "initial": end, "final": end, "rtol": 1e-4, "atol": 1e-4},

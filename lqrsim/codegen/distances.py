@@ -39,6 +39,13 @@ def signed_distance_displaced(world_seen: World, points: Array, displaced: Array
     return out.reshape(trials, count)
 
 
+def signed_distance_at(world_seen: World, points: Array, times: Array) -> Array:
+    """The same where obstacles are at some times (K,) in s, (K, k) from points (K, k, 2 or 3)."""
+    if not world_seen.moving:
+        return signed_distance(world_seen, points)
+    return signed_distance_displaced(world_seen, points, world_seen.displacements(times))
+
+
 def distances_with_normals(world_seen: World, points: npt.ArrayLike) -> tuple[Array, Array]:
     """The signed distance of points (K, 2 or 3) to each obstacle, (K, O), and the directions in which it grows.
 

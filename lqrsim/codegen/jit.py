@@ -58,12 +58,11 @@ class Core:
 
     def __init__(self, source: str, sizes: dict[str, int], what: str) -> None:
         tree = ast.fix_missing_locations(_Specialise(sizes).visit(ast.parse(source)))
-        texts = [(node.name, ast.unparse(node)) for node in tree.body]
-        self.source = "\n\n".join(text for _, text in texts)
-        self._texts = dict(texts)
+        self._texts = {node.name: ast.unparse(node) for node in tree.body}
         self.what = what
         self._entries: dict[tuple[Any, ...], Any] = {}
         self._compilable: dict[str, Any] = {}
+        self._keys: dict[str, str] = {}
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("_"):
@@ -84,7 +83,7 @@ class Core:
         import numba
 
         text = self._entry_source(name, kinds)
-        key = disk.key(_machine(), self.source, text, repr(kinds))
+        key = disk.key(_machine(), self._key_of(name), text, repr(kinds))
         namespace: dict[str, Any] = {"__name__": __name__}
         exec(compile(named(text, "entry", key), "<lqrsim>", "exec"), namespace)
         dispatcher: Any = numba.njit(namespace[f"entry_{key}"], nogil=True, **_options())
@@ -123,23 +122,27 @@ class Core:
     def _namespace(self) -> dict[str, Any]:
         """The functions that the entries call, each made of its text and what it calls."""
         if not self._compilable:
-            keys: dict[str, str] = {}
-
-            def make(name: str) -> str:
-                if name not in keys:
-                    text = self._texts[name]
-                    names = {node.id for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Name)}
-                    callees = sorted(names & self._texts.keys() - {name})
-                    key = disk.key(text, *map(make, callees))
-                    if key not in _parts:
-                        namespace = {**_vocabulary(), **{callee: _parts[keys[callee]] for callee in callees}}
-                        exec(compile(text, "<lqrsim core>", "exec"), namespace)
-                        _parts[key] = namespace[name]
-                    keys[name] = key
-                return keys[name]
-
-            self._compilable.update(_vocabulary(), **{name: _parts[make(name)] for name in self._texts})
+            self._compilable.update(_vocabulary(), **{name: self._part(name) for name in self._texts})
         return self._compilable
+
+    def _part(self, name: str) -> Any:
+        """The function of that name, made once in a process."""
+        key = self._key_of(name)
+        if key not in _parts:
+            namespace = {**_vocabulary(), **{callee: self._part(callee) for callee in self._callees(name)}}
+            exec(compile(self._texts[name], "<lqrsim core>", "exec"), namespace)
+            _parts[key] = namespace[name]
+        return _parts[key]
+
+    def _key_of(self, name: str) -> str:
+        """A hash of the function's text and of all that it calls: what is not called makes no other function of it."""
+        if name not in self._keys:
+            self._keys[name] = disk.key(self._texts[name], *map(self._key_of, self._callees(name)))
+        return self._keys[name]
+
+    def _callees(self, name: str) -> list[str]:
+        names = {node.id for node in ast.walk(ast.parse(self._texts[name])) if isinstance(node, ast.Name)}
+        return sorted(names & self._texts.keys() - {name})
 
 
 # The functions that this process has made, under a hash of their text and of all that they call. Cores share them: the
@@ -184,7 +187,7 @@ def _compile(function: UserFunction) -> tuple[Any, int]:
     """A numba function behind C's calling convention: what must be kept alive, and its address.
 
     Raises:
-      InputError: numba can not compile it.
+      InputError: numba cannot compile it.
     """
     import numba
     from numba import carray  # pyright: ignore[reportPrivateImportUsage]
@@ -197,7 +200,7 @@ def _compile(function: UserFunction) -> tuple[Any, int]:
     try:
         own: Any = numba.njit(**{name: value for name, value in options.items() if name != "nopython"})(plain)
     except Exception as error:
-        raise InputError(f"{function.name}: got what numba can not compile ({error}), want a function") from error
+        raise InputError(f"{function.name}: got code that numba cannot compile ({error}), want a function") from error
     text, names = function.adapter()
     names |= {"function": own, "carray": carray, "readonly": readonly, "nan": float("nan"), "__name__": __name__}
     print_of_it = fingerprint(function.function)
@@ -216,7 +219,7 @@ def _compile(function: UserFunction) -> tuple[Any, int]:
             with uncollected(), apart("adapter"):
                 dispatcher.compile((pointer,) * (3 + (len(function.writes) or 1)))
         except Exception as error:  # mostly NumbaError, and whatever else goes wrong within numba
-            raise InputError(f"{function.name}: got what numba can not compile, want {_reason(error)}") from error
+            raise InputError(f"{function.name}: got code that numba cannot compile, want {_reason(error)}") from error
         # The same holds of the functions it calls, which are as they were: what was made of them is not kept then.
         if print_of_it and lasting and _lasting(dispatcher):
             _keep(key, dispatcher, what)
@@ -305,7 +308,7 @@ def _keep(key: str, dispatcher: Any, what: str) -> None:
     from numba.core import serialize
 
     (result,) = dispatcher.overloads.values()
-    with contextlib.suppress(Exception):  # what can not be kept is made again; a Ctrl-C within LLVM can be the cause
+    with contextlib.suppress(Exception):  # what cannot be kept is made again; a Ctrl-C within LLVM can be the cause
         disk.save(key, serialize.dumps(result._reduce()), what)
 
 

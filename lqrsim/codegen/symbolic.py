@@ -47,7 +47,7 @@ def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]
 def kept(function: Callable[..., Any], details: object, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """What `make` derives from a user's function, from the cache if it is there: then SymPy need not be imported.
 
-    What can not be told from other functions by its fingerprint is derived anew, and errors are not kept.
+    What cannot be told from other functions by its fingerprint is derived anew, and errors are not kept.
     """
     print_of_it = fingerprint(function)
     if print_of_it is None:
@@ -68,7 +68,7 @@ def _writers() -> str:
     """The code that writes what is kept: with other code, something else may be right."""
     package = Path(__file__).parents[1]
     files = [package / "codegen" / "symbolic.py"]
-    files += [package / "problem" / f"{name}.py" for name in ("dynamics", "costs", "constraints", "balls")]
+    files += [package / "problem" / f"{name}.py" for name in ("dynamics", "costs", "constraints", "balls", "noise")]
     return "".join(file.read_text(encoding="utf-8") for file in files)
 
 
@@ -192,7 +192,7 @@ def write_function(
             sign = "+=" if target.endswith("+") else "="
             lines.append(f"    {target.rstrip('+')} {sign} {printer.doprint(value)}")
     except PrintMethodNotImplementedError as error:
-        raise InputError(f"{of}: got what can not be compiled ({error}), want elementary functions") from None
+        raise InputError(f"{of}: got a formula that cannot be compiled ({error}), want elementary functions") from None
     if returns is not None:
         lines.append(f"    return {returns}")
     return "\n".join(lines) + "\n"

@@ -182,7 +182,7 @@ class UserFunction:
                             array[:] = values_written.reshape(-1)
                     else:
                         arrays[0][:] = self._vector(self.function(*given, p))
-            except BaseException as error:  # Ctrl-C, too: C code can not pass it on, so the solver asks for it
+            except BaseException as error:  # Ctrl-C, too: C code cannot pass it on, so the solver asks for it
                 self._thread.raised = error
                 for array in arrays:
                     array[:] = np.nan

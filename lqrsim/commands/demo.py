@@ -1,4 +1,4 @@
-"""The whole chain, once for each scenario: solve, execute, draw, film, and say what came out."""
+"""The whole chain, once for each scenario: solve, simulate, render, and report the results."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -34,7 +34,7 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
       references: the scenarios; see `scenarios/references.py`.
       out: each scenario gets a folder in it.
       seed: of the disturbances.
-      video: whether to film at all. quick: small videos of fewer frames.
+      video: whether to render videos. quick: small videos with fewer frames.
 
     Returns:
       1 if a plan did not converge, or an undisturbed run left its plan by more than the scenario's bound; else 0.
@@ -44,7 +44,7 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
     """
     console.check_output("--out", out)
     scenarios = {reference: resolve(reference) for reference in references}
-    video = video and _can_film()
+    video = video and _can_render()
     rows: list[str] = []
     failures: list[str] = []
     misses: list[str] = []
@@ -75,7 +75,7 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
         plan, reach = runs["undisturbed"].target, runs["undisturbed"].goal_radius
         misses += [f"{reference}: {line}" for line in plan.of_plan(reach)[1:]]
         if video:
-            _film(runs["disturbed"], folder / "video.mp4", quick=quick)
+            _render_video(runs["disturbed"], folder / "video.mp4", quick=quick)
         rows += [_row(reference, name, solution, rollout) for name, rollout in runs.items()]
     console.say("\n" + "\n".join([TABLE, *rows]))
     for miss in misses:
@@ -85,7 +85,7 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
     return 1 if failures else 0
 
 
-def _can_film() -> bool:
+def _can_render() -> bool:
     try:
         gl.bind()
     except InputError as error:
@@ -114,7 +114,7 @@ def _execute(
     return rollout
 
 
-def _film(rollout: Rollout, path: Path, *, quick: bool) -> None:
+def _render_video(rollout: Rollout, path: Path, *, quick: bool) -> None:
     """With the calibrated panes from which the robot's position can be measured."""
     from lqrsim.view import cameras
     from lqrsim.view.render import render

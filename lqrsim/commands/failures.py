@@ -15,26 +15,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Search:
-    """What both commands ask."""
+    """Options of both commands."""
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
     """As in `lqrsim solve`."""
     sweep: Annotated[str, arg(metavar="NAME")] = "scenario"
-    """Disturbances, as in `lqrsim stress`; by default those of the scenario's demo, which its policy should survive."""
+    """Disturbances, as in `lqrsim stress`. By default those of the scenario's demo."""
     strength: Annotated[float, arg(metavar="FACTOR")] = 1.0
-    """What the disturbances are multiplied by."""
+    """Factor by which the disturbances are scaled."""
     policy: Policy = "smooth"
     """As in `lqrsim stress`."""
     stated: Annotated[str | None, optional("NAME")] = None
-    """Disturbances that track or offset_free is made for, as in `lqrsim stress`. By default moderate."""
+    """Disturbances for which track or offset_free is designed, as in `lqrsim stress`. By default moderate."""
     failure: Literal["collision", "miss"] = "collision"
-    """collision: with an obstacle, or lost. miss: any trial that does not reach its goal."""
+    """collision: with an obstacle, or the robot is lost. miss: any trial that does not reach its goal."""
     goal_radius: Annotated[float | None, optional("METRES")] = None
-    """How near the goal counts as having reached it. By default the robot's radius."""
+    """Distance from the goal within which it counts as reached. By default the robot's radius."""
     goal_tolerance: Annotated[float | None, optional("SHARE")] = None
-    """The same for goals without a position, relative to the plan's range of each state. By default 0.1."""
+    """The same for goals without a position, relative to each state's range along the plan. By default 0.1."""
     seed: int = 0
-    """Of all random draws. The same seed gives the same output."""
+    """Seed of all random numbers. The same seed gives the same output."""
 
     def _problem(self) -> "ReliabilityProblem":
         from lqrsim.stress.failure_search import ReliabilityProblem
@@ -53,28 +53,27 @@ class Search:
 
 @dataclass(frozen=True, kw_only=True)
 class Rare(Search):
-    """Measure how likely a failure is that is seldom seen.
+    """Estimate the probability of a rare failure.
 
-    It takes far fewer trials than would have to be run to see it by chance. Trials are split through levels of how near
-    they come to failing, each not so rare given the one before. Prints the levels as a pilot run finds them, and then
-    the probability with its interval, from repetitions that are independent and without bias. Writes rollout.npz, with
-    the worst failure and others as they are typical, to be looked at with `lqrsim render`, and rare.json, with what was
-    asked and found.
+    Multilevel splitting needs far fewer trials than plain sampling. Trials are split through levels of how near they
+    come to a failure, each not rare given the one before. Prints the levels as a pilot run finds them, then the
+    probability with its interval, from independent, unbiased repetitions. Writes rollout.npz, with the worst failure
+    and typical ones, for `lqrsim render`, and rare.json, with settings and results.
 
     Exits with 1 if no failure was found.
     """
 
     particles: int = 250
-    """Trials that are kept at each level. More make the interval shorter."""
+    """Trials kept at each level. More make the interval shorter."""
     repetitions: int = 10
-    """Independent ones, of which the interval is made."""
+    """Independent repetitions; their spread gives the interval."""
     shown: int = 8
-    """How many failures to write."""
+    """Number of failures to write."""
     out: Folder = None
-    """Folder for what is written. By default runs/rare/ and the name of the scenario."""
+    """Output folder. By default runs/rare/ and the name of the scenario."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import check_count
         from lqrsim.scenarios.references import folder_name, resolve
@@ -101,24 +100,23 @@ class Rare(Search):
 
 @dataclass(frozen=True, kw_only=True)
 class Break(Search):
-    """Find the smallest disturbance that breaks the policy.
+    """Find the smallest disturbance that causes a failure.
 
-    Of all failures it is the one that is nearest to no disturbance. That is measured over all random numbers that a
-    trial draws, in standard deviations. Prints it, what probability of failure that would be if nothing else failed
-    than what lies beyond, how much of it falls to each disturbance, and what it does at its largest in physical units.
-    Writes rollout.npz, with that trial, to be looked at with `lqrsim render`, and break.json, with what was asked and
-    found, the numbers too.
+    It is the failure nearest to the undisturbed trial, measured over all random numbers of a trial in standard
+    deviations. Prints that distance, the first-order estimate of the failure probability, the share of each
+    disturbance, and the largest values in physical units. Writes rollout.npz, with that trial, for `lqrsim render`, and
+    break.json, with settings, results and the random numbers.
 
-    What it finds fails; that nothing nearer does is not proven. Exits with 1 if no failure was found.
+    The result does fail; that nothing nearer fails is not proven. Exits with 1 if no failure was found.
     """
 
     rounds: int = 40
-    """In which it comes nearer, at most; it ends where less than 1 % is left to be gained."""
+    """Largest number of rounds; the search ends earlier if less than 1 % is left to gain."""
     out: Folder = None
-    """Folder for what is written. By default runs/break/ and the name of the scenario."""
+    """Output folder. By default runs/break/ and the name of the scenario."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.scenarios.references import folder_name, resolve
         from lqrsim.stress.multilevel_splitting import NoFailure
@@ -127,7 +125,7 @@ class Break(Search):
         console.check_output("--out", folder)
         problem = self._problem()
         try:
-            with console.long_progress("coming nearer", "round") as progress:
+            with console.long_progress("searching", "round") as progress:
                 smallest = problem.smallest_failure(
                     rounds=self.rounds, seed=self.seed, report=console.say, progress=progress
                 )

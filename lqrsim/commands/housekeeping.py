@@ -1,4 +1,4 @@
-"""Commands that run everything, and that look after what is kept."""
+"""Commands that run everything, and that manage the cache."""
 
 import time
 from dataclasses import dataclass
@@ -10,27 +10,27 @@ from tyro.conf import Positional, arg
 
 @dataclass(frozen=True, kw_only=True)
 class Demo:
-    """Solve, execute and film: the main job, for both robots.
+    """Solve, simulate and render both robots.
 
-    Each is solved from a cold start with smooth(); its policy is run undisturbed and then disturbed; the solution, both
-    rollouts, figures of the policy and of the runs, and a video are written.
+    Each is solved with smooth(), and its policy is run undisturbed and then disturbed. Writes the solution, both
+    rollouts, figures of the policy and of the runs, and a video.
 
     Exits with 1 if a plan did not converge or an undisturbed run leaves its plan by more than the scenario's bound.
     """
 
     robots: Annotated[tuple[str, ...], arg(metavar="SCENARIO ...")] = ("differential_drive", "quadrotor")
-    """Scenarios, by the names that `lqrsim list` prints; settings follow after commas: quadrotor,query=3."""
+    """Scenarios, by their names in `lqrsim list`; settings follow after commas: quadrotor,query=3."""
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("videos")
     """Each scenario gets a folder in it."""
     seed: int = 0
-    """Of the disturbances."""
+    """Seed of the disturbances."""
     video: bool = True
-    """--no-video leaves the videos out."""
+    """--no-video skips the videos."""
     quick: bool = False
     """Smaller videos with fewer frames, for a first look."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.commands.demo import demo
 
         return demo(self.robots, out=self.out, seed=self.seed, video=self.video, quick=self.quick)
@@ -38,25 +38,24 @@ class Demo:
 
 @dataclass(frozen=True, kw_only=True)
 class Reproduce:
-    """Run the paper's experiments, and say which of its statements hold.
+    """Reproduce the paper's results and check its statements.
 
-    Writes results.md, which sums them up, results.json, which has every number, and the figures as png and pdf. Takes
-    under an hour, most of it for robust_policies. Other people's solvers and controllers are compared with
-    where the bench extra is installed.
+    Writes results.md with a summary, results.json with every number, and the figures as png and pdf. Takes under an
+    hour, most of it for robust_policies. Includes other solvers and controllers if the bench extra is installed.
 
-    Exits with 1 if an experiment failed; whether the paper's statements hold does not count.
+    Exits with 1 if an experiment failed, whether or not the paper's statements hold.
     """
 
     results: Annotated[Positional[tuple[str, ...]], arg(metavar="RESULT ...", help_behavior_hint="")] = ()
-    """Which: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback, stress_test,
-    robust_policies. By default all."""
+    """Results: figure_2, figure_3, table_1, convergence, state_dimension, state_of_the_art, feedback, stress_test,
+    robust_policies, noise_aware. By default all."""
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/paper")
-    """Where to write."""
+    """Output folder."""
     quick: bool = False
-    """A small part of each, for a first look."""
+    """Run a small part of each, for a first look."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.commands.reproduce import reproduce
 
         return reproduce(self.results, out=self.out, quick=self.quick)
@@ -64,19 +63,19 @@ class Reproduce:
 
 @dataclass(frozen=True, kw_only=True)
 class Cache:
-    """Show what is kept of compiled solvers, or remove it.
+    """Show or clear the cache of compiled solvers.
 
-    That is code and derived formulas. Without it everything works the same, and each kind of problem is compiled again,
-    some 10 seconds.
+    The cache holds compiled code and derived formulas. Without it, each kind of problem is compiled again, in about 10
+    seconds.
 
-    What is kept is programs, which are loaded and run: do not share the folder with people you do not trust.
+    It holds programs, which are loaded and run: do not share the folder with people you do not trust.
     """
 
     clear: bool = False
-    """Remove all of it."""
+    """Remove everything in it."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.codegen import disk_cache
         from lqrsim.commands import console
         from lqrsim.errors import InputError

@@ -32,6 +32,7 @@ SCRIPTS = (
     "feedback",
     "stress_test",
     "robust_policies",
+    "noise_aware",
 )
 
 TIDYING = 20.0  # s

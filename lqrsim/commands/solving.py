@@ -17,7 +17,7 @@ class List:
     """Print the scenarios: robot, scene, states and controls with units."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim import scenarios
         from lqrsim.commands import console
         from lqrsim.scenarios.references import resolve
@@ -42,37 +42,37 @@ class Solve:
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
-    """A name that `lqrsim list` prints; a function of yours that returns a Scenario, file.py:name or module:name; or an
-    MJCF, file.xml. Settings follow after commas: quadrotor,query=3 or "cartpole.xml,start={'pole': 3.14},steps=200"."""
+    """A name from `lqrsim list`; your own function that returns a Scenario, file.py:name or module:name; or an MJCF
+    file, file.xml. Settings follow after commas: quadrotor,query=3 or "cartpole.xml,start={'pole': 3.14},steps=200"."""
     out: Folder = None
     """Folder for solution.npz. By default runs/ and the name of the scenario."""
     solver: Literal["smooth", "ilqr"] = "smooth"
     """smooth: iterated LQR smoothing. ilqr: the baseline with line search, from the scenario's exact start."""
     stop: Literal["optimal", "cost"] = "optimal"
-    """cost: the cost has settled, which is the paper's test. optimal: so have the gap and first-order optimality."""
+    """cost: stop when the cost has settled, as in the paper. optimal: also require gap and first-order optimality."""
     tolerance: float = 1e-4
-    """Relative change of the cost below which it has settled, and the measure of the other tests."""
+    """Relative change of the cost below which it has settled; scales the other tests too."""
     max_iterations: Annotated[int | None, optional("INT")] = None
-    """Give up after so many. By default the solver's own limit."""
+    """Stop after this many iterations. By default the solver's own limit."""
     time_limit: Annotated[float | None, optional("SECONDS")] = None
-    """Give up after so long, compiling not counted, with the best plan so far. By default there is no limit."""
+    """Stop after this time, without compiling, with the best plan so far. By default there is no limit."""
     starts: Annotated[int | None, optional("INT")] = None
-    """How many ways to the goal smooth tries for a few iterations, to go on with the best. By default 7."""
+    """Number of ways to the goal that smooth tries for a few iterations; the best continues. By default 7."""
     paper_start: bool = False
-    """Begin as the paper does in place of that: from the nominal control, with the scenario's prior."""
+    """Begin as in the paper instead: from the nominal control, with the scenario's prior."""
     clearance: Annotated[float | None, optional("METRES")] = None
-    """Keep at least this much between the robot and all obstacles, at the steps. By default they only cost."""
+    """Constrain the distance to all obstacles to at least this, at the steps. By default obstacles only add cost."""
     control_limits: Annotated[tuple[float, float] | None, optional("LOWEST HIGHEST")] = None
-    """Plan with these limits of every control, in its unit. By default those of the actuators."""
+    """Limits of every control for planning, in its unit. By default those of the actuators."""
     figure: Annotated[Path | None, optional("FILE")] = None
-    """Draw the policy, too, in FILE.png, .pdf or .svg: the tube in which it keeps the robot under the scenario's
-    disturbances, cost-to-go along the plan, gains over time."""
+    """Also plot the policy to FILE.png, .pdf or .svg: the predicted tube under the scenario's disturbances, the
+    cost-to-go along the plan, and the gains over time."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError
-        from lqrsim.problem.constraints import Clearance
+        from lqrsim.problem.clearance import Clearance
         from lqrsim.results import save_load
         from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
 
@@ -117,58 +117,59 @@ class Solve:
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate:
-    """Execute a policy in MuJoCo, in closed loop.
+    """Run a policy in MuJoCo, in closed loop.
 
-    Writes the runs to rollout.npz, with the tube in which they are predicted to be under their disturbances, for
-    pictures. Prints where the plan ends, a line for each trial, and how many reached the goal. Without a disturbance it
-    is the plain closed loop. The same seed gives the same bits on equal processors.
+    Writes the runs to rollout.npz, with the tube predicted for their disturbances. Prints where the plan ends, one line
+    per trial, and how many reached the goal. By default there are no disturbances. The same seed gives bit-identical
+    results on equal processors.
 
       lqrsim simulate SOLUTION.npz --force-noise 0.1 --push 0.2 0 0 3.0 --trials 10
       lqrsim simulate SOLUTION.npz --disturbances severe --out runs/severe
-      lqrsim simulate SOLUTION.npz --disturbances severe --open-loop --out runs/open_loop   # meets the same numbers
+      lqrsim simulate SOLUTION.npz --disturbances severe --open-loop --out runs/open_loop   # same random numbers
     """
 
     solution: Annotated[Positional[Path], arg(metavar="SOLUTION")]
-    """What `lqrsim solve` wrote."""
+    """A file from `lqrsim solve`."""
     scenario: Annotated[str | None, optional("SCENARIO")] = None
-    """Whose robot and scene to use, as in `lqrsim solve`. By default the one that was solved, if `lqrsim list` has it.
-    A file is data and never chooses code to run: name a function of yours here."""
+    """Robot and scene, as in `lqrsim solve`. By default the scenario that was solved, if `lqrsim list` has it. Files
+    never choose code to run: name your own function here."""
     out: Folder = None
     """Folder for rollout.npz. By default that of the solution."""
     open_loop: bool = False
-    """Execute the plan without feedback: its controls, whatever the state."""
+    """Run the plan without feedback: its controls, whatever the state."""
     controller: ControllerName = "feedback"
-    """feedback: the solution's policy. track: keeps to its plan. offset_free: the same, and estimates the state and
-    what disturbs it. replan: solves again as it goes, each tenth of the horizon."""
+    """feedback: the solution's policy. track: follows its plan. offset_free: also estimates the state and the
+    disturbances. replan: solves again every tenth of the horizon."""
     stated: Annotated[str | None, optional("NAME")] = None
-    """Disturbances that track or offset_free is made for: a set by name, as below. By default moderate."""
+    """Disturbances for which track or offset_free is designed: the name of a set, as below. By default moderate."""
     disturbances: Annotated[tuple[str, ...], optional("NAME ...")] = ()
     """Sets by name, as in `lqrsim stress --sweep`: a preset (calm, light, moderate, strong, severe), or scenario for
-    those of the scenario's demo; NAME:KIND for one kind of them alone. What the options below say comes on top."""
+    those of the scenario's demo; NAME:KIND for one kind alone. The options below add to them."""
     strength: Annotated[float, arg(metavar="FACTOR")] = 1.0
-    """What those sets are multiplied by."""
+    """Factor by which those sets are scaled."""
     control_noise: Annotated[float, arg(metavar="STD")] = 0.0
     """Standard deviation of white noise on each control, in the control's unit (m/s wheel speed, N rotor force)."""
     force_noise: Annotated[float, arg(metavar="STD")] = 0.0
-    """Standard deviation of a random force at the centre of mass, redrawn each control period, in N along each axis."""
+    """Standard deviation of a random force at the centre of mass, drawn anew each control period, in N along each
+    axis."""
     measurement_noise: Annotated[tuple[float, ...], optional("STD ...")] = ()
-    """Standard deviation of white noise on each measured state, in its unit: one number a state, or one for all."""
+    """Standard deviation of white noise on each measured state, in its unit: one number per state, or one for all."""
     push: Annotated[tuple[float, float, float, float] | None, optional("X Y Z AT")] = None
-    """One push: its impulse in N s along the world's axes, and when it comes, in s."""
+    """One push: its impulse in N s along the world's axes, and its time in s."""
     seed: int = 0
-    """Of all random draws."""
+    """Seed of all random numbers."""
     trials: int = 1
-    """How many runs."""
+    """Number of runs."""
     first_trial: int = 0
-    """Number of the first: trial 7 alone is --first-trial 7, and the same to the last bit as among others."""
+    """Number of the first trial. --first-trial 7 alone gives bit-identical results to trial 7 among others."""
 
     goal_radius: Annotated[float | None, optional("METRES")] = None
-    """How near the goal counts as having reached it. By default the robot's radius."""
+    """Distance from the goal within which it counts as reached. By default the robot's radius."""
     goal_tolerance: Annotated[float | None, optional("SHARE")] = None
-    """The same for goals without a position, relative to the plan's range of each state. By default 0.1."""
+    """The same for goals without a position, relative to each state's range along the plan. By default 0.1."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError
         from lqrsim.results import save_load

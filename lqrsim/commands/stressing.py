@@ -11,56 +11,56 @@ from lqrsim.commands.options import Folder, Policy, optional
 
 @dataclass(frozen=True, kw_only=True)
 class Stress:
-    """Count how often policies fail under growing disturbances.
+    """Measure failure rates of policies against disturbance strength.
 
-    Runs many trials of each, the same ones for all policies. What is stopped, however it is stopped, goes on with the
-    same command; the tables are the same to the bit whatever the workers, the batches and the interruptions, on equal
-    processors. Prints the share of each that reached its goal with the exact interval. `docs/file_format.md` says what
-    is in the folder.
+    All policies meet the same trials. After any interruption, rerunning the command resumes with identical results. On
+    equal processors the tables are bit-identical for any number of workers, any batch size and any interruption. Prints
+    success rates with exact intervals. `docs/file_format.md` describes the folder.
 
-    Exits with 1 if trials came to nothing for an error.
+    Exits with 1 if trials ended with an error.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
     """As in `lqrsim solve`."""
     sweep: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("light",)
     """Disturbances: a preset (calm, light, moderate, strong, severe), or scenario for those of the scenario's demo;
-    NAME:KIND for one kind of them alone."""
+    NAME:KIND for one kind alone."""
     strengths: Annotated[tuple[float, ...], arg(metavar="FACTOR ...")] = (0.0, 0.5, 1.0, 1.5, 2.0)
-    """What the disturbances are multiplied by; 0.5 and 2 make light calm and moderate."""
+    """Factors by which the disturbances are scaled; 0.5 and 2 turn light into calm and moderate."""
     policies: Annotated[tuple[Policy, ...] | None, arg(help_behavior_hint="")] = None
     """open_loop: the plan of smooth without feedback. replan: solves again as it goes. track: keeps to the plan of
     smooth. offset_free: the same, and estimates the state and what disturbs it. All meet the same numbers. By default
     the first four; ilqr is left out where the scenario has constraints, which it cannot keep."""
     stated: Annotated[str | None, optional("NAME")] = None
-    """Disturbances that track and offset_free are made for, named as above, at all strengths. By default moderate."""
+    """Disturbances for which track and offset_free are designed, named as above, at all strengths. By default
+    moderate."""
     trials: int = 200
-    """Of each sweep, strength and policy."""
+    """Number of trials for each sweep, strength and policy."""
     seed: int = 0
-    """Of all random draws."""
+    """Seed of all random numbers."""
     replan_every: Annotated[float | None, optional("SECONDS")] = None
-    """Between two solves of replan. By default a tenth of the horizon."""
+    """Time between two solves of replan. By default a tenth of the horizon."""
     goal_radius: Annotated[float | None, optional("METRES")] = None
-    """How near the goal counts as having reached it. By default the robot's radius."""
+    """Distance from the goal within which it counts as reached. By default the robot's radius."""
     goal_tolerance: Annotated[float | None, optional("SHARE")] = None
-    """The same for goals without a position, relative to the plan's range of each state. By default 0.1."""
+    """The same for goals without a position, relative to each state's range along the plan. By default 0.1."""
     shard: int = 500
-    """Trials of a file, which is what an interruption costs at most for each worker."""
+    """Trials per file; an interruption loses at most this many per worker."""
     time_limit: Annotated[float, arg(metavar="SECONDS")] = 300.0
-    """What a shard may take before it counts as hung, and its trials as errors."""
+    """Time after which a shard counts as hung and its trials as errors."""
     out: Folder = None
     """Folder of the campaign. By default runs/stress/ and the name of the scenario."""
     resume: bool = False
-    """Go on with the campaign in the folder, with what it was begun with in place of the options above."""
+    """Resume the campaign in the folder with its own settings instead of the options above."""
     workers: Annotated[int | None, optional("INT")] = None
-    """Processes on this machine. By default one a processor."""
+    """Processes on this machine. By default one per processor."""
     batch: int = 256
-    """Trials that a worker simulates together; changes nothing but time and memory."""
+    """Trials that a worker simulates together; affects only time and memory."""
     scheduler: Annotated[str | None, optional("ADDRESS")] = None
-    """Of a dask cluster that does the work in place of this machine, such as tcp://10.0.0.1:8786."""
+    """Address of a dask cluster that does the work instead of this machine, such as tcp://10.0.0.1:8786."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.scenarios.references import folder_name, resolve
         from lqrsim.stress.campaign import USUAL, Campaign, run_campaign
@@ -97,27 +97,26 @@ class Stress:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Run one trial of a stress test again, to the bit.
+    """Repeat one trial of a stress test exactly.
 
-    Writes it to rollout.npz, to be looked at with `lqrsim render`. Obstacles stop the robot here, which in the campaign
-    they did not: all that counts is before that. Compares what it prints with the trial's row in the campaign's table,
-    and says what differs; exits with 1 if anything does. On another kind of processor than the campaign's, or with
-    other versions, bits can differ; then it says so.
+    Writes it to rollout.npz for `lqrsim render`. Obstacles stop the robot here, unlike in the campaign; nothing after a
+    collision counts. Compares the result with the trial's row in the campaign's table and reports differences; exits
+    with 1 if there are any. On another kind of processor, or with other versions, results can differ; it then says so.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
-    """What `lqrsim stress` wrote."""
+    """A folder from `lqrsim stress`."""
     cell: Annotated[str, arg(metavar="CELL")]
-    """Which: policy,sweep,strength, such as smooth,light,1.5; or its number, with which its files' names begin."""
+    """policy,sweep,strength, such as smooth,light,1.5; or the number with which the names of its files begin."""
     trial: int
     """Number of the trial, from 0."""
     scenario: Annotated[str | None, optional("SCENARIO")] = None
-    """That of the campaign, where it is a function of yours: a file is data and never chooses code to run."""
+    """The campaign's scenario if it is your own function: files never choose code to run."""
     out: Annotated[Path, arg(metavar="FILE.npz")] = Path("rollout.npz")
-    """What to write."""
+    """File to write."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.results import save_load
         from lqrsim.stress.results import Results, differences, replay
@@ -137,30 +136,30 @@ class Replay:
         for one in different:
             console.say(f"NOT as in the table: {one}")
         if not different:
-            console.say("the same to the bit as in the table")
+            console.say("identical to the table")
         console.say(f"wrote {save_load.save(rollout, self.out)}")
         return 1 if different else 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Write the report of a stress test, one HTML page.
+    """Write the report of a stress test as one HTML page.
 
-    It has tables, curves and videos of the worst trials, and needs no network and no other file. It can be written of a
-    stress test that has not ended, and says so.
+    The page has tables, curves and videos of the worst trials, and needs no network and no other file. It can be
+    written before the stress test has ended, and then says so.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
-    """What `lqrsim stress` wrote."""
+    """A folder from `lqrsim stress`."""
     out: Annotated[Path | None, optional("FILE.html")] = None
     """The page. By default report.html in that folder."""
     videos: int = 4
-    """How many of the worst trials to run again and film."""
+    """Number of the worst trials to repeat and render."""
     scenario: Annotated[str | None, optional("SCENARIO")] = None
-    """That of the campaign, where it is a function of yours: a file is data and never chooses code to run."""
+    """The campaign's scenario if it is your own function: files never choose code to run."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError
         from lqrsim.reports.page import report

@@ -1,4 +1,4 @@
-"""The command that lets pixels testify."""
+"""The command that verifies runs from pixels."""
 
 import os
 from dataclasses import dataclass
@@ -12,26 +12,26 @@ from lqrsim.commands.options import optional
 
 @dataclass(frozen=True, kw_only=True)
 class Verify:
-    """Check from pixels that a run shows what its record says.
+    """Check a run against its rendered frames.
 
-    A run is drawn, in calibrated fixed views; a video is decoded, and the robot's mark found in its panes `top` and
-    `side`. Positions from pixels are compared with the simulator's and with the plan. See docs/verifying.md.
+    A run is rendered in calibrated fixed views. A video is decoded, and the robot's mark is located in its panes `top`
+    and `side`. Positions from pixels are compared with the simulator's and with the plan. See docs/verifying.md.
 
       lqrsim verify runs/quadrotor/rollout.npz
       lqrsim verify videos/quadrotor/video.mp4
     """
 
     file: Annotated[Positional[Path], arg(metavar="RUN.npz|VIDEO.mp4")]
-    """What `lqrsim simulate` wrote, or what `lqrsim render` made of it with the cameras or insets top and side."""
+    """A file from `lqrsim simulate`, or its video from `lqrsim render` with the cameras or insets top and side."""
     run_file: Annotated[Path | None, optional("RUN.npz"), arg(name="run")] = None
-    """The run that the video shows. By default the one in its folder that it says it shows."""
+    """The run that the video shows. By default the run in its folder that the video names."""
     trial: Annotated[int | None, optional("N")] = None
-    """Which row of the rollout, from 0. By default 0, or the first that the video shows."""
+    """Row of the rollout, from 0. By default 0, or the first that the video shows."""
     solution: Annotated[Path | None, optional("SOLUTION.npz")] = None
-    """Whose run it is, for whether the plan is the one that was followed. By default solution.npz beside the run."""
+    """Solution of the run, to check the recorded plan. By default solution.npz beside the run."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code: 1 if a test failed."""
+        """Run the command. Returns the exit code: 1 if a test failed."""
         from lqrsim.commands import console
         from lqrsim.results import save_load
         from lqrsim.verify.ground_truth import ran_policy_of

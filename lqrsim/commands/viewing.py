@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Draw a run, as a video or as a still.
+    """Render a run as a video or a still.
 
-    Shows the obstacles, the plan, the trace that was driven, what disturbs, and the robot. Several runs, or several
-    trials of one, are shown side by side and in step.
+    Shows the obstacles, the plan, the path driven, the disturbing forces, and the robot. Several runs, or several
+    trials of one run, are shown side by side and in step.
 
       lqrsim render runs/quadrotor/rollout.npz --camera chase
       lqrsim render RUN.npz --inset top side          # panes that `lqrsim verify` can measure
@@ -35,24 +35,24 @@ class Render:
     """
 
     rollouts: Annotated[Positional[tuple[Path, ...]], arg(metavar="ROLLOUT ...", help_behavior_hint="")]
-    """What `lqrsim simulate` wrote."""
+    """Files from `lqrsim simulate`."""
     out: Annotated[Path | None, optional("FILE")] = None
-    """What to write: FILE.mp4 (h264), FILE.gif, or FILE.png for a still. By default the rollout's path with .mp4."""
+    """Output: FILE.mp4 (h264), FILE.gif, or FILE.png for a still. By default the rollout's path with .mp4."""
     trial: Annotated[tuple[int, ...], arg(metavar="N ...")] = (0,)
-    """Which row of the rollout, from 0; several of one rollout, or one for each of several."""
+    """Row of the rollout, from 0; several rows of one rollout, or one for each of several rollouts."""
     camera: Annotated[str, arg(metavar="NAME")] = "overview"
     """overview, chase, top or side, or another camera of the scene."""
     inset: Annotated[tuple[str, ...], optional("NAME ...")] = ()
     """More cameras, in panes beside the first. top and side are calibrated, and the robot wears a mark in them."""
     title: Annotated[tuple[str, ...], optional("TEXT ...")] = ()
-    """Of each run. By default the robot and the scene."""
+    """Title of each run. By default the robot and the scene."""
     overlays: tuple[Overlay, ...] = OVERLAYS
-    """What is drawn over the scene. tube: where the run was predicted to be under its disturbances, 2 sigma, if it was.
-    cost_tube: where the total cost is near its least, whatever disturbs; it needs --solution, and to be asked for."""
+    """Drawn over the scene. tube: the predicted tube under the run's disturbances, 2 sigma, if there is one. cost_tube:
+    where the total cost is near its minimum; it needs --solution and is not drawn by default."""
     solution: Annotated[tuple[Path, ...], optional("SOLUTION ...")] = ()
-    """Whose run it is, one for all or one each, for cost_tube."""
+    """Solution of the runs, one for all or one each, for cost_tube."""
     quality: Quality = "standard"
-    """Size, smooth edges, shadows, and how much a video is compressed: 640 x 360, 1280 x 720 or 1920 x 1080."""
+    """Size, antialiasing, shadows and video compression: 640 x 360, 1280 x 720 or 1920 x 1080."""
     size: Annotated[tuple[int, int] | None, optional("WIDTH HEIGHT")] = None
     """In pixels. By default that of the quality, and half of it for a GIF, but not less than 480 x 270."""
     fps: Annotated[float | None, optional("RATE")] = None
@@ -65,7 +65,7 @@ class Render:
     """In a still, show the robot also where it was at each multiple of this."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError
         from lqrsim.results import save_load
@@ -103,46 +103,46 @@ class Render:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Watch a run, or a policy at work, in a window or in a browser.
+    """Watch a run, or a live policy, in a window or a browser.
 
     lqrsim view RUN.npz plays what `lqrsim simulate` wrote. lqrsim view SCENARIO solves the scenario and runs its policy
-    live, again and again, and you interfere: the arrow keys and Page Up and Down push the robot, seen from the camera;
-    Ctrl and the right mouse button drag it. Space pauses, Backspace starts again. With --replan 30 it plans again 30
-    times a second, and Enter has the same keys and mouse move the goal.
+    live in a loop, and you can interfere. The arrow keys and Page Up and Down push the robot, as seen from the camera;
+    Ctrl and the right mouse button drag it. Space pauses, Backspace starts again. With --replan 30 it re-plans 30 times
+    a second; after Enter the same keys and mouse move the goal.
 
-    The browser's server can be reached from this machine only. Ctrl-C ends it.
+    Only this machine can reach the browser's server. Ctrl-C ends it.
     """
 
     what: Annotated[Positional[str], arg(metavar="RUN.npz|SCENARIO")]
-    """What `lqrsim simulate` wrote, or a scenario as in `lqrsim solve`."""
+    """A file from `lqrsim simulate`, or a scenario as in `lqrsim solve`."""
     viewer: Literal["auto", "window", "browser"] = "auto"
     """auto: a window where there is a display."""
     port: int = 0
-    """Of the browser's server. By default the first free one from 8080 on."""
+    """Port of the browser's server. By default the first free one from 8080 on."""
     speed: float = 1.0
-    """Of the time that is shown; 0.5 is half as fast as the real one."""
+    """Speed relative to real time; 0.5 is half as fast."""
     seconds: Annotated[float | None, optional("SECONDS")] = None
-    """Close after so long."""
+    """Close after this time."""
     trial: int = 0
-    """Which row of the run, from 0."""
+    """Row of the run, from 0."""
     loop: bool = True
     """--no-loop stops at the end of the run."""
     disturbances: Annotated[float, arg(metavar="FACTOR")] = 0.0
-    """What else goes wrong in a live run: the scenario's disturbances, so many times as strong."""
+    """Adds the scenario's disturbances to a live run, scaled by this factor."""
     seed: int = 0
-    """Of their random draws."""
+    """Seed of their random numbers."""
     controller: ControllerName = "feedback"
-    """What flies or drives a live run, as in `lqrsim simulate`."""
+    """Controller of a live run, as in `lqrsim simulate`."""
     stated: Annotated[str | None, optional("NAME")] = None
-    """Disturbances that track or offset_free is made for, as in `lqrsim simulate`. By default moderate."""
+    """Disturbances for which track or offset_free is designed, as in `lqrsim simulate`. By default moderate."""
     replan: Annotated[float | None, optional("HZ")] = None
-    """Plan again as the robot goes, so many times a second, rounded to control periods; the run then goes on after the
-    plan's horizon. What is not ready within a control period of the clock is not used."""
+    """Re-plan this many times a second, rounded to control periods; the run then continues after the plan's horizon. A
+    solve that takes longer than a control period of real time is not used."""
     push: Annotated[float, arg(metavar="M/S")] = 0.3
-    """By how much a key changes the robot's velocity."""
+    """Change of the robot's velocity per key press."""
 
     def run(self) -> int:
-        """Carry the command out; its exit code."""
+        """Run the command. Returns the exit code."""
         from lqrsim.commands import console
         from lqrsim.errors import InputError, check_count, check_number, check_seed
         from lqrsim.results import save_load

@@ -42,8 +42,10 @@ class SafePlan:
     """A plan with its predicted chance of collision.
 
     Attributes:
-      problem: with the clearances that were found as constraints. solution: of it.
-      controller: what runs it. tube: where that will be; `tube.collision_chance` is the chance.
+      problem: with the clearances that were found as constraints.
+      solution: of it.
+      controller: what runs it.
+      tube: where that will be; `tube.collision_chance` is the chance.
       asked: the chance that was asked for.
       rounds: clearance's smallest and largest margin in m, cost and predicted chance of each plan that was solved for.
     """
@@ -93,11 +95,16 @@ def smooth_chance_constrained(
     far it got, and allow more, estimate better, or have another way round.
 
     Args:
-      problem: with obstacles in its costs or constraints. uncertainty: what runs meet; see `uncertainty_of`.
+      problem: with obstacles in its costs or constraints.
+      uncertainty: what runs meet; see `uncertainty_of`.
       chance: of collision, between 0 and 1.
       controller: (problem, solution) -> what runs the plan, an OffsetFree, a Feedback or a policy; by default an
         OffsetFree for the uncertainty, with tolerances chosen for the second plan.
-      rounds: plans to solve for, at most. progress: called with the rounds that are done, and all of them.
+      rounds: plans to solve for, at most.
+      progress: called with the rounds that are done, and all of them.
+
+    Returns:
+      The SafePlan.
 
     Raises:
       InputError: there are no obstacles, an option is out of range, or something does not fit the system.

@@ -13,9 +13,9 @@ import numpy as np
 from scipy.special import ndtr
 
 from lqrsim.codegen.distances import distances_with_normals
-from lqrsim.errors import Array
+from lqrsim.errors import Array, InputError
 from lqrsim.problem.balls import Places, bind_outline, evaluate_slopes
-from lqrsim.problem.constraints import Clearance
+from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.costs import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.scenes.world import World
@@ -60,6 +60,10 @@ class Surroundings:
             kind = id(one.world), one.radius, id(one.balls)
             if not any((id(other.world), other.radius, id(other.balls)) == kind for other in worlds):
                 worlds.append(one)
+        if any(one.moving for one in worlds):
+            raise InputError(
+                "problem: got obstacles that move, want none: chances of collision are for obstacles that stand still"
+            )
         bound = [bind_outline("problem", one.balls, problem.dynamics, one.world) for one in worlds]
         found = [(one, places, seen) for one, (places, seen) in zip(worlds, bound, strict=True) if len(seen)]
         moving = space.position

@@ -19,6 +19,12 @@ class Controller(abc.ABC):
         """Begin a run of K trials: (step, states that are shown (K, n)) -> controls (K, m) within the limits.
 
         Each trial gets the controls that it gets alone, to the last bit.
+
+        Args:
+          trials: K, how many run at once.
+
+        Returns:
+          A function (step, states shown (K, n)) -> controls (K, m).
         """
 
     @property
@@ -44,7 +50,14 @@ class Controller(abc.ABC):
 
 
 class Feedback(Controller):
-    """A policy, or an open-loop plan, whose gains are zero."""
+    """A policy, or an open-loop plan, whose gains are zero.
+
+    Args:
+      policy: the feedback law, or `solution.open_loop()`.
+
+    Raises:
+      InputError: the policy is not an AffinePolicy.
+    """
 
     def __init__(self, policy: AffinePolicy) -> None:
         self.policy = check_kind("Feedback: policy", policy, AffinePolicy, "an AffinePolicy, such as solution.policy")

@@ -20,7 +20,8 @@ class Moments(NamedTuple):
     """Of a closed loop about its plan, X as above.
 
     Attributes:
-      mean: of X, (T+1, X). covariance: of X, (T+1, X, X).
+      mean: of X, (T+1, X).
+      covariance: of X, (T+1, X, X).
       across: of the deviation of the states with that of the knot before, (T, n, n).
       command: standard deviation of each command, before it is limited, (T, m).
       saturation: share of the commands that are beyond the limits, (T, m).

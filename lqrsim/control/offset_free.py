@@ -48,10 +48,13 @@ class OffsetFree(Controller):
     winds up.
 
     Args:
-      problem: that was solved. solution: its solution, or any with a plan of the same system.
+      problem: that was solved.
+      solution: its solution, or any with a plan of the same system.
       uncertainty: what the run meets, as `uncertainty_of` makes it. What varies may have a mean, too, and what is
         constant may change, in `memory` seconds by about its standard deviation: see `Uncertainty.steady`.
-      tolerate, effort, at_end: as in `track`.
+      tolerate: as in `track`.
+      effort: as in `track`.
+      at_end: as in `track`.
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
         SymPy symbols, as in `Dynamics`, that does not depend on u.
       memory: in s, by default 5 s, or the plan's horizon where that is shorter.
@@ -63,8 +66,10 @@ class OffsetFree(Controller):
       replan_always: whether to solve at each of these times, wherever the law leads.
 
     Attributes:
-      model, filter: the linear model about the plan, with z = (state, what the actuators have reached, unknowns), and
-        the filter's gains and covariances. gain, offset: of the law, (T, m, Z) and (T, m).
+      model: the linear model about the plan, with z = (state, what the actuators have reached, unknowns).
+      filter: the filter's gains and covariances.
+      gain: of the law, (T, m, Z).
+      offset: of the law, (T, m).
       estimates: with `record`, the estimates (T+1, K, Z) of the K trials of the last run, each with the measurement of
         its knot: NaN where none was taken in, which is so of the last knot, and of as many more as measurements are
         late. Their errors have the covariances `filter.corrected`. Else None.
@@ -142,7 +147,7 @@ class OffsetFree(Controller):
             got = f"{every:g} with a latency of {late[0]} and a delay of {late[1]} periods"
             raise InputError(f"OffsetFree: replan_every: got {got}, want None, or an uncertainty without both")
         problem = replace(self.problem, dynamics=self.model.dynamics)
-        return Replanner("OffsetFree", problem, self.solution, every, name="replan_every")
+        return Replanner("OffsetFree", problem, self.solution, every, name="replan_every", deadline=0.0)
 
     def _weights(self, tolerate: PerEntry | None, effort: Array, at_end: float) -> Weights:
         """Of the tolerances, or of those that are chosen."""

@@ -1,6 +1,5 @@
 """Re-planning on a robot: a law that is always at hand, and plans that are made beside it, in a thread."""
 
-import logging
 import queue
 import threading
 import time
@@ -8,16 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
-import numpy as np
 import numpy.typing as npt
 
-from lqrsim.control.replanner import Account, Law, Replanner, ReplanRecord, Task
+from lqrsim.control.replanner import Account, Law, Replanner, Task
 from lqrsim.errors import Array, InputError, check_flag, check_number, vectors_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.replan import Replan
 from lqrsim.results.solution import Solution
-
-logger = logging.getLogger("lqrsim")
 
 SPARE = 0.5e-3  # s, between the end of a solve and its deadline: for handing the answer over
 
@@ -45,7 +41,8 @@ class Planner:
     the deadline. What is not ready then is not used, and the law before goes on. All is compiled before the first step.
 
     Args:
-      problem: that was solved. solution: its solution.
+      problem: that was solved.
+      solution: its solution.
       every: seconds between two solves, rounded to control periods.
       deadline: seconds until an answer comes into force, rounded up to control periods; by default one period.
       horizon: "moving", always as long as the first plan's, or "shrinking", to its end.
@@ -54,7 +51,8 @@ class Planner:
       clock: what time it is, in seconds, for deadlines; for tests.
 
     Attributes:
-      law: in force, with the step that it begins at. account: how the solves went, one record each.
+      law: in force, with the step that it begins at.
+      account: how the solves went, one record each.
 
     Raises:
       InputError: as `Replanning`.
@@ -71,8 +69,8 @@ class Planner:
         interpolate: bool = False,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        given = getattr(problem, "dt", 1.0) if deadline is None else deadline
-        deadline = check_number("Planner: deadline", given, above=0.0)
+        if deadline is not None:
+            check_number("Planner: deadline", deadline, above=0.0)
         self._replanner = Replanner("Planner", problem, solution, every, deadline=deadline, horizon=horizon)
         self._interpolate, self._clock = check_flag("Planner: interpolate", interpolate), clock
         self.problem = problem
@@ -99,24 +97,18 @@ class Planner:
     def account(self) -> Account:
         return self._replanner.account
 
-    @property
-    def records(self) -> list[ReplanRecord]:
-        """One a solve."""
-        return self.account.records
-
     def summary(self) -> str:
         """How often it solved, how long that took, and why the law before was kept where it was, in a line."""
-        line = self.account.summary()
-        if self.records:
-            took = 1e3 * np.array([one.seconds for one in self.records])
-            line += f"; a solve took {np.median(took):.1f} ms in the median and {took.max():.1f} ms at most"
-        return line
+        return self.account.summary(times=True)
 
     def change(self, **parts: Any) -> None:
-        """Plan for another problem from the next solve on: `planner.change(final_cost=...)`; see `dataclasses.replace`.
+        """Change the problem from the next solve on: `planner.change(final_cost=...)`; see `dataclasses.replace`.
 
         Goals, weights, obstacles, parameters and limits can change. So that a new estimate of what disturbs the robot
         can, plan with `dynamics.disturbed` from the beginning.
+
+        Args:
+          **parts: field of `Problem` -> new value.
 
         Raises:
           InputError: the problem is none, or would have to be compiled.
@@ -130,6 +122,13 @@ class Planner:
 
     def step(self, state: npt.ArrayLike, t: float) -> Array:
         """The control (m,) to apply in a measured state (n,), `t` seconds after the start.
+
+        Args:
+          state: (n,), measured.
+          t: seconds since the start, 0 or more.
+
+        Returns:
+          (m,).
 
         Raises:
           InputError: the state is not finite, the time is negative, or the thread does not run.

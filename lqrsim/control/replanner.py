@@ -48,10 +48,15 @@ class ReplanRecord:
     """How one solve went.
 
     Attributes:
-      step: the control period in which it began. trial: of a simulation, else 0.
-      status: how the solve ended. iterations: how many it took. seconds: how long it took.
-      cost, before: of the new plan, and of where the law in force led from there.
-      used: whether its plan came into force. reason: why not, or why it is no better; empty if all went well.
+      step: the control period in which it began.
+      trial: of a simulation, else 0.
+      status: how the solve ended.
+      iterations: how many it took.
+      seconds: how long it took.
+      cost: of the new plan.
+      before: cost of continuing with the law in force.
+      used: whether its plan came into force.
+      reason: why not, or why it is no better; empty if all went well.
     """
 
     step: int
@@ -107,8 +112,8 @@ class Account:
         """Count a solve that did not begin."""
         self.kept[reason] += 1
 
-    def summary(self) -> str:
-        """How often it was solved, and why the law before was kept where it was, in a line."""
+    def summary(self, *, times: bool = False) -> str:
+        """How often it was solved, and why the law before went on where it did; with `times`, how long solves took."""
         line = f"solved again {self.solved} times"
         early = Counter(one.reason for one in self.records if one.used and one.reason)
         if early:
@@ -116,6 +121,9 @@ class Account:
         if self.kept:
             reasons = "; ".join(f"{count} times {reason}" for reason, count in self.kept.most_common())
             line += f", kept the law before {self.kept.total()} times: {reasons}"
+        if times and self.records:
+            took = 1e3 * np.array([one.seconds for one in self.records])
+            line += f"; a solve took {np.median(took):.1f} ms in the median and {took.max():.1f} ms at most"
         return line
 
 
@@ -124,8 +132,8 @@ class Replanner:
 
     Args:
       who: for messages. problem: that was solved. solution: its solution.
-      every: seconds between two solves. deadline: seconds until its answer comes into force. Both are rounded to
-        control periods, the deadline up.
+      every: seconds between two solves. deadline: seconds until its answer comes into force, by default a control
+        period. Both are rounded to control periods, the deadline up.
       horizon: "shrinking", to the end of the first plan, or "moving", as long as that.
       predict: whether to solve from where the law in force leads by the deadline, or from the state at the beginning.
 
@@ -145,7 +153,7 @@ class Replanner:
         every: float,
         *,
         name: str = "every",
-        deadline: float = 0.0,
+        deadline: float | None = None,
         horizon: str = "shrinking",
         predict: bool = True,
     ) -> None:
@@ -160,7 +168,7 @@ class Replanner:
             raise InputError(f"{who}: solution: got {got}, want the problem's: {want}")
         self.every = check_number(f"{who}: {name}", every, at_least=0.999 * problem.dt)
         self.periods = round(self.every / problem.dt)
-        self.deadline = check_number(f"{who}: deadline", deadline, at_least=0.0)
+        self.deadline = check_number(f"{who}: deadline", problem.dt if deadline is None else deadline, at_least=0.0)
         self.delay = math.ceil(self.deadline / problem.dt - 1e-9)
         if self.delay > self.periods:
             raise InputError(
@@ -208,5 +216,7 @@ class Replanner:
 
     def solve(self, task: Task, time_limit: float | None = None) -> Replan:
         """The answer, to a task that is due."""
-        after = task.first if self.horizon == "shrinking" else 0
-        return self.solver.solve(task.state, task.start, problem=task.problem, after=after, time_limit=time_limit)
+        problem, after = task.problem, task.first
+        if self.horizon == "moving":
+            problem, after = problem.later(task.first * problem.dt), 0
+        return self.solver.solve(task.state, task.start, problem=problem, after=after, time_limit=time_limit)

@@ -32,7 +32,8 @@ class Replanning(Controller):
     the last bit wherever they are computed; "measured" is as fast as this machine is. On a robot, use `Planner`.
 
     Args:
-      problem: that was solved. solution: its solution.
+      problem: that was solved.
+      solution: its solution.
       every: seconds between two solves, rounded to control periods.
       deadline: seconds until an answer comes into force, rounded up to control periods, and no more than `every`. By
         default as long as `computing` takes, where that is a number, and else one control period.
@@ -47,8 +48,8 @@ class Replanning(Controller):
 
     Attributes:
       records: a `ReplanRecord` of each solve of the last run.
-      solved: how many of them were used, of all trials. kept: why others were not, and the law before went on: reason
-        -> how many. `summary()` says both in a line.
+      solved: how many of them were used, of all trials.
+      kept: why others were not, and the law before went on: reason -> how many. `summary()` says both in a line.
 
     Raises:
       InputError: `every` is shorter than a control period or the deadline, or the solution is of another problem.
@@ -74,19 +75,10 @@ class Replanning(Controller):
             raise InputError(f'{who}: computing: got {excerpt(computing)}, want seconds, a function or "{MEASURED}"')
         elif not isinstance(computing, str):
             computing = check_number(f"{who}: computing", computing, at_least=0.0)
-        period = float(getattr(problem, "dt", 0.0))
-        by_default = computing if isinstance(computing, float) else period
-        deadline = by_default if deadline is None else deadline
+        if deadline is None and isinstance(computing, float):
+            deadline = computing
         check_function(f"{who}: changes", changes, "a function of the time and the problem", arguments=2)
-        self._replanner = Replanner(
-            who,
-            problem,
-            solution,
-            every,
-            deadline=deadline,
-            horizon=horizon,
-            predict=predict,
-        )
+        self._replanner = Replanner(who, problem, solution, every, deadline=deadline, horizon=horizon, predict=predict)
         self.problem, self.solution = problem, solution
         self.every, self.deadline, self.horizon = self._replanner.every, self._replanner.deadline, horizon
         self.computing, self.changes, self.seed = computing, changes, check_count(f"{who}: seed", seed, at_least=0)
@@ -159,11 +151,7 @@ class Replanning(Controller):
 
     def summary(self) -> str:
         """How often it solved in the last run, and why where it kept the law before, in a line."""
-        line = self._replanner.account.summary()
-        if self.computing == MEASURED and self.records:
-            took = 1e3 * np.array([one.seconds for one in self.records])
-            line += f"; a solve took {np.median(took):.1f} ms in the median and {took.max():.1f} ms at most"
-        return line
+        return self._replanner.account.summary(times=self.computing == MEASURED)
 
     @property
     def digest(self) -> str:

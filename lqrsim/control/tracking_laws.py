@@ -68,7 +68,32 @@ def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
     return CONTROL_SHARE * ranges
 
 
-def tracking_laws(model: PlanModel, weights: Weights) -> tuple[Array, Array]:
+@dataclass(frozen=True)
+class Averse:
+    """Noise on the states about a plan, and how much large deviations are dreaded.
+
+    Attributes:
+      matrices: M (T, n, k), at each step. risk: theta, of 1/2 the sum that the law minimises.
+    """
+
+    matrices: Array
+    risk: float
+
+    def worst(self, t: int, S: Array, s: Array) -> tuple[Array, Array]:
+        """What 1/2 y'Sy + s'y is taken for at t + 1, where noise gets it to: S + S Y S and s + S Y s.
+
+        Raises:
+          np.linalg.LinAlgError: the risk is too high.
+        """
+        M = np.zeros((len(S), self.matrices.shape[2]))
+        M[: self.matrices.shape[1]] = self.matrices[t]
+        inner = np.eye(M.shape[1]) - self.risk * M.T @ S @ M
+        np.linalg.cholesky(inner)
+        spread = self.risk * S @ M @ np.linalg.solve(inner, M.T)
+        return S + spread @ S, s + spread @ s
+
+
+def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = None) -> tuple[Array, Array]:
     """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m)."""
     n, m, steps = model.n, model.m, model.plan.steps
     own = n + model.lagging  # what the controls can do something about
@@ -82,6 +107,8 @@ def tracking_laws(model: PlanModel, weights: Weights) -> tuple[Array, Array]:
     S, D, s = np.zeros((own, own)), np.zeros((own, E.shape[2])), np.zeros(own)
     S[range(n), range(n)] = weights.end
     for t in range(steps - 1, -1, -1):
+        if averse is not None:
+            S, s = averse.worst(t, S, s)
         SF, ahead = S @ F[t], S @ E[t] + D
         slope = S @ c[t] + s
         to_control = G[t].T

@@ -30,8 +30,10 @@ class Tube:
     """Where the closed loop will be about its plan.
 
     Attributes:
-      plan: nominal states and controls. state_coordinates: what the states are.
-      mean: of the deviation of the state, (T+1, n). covariance: of it, (T+1, n, n).
+      plan: nominal states and controls.
+      state_coordinates: what the states are.
+      mean: of the deviation of the state, (T+1, n).
+      covariance: of it, (T+1, n, n).
       across: of the deviation with that of the knot before, (T, n, n).
       estimate_covariance: of the error of the estimate, before each measurement, (T+1, n, n); None without a filter.
       command: standard deviation of each command, before it is limited, (T, m).
@@ -77,6 +79,12 @@ class Tube:
     def added_to(self, rollout: Rollout) -> Rollout:
         """The rollout with the covariance of the position and the chance of collision, for its figures and videos.
 
+        Args:
+          rollout: of the same plan.
+
+        Returns:
+          The rollout with its `tube` and `collision_chance`.
+
         Raises:
           InputError: it is a run of another plan, or of a robot without a position.
         """
@@ -94,9 +102,13 @@ def predict_tube(
     """Where a run will be about its plan, and how likely it is to collide, before any run.
 
     Args:
-      problem: that was solved, with the obstacles in its costs and constraints. solution: with the plan.
-      uncertainty: what the run meets. controller: what runs it: an OffsetFree, a Feedback or a policy; by default the
-        solution's policy.
+      problem: that was solved, with the obstacles in its costs and constraints.
+      solution: with the plan.
+      uncertainty: what the run meets.
+      controller: what runs it: an OffsetFree, a Feedback or a policy; by default the solution's policy.
+
+    Returns:
+      The Tube.
 
     Raises:
       InputError: something does not fit the system; the controller is of another kind; or the uncertainty has a latency

@@ -104,9 +104,11 @@ class Uncertainty:
     Attributes:
       unknowns: parameters, winds, forces, actuators' gains and offsets.
       start: standard deviation of where a run begins, of each state.
-      control: of white noise on each control. measurement: of white noise on each state that is measured.
+      control: of white noise on each control.
+      measurement: of white noise on each state that is measured.
       lag: time constant in s with which the actuators follow their commands.
-      delay: control periods by which commands come late. latency: by which measurements do.
+      delay: control periods by which commands come late.
+      latency: by which measurements do.
       loss: share of the measurements that get lost.
       obstacles: standard deviation in m, along each of the world's axes, of where an obstacle is; planes stay.
       left_out: what was stated besides and no linear model has; for the record.
@@ -139,7 +141,14 @@ class Uncertainty:
         object.__setattr__(self, "left_out", left_out)
 
     def check(self, dynamics: Dynamics) -> None:
-        """Raise InputError unless all of it fits the dynamics; the field is named, and what there is to choose from."""
+        """Check that it fits a system.
+
+        Args:
+          dynamics: of the system.
+
+        Raises:
+          InputError: something does not fit.
+        """
         states, controls = dynamics.state_coordinates, dynamics.control_coordinates
         per_entry("Uncertainty: start", self.start, states)
         per_entry("Uncertainty: measurement", self.measurement, states)
@@ -157,6 +166,9 @@ class Uncertainty:
         Args:
           memory: seconds in which a constant may wander by its standard deviation.
           share: of what varies, the standard deviation of its mean, relative to its own.
+
+        Returns:
+          An Uncertainty.
 
         Raises:
           InputError: a number is out of range.

@@ -1,7 +1,8 @@
 """The cost of obstacles for a robot of several balls: that of `obstacle_cost.py`, of each ball. The numba subset.
 
-`data` has what `places` reads, and from AT on the sharpness, the weight, how many obstacles there are, the radius of
-each ball, and the ROW numbers of each obstacle. What `places` and `places_jacobian` are, `Places` says.
+`data` has what `places` reads, and from AT on the sharpness, the weight, how many obstacles there are and at how many
+steps they are told, of which the last holds from there on; the radius of each ball, and for each step the ROW numbers
+of each obstacle. What `places` and `places_jacobian` are, `Places` says.
 """
 
 from math import exp
@@ -20,10 +21,11 @@ def value(x, u, t, data):
     """The cost; none at the first step, whose state is given."""
     total = 0.0
     if t > 0:
-        at, obstacles = stack(PLACES), AT + 3 + BALLS
+        at = stack(PLACES)
+        obstacles = AT + 4 + BALLS + ROW * int(data[AT + 2]) * min(t, int(data[AT + 3]) - 1)
         places(x, data, at)
         for k in range(BALLS):
-            radius = data[AT + 3 + k]
+            radius = data[AT + 4 + k]
             for i in range(int(data[AT + 2])):
                 distance = signed_distance(data, obstacles + ROW * i, at[3 * k], at[3 * k + 1], at[3 * k + 2])
                 total += exp(-data[AT] * (distance - radius))
@@ -34,7 +36,8 @@ def derivatives(x, u, t, data, hessian, gradient):
     """Add the Hessian and the gradient, and return the cost. The places' own curvature is left out."""
     total = 0.0
     if t > 0:
-        at, moves, obstacles = stack(PLACES), stack(PLACES, N), AT + 3 + BALLS
+        at, moves = stack(PLACES), stack(PLACES, N)
+        obstacles = AT + 4 + BALLS + ROW * int(data[AT + 2]) * min(t, int(data[AT + 3]) - 1)
         normal, curve, force, stiffness, sides = stack(3), stack(3, 3), stack(3), stack(3, 3), stack(3)
         sharpness = data[AT]
         clear(moves, PLACES, N)
@@ -47,7 +50,7 @@ def derivatives(x, u, t, data, hessian, gradient):
                 distance = signed_distance_derivatives(
                     data, obstacles + ROW * i, at[3 * k], at[3 * k + 1], at[3 * k + 2], normal, curve
                 )
-                cost = data[AT + 1] * exp(-sharpness * (distance - data[AT + 3 + k]))
+                cost = data[AT + 1] * exp(-sharpness * (distance - data[AT + 4 + k]))
                 total += cost
                 for j in range(3):
                     force[j] -= cost * normal[j]

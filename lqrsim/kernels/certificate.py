@@ -7,6 +7,7 @@ derivatives, and a Cholesky factor. `certify.py` compares with what a solver cla
 from math import nan
 
 from lqrsim.kernels.declarations import (
+    NOISY,
     M,
     N,
     W,
@@ -14,16 +15,17 @@ from lqrsim.kernels.declarations import (
     final_value,
     initial_quadratic,
     initial_value,
+    noise_quadratic,
     stack,
     stage_quadratic,
     stage_value,
 )
 from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, clear
-from lqrsim.kernels.records import Limits, Slopes, Stage, Step
+from lqrsim.kernels.records import Ahead, Limits, Slopes, Stage, Step
 from lqrsim.kernels.runge_kutta import step_jacobian
 
 
-def certify(settings, own, plan, policy, hessians, model, found):
+def certify(settings, own, plan, policy, to_go, model, found):
     """Write to `found`: cost, its scale, motion, law, limits, and the decrease of cost that is still promised.
 
     The scale is what the curved part of the cost would be if nothing in it cancelled: rounding is a share of it.
@@ -34,21 +36,21 @@ def certify(settings, own, plan, policy, hessians, model, found):
     The promised decrease is `1/2 sum e' E^-1 e` with the slopes e of the cost in the offsets of the policy, later
     controls responding with its gains, and E = R + B'SB with the Hessians S (T+1, N, N) of the cost-to-go. It is what
     a Riccati pass predicts where the gains are that pass's, about the plan. Controls go no further than their limits.
-    With `own`, the Hessians are worked out here, of the policy as it is with controls at their limits, and written to
-    `hessians`: those of a Riccati pass take controls to respond that cannot. The cost includes no augmented Lagrangian,
-    the decrease does.
+    What noise is expected to cost belongs to all of it. With `own`, the Hessians are worked out here, of the policy as
+    it is with controls at their limits, and written to the cost-to-go: those of a Riccati pass take controls to respond
+    that cannot. The cost includes no augmented Lagrangian, the decrease does.
     """
     stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
     slopes, room = Slopes(stack(N, N), stack(N, M), stack(N)), Limits(stack(M), stack(M))
     none, costate, size, beyond = stack(M), stack(N), stack(N), stack(N)
-    states, steps = plan.states, settings.steps
+    states, steps, hessians, nowhere = plan.states, settings.steps, to_go.hessian, stack(N)
     clear(slopes.state, N, N)
     clear(slopes.control, N, M)
     law, limits, decrease = 0.0, 0.0, 0.0
     for i in range(M):
         none[i] = 0.0
     for i in range(N):
-        size[i], beyond[i] = 1.0, 0.0
+        size[i], beyond[i], nowhere[i] = 1.0, 0.0, 0.0
         for t in range(steps + 1):
             size[i] = max(size[i], abs(states[t, i]))
     cost = final_value(states[steps], none, steps, model.final)
@@ -64,6 +66,14 @@ def certify(settings, own, plan, policy, hessians, model, found):
         cost += stage_value(x, u, t, model.stage)
         step_jacobian(x, u, model.parameters, model.dt, slopes.state, slopes.control, slopes.arrived, step.jacobian)
         stage_quadratic(x, u, t, model.stage, stage.hessian, stage.gradient)
+        if NOISY:  # of the policy as it is, the slope ahead is the costate
+            slope = Ahead(
+                step.jacobian,
+                nowhere if own else slopes.arrived,
+                hessians[t + 1],
+                costate if own else to_go.gradient[t + 1],
+            )
+            cost += noise_quadratic(x, u, model, slope, False, stage)
         scale += scale_of(x, u, stage)
         for i in range(N):
             difference = abs(states[t + 1, i] - slopes.arrived[i])

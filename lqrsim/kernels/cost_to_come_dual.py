@@ -75,6 +75,11 @@ def linearize(x, u, model, slopes, step):
     offset(step.jacobian, x, u, slopes.arrived, step.offset)
 
 
+def forward_jacobian(x, u, model, slopes, step, spare):
+    """The Jacobian (N, W) of the step forwards, which this form has anyway."""
+    return step.jacobian
+
+
 def riccati_forward(t, step, stage, constant, to_come, smoothing):
     """One step of the cost-to-come, in moments: from t to t + 1. Returns whether it succeeded.
 

@@ -4,7 +4,7 @@
 """
 
 from lqrsim.kernels.cost_to_go import minimize_control
-from lqrsim.kernels.declarations import M, N, W, stack
+from lqrsim.kernels.declarations import NOISY, M, N, W, stack
 from lqrsim.kernels.linear_algebra import (
     affine,
     cholesky,
@@ -35,6 +35,13 @@ def linearize(x, u, model, slopes, step):
         slopes.arrived, u, model.parameters, -model.dt, slopes.state, slopes.control, x_back, step.jacobian
     )  # fmt: skip
     offset(step.jacobian, slopes.arrived, u, x_back, step.offset)
+
+
+def forward_jacobian(x, u, model, slopes, step, spare):
+    """The Jacobian (N, W) of the step forwards, which is worked out where there is a risk."""
+    if NOISY and model.noise[1][0] != 0:
+        step_jacobian(x, u, model.parameters, model.dt, slopes.state, slopes.control, slopes.arrived, spare)
+    return spare
 
 
 def riccati_forward(t, step, stage, constant, to_come, smoothing):

@@ -7,7 +7,19 @@ Levenberg-Marquardt is to Gauss-Newton, the damped iterations are to LQR smoothi
 
 from math import inf, isnan, nan
 
-from lqrsim.kernels.declarations import DAMPED, ILQR, MAX_ITERATIONS, PATIENCE, REJECTED, RUNNING, STALLED, M, N, stack
+from lqrsim.kernels.declarations import (
+    DAMPED,
+    ILQR,
+    MAX_ITERATIONS,
+    NOISY,
+    PATIENCE,
+    REJECTED,
+    RUNNING,
+    STALLED,
+    M,
+    N,
+    stack,
+)
 from lqrsim.kernels.iterations import outcome_of, relative_improvement, relative_optimality, write_row
 from lqrsim.kernels.passes import backward_pass, copy, forward_pass, minimizers
 from lqrsim.kernels.records import Linearization
@@ -20,6 +32,7 @@ from lqrsim.kernels.rollouts import (
     keep_plan,
     largest_gap,
     line_search,
+    plan_cost,
 )
 
 
@@ -43,7 +56,8 @@ def damped_iterations(first, last, settings, model, work, memory, log):
     With `first` of `last`, there is no iteration: only policy and value functions are made, about the plan as it is.
     """
     if first == last:
-        relinearize(settings, False, 0.0, model, work, memory, log[first])
+        _, failed = relinearize(settings, False, 0.0, model, work, memory, log[first])
+        return last, RUNNING, failed >= 0, failed
     for done in range(first, last):
         reach = memory.reach
         merit, cost, fraction, nothing = damped_step(settings, model, work, memory)
@@ -66,7 +80,7 @@ def damped_iterations(first, last, settings, model, work, memory, log):
             settled = stalled
             write_row(log[done], memory.plan_cost, 0.0, nan, nan, nan, REJECTED)
         if settled or full:
-            outcome = relinearize(settings, settled, nothing, model, work, memory, log[done])
+            outcome, _ = relinearize(settings, settled, nothing, model, work, memory, log[done])
             if outcome == RUNNING and (stalled or full):
                 outcome = STALLED if stalled else MAX_ITERATIONS
             if outcome != RUNNING:
@@ -89,12 +103,18 @@ def damped_step(settings, model, work, memory):
         for i in range(N):
             shift[i] = work.x_hat[i] - work.plan.states[0, i]
         about_plan(settings.steps, work.plan, work.policy)
+        if NOISY:  # as the new policy's cost-to-go weighs it
+            weigh_plan(settings.steps, model, work, memory)
         smallest = 0.1 if reach > 0 else 1e-8
         bound = memory.merit + 1e-12 * abs(memory.merit)  # what differs by rounding is not refused
-        merit, cost, fraction = line_search(
-            settings.steps, work.plan, shift, work.policy, model, bound, smallest, work.rollout
-        )
+        merit, cost, fraction = line_search(settings.steps, shift, work, model, bound, smallest, work.rollout)
     return merit, cost, fraction, nothing
+
+
+def weigh_plan(steps, model, work, memory):
+    """Work out anew what the plan is expected to cost, with the cost-to-go that was found last."""
+    cost, added = plan_cost(steps, work.plan, model, work.to_go)
+    memory.plan_cost, memory.merit = cost, cost + added
 
 
 def relax_damping(memory, fraction):
@@ -130,7 +150,7 @@ def turn_to_ilqr(memory):
 
 
 def relinearize(settings, settled, nothing, model, work, memory, row):
-    """Policy and value functions about the plan, without a weight. Returns the outcome.
+    """Policy and value functions about the plan, without a weight. Returns the outcome, and the step that failed or -1.
 
     Writes optimality and residual to the row of the log, and to the memory how far the states of least total cost are
     from the plan: where motions are unstable, rounding can spoil the cost-to-come while the rest is right.
@@ -138,7 +158,10 @@ def relinearize(settings, settled, nothing, model, work, memory, row):
     steps, plan, policy, shift = settings.steps, work.plan, work.policy, stack(N)
     failed, _, left = differential_pass(steps, plan, model, 0.0, 1, policy, work.to_go)
     if failed >= 0:
-        return RUNNING
+        return RUNNING, failed
+    if NOISY:
+        weigh_plan(steps, model, work, memory)
+        row.cost = memory.plan_cost
     if not settings.fixed:
         left += initial_step(plan.states[0], model, work.to_go, shift)
     left = relative_optimality(failed, left, memory.merit, nothing)
@@ -157,4 +180,4 @@ def relinearize(settings, settled, nothing, model, work, memory, row):
     row.optimality, row.residual = left, dynamics_residual(steps, work.x_hats, policy, model, plan.states)
     if isnan(row.gap):  # of an iteration that was rejected
         row.gap = 0.0
-    return outcome_of(settled and left < settings.tolerance, settings, left, memory.plan_cost, False)
+    return outcome_of(settled and left < settings.tolerance, settings, left, memory.plan_cost, False), -1

@@ -12,13 +12,15 @@ N = 0  # states
 M = 0  # controls
 W = N + M  # a state and a control, joined
 K = 0  # of these, how many entries a cost is not convex in
+NOISY = 0  # 1 for a problem with noise: what `if NOISY` guards is not in the cores of others
 
 # How iterations end; see `Status`. Of those without a status of their own, NO_START is a first trajectory that is not
 # finite, STALLED a line search that found no lower cost, CYCLING that the same costs come again and again, and
 # NO_PROGRESS that the least cost so far does not fall. TIMED_OUT is for the drivers: no kernel looks at a clock.
+# RISK_TOO_HIGH is a pass that failed because no expectation exists.
 RUNNING, CONVERGED, COST_CONVERGED, MAX_ITERATIONS, DIVERGED = 0, 1, 2, 3, 4
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED, CYCLING = 5, 6, 7, 8, 9
-NO_PROGRESS, TIMED_OUT = 10, 11
+NO_PROGRESS, TIMED_OUT, RISK_TOO_HIGH = 10, 11, 12
 LONGEST_CYCLE = 8
 # After how many iterations without a lower cost, and after how many in which it fell by less than a thousandth, there
 # is no progress. `python experiments/benchmark_reliability.py --sections overhead` shows that neither is met where the
@@ -159,6 +161,24 @@ def final_quadratic(x, u, t, data, hessian, gradient) -> float:
     return 0.0
 
 
+def noise_values(x, u, data, out) -> None:
+    """Write M(x, u), the rows of it that `noise.py` takes."""
+
+
+def noise_slopes(x, u, data, out, slopes) -> None:
+    """Write these, and their derivatives, column by column, in the entries of (x, u) that `noise.py` takes."""
+
+
+def noise_value(x, u, model, ahead) -> float:
+    """What noise is expected to cost at (x, u); see `noise.py`."""
+    return 0.0
+
+
+def noise_quadratic(x, u, model, ahead, convex, stage) -> float:
+    """The same, and its quadratic model added to the stage."""
+    return 0.0
+
+
 # What the form of the cost-to-come brings; see `cost_to_come_dual.py`, `cost_to_come_primal.py` and `records.py`.
 
 
@@ -169,6 +189,11 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come) -> tuple[float, bool
 
 def linearize(x, u, model, slopes, step) -> None:
     """Write where (x, u) leads, and the linearised step that `riccati_forward` takes."""
+
+
+def forward_jacobian(x, u, model, slopes, step, spare):
+    """The Jacobian (N, W) of the step forwards, after `linearize`; `spare` may be written to."""
+    return step.jacobian
 
 
 def riccati_forward(t, step, stage, constant, to_come, smoothing) -> bool:

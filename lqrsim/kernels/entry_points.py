@@ -16,7 +16,7 @@ def smoother(task, first, last, settings, model, work, memory, log):
     """
     if task >= CERTIFY:
         own = task == EVALUATE
-        certify(settings, own, work.rollout, work.kept, work.to_go.hessian, model, work.certificate[0])
+        certify(settings, own, work.rollout, work.kept, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
     if task == DAMP:
         return damped_iterations(first, last, settings, model, work, memory[0], log)
@@ -27,6 +27,6 @@ def ilqr(task, first, last, settings, model, work, log):
     """Iterations of iLQR; or the certificate of the plan and the policy; see `smoother`."""
     if task >= CERTIFY:
         own = task == EVALUATE
-        certify(settings, own, work.plan, work.policy, work.to_go.hessian, model, work.certificate[0])
+        certify(settings, own, work.plan, work.policy, work.to_go, model, work.certificate[0])
         return 0, 0, False, -1
     return ilqr_iterations(first, last, settings, model, work, log)

@@ -18,8 +18,10 @@ from lqrsim.kernels.declarations import (
     NO_FALL,
     NO_PROGRESS,
     NO_START,
+    NOISY,
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
+    RISK_TOO_HIGH,
     RUNNING,
     SLOW_FALL,
     SMOOTH,
@@ -38,6 +40,8 @@ from lqrsim.kernels.rollouts import (
     keep_policy,
     largest_gap,
     line_search,
+    noise_cost,
+    plan_cost,
     rollout,
 )
 
@@ -63,7 +67,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
     no_weight, steps, fixed, x_hat = stack(N), settings.steps, settings.fixed, work.x_hat
     for i in range(N):
         no_weight[i] = 0.0
-    eased = Model(model.parameters, model.dt, model.initial, work.eased, model.final, model.limits)
+    eased = Model(model.parameters, model.dt, model.initial, work.eased, model.final, model.limits, model.noise)
     if memory.started == 0:
         memory.started, memory.plan_cost = 1.0, inf
         keep_rollout(steps, work.start, model, work, memory)
@@ -79,10 +83,12 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         about = Linearization(work.guess, guided, 1.0, 0.0, Prior(weight, work.prior.about))
         failed, good = forward_pass(settings, eased, about, work)
         if failed >= 0:
-            return done, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, False, failed
+            return done, failure(good, model), False, failed
         failed, good, nothing = backward_pass(settings, eased, about, work)
         if failed >= 0:
-            return done, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, True, failed
+            return done, failure(good, model), True, failed
+        if NOISY and done == 0 and memory.plan_cost > -inf:  # the cost-to-go of the first policy was not known
+            memory.plan_cost, _ = plan_cost(steps, work.plan, model, work.to_go)
         cost = keep_rollout(steps, x_hat, model, work, memory)
         improvement = relative_improvement(log[done - 1].cost if done > 0 else inf, cost, nothing)
         gap = largest_gap(steps, work.x_hats, work.rollout.states)
@@ -106,11 +112,20 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
 def keep_rollout(steps, start, model, work, memory):
     """Run the policy and keep it with where it leads; the best so far is the plan. Returns the cost."""
     cost = rollout(steps, start, work.policy, model, work.rollout)
+    if NOISY:
+        cost += noise_cost(steps, work.rollout, model, work.to_go)
     keep_policy(steps, work.policy, work.kept)
     if cost < memory.plan_cost:
         memory.plan_cost = cost
         keep_plan(steps, work.rollout, work.plan)
     return cost
+
+
+def failure(good, model):
+    """The outcome of a pass that failed, given whether all numbers there were finite."""
+    if NOISY and model.noise[1][1] > 0:
+        return RISK_TOO_HIGH
+    return NOT_POSITIVE_DEFINITE if good else NOT_FINITE
 
 
 def cycling(log, done):
@@ -220,11 +235,13 @@ def ilqr_iterations(first, last, settings, model, work, log):
             damping[0] = max(10 * damping[0], 1.0)
             failed, good, _ = differential_pass(steps, plan, model, damping[0], 1, policy, to_go)
         if failed >= 0:
-            return done, NOT_POSITIVE_DEFINITE if good else NOT_FINITE, True, failed
+            return done, failure(good, model), True, failed
         if not damping[0] > 1.0:
             damping[0] = 0.0
+        if NOISY:  # with the cost-to-go that the new policy has
+            cost, _ = plan_cost(steps, plan, model, to_go)
         old = cost
-        cost, _, fraction = line_search(steps, plan, no_shift, policy, model, old, 1e-8, work.trial)
+        cost, _, fraction = line_search(steps, no_shift, work, model, old, 1e-8, work.trial)
         if fraction > 0:
             keep_plan(steps, work.trial, plan)
         improvement = relative_improvement(old, cost, 0.0)
@@ -232,6 +249,8 @@ def ilqr_iterations(first, last, settings, model, work, log):
         left = nan
         if settled or done + 1 == settings.max_iterations:
             failed, _, left = differential_pass(steps, plan, model, 0.0, 1, policy, to_go)
+            if NOISY:
+                cost, _ = plan_cost(steps, plan, model, to_go)
             left = relative_optimality(failed, left, cost, 0.0)
         write_row(log[done], cost, improvement, 0.0, left, 0.0, ILQR)
         outcome = outcome_of(settled, settings, left, cost, done + 1 == settings.max_iterations)

@@ -1,6 +1,7 @@
 """`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. The numba subset; see `declarations.py`.
 
-`data` has the radius, the sharpness, the weight, how many obstacles there are, and the ROW numbers of each.
+`data` has the radius, the sharpness, the weight, how many obstacles there are and at how many steps they are told, of
+which the last holds from there on; and for each of these the ROW numbers of each obstacle.
 """
 
 from math import exp
@@ -16,8 +17,10 @@ def value(x, u, t, data):
     """The cost; none at the first step, whose state is given."""
     total = 0.0
     if t > 0:
+        first = 5 + ROW * int(data[3]) * min(t, int(data[4]) - 1)
         for i in range(int(data[3])):
-            distance = signed_distance(data, 4 + ROW * i, x[AXES[0]], x[AXES[1]], x[AXES[2]] if len(AXES) == 3 else 0.0)
+            at = first + ROW * i
+            distance = signed_distance(data, at, x[AXES[0]], x[AXES[1]], x[AXES[2]] if len(AXES) == 3 else 0.0)
             total += exp(-data[1] * (distance - data[0]))
     return data[2] * total
 
@@ -30,9 +33,10 @@ def derivatives(x, u, t, data, hessian, gradient):
         clear(curves, 3, 3)
         for j in range(3):
             slopes[j] = 0.0
+        first = 5 + ROW * int(data[3]) * min(t, int(data[4]) - 1)
         for i in range(int(data[3])):
             distance = signed_distance_derivatives(
-                data, 4 + ROW * i, x[AXES[0]], x[AXES[1]], x[AXES[2]] if len(AXES) == 3 else 0.0, slope, curve
+                data, first + ROW * i, x[AXES[0]], x[AXES[1]], x[AXES[2]] if len(AXES) == 3 else 0.0, slope, curve
             )
             cost = data[2] * exp(-data[1] * (distance - data[0]))
             total += cost

@@ -7,21 +7,24 @@ from math import inf
 
 from lqrsim.kernels.control_limits import fix_controls_at_limits, riccati_backward_within
 from lqrsim.kernels.declarations import (
+    NOISY,
     M,
     N,
     W,
     backtrack,
     final_quadratic,
+    forward_jacobian,
     initial_cost_to_come,
     initial_quadratic,
     linearize,
     minimizer,
+    noise_quadratic,
     riccati_forward,
     stack,
     stage_quadratic,
 )
 from lqrsim.kernels.linear_algebra import about_origin, affine, cholesky, cholesky_solve, clear, finite, offset, within
-from lqrsim.kernels.records import Linearization, Slopes, Stage, Step
+from lqrsim.kernels.records import Ahead, Linearization, Slopes, Stage, Step
 from lqrsim.kernels.runge_kutta import advance, step_jacobian
 
 
@@ -35,6 +38,7 @@ def forward_pass(settings, model, about, work):
     slopes = Slopes(stack(N, N), stack(N, M), stack(N))
     clear_slopes(slopes)
     costate, u, x_hat, to_go, to_come = stack(N), stack(M), work.x_hat, work.to_go, work.to_come
+    spare = stack(N, W)
     good, _ = initial_model(x_hat, settings.fixed, model, about, to_go, to_come)
     if not good:
         return 0, finite(to_come.matrix[0], N, N)
@@ -46,7 +50,9 @@ def forward_pass(settings, model, about, work):
             affine(work.policy.gain[t], work.policy.offset[t], x_hat, u)
             within(u, model.limits)
         linearize(x_hat, u, model, slopes, step)
-        constant = stage_model(x_hat, u, t, model, about, stage)
+        jacobian = forward_jacobian(x_hat, u, model, slopes, step, spare)
+        ahead = Ahead(jacobian, slopes.arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
+        constant = stage_model(x_hat, u, t, model, about, ahead, True, stage)
         constant += fix_controls_at_limits(u, work.policy.gain[t], model.limits, stage, step)
         if not riccati_forward(t, step, stage, constant, to_come, work.smoothing):
             return t, finite(stage.hessian, W, W) and finite(step.jacobian, N, W)
@@ -89,7 +95,8 @@ def backward_pass(settings, model, about, work):
             towards(x, about.reach, about.plan.states[t], N)
             towards(u, about.reach, about.plan.controls[t], M)
         linearize_forward(x, u, model, slopes, step)
-        constant = stage_model(x, u, t, model, about, stage)
+        ahead = Ahead(step.jacobian, slopes.arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
+        constant = stage_model(x, u, t, model, about, ahead, False, stage)
         size += abs(constant)
         good = riccati_backward_within(t, step, stage, constant, x, model.limits, work.policy, to_go)
         if not good or not minimizer(t, to_go, to_come, costate, x_hat):
@@ -131,7 +138,8 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
         else:
             advance(x_hat, u, model.parameters, -model.dt, x)
         linearize_forward(x, u, model, slopes, step)
-        constant = stage_model(x, u, t, model, about, stage)
+        ahead = Ahead(step.jacobian, slopes.arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
+        constant = stage_model(x, u, t, model, about, ahead, False, stage)
         if not riccati_backward_within(t, step, stage, constant, x, model.limits, policy, to_go):
             return t, finite(stage.hessian, W, W) and finite(step.jacobian, N, W)
         copy(x, N, x_hat)
@@ -145,14 +153,17 @@ def linearize_forward(x, u, model, slopes, step):
     offset(step.jacobian, x, u, slopes.arrived, step.offset)
 
 
-def stage_model(x, u, t, model, about, stage):
+def stage_model(x, u, t, model, about, ahead, convex, stage):
     """Write the stage about (x, u) as a quadratic about the origin, Eqs. (26)-(27); return its constant.
 
+    What noise is expected to cost belongs to it, given what lies ahead; `convex` is as in `noise_quadratic`.
     The prior is no part of the cost, but added to its quadratic model in the first iterations, where it keeps the
     linearisations sensible. Damping weighs how far the control moves from the plan's.
     """
     hessian, gradient, prior = stage.hessian, stage.gradient, about.prior
     value = stage_quadratic(x, u, t, model.stage, hessian, gradient)
+    if NOISY:
+        value += noise_quadratic(x, u, model, ahead, convex, stage)
     if t > 0:
         for i in range(N):
             weight, error = prior.weight[i], x[i] - prior.about[t, i]

@@ -20,7 +20,10 @@ class Limits(NamedTuple):
 
 
 class Model(NamedTuple):
-    """A problem as numbers: of the dynamics (any,), the time step in s, of each cost one array (any,) a term."""
+    """A problem as numbers: of the dynamics (any,), the time step in s, of each cost one array (any,) a term.
+
+    `noise` is empty, or has what the noise's function reads (any,), and (2,) the risk, and whether it was too high.
+    """
 
     parameters: Arrays
     dt: float
@@ -28,6 +31,7 @@ class Model(NamedTuple):
     stage: Any
     final: Any
     limits: Limits
+    noise: Any = ()
 
 
 class Plan(NamedTuple):
@@ -99,6 +103,17 @@ class Step(NamedTuple):
 
     jacobian: Arrays
     offset: Arrays
+
+
+class Ahead(NamedTuple):
+    """What lies ahead of a step: its Jacobian [A B] (N, W), where it leads (N,), and the cost-to-go there, Hessian
+    (N, N) and gradient at the origin (N,).
+    """
+
+    jacobian: Arrays
+    arrived: Arrays
+    hessian: Arrays
+    gradient: Arrays
 
 
 class Slopes(NamedTuple):

@@ -7,6 +7,7 @@ from math import isnan, nan
 
 from lqrsim.kernels.control_limits import minimize_within
 from lqrsim.kernels.declarations import (
+    NOISY,
     M,
     N,
     W,
@@ -15,6 +16,8 @@ from lqrsim.kernels.declarations import (
     final_value,
     initial_quadratic,
     initial_value,
+    noise_quadratic,
+    noise_value,
     stack,
     stage_added,
     stage_quadratic,
@@ -22,7 +25,7 @@ from lqrsim.kernels.declarations import (
 )
 from lqrsim.kernels.linear_algebra import affine, cholesky, cholesky_solve, congruence, finite, within
 from lqrsim.kernels.passes import clear_slopes, copy, end_model
-from lqrsim.kernels.records import Limits, Slopes, Stage
+from lqrsim.kernels.records import Ahead, Limits, Slopes, Stage
 from lqrsim.kernels.runge_kutta import advance, step_jacobian
 
 
@@ -50,6 +53,27 @@ def costs_of(count, steps, plans, model, costs):
             costs[k] += stage_value(x, u, t, model.stage)
         last = plans.controls[(k + 1) * steps - 1]
         costs[k] += final_value(plans.states[(k + 1) * (steps + 1) - 1], last, steps, model.final)
+
+
+def noise_cost(steps, plan, model, to_go):
+    """What noise is expected to cost along a trajectory, with the cost-to-go of the policy that makes it."""
+    total, none = 0.0, stack(N, W)
+    for t in range(steps):
+        ahead = Ahead(none, plan.states[t + 1], to_go.hessian[t + 1], to_go.gradient[t + 1])
+        total += noise_value(plan.states[t], plan.controls[t], model, ahead)
+    return total
+
+
+def plan_cost(steps, plan, model, to_go):
+    """Cost of a trajectory, with what noise is expected to cost, and what the augmented Lagrangian adds to it."""
+    states, controls = plan.states, plan.controls
+    cost, added = initial_value(states[0], controls[0], 0, model.initial), 0.0
+    for t in range(steps):
+        cost += stage_value(states[t], controls[t], t, model.stage)
+        added += stage_added(states[t], controls[t], t, model.stage)
+    cost += final_value(states[steps], controls[steps - 1], steps, model.final)
+    added += final_added(states[steps], controls[steps - 1], steps, model.final)
+    return cost + noise_cost(steps, plan, model, to_go), added
 
 
 def differential_pass(steps, plan, model, damping, keep, policy, to_go):
@@ -83,6 +107,9 @@ def differential_pass(steps, plan, model, damping, keep, policy, to_go):
         at, x, u = t * keep, states[t], controls[t]
         step_jacobian(x, u, model.parameters, model.dt, slopes.state, slopes.control, slopes.arrived, jacobian)
         ahead += stage_quadratic(x, u, t, model.stage, hessian, gradient)
+        if NOISY:
+            beyond = Ahead(jacobian, slopes.arrived, curve, s[(t + 1) * keep])
+            ahead += noise_quadratic(x, u, model, beyond, False, stage)
         congruence(jacobian, curve, slope, hessian, gradient)
         for i in range(M):
             hessian[N + i, N + i] += damping
@@ -166,13 +193,14 @@ def dynamics_residual(steps, x_hats, policy, model, states):
     return residual
 
 
-def line_search(steps, plan, shift, policy, model, bound, smallest, trial):
+def line_search(steps, shift, work, model, bound, smallest, trial):
     """Try steps 1, 1/2, 1/4, ... along the changes of start and controls until the merit falls below `bound`.
 
-    The merit is the true cost and what the augmented Lagrangian adds to it. Writes the trajectory. Returns its merit,
-    its cost, and the step, which is 0 if none down to `smallest` lowers the merit.
+    The changes are from the plan, by the policy in the workspace. The merit is the true cost, expected where there is
+    noise, and what the augmented Lagrangian adds to it. Writes the trajectory. Returns its merit, its cost, and the
+    step, which is 0 if none down to `smallest` lowers the merit.
     """
-    fraction = 1.0
+    fraction, plan, policy = 1.0, work.plan, work.policy
     while fraction >= smallest:
         for i in range(N):
             trial.states[0, i] = plan.states[0, i] + fraction * shift[i]
@@ -189,6 +217,8 @@ def line_search(steps, plan, shift, policy, model, bound, smallest, trial):
             added += stage_added(x, u, t, model.stage)
             advance(x, u, model.parameters, model.dt, trial.states[t + 1])
         cost += final_value(trial.states[steps], trial.controls[steps - 1], steps, model.final)
+        if NOISY:
+            cost += noise_cost(steps, trial, model, work.to_go)
         added += final_added(trial.states[steps], trial.controls[steps - 1], steps, model.final)
         if cost + added < bound:
             return cost + added, cost, fraction

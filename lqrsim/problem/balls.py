@@ -68,7 +68,15 @@ class Places:
         return len(self.functions) + len(self.data)
 
     def world_seen(self, world: World, space: Coordinates) -> World:
-        """The obstacles, in the coordinates that the places are in."""
+        """The obstacles in the coordinates of the places.
+
+        Args:
+          world: the obstacles.
+          space: the coordinates of the states.
+
+        Returns:
+          A World.
+        """
         return world.seen_by(space.plane, space.offset) if self.in_plane else world.seen_by(SPACE)
 
 
@@ -169,7 +177,17 @@ class Balls:
         return f"{name_of(self.function)}(x, p)"
 
     def bind(self, dynamics: Dynamics) -> Places:
-        """The places for a system. Raises InputError if they do not fit it."""
+        """Bind the places to a system.
+
+        Args:
+          dynamics: of the system whose states move the balls.
+
+        Returns:
+          The `Places`.
+
+        Raises:
+          InputError: the places do not fit the system.
+        """
         if self.level != "symbolic":
             return self._bind_functions(dynamics)
         n, constants = len(dynamics.state_coordinates), dynamics.constants
@@ -261,6 +279,13 @@ class Balls:
         """The middle of each ball, (..., K, 3), at states (..., n), in the world and in metres.
 
         Of places in a plane that is seen from above, the height is 0.
+
+        Args:
+          dynamics: of the system whose states move the balls.
+          states: (..., n).
+
+        Returns:
+          (..., K, 3), world coordinates in metres.
         """
         check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
         states = vectors_of("states", states, len(dynamics.state_coordinates))
@@ -330,11 +355,14 @@ def _call(places: Places, name: str, states: Array, *outputs: Array) -> None:
             raise error
 
 
-def clearances(balls: Balls, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> Array:
-    """Signed distance of each ball to the nearest obstacle minus its radius, (..., K), at states (..., n)."""
+def clearances(balls: Balls, dynamics: Dynamics, world: World, states: npt.ArrayLike, times: Array) -> Array:
+    """Signed distance of each ball to the nearest obstacle minus its radius, (T, K).
+
+    At states (T, n), and for obstacles that move at the times (T,) in s.
+    """
     places = balls.bind(dynamics)
     seen = places.world_seen(world, dynamics.state_coordinates)
-    return distances.signed_distance(seen, evaluate(places, len(balls), states)) - balls.radii
+    return distances.signed_distance_at(seen, evaluate(places, len(balls), states), times) - balls.radii
 
 
 @functools.cache

@@ -26,12 +26,9 @@ from lqrsim.errors import (
     check_name,
     check_number,
     excerpt,
-    real,
 )
-from lqrsim.kernels import ball_clearance, clearance, state_bound
-from lqrsim.problem.balls import Balls, bind_outline, check_outline
+from lqrsim.kernels import state_bound
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.scenes.world import World
 
 EQUALITY_TOLERANCE = 1e-6  # how closely equalities are kept, where `constraint_tolerance` is no smaller
 STEPS = ("all", "final")  # at which a constraint can act
@@ -87,85 +84,38 @@ class Constraint(abc.ABC):
 
     @abc.abstractmethod
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        """This constraint for a system. Raises InputError if it does not fit."""
+        """Bind the constraint to a system.
+
+        Args:
+          dynamics: of the system.
+
+        Returns:
+          The ConstraintTerm that solvers use.
+
+        Raises:
+          InputError: it does not fit the system.
+        """
+
+    @property
+    def moving(self) -> bool:
+        """Whether it changes with time; see `_bind_at`."""
+        return False
+
+    def _bind_at(self, dynamics: Dynamics, times: Array) -> ConstraintTerm:
+        """This constraint for a system and the times (T+1,) in s of a problem's knots."""
+        return self.bind(dynamics)
 
     def ahead(self, steps: int) -> "Constraint":
-        """What is left of it after so many steps: itself, unless it says something else of each."""
+        """The constraint after `steps` steps are over: itself, unless it differs from step to step.
+
+        Args:
+          steps: how many steps are over.
+
+        Returns:
+          A Constraint.
+        """
         check_count("steps", steps, at_least=0)
         return self
-
-
-class Clearance(Constraint):
-    """At least `margin` between the robot and each obstacle, at the steps; walls are obstacles too.
-
-    An ObstacleCost keeps away from obstacles as far as that pays, and can end inside one; this does not. Only at a
-    start that is given exactly, about which nothing can be done, it does not act. Between two steps a plan can come a
-    little nearer, by `v^2 dt^2 / 8 r` at the speed v along an obstacle of radius r, and what is thinner than a step is
-    long it can step over. Which way round is better only a cost says: have an ObstacleCost, too, if only of a small
-    weight, and the search has something to go by.
-
-    Args:
-      world: the obstacles; a robot in the plane sees them as for an ObstacleCost.
-      radius, balls: of the robot, one of the two, as for an ObstacleCost.
-      margin: what is to be left beyond that, in metres; a number, or one for each of the T + 1 knots, or (T + 1, O),
-        one for each knot and obstacle, as the robot sees the world.
-    """
-
-    def __init__(
-        self,
-        world: World,
-        *,
-        radius: float | None = None,
-        balls: Balls | None = None,
-        margin: float | npt.ArrayLike = 0.0,
-    ) -> None:
-        if not isinstance(world, World):
-            raise InputError(f"Clearance: world: got {excerpt(world)}, want a World, such as scene.world")
-        self.world, self.balls = world, balls
-        self.radius = check_outline("Clearance", radius, balls)
-        given = real("Clearance: margin", margin)
-        if given.ndim == 0:
-            self.margin: float | Array = check_number("Clearance: margin", margin)
-        else:
-            self.margin = check_array("Clearance: margin", margin, (None,) * min(given.ndim, 2))
-            if not self.margin.size:
-                raise InputError("Clearance: margin: got no numbers, want one, or one for each knot")
-
-    def ahead(self, steps: int) -> "Clearance":
-        steps = check_count("steps", steps, at_least=0)
-        if not isinstance(self.margin, np.ndarray):
-            return self
-        left = self.margin[min(steps, len(self.margin) - 1) :]
-        return Clearance(self.world, radius=self.radius if self.balls is None else None, balls=self.balls, margin=left)
-
-    def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        balls = self.balls
-        places, world = bind_outline("Clearance", balls, dynamics, self.world)
-        margins = np.atleast_1d(self.margin).reshape(np.shape(self.margin)[0] if np.ndim(self.margin) else 1, -1)
-        if margins.shape[1] not in (1, len(world)):
-            want = f"{len(world)}, one an obstacle: {', '.join(world.names)}"
-            raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
-
-        def describe(row: int) -> str:
-            ball, place = divmod(row, len(world))
-            own, who = margins[:, place % margins.shape[1]], "" if balls is None else f" of {balls.names[ball]!r}"
-            low, high = f"{own.min():g}", f"{own.max():g}"
-            said = low if low == high else f"{low} to {high}"
-            return f"a clearance of {said} m{who} to obstacle {world.names[place]!r}"
-
-        if balls is None or places is None:
-            data = np.concatenate([margins.shape, (self.radius + margins).ravel(), world.table.ravel()])
-            source = source_of(clearance, AXES=dynamics.state_coordinates.position)
-            return ConstraintTerm(source, data, len(world), describe)
-        own = [*margins.shape, len(world), *balls.radii, *margins.ravel(), *world.table.ravel()]
-        return ConstraintTerm(
-            source=f"{places.source}\n\n{source_of(ball_clearance, AT=places.numbers, BALLS=len(balls))}",
-            data=np.concatenate([places.data, own]),
-            rows=len(balls) * len(world),
-            describe=describe,
-            balls=len(balls),
-            functions=places.functions,
-        )
 
 
 class SymbolicConstraint(Constraint):
@@ -296,7 +246,8 @@ class StateBounds(Constraint):
     Nor at the end on a state that a GoalState fixes there, which may be at its bound.
 
     Args:
-      low, high: name of a state -> the least and the most it may be, in its unit.
+      low: name of a state -> its lower bound, in its unit.
+      high: name of a state -> its upper bound, in its unit.
     """
 
     def __init__(self, low: Mapping[str, float] | None = None, high: Mapping[str, float] | None = None) -> None:
@@ -342,19 +293,18 @@ def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int,
     return goals
 
 
-def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, steps: int) -> tuple[ConstraintTerm, ...]:
-    """The constraints for a system and so many steps. Raises InputError if they do not fit it, or each other."""
-    goals, terms = goals_of(constraints, dynamics), []
+def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array) -> tuple[ConstraintTerm, ...]:
+    """The constraints for a system and the times (T+1,) in s of the knots.
+
+    Raises:
+      InputError: they do not fit it, or each other.
+    """
+    goals, terms, steps = goals_of(constraints, dynamics), [], len(times) - 1
     for constraint in constraints:
         if isinstance(constraint, StateBounds):
             term = constraint._bind_to_goal(dynamics, goals, steps)
         else:
-            term = constraint.bind(dynamics)
-        margins = len(np.atleast_1d(constraint.margin)) if isinstance(constraint, Clearance) else 1
-        if margins not in (1, steps + 1):
-            raise InputError(
-                f"Clearance: margin: got {margins} numbers, want one, or one for each of {steps + 1} knots"
-            )
+            term = constraint._bind_at(dynamics, times)
         terms.append(check_kind(f"{type(constraint).__name__}.bind", term, ConstraintTerm, "a ConstraintTerm"))
     return tuple(terms)
 

@@ -88,7 +88,26 @@ class Cost(abc.ABC):
 
     @abc.abstractmethod
     def bind(self, dynamics: Dynamics) -> Term:
-        """This cost for a system. Raises InputError if it does not fit (a weight of the wrong size, say)."""
+        """Bind the cost to a system.
+
+        Args:
+          dynamics: of the system.
+
+        Returns:
+          The Term that solvers use.
+
+        Raises:
+          InputError: it does not fit the system.
+        """
+
+    @property
+    def moving(self) -> bool:
+        """Whether it changes with time; see `_bind_at`."""
+        return False
+
+    def _bind_at(self, dynamics: Dynamics, times: Array) -> Term:
+        """This cost for a system and the times (T+1,) in s of a problem's knots."""
+        return self.bind(dynamics)
 
     def __add__(self, other: "Cost") -> "CostSum":
         return CostSum((*terms_of(self), *terms_of(other)))
@@ -161,9 +180,11 @@ class ObstacleCost(Cost):
 
     Args:
       world: the obstacles.
-      radius: of the robot at its position, in metres. balls: the robot in its place, as `robot.balls`; one of the two.
-        With balls the attribute `radius` is that of the largest.
-      sharpness: in 1/m. weight: cost of touching one obstacle, with one ball, for one step.
+      radius: of the robot at its position, in metres.
+      balls: the robot in its place, as `robot.balls`; one of the two. With balls the attribute `radius` is that of the
+        largest.
+      sharpness: in 1/m.
+      weight: cost of touching one obstacle, with one ball, for one step.
     """
 
     def __init__(
@@ -183,20 +204,36 @@ class ObstacleCost(Cost):
         self.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
 
     def weighing(self, weight: float) -> "ObstacleCost":
-        """The same with another weight."""
+        """The same cost with another weight.
+
+        Args:
+          weight: cost of touching one obstacle, with one ball, for one step.
+
+        Returns:
+          An ObstacleCost.
+        """
         radius = self.radius if self.balls is None else None
         return ObstacleCost(self.world, radius=radius, balls=self.balls, sharpness=self.sharpness, weight=weight)
 
+    @property
+    def moving(self) -> bool:
+        return self.world.moving
+
     def bind(self, dynamics: Dynamics) -> Term:
+        return self._bind_at(dynamics, np.zeros(1))
+
+    def _bind_at(self, dynamics: Dynamics, times: Array) -> Term:
         places, world = bind_outline("ObstacleCost", self.balls, dynamics, self.world)
+        tables = world.tables(times)
         if self.balls is not None and places is not None:
-            return self._bind_balls(self.balls, places, world)
+            return self._bind_balls(self.balls, places, tables)
         position = dynamics.state_coordinates.position
-        data = np.concatenate([[self.radius, self.sharpness, self.weight, len(world)], world.table.ravel()])
+        first = [self.radius, self.sharpness, self.weight, len(world), len(tables)]
+        data = np.concatenate([first, tables.ravel()])
         return Term(source_of(obstacle_cost, AXES=position), data, nonconvex_in=position, factor=2)
 
-    def _bind_balls(self, balls: Balls, places: Places, world: World) -> Term:
-        own = np.concatenate([[self.sharpness, self.weight, len(world)], balls.radii, world.table.ravel()])
+    def _bind_balls(self, balls: Balls, places: Places, tables: Array) -> Term:
+        own = np.concatenate([[self.sharpness, self.weight, tables.shape[1], len(tables)], balls.radii, tables.ravel()])
         count, axes = len(balls), places.depends_on
         kernel = source_of(ball_cost, AT=places.numbers, BALLS=count, PLACES=3 * count, AXES=axes)
         return Term(
@@ -271,7 +308,7 @@ class SymbolicCost(Cost):
 
 
 class FunctionCost(Cost):
-    """A cost given as a numba or a plain Python function, for what `SymbolicCost` can not express.
+    """A cost given as a numba or a plain Python function, for what `SymbolicCost` cannot express.
 
     Args:
       function: `function(x, u, p)` of NumPy arrays x (n,) and u (m,), which must not be changed; returns the cost.

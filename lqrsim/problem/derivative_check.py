@@ -11,19 +11,21 @@ from lqrsim.errors import Array, InputError, check_count, check_number, check_se
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import Term, terms_of
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.noise import NoiseTerm
 from lqrsim.problem.problem import FixedState, Problem
 
 
 def functions_of(problem: Problem) -> list[UserFunction]:
     """The numba and plain Python functions of a problem."""
     terms = [term for name in ("initial", "stage_cost", "final_cost") for term in problem.terms(name)]
-    parts = (problem.dynamics, *terms, *problem.constraint_terms)
+    parts = (problem.dynamics, *terms, *problem.constraint_terms, *_noise(problem))
     return [function for part in parts for function in part.functions]
 
 
 def check_functions(problem: Problem, x: Array, u: Array) -> None:
     """Call each numba and plain Python function once. Raises InputError if one does not return what it should."""
-    for part in (problem.dynamics, *(term for _, term in _terms(problem)), *problem.constraint_terms):
+    parts = (problem.dynamics, *(term for _, term in _terms(problem)), *problem.constraint_terms, *_noise(problem))
+    for part in parts:
         for function in part.functions:
             parameters = dict(zip(function.parameters, part.data.tolist(), strict=False))
             values = function.call(x, u, parameters)
@@ -32,6 +34,10 @@ def check_functions(problem: Problem, x: Array, u: Array) -> None:
                 z[i] += 1e-2 * max(1.0, abs(z[i]))
                 if not np.array_equal(function.call(z[: len(x)], z[len(x) :], parameters), values, equal_nan=True):
                     raise InputError(f"{function.name}: got a value that depends on {name}, want it in depends_on")
+
+
+def _noise(problem: Problem) -> tuple[NoiseTerm, ...]:
+    return () if problem.noise_term is None else (problem.noise_term,)
 
 
 def check_start(problem: Problem, x: Array, u: Array) -> None:
@@ -124,8 +130,12 @@ class DerivativeCheck:
     Attributes:
       what: which derivative: `df/dx of ...`, say.
       error: largest difference over entries and samples, relative to the entry and the differences' own rounding.
-      row, column: the names at that entry.
-      stated, difference: the two values there. state (n,), control (m,): where that was.
+      row: the name of the output at that entry.
+      column: the name of the input at that entry.
+      stated: the stated derivative there.
+      difference: the difference quotient there.
+      state: (n,), where that was.
+      control: (m,), where that was.
       tolerance: what the error must not exceed.
     """
 
@@ -173,8 +183,10 @@ def check_derivatives(
 
     Args:
       subject: dynamics, looked at around zero, or a problem, around its start and nominal control.
-      samples: how many points. spread: their standard deviation, in the units of states and controls.
-      tolerance: of the error, relative to each entry. seed: of the points.
+      samples: how many points.
+      spread: their standard deviation, in the units of states and controls.
+      tolerance: of the error, relative to each entry.
+      seed: of the points.
 
     Returns:
       One check a matrix of derivatives, with the worst entry by row and column; print it. `check.good` is the verdict.

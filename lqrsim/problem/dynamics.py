@@ -56,7 +56,8 @@ class Dynamics:
     Args:
       f: `f(x, u, p)`; returns one entry a state. x (n,) and u (m,) must not be changed; p has the parameters as
         attributes.
-      states, controls: name -> unit, in order.
+      states: name -> unit, in order; n of them.
+      controls: name -> unit, in order; m of them.
       parameters: name -> value. Values are data: changing one compiles nothing.
       disturbances: what is unknown when planning, as a wind or the share of its force that a motor has left: name ->
         the value that the plan takes for granted, mostly 0 or 1. To f they are parameters. Plans know them as constants
@@ -64,8 +65,9 @@ class Dynamics:
         knows: wind_x, wind_y, wind_z in m/s; force_x, ... in N; torque_x, ... in N m; in the world's axes.
       position: names of the 2 or 3 states that are the robot's position in the world, in metres. A robot in space has
         x, y and z, in this order.
-      plane, offset: in which plane a position of 2 states is, as "xz", and where that is along the third axis, in
-        metres: see `Coordinates`. By default the plane is that of the names, if they say two of x, y and z.
+      plane: in which plane a position of 2 states is, as "xz"; see `Coordinates`. By default that of the names, if they
+        are two of x, y and z.
+      offset: where the plane is along the third axis, in metres.
       angles: names of the states that are angles in radians, equal up to whole turns.
       rotation_vectors: names, by threes, of the states that are rotation vectors.
       control_limits: lowest and highest control, numbers or (m,); what the actuators can do, for execution.
@@ -162,7 +164,7 @@ class Dynamics:
         self.functions = self._functions()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what is derived and can not be pickled."""
+        """Without what is derived and cannot be pickled."""
         return {name: value for name, value in vars(self).items() if name not in ("_plain", "disturbed")}
 
     @property
@@ -171,7 +173,14 @@ class Dynamics:
         return name_of(self.f)
 
     def with_parameters(self, **values: float) -> "Dynamics":
-        """The same with other values of some parameters: `dynamics.with_parameters(mass=0.6)`. Nothing compiles again.
+        """The same dynamics with other values of some parameters: `dynamics.with_parameters(mass=0.6)`. Nothing
+        compiles again.
+
+        Args:
+          **values: parameter -> number.
+
+        Returns:
+          Dynamics.
 
         Raises:
           InputError: there is no such parameter, or the value is not finite.
@@ -245,27 +254,64 @@ class Dynamics:
         )
 
     def period_near(self, dt: float) -> float:
-        """The duration nearest to `dt` seconds that they can be stepped by: that, but where MuJoCo steps them."""
+        """The possible duration of a step nearest to `dt`: `dt` itself, except where MuJoCo does the steps.
+
+        Args:
+          dt: seconds.
+
+        Returns:
+          Seconds.
+        """
         return check_number("dt", dt)
 
     def check_period(self, dt: float) -> None:
-        """Raises InputError if they cannot be stepped by `dt` seconds; they always can, but where MuJoCo steps them."""
+        """Check that a step can last `dt` seconds. It always can, except where MuJoCo does the steps.
+
+        Args:
+          dt: seconds.
+
+        Raises:
+          InputError: it cannot.
+        """
         check_number("dt", dt)
 
     def solving(self, threads: int) -> contextlib.AbstractContextManager[None]:
-        """What lasts while a solver is at work that may use so many threads for one trajectory."""
+        """A context that lasts while a solver is at work.
+
+        Args:
+          threads: how many threads the solver may use for one trajectory.
+
+        Returns:
+          A context manager.
+        """
         check_count("threads", threads)
         return contextlib.nullcontext()
 
     def rate(self, state: npt.ArrayLike, control: npt.ArrayLike) -> Array:
-        """`xdot` (n,) at one state (n,) and control (m,), in plain Python."""
+        """`xdot` (n,) at one state (n,) and control (m,), in plain Python.
+
+        Args:
+          state: (n,).
+          control: (m,).
+
+        Returns:
+          (n,), per second.
+        """
         x, u = self._check(state, control)
         out = np.zeros(len(x))
         self._plain["rate"](x, u, self._numbers(), out)
         return out
 
     def rate_jacobian(self, state: npt.ArrayLike, control: npt.ArrayLike) -> tuple[Array, Array]:
-        """df/dx (n, n) and df/du (n, m) at one state and control, in plain Python."""
+        """df/dx (n, n) and df/du (n, m) at one state and control, in plain Python.
+
+        Args:
+          state: (n,).
+          control: (m,).
+
+        Returns:
+          df/dx (n, n) and df/du (n, m).
+        """
         x, u = self._check(state, control)
         n, m = len(x), len(u)
         fx, fu = np.zeros((n, n)), np.zeros((n, m))
@@ -273,14 +319,32 @@ class Dynamics:
         return fx, fu
 
     def step(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> Array:
-        """The state (n,) after `dt` seconds (negative: before), control held: one Runge-Kutta step, in plain Python."""
+        """The state (n,) after `dt` seconds (negative: before), control held: one Runge-Kutta step, in plain Python.
+
+        Args:
+          state: (n,).
+          control: (m,), held over the step.
+          dt: seconds; negative steps lead backwards in time.
+
+        Returns:
+          (n,).
+        """
         x, u = self._check(state, control)
         out = np.zeros(len(x))
         self._plain["advance"](x, u, self._numbers(), check_number("dt", dt), out)
         return out
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
-        """A (n, n), B (n, m) and c (n,) of the step about a state and control: x' = A x + B u + c. Eqs. (24)-(25)."""
+        """A (n, n), B (n, m) and c (n,) of the step about a state and control: x' = A x + B u + c. Eqs. (24)-(25).
+
+        Args:
+          state: (n,).
+          control: (m,), held over the step.
+          dt: seconds.
+
+        Returns:
+          A (n, n), B (n, m) and c (n,).
+        """
         x, u = self._check(state, control)
         n, m = len(x), len(u)
         out, jacobian = np.zeros(n), np.zeros((n, n + m))

@@ -21,9 +21,15 @@ class Stage:
     A, B and R may be left out and is zero then. Paper: Eqs. (4), (7).
 
     Attributes:
-      A: (..., n, n). B: (..., n, m). c: (..., n).
-      Q: (..., n, n) symmetric. P: (..., m, n). R: (..., m, m) symmetric, positive definite.
-      q: (..., n). r: (..., m). constant: (...).
+      A: (..., n, n).
+      B: (..., n, m).
+      c: (..., n).
+      Q: (..., n, n) symmetric.
+      P: (..., m, n).
+      R: (..., m, m) symmetric, positive definite.
+      q: (..., n).
+      r: (..., m).
+      constant: (...).
 
     Raises:
       InputError: shapes that do not fit together, numbers that are not finite, Q or R not symmetric.

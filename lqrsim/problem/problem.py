@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,13 +24,21 @@ from lqrsim.problem.balls import evaluate
 from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, goals_of
 from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost, Term, terms_of
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
 
 
 @dataclass(frozen=True)
 class FixedState:
-    """An initial state (n,) that is given exactly, in place of an initial cost."""
+    """An initial state (n,) that is given exactly, in place of an initial cost.
+
+    Attributes:
+      state: (n,).
+
+    Raises:
+      InputError: not finite numbers (n,).
+    """
 
     state: npt.ArrayLike
 
@@ -47,7 +55,8 @@ class Problem:
 
     Attributes:
       dynamics: whose Runge-Kutta step over `dt`, control held, is g.
-      dt: the control period in seconds. steps: T, the number of them.
+      dt: the control period in seconds.
+      steps: T, the number of them.
       initial: c_0, the cost of starting elsewhere than wished (the paper's soft start); or `FixedState(x)`.
       stage_cost: c, per step: it is *not* multiplied by dt.
       final_cost: c_T.
@@ -55,6 +64,11 @@ class Problem:
         ones plan as if there were none. Plan and policy keep them exactly, and the policy keeps the actuators', too.
       constraints: what the plan must keep to at the steps; see `SymbolicConstraint`, `GoalState`, `StateBounds` and
         `Clearance`.
+      begin: the time in s at which it begins, for obstacles that move: where they are at 0, their positions say.
+      noise: what drives the dynamics besides: x_{t+1} = g(x_t, u_t) + M(x_t, u_t) w_t. The cost is then an expectation,
+        worked out to second order about the plan. None for none.
+      risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it shuns
+        runs that cost much, below 0 it hopes for those that cost little; 0 is the expectation.
 
     Raises:
       InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
@@ -70,12 +84,17 @@ class Problem:
     final_cost: Cost
     control_limits: tuple[npt.ArrayLike, npt.ArrayLike] | None = None
     constraints: Sequence[Constraint] = ()
+    begin: float = 0.0
+    noise: Noise | None = None
+    risk: float = 0.0
     _terms: dict[str, tuple[Term, ...]] = field(init=False, repr=False, compare=False)
     _constraint_terms: tuple[ConstraintTerm, ...] = field(init=False, repr=False, compare=False)
+    _noise_term: NoiseTerm | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dt", check_number("dt", self.dt, above=0.0))
         object.__setattr__(self, "steps", check_count("steps", self.steps))
+        object.__setattr__(self, "begin", check_number("begin", self.begin))
         if not isinstance(self.dynamics, Dynamics):
             raise InputError(f"dynamics: got {excerpt(self.dynamics)}, want Dynamics(...), such as robot.dynamics")
         self.dynamics.check_period(self.dt)
@@ -87,15 +106,20 @@ class Problem:
             costs["initial"] = (QuadraticCost(np.zeros(len(state)), about=state),)
         else:
             costs["initial"] = terms_of(self.initial, "initial")
-        bound = {name: tuple(_bound(cost, self.dynamics) for cost in terms) for name, terms in costs.items()}
+        bound = {name: self._bound(terms) for name, terms in costs.items()}
         for name in ("initial", "final_cost"):
             if any(term.uses_control for term in bound[name]):
                 raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
         object.__setattr__(self, "_terms", bound)
         wanted = "a list of constraints, such as [Clearance(...)]"
         object.__setattr__(self, "constraints", check_items("constraints", self.constraints, Constraint, wanted))
-        terms = bind_all(self.constraints, self.dynamics, self.steps)
+        terms = bind_all(self.constraints, self.dynamics, self.times)
         object.__setattr__(self, "_constraint_terms", terms)
+        check_kind("noise", self.noise, (Noise, type(None)), "a Noise, or None")
+        object.__setattr__(self, "_noise_term", None if self.noise is None else self.noise.bind(self.dynamics))
+        object.__setattr__(self, "risk", check_number("risk", self.risk))
+        if self.risk and self.noise is None:
+            raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
         if self.control_limits is not None:
             try:
                 low, high = self.control_limits
@@ -108,10 +132,34 @@ class Problem:
             object.__setattr__(self, "control_limits", (limited.low, limited.high))
         self._check_start_clear()
 
+    @property
+    def times(self) -> Array:
+        """When its knots are, (T+1,) in s: see `begin`."""
+        return self.begin + self.dt * np.arange(self.steps + 1)
+
+    @property
+    def moving(self) -> bool:
+        """Whether it changes with the time at which it begins: whether obstacles move."""
+        return any(one.moving for one in (*terms_of(self.stage_cost), *self.constraints))
+
+    def _bound(self, costs: tuple[Cost, ...]) -> tuple[Term, ...]:
+        """The costs for the system. Raises InputError if what is bound is no term."""
+        return tuple(
+            check_kind(f"{type(cost).__name__}.bind", cost._bind_at(self.dynamics, self.times), Term, "a Term")
+            for cost in costs
+        )
+
     def from_state(self, state: npt.ArrayLike, *, after: int = 0) -> "Problem":
-        """What is left of it after so many steps, from a state (n,) that is given exactly.
+        """The rest of the problem after some steps, from a state that is given exactly.
 
         It may begin within an obstacle, unlike a problem that is stated: there a plan is to find out of it.
+
+        Args:
+          state: (n,).
+          after: how many steps are over.
+
+        Returns:
+          A Problem.
 
         Raises:
           InputError: the state is not one, or no step is left.
@@ -124,12 +172,29 @@ class Problem:
             object.__setattr__(term, "data", np.concatenate([here, term.data[len(here) :]]))
         else:
             term = QuadraticCost(np.zeros(len(here)), about=here).bind(self.dynamics)
-        changed: dict[str, Any] = {"initial": start, "_terms": self._terms | {"initial": (term,)}}
-        if after:
-            steps, constraints = self.steps - after, tuple(one.ahead(after) for one in self.constraints)
-            terms = bind_all(constraints, self.dynamics, steps)
-            changed |= {"steps": steps, "constraints": constraints, "_constraint_terms": terms}
-        # All of it was checked when it was stated, and this is done at every solve of a robot that plans as it goes.
+        other = self._with(initial=start, _terms=self._terms | {"initial": (term,)})
+        if not after:
+            return other
+        left, begin = tuple(one.ahead(after) for one in self.constraints), self.begin + after * self.dt
+        return other._with(steps=self.steps - after, begin=begin, constraints=left)._bound_anew()
+
+    def later(self, seconds: float) -> "Problem":
+        """The same with a later begin, by when obstacles that move have gone on."""
+        other = self._with(begin=self.begin + check_number("seconds", seconds))
+        return other._bound_anew() if self.moving else other
+
+    def _bound_anew(self) -> "Problem":
+        """The same with all that depends on the steps or on when it begins as it then is."""
+        stage = zip(terms_of(self.stage_cost), self._terms["stage_cost"], strict=True)
+        terms = tuple(self._bound((cost,))[0] if cost.moving else term for cost, term in stage)
+        constraints = bind_all(self.constraints, self.dynamics, self.times)
+        return self._with(_terms=self._terms | {"stage_cost": terms}, _constraint_terms=constraints)
+
+    def _with(self, **changed: Any) -> "Problem":
+        """The same with other parts, without a check.
+
+        All of it was checked when it was stated, and this is done at every solve of a robot that plans as it goes.
+        """
         other = copy.copy(self)
         for name, value in changed.items():
             object.__setattr__(other, name, value)
@@ -193,13 +258,30 @@ class Problem:
         return tuple(cost for cost in terms_of(self.stage_cost) if isinstance(cost, ObstacleCost))
 
     def terms(self, which: str) -> tuple[Term, ...]:
-        """The bound terms of `initial`, `stage_cost` or `final_cost`."""
+        """The bound terms of `initial`, `stage_cost` or `final_cost`.
+
+        Args:
+          which: "initial", "stage_cost" or "final_cost".
+
+        Returns:
+          The terms, one for each cost that was added.
+        """
         return self._terms[check_name("which", which, self._terms)]
 
     @property
     def constraint_terms(self) -> tuple[ConstraintTerm, ...]:
         """The bound constraints."""
         return self._constraint_terms
+
+    @property
+    def noise_term(self) -> NoiseTerm | None:
+        """The bound noise."""
+        return self._noise_term
+
+    def driven_by(self, noise: Noise | None, risk: float | None) -> "Problem":
+        """The same under other noise, or another risk; of what is None, its own."""
+        changed = {name: value for name, value in (("noise", noise), ("risk", risk)) if value is not None}
+        return replace(self, **changed) if changed else self
 
     @property
     def digest(self) -> str:
@@ -220,6 +302,9 @@ class Problem:
             functions += term.functions
             if term.equality or term.final_only:
                 parts.append(repr((term.equality, term.final_only)))
+        if self._noise_term is not None:
+            parts += [self._noise_term.source, self._noise_term.data, repr((self._noise_term.filled, self.risk))]
+            functions += self._noise_term.functions
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
 
     def _check_start_clear(self) -> None:
@@ -229,11 +314,13 @@ class Problem:
         space = self.dynamics.state_coordinates
         for cost in self.obstacle_costs:
             if cost.balls is None:
-                world, places = cost.world.seen_by(space.plane, space.offset), self.start[None, list(space.position)]
+                world = cost.world.moved(self.begin).seen_by(space.plane, space.offset)
+                places = self.start[None, list(space.position)]
                 parts = [("a start", "the robot's radius", cost.radius)]
             else:
                 bound = cost.balls.bind(self.dynamics)
-                world, places = bound.world_seen(cost.world, space), evaluate(bound, len(cost.balls), self.start)
+                world = bound.world_seen(cost.world.moved(self.begin), space)
+                places = evaluate(bound, len(cost.balls), self.start)
                 balls = zip(cost.balls.names, cost.balls.radii, strict=True)
                 parts = [(f"a start with {name!r}", "its radius", radius) for name, radius in balls]
             for place, (what, whose, radius) in zip(places, parts if len(world) else (), strict=False):
@@ -245,12 +332,6 @@ class Problem:
                         f"initial: got {what} at ({where}) m, {-distances.min():.3g} m inside obstacle {name!r},"
                         f" want it clear of obstacles by {whose} of {radius:g} m"
                     )
-
-
-def _bound(cost: Cost, dynamics: Dynamics) -> Term:
-    """The cost for a system. Raises InputError if what is bound is no term."""
-    wanted = "a Term"
-    return check_kind(f"{type(cost).__name__}.bind", cost.bind(dynamics), Term, wanted)
 
 
 def _check_within_reach(limits: Coordinates, actuators: Coordinates) -> None:

@@ -39,8 +39,13 @@ def report(
     """Writes one HTML page of a campaign, with everything in it; returns its path.
 
     Args:
-      videos: how many of the worst trials to run again and film. Without OpenGL the page says that there are none.
+      results: the campaign.
+      out: FILE.html.
+      videos: number of the worst trials to repeat and render. Without OpenGL the page says that there are none.
       progress: called with the parts that are done, and all of them.
+
+    Returns:
+      The path of the page.
 
     Raises:
       InputError: nothing has been run yet; something is damaged; the scenario is one of yours, and `results` was not
@@ -67,10 +72,10 @@ def report(
             _sweep(name, table, scenario, results.campaign, Path(folder)) for name in results.campaign.sweeps
         ]
         tell(2, parts)
-        filmed = videos_of_worst(results, table, videos, Path(folder))
-        page["videos_note"] = next(filmed)
+        rendered = videos_of_worst(results, table, videos, Path(folder))
+        page["videos_note"] = next(rendered)
         page["videos"] = []
-        for number, video in enumerate(filmed):
+        for number, video in enumerate(rendered):
             page["videos"].append(video)
             tell(3 + number, parts)
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
@@ -92,7 +97,7 @@ def _text_and_tables(results: Results, table: analysis.Table, scenario: Scenario
         warnings.append(f"{erred} trials did not run through; they count as failures.")
     warnings += [f"{line}." for line in results.came_to_nothing()]
     commands = {
-        "To go on with the campaign, or to repair it": results.command,
+        "To resume or repair the campaign": results.command,
         "This page": results.command_of("report"),
     }
     return {

@@ -1,4 +1,4 @@
-"""The videos of a report: the worst trial of each policy and sweep, run again and filmed, as text for the page."""
+"""The videos of a report: the worst trial of each policy and sweep, run again and rendered, as text for the page."""
 
 import base64
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ def videos_of_worst(results: Results, table: analysis.Table, count: int, folder:
         except InputError as error:
             problem = str(error)
     if not chosen:
-        yield "None were asked for." if count == 0 else "There is no trial to film."
+        yield "No videos were requested." if count == 0 else "There is no trial to render."
     elif problem:
         yield f"There are none, for no pictures can be drawn here: {problem}"
     else:

@@ -43,7 +43,8 @@ class Coordinates:
         `World.seen_by`.
       angles: indices of the entries that are angles in radians, equal up to whole turns.
       rotation_vectors: index of the first of each three entries that are a rotation vector, axis times angle in rad.
-      low, high: limits of each entry, (len(names),); infinite where there is none.
+      low: lower limit of each entry, (len(names),); -inf where there is none.
+      high: upper limit of each entry, (len(names),); inf where there is none.
     """
 
     names: tuple[str, ...]
@@ -154,7 +155,11 @@ class Coordinates:
         """Points (..., 3) in the world of positions (..., 2 or 3).
 
         Args:
+          places: (..., d), d position coordinates in metres.
           height: in metres, of those that are seen from above; the rest have their own.
+
+        Returns:
+          Points (..., 3).
 
         Raises:
           InputError: not numbers of such a shape, or there is no position.
@@ -170,6 +175,12 @@ class Coordinates:
     def of_world(self, points: npt.ArrayLike) -> Array:
         """Positions (..., 2 or 3) of points (..., 3) in the world; what is across the plane is left out.
 
+        Args:
+          points: (..., 3), in metres.
+
+        Returns:
+          Positions (..., d).
+
         Raises:
           InputError: not numbers of such a shape.
         """
@@ -184,7 +195,11 @@ class Coordinates:
         """The representative of `vector` nearest to `near`; angles and rotation vectors are equal up to whole turns.
 
         Args:
-          vector, near: (..., n); leading dimensions broadcast.
+          vector: (..., n).
+          near: (..., n); leading dimensions broadcast.
+
+        Returns:
+          (..., n).
 
         Raises:
           InputError: not numbers of such shapes.
@@ -202,11 +217,26 @@ class Coordinates:
         return out
 
     def difference(self, vector: npt.ArrayLike, near: npt.ArrayLike) -> Array:
-        """`nearest(vector, near) - near`, (..., n): the error of `vector`, with whole turns taken out."""
+        """The difference `vector - near`, with angles and rotation vectors in the representative nearest to `near`.
+
+        Args:
+          vector: (..., n).
+          near: (..., n); leading dimensions broadcast.
+
+        Returns:
+          (..., n).
+        """
         return self.nearest(vector, near) - vectors_of("near", near, len(self))
 
     def limited(self, low: npt.ArrayLike, high: npt.ArrayLike) -> "Coordinates":
         """The same with other limits, each a number or one an entry.
+
+        Args:
+          low: lower limits, a number or (n,).
+          high: upper limits, a number or (n,).
+
+        Returns:
+          Coordinates with these limits.
 
         Raises:
           InputError: not numbers, or not in order.
@@ -225,7 +255,17 @@ class Coordinates:
         return replace(self, low=tuple(sides[0].tolist()), high=tuple(sides[1].tolist()))
 
     def within(self, other: "Coordinates") -> "Coordinates":
-        """The same with limits that are also the other's. Raises InputError where nothing is within both."""
+        """The same with limits that are also the other's.
+
+        Args:
+          other: as many entries, with limits.
+
+        Returns:
+          Coordinates with the narrower limits.
+
+        Raises:
+          InputError: they have another number of entries, or nothing is within both limits.
+        """
         check_kind("other", other, Coordinates, f"Coordinates of {len(self)} entries")
         if len(other) != len(self):
             raise InputError(f"other: got {len(other)} entries, want {len(self)}: {', '.join(self.names)}")
@@ -233,7 +273,14 @@ class Coordinates:
         return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def clip(self, vector: npt.ArrayLike) -> Array:
-        """`vector` (..., n) held within the limits."""
+        """`vector` (..., n) held within the limits.
+
+        Args:
+          vector: (..., n).
+
+        Returns:
+          (..., n), within the limits.
+        """
         return np.clip(vectors_of("vector", vector, len(self)), self.low, self.high)
 
 

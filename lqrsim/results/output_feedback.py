@@ -33,15 +33,20 @@ class OutputFeedbackPolicy:
     Angles of x are taken nearest to the nominal before, those of y nearest to what is expected. z begins as nominal_0.
 
     Attributes:
-      gain, offset: the law, (T, m, Z) and (T, m).
+      gain: (T, m, Z); u = clip(gain z + offset).
+      offset: (T, m).
       correction: the filter's gain, (T, Z, Y).
-      sensor, sensor_offset: what is measured, of the state, (T, Y, n) and (T, Y).
-      transition, input, drift: to the next control period, (T, Z, Z), (T, Z, m) and (T, Z).
+      sensor: (T, Y, n), of the state: the measurement is sensor x + sensor_offset.
+      sensor_offset: (T, Y).
+      transition: (T, Z, Z), to the next control period: z = transition z + input u + drift.
+      input: (T, Z, m).
+      drift: (T, Z).
       nominal: (T, Z), what z is in an undisturbed run: the state, what the actuators have reached if they lag, the
         states of what disturbs the robot; and, where commands or measurements are late, the commands under way.
       dt: seconds of a control period.
-      state_coordinates, control_coordinates, measured_coordinates: names and units; which entries wrap; the limits that
-        the actuators keep.
+      state_coordinates: names and units of the states, and which of them wrap.
+      control_coordinates: names and units of the controls, and the limits that the actuators keep.
+      measured_coordinates: names and units of the measured numbers, and which of them wrap.
 
     Raises:
       InputError: arrays that do not fit together, or numbers that are not finite.
@@ -100,6 +105,9 @@ class OutputFeedbackPolicy:
           z: (..., Z), from `start` or the call before; it is not changed.
           measurement: (..., Y), angles in any representative; None where it got lost: then it is predicted.
           t: seconds since the start.
+
+        Returns:
+          Controls (..., m), and z (..., Z) for the next period.
 
         Raises:
           InputError: `t` is negative or not finite, or the others are not finite or of another length.

@@ -38,7 +38,8 @@ class AffinePolicy:
       offset: (T, m); bold l.
       nominal: (T, n), the state that each law was made about. Angles of a measured state are taken nearest to it.
       dt: seconds between two laws.
-      state_coordinates, control_coordinates: names and units; which states wrap; the limits that the actuators keep.
+      state_coordinates: names and units of the states, and which of them wrap.
+      control_coordinates: names and units of the controls, and the limits that the actuators keep.
     """
 
     gain: Array
@@ -72,7 +73,15 @@ class AffinePolicy:
         return sha256(self.gain, self.offset, self.nominal, np.float64(self.dt))[:16]
 
     def shifted(self, steps: int, *, horizon: str = "moving") -> "AffinePolicy":
-        """What is left of it after so many steps; see `Solution.shifted`."""
+        """The rest of the policy after `steps` steps; see `Solution.shifted`.
+
+        Args:
+          steps: how many steps are over.
+          horizon: "moving" or "shrinking", as in `Solution.shifted`.
+
+        Returns:
+          An AffinePolicy.
+        """
         steps = check_count("steps", steps, at_least=0, at_most=self.steps - 1)
         filled = check_name("horizon", horizon, HORIZONS) == "moving"
         parts = {name: left_after(steps, getattr(self, name), filled=filled) for name in ("gain", "offset", "nominal")}
@@ -80,6 +89,13 @@ class AffinePolicy:
 
     def control(self, state: npt.ArrayLike, step: int) -> Array:
         """The law of one step before saturation, (..., m), at states (..., n) given in the nominal's representative.
+
+        Args:
+          state: (..., n), in the nominal's representative.
+          step: number of the step, from 0.
+
+        Returns:
+          Controls (..., m), before saturation.
 
         Raises:
           InputError: no such step, counted from 0, or no such states.
@@ -93,6 +109,14 @@ class AffinePolicy:
         Angles and rotation vectors may be given in any representative. The result is held within the control
         limits. Between two knots the earlier law is held, as it is in the plan; `interpolate=True` blends the two
         instead, for controllers that run faster than the plan. After the horizon the last law stays in force.
+
+        Args:
+          state: (..., n), measured; angles and rotation vectors in any representative.
+          t: seconds since the start, 0 or more.
+          interpolate: whether to blend the laws of two knots instead of holding the earlier one.
+
+        Returns:
+          Controls (..., m), within the control limits.
 
         Raises:
           InputError: `t` is negative or not finite, or the state is not finite or not of length n.

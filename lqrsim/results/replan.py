@@ -21,12 +21,17 @@ class Replan:
       status: how the solve ended; see `Status`. The plan can be used whatever it is, unless `cost` is not finite.
       detail: where and why, if it is not a success.
       improved: whether there is a new plan; else this is where the law leads that the solve began with.
-      policy: the feedback law. trajectory: the plan, its rollout by the model.
-      cost: of the plan, start and end included. before: of where the law led that the solve began with.
+      policy: the feedback law.
+      trajectory: the plan, its rollout by the model.
+      cost: of the plan, start and end included.
+      before: of where the law led that the solve began with.
       violation: by how much the worst constraint is missed at the steps; 0 where none is.
-      cost_to_go, multipliers: what the next solve begins with.
-      iterations: how many there were. seconds: how long the solve took. iterating: how much of that, in seconds, the
-        iterations took, and to see where the law leads that the solve began with.
+      cost_to_go: with which the next solve begins.
+      multipliers: with which the next solve begins.
+      iterations: how many there were.
+      seconds: how long the solve took.
+      iterating: how much of that, in seconds, the iterations took, and to see where the law leads that the solve began
+        with.
     """
 
     status: Status
@@ -57,7 +62,15 @@ class Replan:
         return self.status.success
 
     def shifted(self, steps: int, *, horizon: str = "moving") -> "Replan":
-        """What is left of it after so many steps; see `Solution.shifted`."""
+        """The rest of it after `steps` steps; see `Solution.shifted`.
+
+        Args:
+          steps: how many steps are over.
+          horizon: "moving" or "shrinking", as in `Solution.shifted`.
+
+        Returns:
+          A Replan.
+        """
         policy = self.policy.shifted(steps, horizon=horizon)
         plan, value, filled = self.trajectory, self.cost_to_go, horizon == "moving"
 

@@ -38,17 +38,24 @@ class Rollout:
     on equal processors.
 
     Attributes:
-      robot, scene: their names. body: the robot's in the MJCF. model: the MJCF that was run, as text.
-      plan: what the policy meant to do. policy_digest: hash of the policy.
+      robot: its name.
+      body: the robot's in the MJCF.
+      scene: its name.
+      model: the MJCF that was run, as text.
+      plan: what the policy meant to do.
+      policy_digest: hash of the policy.
+      state_coordinates: names and units of the states, and which of them wrap.
+      control_coordinates: names and units of the controls, and their limits.
       goal: (n,) the state that the plan was to reach, NaN in states that do not count; None where it is the plan's end.
       goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: metres, or of the
         scaled error where the goal has no position.
       radius: of the robot's collision circle or sphere, in metres.
       states: (K, T+1, n) true states; angles in the representative nearest the plan.
       measured: (K, T+1, n) the states that the policy was shown.
-      commanded: (K, T, m) what the policy asked for. applied: (K, T, m) what the actuators got, within
-        the robot's limits.
-      forces: (K, T, 3) disturbing force at the robot's centre of mass in N, world axes. torques: the same in N m.
+      commanded: (K, T, m) what the policy asked for.
+      applied: (K, T, m) what the actuators got, within the robot's limits.
+      forces: (K, T, 3) disturbing force at the robot's centre of mass in N, world axes.
+      torques: the same in N m.
       displaced: (K, obstacles, 3) by how much each obstacle is away from where the plan believes it, in metres.
       clearance: (K, T+1) signed distance to the nearest obstacle minus the radius in metres; infinite without any.
       contacts: (K,) control periods from the collision on in which MuJoCo reported a contact of the robot with an
@@ -59,13 +66,16 @@ class Rollout:
         not finite, or its filter had diverged; infinite where nothing was. The states are NaN from there on.
       failed_at: (K,) seconds to the knot at which the controller failed; infinite where it did not. From there on, too.
       reasons: (K) why it failed, or what of its filter diverged; empty where neither was so.
-      frame_times: (F,) seconds; frames: (K, F, nq) MuJoCo's qpos then, for drawing.
+      frame_times: (F,) seconds.
+      frames: (K, F, nq) MuJoCo's qpos then, for drawing.
+      disturbances: one description each.
+      seed: from which the random numbers were drawn.
+      first_trial: number of the first trial, from which its random numbers were drawn.
+      versions: of lqrsim and the libraries that the bits depend on, and the processor.
       tube: (T+1, p, p) covariance of the position about the plan that was predicted for the controller and the
         disturbances, in m^2; p is 2 or 3, as the position has it. None where nobody predicted it; see `predict_tube`.
       collision_chance: (T+1,) the predicted chance of being in collision at each knot, or None.
       balls: where the robot's balls were, if it has any and was recorded for drawing; or None.
-      disturbances: one description each. seed, first_trial: what the draws came from.
-      versions: of lqrsim and the libraries that the bits depend on, and the processor.
     """
 
     robot: str
@@ -223,7 +233,17 @@ class Rollout:
         return self.state_coordinates.plane or ("xyz" if self.balls is not None else "")
 
     def places(self, trial: int) -> Array:
-        """Where the robot was in a trial, (T+1, 2 or 3): its position, or its last ball."""
+        """Places of the robot in a trial: its position, or its last ball.
+
+        Args:
+          trial: row of the rollout.
+
+        Returns:
+          (T+1, 2 or 3), in metres.
+
+        Raises:
+          InputError: there is no such trial.
+        """
         if not check_count("trial", trial, at_least=0) < self.trials:
             raise InputError(f"trial: got {trial}, want one of 0 to {self.trials - 1}")
         if self.state_coordinates.position or self.balls is None:
@@ -238,14 +258,29 @@ class Rollout:
         return self.balls.planned[:, -1]
 
     def in_world(self, places: npt.ArrayLike, *, height: float = 0.0) -> Array:
-        """Points (..., 3) in the world of places (..., 2 or 3); height in metres is that of those seen from above."""
+        """Points (..., 3) in the world of places (..., 2 or 3); height in metres is that of those seen from above.
+
+        Args:
+          places: (..., 2 or 3), in metres.
+          height: in metres, of places that are seen from above.
+
+        Returns:
+          Points (..., 3).
+        """
         space = self.state_coordinates
         if space.position or self.balls is None:
             return space.in_world(places, height=height)
         return vectors_of("places", places, 3)
 
     def of_world(self, points: npt.ArrayLike) -> Array:
-        """Places (..., 2 or 3) of points (..., 3) in the world."""
+        """Places (..., 2 or 3) of points (..., 3) in the world.
+
+        Args:
+          points: (..., 3), in metres.
+
+        Returns:
+          Places (..., 2 or 3).
+        """
         points = vectors_of("points", points, 3)
         return self.state_coordinates.of_world(points) if self.state_coordinates.position else points
 

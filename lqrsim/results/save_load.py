@@ -99,6 +99,13 @@ Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:
     """Write a solution, a rollout or a policy alone; the file is whole or not there. Returns its path.
 
+    Args:
+      result: a Solution, a Rollout or a policy.
+      path: FILE.npz.
+
+    Returns:
+      The path.
+
     Raises:
       InputError: the file cannot be written; or what it would hold could not be read again.
     """
@@ -127,6 +134,12 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
 def load_solution(path: str | os.PathLike[str]) -> Solution:
     """Read what `save` wrote of a Solution. Loading never runs code.
 
+    Args:
+      path: of a file that `save` wrote.
+
+    Returns:
+      The Solution.
+
     Raises:
       InputError: no such file, not a solution, of another version, or anything in it is not what was written.
     """
@@ -134,12 +147,32 @@ def load_solution(path: str | os.PathLike[str]) -> Solution:
 
 
 def load_rollout(path: str | os.PathLike[str]) -> Rollout:
-    """Read what `save` wrote of a Rollout. Raises InputError as `load_solution` does."""
+    """Read what `save` wrote of a Rollout.
+
+    Args:
+      path: of a file that `save` wrote.
+
+    Returns:
+      The Rollout.
+
+    Raises:
+      InputError: the file is missing, damaged or of another kind.
+    """
     return _load(path, "rollout")
 
 
 def load_policy(path: str | os.PathLike[str]) -> AffinePolicy | OutputFeedbackPolicy:
-    """Read what `save` wrote of a policy alone. Raises InputError as `load_solution` does."""
+    """Read what `save` wrote of a policy alone.
+
+    Args:
+      path: of a file that `save` wrote.
+
+    Returns:
+      An AffinePolicy or an OutputFeedbackPolicy.
+
+    Raises:
+      InputError: the file is missing, damaged or of another kind.
+    """
     return _load(path, "policy")
 
 

@@ -47,15 +47,17 @@ class Solution:
       policy: the feedback law, from the last backward pass that was completed.
       inverse_policy: the law that traces the optimum backwards from a state of arrival; None from `ilqr`, and where
         states of arrival cannot be chosen freely, as after a fixed start.
-      cost_to_go, cost_to_come: the value functions of the last passes; None where a pass failed, the latter also from
-        `ilqr`. The cost-to-come is a `Quadratic` in the primal form and `Moments` in the dual.
+      cost_to_go: the value function of the last backward pass, a `Quadratic`; None where a pass failed.
+      cost_to_come: the value function of the last forward pass, a `Quadratic` in the primal form and `Moments` in the
+        dual; None where a pass failed, and from `ilqr`.
       trajectory: the plan: the rollout of the policy under the true dynamics from its first state.
       iterations: the log.
-      clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,);
-        None where the problem has no obstacles.
-      solver, options: what was called, with which settings.
+      clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,); None
+        where the problem has no obstacles.
       certificate: what the plan is, recomputed from the problem; cost, violation and optimality are read from it.
       gap: of the plan; see `Iteration.gap`. NaN if there is none.
+      solver: name of the function that was called.
+      options: its settings; with noise, that in words, and the risk.
       problem_digest: hash of everything that defined the problem.
       versions: of lqrsim and the libraries that the bits depend on, and the processor.
       scenario: what the command line was asked for; empty where a program called the solver.
@@ -148,7 +150,10 @@ class Solution:
 
     @property
     def cost(self) -> float:
-        """True cost of the plan, start and end included."""
+        """True cost of the plan, start and end included; with noise what runs of the policy are expected to cost.
+
+        With a risk it is (1/risk) log E exp(risk cost) of them. Either is worked out to second order about the plan.
+        """
         return self.certificate.cost
 
     @property
@@ -177,11 +182,18 @@ class Solution:
         return TotalCost(self.cost_to_go, self.cost_to_come)
 
     def shifted(self, steps: int, *, horizon: str = "moving") -> "Solution":
-        """What is left of it after so many steps, to start the next solve with: `start=solution.shifted(k)`.
+        """The rest of the solution after `steps` steps, to start the next solve with: `start=solution.shifted(k)`.
 
         Of a "moving" horizon the end is filled up: the last law, value function and multipliers stay in force, as a
         policy's last law does after its horizon, and the last control is held. A "shrinking" one has so many steps
         less. Status, log, cost and digest stay those of the whole.
+
+        Args:
+          steps: how many steps are over, less than the solution has.
+          horizon: "moving" fills up the end, "shrinking" has fewer steps.
+
+        Returns:
+          A Solution.
 
         Raises:
           InputError: `steps` is not a whole number from 0 to the last step, or `horizon` is neither of the two.
@@ -206,7 +218,7 @@ class Solution:
             clearance=None if self.clearance is None else moved(self.clearance),
             candidates=(),
             multipliers=tuple(replace(one, values=moved(one.values)) for one in self.multipliers),
-            detail=f"what is left of a solution after {steps} steps; {self.detail}".removesuffix("; "),
+            detail=f"the rest of a solution after {steps} steps; {self.detail}".removesuffix("; "),
         )
 
     def open_loop(self) -> "Solution":
@@ -227,6 +239,13 @@ class Solution:
         if self.status.remedy:
             lines.append(f"  remedy:    {self.status.remedy}")
         lines.append(f"  cost:      {self.cost:.9g}   gap: {self.gap:.1e}   optimality: {self.optimality:.1e}")
+        if "noise" in self.options:
+            meant = f"log E exp(risk cost) / risk, risk {self.options.get('risk')}"
+            if self.cost_to_go is None:
+                meant = "that without noise: there is no cost-to-go to weigh it with"
+            elif not self.options.get("risk"):
+                meant = "an expectation"
+            lines.append(f"  noise:     {self.options['noise']}; the cost is {meant}")
         if self.clearance is not None:
             knot = int(np.argmin(self.clearance))
             verdict = "collides" if self.clearance[knot] < 0 else "clear"

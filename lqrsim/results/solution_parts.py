@@ -21,7 +21,12 @@ def left_after(steps: int, array: npt.ArrayLike, *, filled: bool) -> Array:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """States (T+1, n) and the controls (T, m) held between them, `dt` seconds apart.
+    """States and the controls held between them.
+
+    Attributes:
+      states: (T+1, n).
+      controls: (T, m).
+      dt: seconds between two states.
 
     Raises:
       InputError: they do not fit together, there is no step, or dt is not above 0. NaN is what a failed solve has.
@@ -70,6 +75,7 @@ class Status(enum.StrEnum):
     DIVERGED = "diverged"
     NOT_FINITE = "not finite"
     NOT_POSITIVE_DEFINITE = "not positive definite"
+    RISK_TOO_HIGH = "risk too high"
     NOT_CERTIFIED = "not certified"
 
     @property
@@ -121,6 +127,10 @@ _STATUS_TEXT = {
         "a matrix that must be inverted was not positive definite",
         "raise the control weight, start with an InitialPrior, shorten dt, or try the other solver",
     ),
+    Status.RISK_TOO_HIGH: (
+        "the expectation of exp(risk * cost) does not exist: the noise is too strong for so much risk aversion",
+        "lower the risk, below the largest that is named, or the noise; or begin with start=solution of a lower risk",
+    ),
     Status.NOT_CERTIFIED: (
         "the method converged, but its plan, checked against the problem, is not what it claims",
         "try another start or form; and please report it, for it is a fault of lqrsim",
@@ -136,7 +146,8 @@ class Iteration:
     """One line of the log.
 
     Attributes:
-      cost: true cost of rolling the policy out under the true dynamics; NaN where it was only to keep the constraints.
+      cost: true cost of rolling the policy out under the true dynamics, with noise that which is expected; NaN where it
+        was only to keep the constraints.
       improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration. Of damped iterations with
         constraints it is of the cost with the augmented Lagrangian, and so is the optimality.
       gap: largest difference between the minimal-total-cost states and that rollout, each state relative to its
@@ -174,7 +185,14 @@ class Iteration:
     )
 
     def row(self, number: int) -> str:
-        """This iteration as a line under `HEADER`."""
+        """This iteration as a line under `HEADER`.
+
+        Args:
+          number: of the iteration, from 1.
+
+        Returns:
+          A line of text.
+        """
         number = check_count("number", number, at_least=0)
         optimality = "-" if np.isnan(self.optimality) else f"{self.optimality:.1e}"
         improvement = "-" if np.isinf(self.improvement) else f"{self.improvement:.2e}"
@@ -193,7 +211,7 @@ class Certificate:
     A solution that says CONVERGED has passed: each of these is within rounding, and the optimality within tolerance.
 
     Attributes:
-      cost: of the plan.
+      cost: of the plan; see `Solution.cost`.
       start: largest difference of its first state from a `FixedState`; 0 where the start is not fixed.
       motion: largest difference of a state from a step of the dynamics out of the state before it; each state relative
         to its largest size along the plan, at least 1 unit.

@@ -55,7 +55,17 @@ class Quadratic:
         return Quadratic(self.hessian + other.hessian, self.gradient + other.gradient, self.constant + other.constant)
 
     def __call__(self, states: npt.ArrayLike) -> Array:
-        """The values (T+1,) at states (T+1, n), one a knot. Raises InputError for other shapes."""
+        """The values at given states, one per knot.
+
+        Args:
+          states: (T+1, n).
+
+        Returns:
+          (T+1,).
+
+        Raises:
+          InputError: other shapes.
+        """
         x = vectors_of("states", states, self.gradient.shape[-1])
         try:
             np.broadcast_shapes(x.shape, self.gradient.shape)
@@ -113,7 +123,12 @@ class Moments:
 
 @dataclass(frozen=True)
 class TotalCost:
-    """Cost-to-go plus cost-to-come: the least cost of a trajectory through a state, at each knot. Paper: Eq. (20)."""
+    """Cost-to-go plus cost-to-come: the least cost of a trajectory through a state, at each knot. Paper: Eq. (20).
+
+    Attributes:
+      cost_to_go: the least cost from a state to the end.
+      cost_to_come: the least cost from the start to a state.
+    """
 
     cost_to_go: Quadratic
     cost_to_come: Quadratic | Moments

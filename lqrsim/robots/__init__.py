@@ -18,10 +18,24 @@ def _registry() -> dict[str, type[Robot]]:
 
 
 def names() -> list[str]:
-    """Names of the robots."""
+    """Names of the robots.
+
+    Returns:
+      The names, sorted.
+    """
     return sorted(_registry())
 
 
 def get(name: str) -> Robot:
-    """The robot of that name, with its default constants. Raises InputError for an unknown name."""
+    """The robot of that name, with its default constants.
+
+    Args:
+      name: one of `names()`.
+
+    Returns:
+      The Robot.
+
+    Raises:
+      InputError: there is no such robot.
+    """
     return _registry()[check_name("robot", name, names())]()

@@ -50,14 +50,36 @@ class Robot(abc.ABC):
         """The analytic state (..., n) of MuJoCo's `qpos` (..., nq), `qvel` (..., nv).
 
         Angles come out in the representative nearest to `near` (..., n), if given. Without the `activations`.
+
+        Args:
+          qpos: (..., nq) of MuJoCo.
+          qvel: (..., nv) of MuJoCo.
+          near: (..., n), to which angles are taken nearest; None for any representative.
+
+        Returns:
+          (..., n).
         """
 
     @abc.abstractmethod
     def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
-        """The `qpos` (..., nq) and `qvel` (..., nv) that realise an analytic state (..., n)."""
+        """The `qpos` (..., nq) and `qvel` (..., nv) that realise an analytic state (..., n).
+
+        Args:
+          state: (..., n).
+
+        Returns:
+          qpos (..., nq) and qvel (..., nv).
+        """
 
     def actuation(self, control: npt.ArrayLike) -> Array:
-        """MuJoCo's `ctrl` (..., nu) that realises an analytic control (..., m); the same numbers by default."""
+        """MuJoCo's `ctrl` (..., nu) that realises an analytic control (..., m); the same numbers by default.
+
+        Args:
+          control: (..., m).
+
+        Returns:
+          (..., nu).
+        """
         import numpy as np
 
         return np.asarray(control, dtype=np.float64)

@@ -17,6 +17,15 @@ class DifferentialDrive(Robot):
     """State: (x, y, heading) of the middle of the axle. Control: speed of the left and the right wheel.
 
     MJCF: models/create.xml.
+
+    Attributes:
+      axle_length: in m, between the wheels.
+      radius: in m, of the body.
+      max_speed: in m/s, of a wheel's rim, in either direction.
+      wheel_radius: in m; the height of the axle.
+
+    Raises:
+      InputError: a constant is not above 0.
     """
 
     axle_length: float = 0.258  # m, between the wheels
@@ -46,7 +55,14 @@ class DifferentialDrive(Robot):
         return state if near is None else self.dynamics.state_coordinates.nearest(state, near)
 
     def configuration(self, state: npt.ArrayLike) -> tuple[Array, Array]:
-        """At rest, wheels on a floor at height zero."""
+        """At rest, wheels on a floor at height zero.
+
+        Args:
+          state: (..., 3).
+
+        Returns:
+          qpos (..., 9) and qvel (..., 8).
+        """
         state = vectors_of("state", state, 3)
         qpos = np.zeros((*state.shape[:-1], 9))
         qpos[..., :2] = state[..., :2]

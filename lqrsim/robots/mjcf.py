@@ -55,7 +55,9 @@ class MjcfRobot(Robot):
       floors: whether level planes are for standing on.
 
     Attributes:
-      scene: what it moves in. dynamics: MuJoCo's steps. balls: its outline, or None for one ball of `radius`.
+      scene: what it moves in.
+      dynamics: MuJoCo's steps.
+      balls: its outline, or None for one ball of `radius`.
 
     Raises:
       InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
@@ -149,9 +151,15 @@ class MjcfRobot(Robot):
         return self._dynamics
 
     def with_parameters(self, **values: float) -> "MjcfRobot":
-        """The same in an MJCF with other numbers, for a plant, too: `robot.with_parameters(mass=0.6)`.
+        """The robot with other numbers in its MJCF, also for a plant: `robot.with_parameters(mass=0.6)`.
 
         `dynamics.numbers` has their names and values; `dynamics.with_parameters` is the same for a plan alone.
+
+        Args:
+          **values: number of the MJCF, as in `dynamics.numbers` -> value.
+
+        Returns:
+          An MjcfRobot.
 
         Raises:
           InputError: as there.
@@ -173,7 +181,14 @@ class MjcfRobot(Robot):
         )
 
     def at(self, keyframe: str | None = None, **values: float) -> Array:
-        """A state (n,): at rest as the MJCF has it, or in one of its keyframes, but for the states that are named.
+        """A state at rest as in the MJCF, or in one of its keyframes, except for the named states.
+
+        Args:
+          keyframe: its name; None for the MJCF's rest.
+          **values: name of a state -> value.
+
+        Returns:
+          (n,).
 
         Raises:
           InputError: no such keyframe or state.

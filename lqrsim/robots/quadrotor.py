@@ -18,6 +18,19 @@ class Quadrotor(Robot):
     """State: position, velocity in world axes, rotation vector, angular velocity in body axes. Control: rotor forces.
 
     Rotor 1 is at +x, 2 at +y, 3 at -x, 4 at -y of the body. MJCF: models/quadrotor.xml.
+
+    Attributes:
+      mass: in kg.
+      inertia: in kg m^2, about each axis.
+      arm: in m, from the centre of mass to a rotor.
+      torque_ratio: in N m of a rotor's drag per N of its force; the paper's k_m.
+      drag: in N s/m, against the velocity; the paper's k_v.
+      gravity: in m/s^2.
+      max_force: in N, of a rotor; the least is 0.
+      radius: in m, of the collision sphere.
+
+    Raises:
+      InputError: a constant is out of range.
     """
 
     mass: float = 0.5  # kg

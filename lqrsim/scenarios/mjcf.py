@@ -36,14 +36,21 @@ def mjcf(
 
     Args:
       path: of the MJCF.
-      start, goal: the name of a keyframe, or states by name, {"pole": 3.14}; a keyframe among them is
-        {"keyframe": "home", "pole": 3.14}. What is not named is at rest as the MJCF has it.
+      start: the name of a keyframe, or states by name, {"pole": 3.14}; a keyframe among them is {"keyframe": "home",
+        "pole": 3.14}. States that are not named are at rest as in the MJCF.
+      goal: likewise.
       weights: of what misses the goal at the end: of all states, by name, or by unit, as {"m": 100, "rad": 100}; what
         is not named then has none.
       effort: of the controls, a number, by name or by unit; by default 1 for a control at its limit, or at 1.
-      dt: seconds of a control period, by default about 0.02. steps: how many.
-      body, floors: as in `MjcfRobot`. obstacles: whether to keep clear of them.
+      dt: seconds of a control period, by default about 0.02.
+      steps: how many.
+      body: as in `MjcfRobot`.
+      floors: as in `MjcfRobot`.
+      obstacles: whether to keep clear of them.
       parameters: other numbers of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
+
+    Returns:
+      The Scenario.
 
     Raises:
       InputError: no such file, keyframe, state, unit or number; or as `MjcfRobot` and `Problem` do.

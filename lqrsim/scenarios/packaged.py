@@ -26,13 +26,16 @@ class Scenario:
     """A robot in a scene with something to do.
 
     Attributes:
-      name: what the command line calls it. summary: what it is, in a line.
+      name: what the command line calls it.
+      summary: what it is, in a line.
+      robot: the robot.
+      scene: its scene.
       problem: what to solve; ready to change with `dataclasses.replace(scenario.problem, ...)`.
       tracking_bound: how far in metres an undisturbed run may be from its plan, at any time.
       disturbances: what the demo's disturbed run meets: plain to see, and no more than the policy copes with.
+      paper_start: how the paper begins, for `smooth(problem, start=...)`; by default several starts are tried.
       goal_radius: how near the goal counts as having reached it, in metres; by default the robot's radius.
       goal_tolerance: the same for goals without a position; both as in `simulate`.
-      paper_start: how the paper begins, for `smooth(problem, start=...)`; by default several starts are tried.
     """
 
     name: str
@@ -47,13 +50,32 @@ class Scenario:
     goal_tolerance: float | None = None
 
     def near_enough(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> dict[str, Any]:
-        """These options of `simulate`, or the scenario's own where neither is given."""
+        """These options of `simulate`, or the scenario's own if neither is given.
+
+        Args:
+          goal_radius: in metres, or None.
+          goal_tolerance: a scaled error, or None.
+
+        Returns:
+          Options for `simulate`.
+        """
         if goal_radius is None and goal_tolerance is None:
             goal_radius, goal_tolerance = self.goal_radius, self.goal_tolerance
         return {"goal_radius": goal_radius, "goal_tolerance": goal_tolerance}
 
     def target_radius(self, goal_radius: float | None = None, goal_tolerance: float | None = None) -> float:
-        """Within which distance the goal counts as reached, in `Target.unit`. Raises InputError as `simulate` does."""
+        """The distance from the goal within which it counts as reached, in `Target.unit`.
+
+        Args:
+          goal_radius: in metres, or None.
+          goal_tolerance: a scaled error, or None.
+
+        Returns:
+          The distance.
+
+        Raises:
+          InputError: as `simulate` does.
+        """
         dynamics, goal = self.problem.dynamics, self.problem.weighed_goal
         target = Target(dynamics.state_coordinates, goal, np.zeros((1, len(dynamics.state_coordinates))))
         return target.radius(self.robot.radius, **self.near_enough(goal_radius, goal_tolerance))
@@ -79,12 +101,26 @@ class Scenario:
 
 
 def names() -> list[str]:
-    """Names of the scenarios."""
+    """Names of the scenarios.
+
+    Returns:
+      The names, sorted.
+    """
     return sorted(_functions())
 
 
 def get(name: str) -> Scenario:
-    """The scenario of that name, with its default settings. Raises InputError for an unknown name."""
+    """The scenario of that name, with its default settings.
+
+    Args:
+      name: one of `names()`.
+
+    Returns:
+      The Scenario.
+
+    Raises:
+      InputError: there is no such scenario.
+    """
     return _functions()[check_name("scenario", name, names())]()
 
 
@@ -99,7 +135,11 @@ def _functions() -> dict[str, Callable[..., Scenario]]:
 
 
 def differential_drive() -> Scenario:
-    """The iRobot Create among eleven pillars: Fig. 2, with the authors' weights."""
+    """The iRobot Create among eleven pillars: Fig. 2, with the authors' weights.
+
+    Returns:
+      The Scenario.
+    """
     robot, scene = DifferentialDrive(), load_scene("arena")
     start, goal, nominal = (0.0, -2.5, np.pi), (0.0, 2.5, np.pi), (0.25, 0.25)
     weight = (5000.0, 5000.0, 50.0)
@@ -129,7 +169,11 @@ def quadrotor(query: int = 0, seed: int = 0) -> Scenario:
     """The quadrotor through a cage of twelve beams, from one edge to the antipode: Fig. 3.
 
     Args:
-      query, seed: which of the random starts and goals; see `quadrotor_queries`.
+      query: which of the random starts and goals, from 0; see `quadrotor_queries`.
+      seed: from which the starts and goals are drawn.
+
+    Returns:
+      The Scenario.
     """
     starts, goals = quadrotor_queries(check_count("query", query, at_least=0, at_most=999_999) + 1, seed=seed)
     robot, scene = Quadrotor(), load_scene("cage")
@@ -166,6 +210,13 @@ def quadrotor_queries(count: int, *, seed: int = 0) -> tuple[np.ndarray, np.ndar
 
     A start lies on an edge of the cube of half-side 2.25 m: one coordinate uniform, the others at +-2.25 m with a
     jitter of +-0.01 m; its goal is the antipode.
+
+    Args:
+      count: how many.
+      seed: from which they are drawn.
+
+    Returns:
+      Starts and goals, each (count, 12).
     """
     check_count("count", count, at_least=0, at_most=1_000_000)
     rng = np.random.default_rng(check_seed("seed", seed))

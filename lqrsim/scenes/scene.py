@@ -79,6 +79,12 @@ def names() -> list[str]:
 def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
     """A packaged scene by name, or any MJCF by path. It may include the packaged robots, e.g. `create.xml`, by name.
 
+    Args:
+      name_or_path: a name in models/, or the path of an MJCF file.
+
+    Returns:
+      The Scene.
+
     Raises:
       InputError: no such scene or file; it does not parse or compile; an obstacle is of a type without a distance.
     """

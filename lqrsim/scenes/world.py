@@ -1,7 +1,7 @@
 """Obstacles as primitives, and the world of them; `kernels/signed_distance.py` has the distance to each."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,11 +23,15 @@ class Obstacle:
     """One primitive; sizes and axes as MuJoCo has them.
 
     Attributes:
+      name: of the geom in the MJCF.
       kind: one of `KINDS`.
-      position: (3,) in metres. rotation: (3, 3), whose columns are the local axes; a plane's free side is its local +z,
-        capsules and cylinders lie along their local z.
+      position: (3,) in metres.
+      rotation: (3, 3), whose columns are the local axes; a plane's free side is its local +z, capsules and cylinders
+        lie along their local z.
       size: (3,) in metres: sphere (radius, 0, 0); capsule and cylinder (radius, half length, 0), the latter infinite if
         the half length is; box half lengths; plane (0, 0, 0).
+      velocity: (3,) in m/s, of an obstacle that moves straight on: `position` is where it is at the time 0. Plans take
+        it into account; the scene that MuJoCo simulates is another matter, and stands still.
     """
 
     name: str
@@ -35,6 +39,7 @@ class Obstacle:
     position: Array
     rotation: Array
     size: Array
+    velocity: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         check_text("obstacle: name", self.name, "a name", at_most=1000)
@@ -49,6 +54,7 @@ class Obstacle:
         if (size[:used] <= 0).any():
             raise InputError(f"obstacle {self.name!r}: size: got {size[:used].tolist()}, want lengths above 0")
         object.__setattr__(self, "size", size)
+        object.__setattr__(self, "velocity", check_array(f"obstacle {self.name!r}: velocity", self.velocity, (3,)))
 
     @property
     def row(self) -> Array:
@@ -58,7 +64,11 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class World:
-    """The obstacles that a robot must stay clear of."""
+    """A set of obstacles.
+
+    Attributes:
+      obstacles: in the order in which they are numbered.
+    """
 
     obstacles: Sequence[Obstacle] = ()
 
@@ -77,6 +87,34 @@ class World:
         """The obstacles as numbers, (len(self), ROW)."""
         return np.array([obstacle.row for obstacle in self.obstacles]).reshape(len(self), ROW)
 
+    @cached_property
+    def moving(self) -> bool:
+        """Whether an obstacle of it moves."""
+        return any(obstacle.velocity.any() for obstacle in self.obstacles)
+
+    def displacements(self, times: npt.ArrayLike) -> Array:
+        """How far each obstacle has moved by some times (K,) in s, (K, len(self), 3) in metres."""
+        velocities = np.array([obstacle.velocity for obstacle in self.obstacles]).reshape(len(self), 3)
+        return np.multiply.outer(check_array("times", times, (None,)), velocities)
+
+    def tables(self, times: npt.ArrayLike) -> Array:
+        """The obstacles as numbers at some times (K,) in s, (K, len(self), ROW); only once where none moves."""
+        if not self.moving:
+            return self.table[None]
+        moved = self.displacements(times)
+        tables = np.repeat(self.table[None], len(moved), axis=0)
+        tables[:, :, 1:4] += moved
+        return tables
+
+    def moved(self, seconds: float) -> "World":
+        """The world as it is so much later, or earlier: each obstacle has gone on at its velocity.
+
+        An obstacle that is seen at the time t of a run belongs into its problem as `ls.World([seen]).moved(-t)`.
+        """
+        seconds = check_number("seconds", seconds)
+        moved = [replace(one, position=one.position + seconds * one.velocity) for one in self.obstacles]
+        return World(moved) if self.moving else self
+
     def seen_by(self, plane: str, offset: float | None = None) -> "World":
         """The world of a robot whose position is in that plane, in the plane's coordinates: see `Coordinates`.
 
@@ -87,6 +125,13 @@ class World:
         it is this world seen from above: the robot is as high as everything, upright obstacles reach from the floor to
         the sky, and a sphere counts with its equator. Either way planes parallel to the robot's bound nothing: in the
         horizontal one that is the floor.
+
+        Args:
+          plane: as in `Coordinates`.
+          offset: as in `Coordinates`, in metres.
+
+        Returns:
+          A World in the plane's coordinates.
 
         Raises:
           InputError: there is no such plane, a vertical one has no offset; or, seen from above, an obstacle is tilted,
@@ -112,7 +157,12 @@ class World:
         origin[across] = 0.0 if offset is None else offset
         return World(
             [
-                replace(obstacle, position=turn @ (obstacle.position - origin), rotation=turn @ obstacle.rotation)
+                replace(
+                    obstacle,
+                    position=turn @ (obstacle.position - origin),
+                    rotation=turn @ obstacle.rotation,
+                    velocity=turn @ obstacle.velocity,
+                )
                 for obstacle in seen
                 if not _parallel(obstacle, across)
             ]
@@ -122,19 +172,42 @@ class World:
         """Signed distances in metres to each obstacle, (len(self),), of one point (2,) or (3,); negative inside.
 
         Points (2,) are for a world that is seen by a robot in the plane, and in its coordinates.
+
+        Args:
+          point: (3,), or (2,) in a plane, in metres.
+
+        Returns:
+          One signed distance per obstacle, in metres.
         """
         x, y, z = (*_places("point", point, one=True).tolist(), 0.0)[:3]
         data = self.table.ravel()
         return np.array([signed_distance(data, ROW * i, x, y, z) for i in range(len(self))])
 
     def distance(self, points: npt.ArrayLike) -> Array:
-        """Signed distance in metres to the nearest obstacle, (...), of points (..., 2 or 3); infinite without any."""
+        """Signed distance in metres to the nearest obstacle, (...), of points (..., 2 or 3); infinite without any.
+
+        Args:
+          points: (..., 3), or (..., 2) in a plane, in metres.
+
+        Returns:
+          (...), in metres; infinite without obstacles.
+        """
         points = _places("points", points)
         flat = [self.distances(point).min(initial=np.inf) for point in points.reshape(-1, points.shape[-1])]
         return np.array(flat).reshape(points.shape[:-1])
 
     def nearest(self, points: npt.ArrayLike) -> npt.NDArray[np.int64]:
-        """Which obstacle is nearest, (...), at points (..., 2 or 3). Raises InputError in an empty world."""
+        """Which obstacle is nearest, (...), at points (..., 2 or 3).
+
+        Args:
+          points: (..., 3), or (..., 2) in a plane, in metres.
+
+        Returns:
+          (...), indices of obstacles.
+
+        Raises:
+          InputError: there are no obstacles.
+        """
         if not self.obstacles:
             raise InputError("nearest: got a world without obstacles, want at least one")
         points = _places("points", points)

@@ -13,11 +13,13 @@ import numpy.typing as npt
 
 from lqrsim.control.controllers import Controller
 from lqrsim.errors import Array, InputError, check_function, excerpt, told
+from lqrsim.problem.noise import Noise
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenes.scene import unlogged
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance
+from lqrsim.simulation.disturbances.state_noise import as_disturbances
 from lqrsim.simulation.effects import Effects
 from lqrsim.simulation.physics import Physics
 from lqrsim.simulation.plant import Plant
@@ -30,7 +32,7 @@ def simulate(
     plant: Plant,
     solution: Solution,
     *,
-    disturbances: Sequence[Disturbance] = (),
+    disturbances: Sequence[Disturbance | Noise] = (),
     controller: Controller | None = None,
     seed: int = 0,
     trials: int = 1,
@@ -46,7 +48,8 @@ def simulate(
 ) -> Rollout:
     """Execute the solution's policy closed-loop in MuJoCo, from the first state of its plan.
 
-    In each control period: read the true state, measure it, ask the policy, disturb its command, saturate, push, step.
+    In each control period: read the true state, measure it, ask the policy, disturb its command, saturate, push, step,
+    kick.
 
     A trial ends with the first collision, as `collisions.py` defines it, when it becomes unstable, when the filter of
     its controller diverges, or when the controller fails: raises an exception, which ends all the trials that it was
@@ -54,10 +57,14 @@ def simulate(
     others it is NaN.
 
     Args:
+      plant: robot and scene to run.
+      solution: whose policy runs, or about whose plan the controller runs.
       disturbances: what goes wrong, in the order in which it happens. Each has its own stream of random numbers.
+        A `Noise`, with which problems are stated, is one, too.
       controller: what decides on the controls; by default the solution's policy.
-      seed: of all random numbers. trials: how many runs. first_trial: number of the first; trial `i` of a seed is the
-        same to the last bit whatever runs beside it.
+      seed: of all random numbers.
+      trials: how many runs.
+      first_trial: number of the first; trial `i` of a seed is the same to the last bit whatever runs beside it.
       goal_radius: how near the goal counts as having reached it, in metres; by default the robot's radius.
       goal_tolerance: the same for goals without a position, relative to the plan's range; 0.1 by default.
         `results/goal.py` says of what.
@@ -69,12 +76,16 @@ def simulate(
       progress: called after each control period with the number of periods done and of all.
       watch: called with each frame as it comes: its time, MuJoCo's qpos (K, nq), and who has become unstable (K,).
 
+    Returns:
+      A Rollout of the trials.
+
     Raises:
       InputError: the policy is for another robot, or its plan is not finite; the control period is no multiple of the
         physics step; a disturbance does not fit; or an option is out of range.
     """
+    stated = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
     settings = RunSettings(
-        plant=plant, solution=solution, disturbances=disturbances, controller=controller, seed=seed, trials=trials,
+        plant=plant, solution=solution, disturbances=stated, controller=controller, seed=seed, trials=trials,
         first_trial=first_trial, goal_radius=goal_radius, goal_tolerance=goal_tolerance, frames=frames,
         contacts=contacts, threads=threads, generators=generators, progress=progress, watch=watch,
     )  # fmt: skip
@@ -166,11 +177,15 @@ class Loop:
     def advance(self, step: int, controls: Array, wrench: Array) -> None:
         """Take the physics to the next knot; obstacles stop who collides, from this period on."""
         physics, over = self.physics, self.records.over(step)
-        period = physics.advance(controls, wrench)
+        period, kick = physics.advance(controls, wrench), self.effects.kick(step, self.states, controls)
+        if kick is not None:
+            physics.kick(period, kick)
         collided = self.collisions.detect(step, period, ignored=over)
         if self.settings.contacts:
             if len(collided):
                 physics.rerun_with_contacts(collided, period)
+                if kick is not None:
+                    physics.kick(period, kick, collided)
                 self.collisions.relocate(period.states[-1])
             self.records.contacts += physics.touched(period) & ~over
         self.states = period.states[-1]

@@ -9,7 +9,6 @@ from mujoco import batch
 from lqrsim.errors import Array, InputError, check_kind, excerpt, shaped
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances import Disturbance, Effect
-from lqrsim.simulation.disturbances.base import Hook
 from lqrsim.simulation.plant import Plant
 
 MakeGenerator = Callable[[int, int], np.random.Generator]
@@ -51,8 +50,9 @@ class Effects:
         self._measures, self._actuations = self._hooks("measure"), self._hooks("actuate")
         self._pushes = [(slice(0, 3), *hook) for hook in self._hooks("force")]
         self._pushes += [(slice(3, 6), *hook) for hook in self._hooks("torque")]
+        self._kicks = self._hooks("kick")
 
-    def _hooks(self, kind: str) -> list[tuple[str, Hook]]:
+    def _hooks(self, kind: str) -> list[tuple[str, Any]]:
         """What is called in each period, and what messages call it."""
         given = [(name, getattr(effect, kind)) for name, effect in self._effects]
         return [(f"{name}: {kind}: returned", hook) for name, hook in given if hook is not None]
@@ -99,6 +99,11 @@ class Effects:
         for which, name, push in self._pushes:
             wrench[:, which] += shaped(name, push(step, states), (len(states), 3))
         return wrench
+
+    def kick(self, step: int, states: Array, controls: Array) -> Array | None:
+        """By how much the states (K, n) jump at a period's end, given what the actuators got; None if by nothing."""
+        jumps = [shaped(name, kick(step, states, controls), states.shape) for name, kick in self._kicks]
+        return sum(jumps[1:], start=jumps[0]) if jumps else None
 
 
 class _Streams(Sequence[np.random.Generator]):

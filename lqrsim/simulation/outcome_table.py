@@ -17,11 +17,13 @@ class Outcomes:
     """One entry a trial; what is measured is of the time until it ended, as `Rollout.outcome` and `ended` say.
 
     Attributes:
-      trial: its number. outcome: one of OUTCOMES.
+      trial: its number.
+      outcome: one of OUTCOMES.
       obstacle: what it collided with; empty unless that ended it.
       ended: when it collided, was lost or failed, in seconds; the horizon where none of that happened.
-      worst, rms: tracking error, in `Rollout.tracking_unit`: metres for robots with a position. final: at the end of
-        the plan; NaN for what ended before.
+      worst: largest tracking error, in `Rollout.tracking_unit`: metres for robots with a position.
+      rms: root mean square of the tracking error, likewise.
+      final: at the end of the plan; NaN for what ended before.
       goal: distance from the goal at the end, in `Target.unit`; NaN for what ended before.
       clearance: the least, in metres; not above 0 where it collided.
       effort: the integral of the squares of the applied controls over time, in their unit squared times s.
@@ -78,8 +80,13 @@ def outcomes(
     """The outcomes of a rollout's trials.
 
     Args:
+      rollout: what `simulate` returned.
       problem: whose cost to work out; NaN without one.
-      goal_radius, goal_tolerance: to be judged by in place of the rollout's; see `simulate`.
+      goal_radius: in metres, replaces the rollout's; see `simulate`.
+      goal_tolerance: a scaled error, replaces the rollout's; see `simulate`.
+
+    Returns:
+      The Outcomes, one row per trial.
 
     Raises:
       InputError: one of these is out of range, or not what this rollout's goal is judged by.

@@ -78,6 +78,7 @@ class Physics:
         self.solid = np.zeros(trials, dtype=bool)
         self._contacts, self._before = contacts, self.simulations.state
         self._inactive: list[tuple[Array, npt.NDArray[np.intp], Array]] = []
+        self._quaternions = _quaternions(plant)
 
     def place(self, states: Array) -> None:
         """Put the robots where analytic states (K, n) say."""
@@ -132,6 +133,24 @@ class Physics:
             self._before, self._was_unstable = self.simulations.state.copy(), self.unstable.copy()
         return self._run(None)
 
+    def kick(self, period: Period, jumps: Array, rows: npt.NDArray[np.intp] | None = None) -> None:
+        """Have the states jump by (K, n) at the end of a period, those of some trials or of all.
+
+        What is no state, such as the wheels' angles or a small tilt, stays as it is.
+        """
+        which = np.arange(len(jumps)) if rows is None else rows
+        states, robot = period.states[-1][which], self.plant.robot
+        before, after = robot.configuration(states), robot.configuration(states + jumps[which])
+        qpos = self._qpos[which][:, self.plant.qpos]
+        moved = qpos + (after[0] - before[0])
+        for first in self._quaternions:
+            turn = slice(first, first + 4)
+            moved[:, turn] = _turned(after[0][:, turn], before[0][:, turn], qpos[:, turn])
+        self._qpos[np.ix_(which, self.plant.qpos)] = moved
+        self._qvel[np.ix_(which, self.plant.qvel)] += after[1] - before[1]
+        self._act[which] += jumps[which, jumps.shape[1] - self._act.shape[1] :]
+        period.states[-1][which], period.frames[-1][which] = self.state()[which], self.frame()[which]
+
     def rerun_with_contacts(self, rows: npt.NDArray[np.intp], period: Period) -> None:
         """From the period's start on, let these simulations run into the obstacles; replaces what it came to."""
         self.simulations.state[rows] = self._before[rows]
@@ -180,6 +199,35 @@ class Physics:
             else:
                 period.touching.append(np.zeros((0, 0), dtype=bool))
         return period
+
+
+def _quaternions(plant: Plant) -> list[int]:
+    """Where quaternions begin in the robot's own qpos."""
+    found, first = [], 0
+    for name in plant.robot.joints:
+        joint = plant.model.joint(name)
+        if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL:
+            found.append(first)
+        elif joint.type[0] == mujoco.mjtJoint.mjJNT_FREE:
+            found.append(first + 3)
+        first += joint.qpos0.size
+    return found
+
+
+def _turned(after: Array, before: Array, now: Array) -> Array:
+    """Quaternions (K, 4) turned by what leads from one to another, in the world's axes."""
+    back = before * np.array([1.0, -1.0, -1.0, -1.0])
+    turned = _product(_product(after, back), now)
+    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Of quaternions (K, 4)."""
+    (w, x, y, z), (s, i, j, k) = a.T, b.T
+    return np.stack(
+        [w * s - x * i - y * j - z * k, w * i + x * s + y * k - z * j, w * j - x * k + y * s + z * i,
+         w * k + x * j - y * i + z * s], axis=1,
+    )  # fmt: skip
 
 
 def part_of(plant: Plant, substeps: int) -> int:

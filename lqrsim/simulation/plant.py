@@ -27,14 +27,16 @@ class Plant:
     """A robot in a scene, ready to run.
 
     Attributes:
-      robot, scene: what it is made of.
+      robot: whose dynamics and limits the plant has.
+      scene: whose MJCF is simulated, with its obstacles.
       balls, places: the robot's balls, and where they are; None where it is one ball at its position.
       world: the obstacles that bound the robot's position, or its balls; none without either.
       obstacles: names of what the robot can collide with: those; without a position all that the MJCF lets it touch,
         but level planes if a free joint, or a slide that is not level, lets the robot stand on them. For balls in space
         it is the same.
       model: the compiled scene, with a contact sensor for each obstacle.
-      body: id of the robot's body. qpos, qvel, ctrl: where its joints' and actuators' numbers are in MuJoCo's arrays.
+      body: id of the robot's body.
+      qpos, qvel, ctrl: where its joints' and actuators' numbers are in MuJoCo's arrays.
       contact: where the contact sensors are in MuJoCo's `sensordata`; positive while the robot touches the obstacle.
       timestep: of the physics, in seconds.
 
@@ -75,7 +77,17 @@ class Plant:
         return float(self.model.opt.timestep)
 
     def substeps(self, period: float) -> int:
-        """Physics steps in a control period of that many seconds. Raises InputError if it is no multiple of one."""
+        """The number of physics steps in a control period.
+
+        Args:
+          period: seconds.
+
+        Returns:
+          A count.
+
+        Raises:
+          InputError: the period is not a multiple of the physics step.
+        """
         period = check_number("control period", period, above=0.0)
         steps = period / self.timestep
         if steps > MOST_SUBSTEPS:
@@ -107,7 +119,17 @@ class Plant:
         return not self.obstacles or (len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9))
 
     def state(self, qpos: Array, qvel: Array, act: Array, near: Array | None = None) -> Array:
-        """The analytic state (..., n) of the robot's `qpos`, `qvel` and the actuators' `act`; see `Robot.state`."""
+        """The analytic state (..., n) of the robot's `qpos`, `qvel` and the actuators' `act`; see `Robot.state`.
+
+        Args:
+          qpos: (..., nq) of MuJoCo.
+          qvel: (..., nv) of MuJoCo.
+          act: (..., na), activations of the actuators.
+          near: (..., n), to which angles are taken nearest; None for any representative.
+
+        Returns:
+          (..., n).
+        """
         state = self.robot.state(qpos, qvel, near=near)
         if not self.robot.activations:
             return state
@@ -119,8 +141,15 @@ class Plant:
         Of balls it is the least of theirs.
 
         Args:
+          states: (..., n).
           displaced: (K, obstacles, 3), by how much obstacles are elsewhere in each trial, along the world's axes;
             states are then (K, k, n).
+
+        Returns:
+          (...), in metres.
+
+        Raises:
+          InputError: the shapes of states and displaced obstacles do not fit together.
         """
         states = vectors_of("states", states, len(self.robot.dynamics.state_coordinates))
         if displaced is not None:
@@ -136,13 +165,28 @@ class Plant:
         return np.array([self.robot.radius]) if self.balls is None else self.balls.radii
 
     def middles(self, states: Array) -> Array:
-        """Where the middles of its balls are, as the world is seen: (..., B, 2 or 3) at states (..., n)."""
+        """The centres of the robot's balls, in the coordinates in which it sees the world.
+
+        Args:
+          states: (..., n).
+
+        Returns:
+          (..., B, 2 or 3), in metres.
+        """
         if self.balls is None or self.places is None:
             return states[..., None, list(self.robot.dynamics.state_coordinates.position)]
         return evaluate(self.places, len(self.balls), states)
 
     def clearance_at(self, middles: Array, displaced: Array | None = None) -> Array:
-        """The clearance (...) with the middles of its balls there, (..., B, 2 or 3)."""
+        """The clearance for given centres of the balls.
+
+        Args:
+          middles: (..., B, 2 or 3), as of `middles`.
+          displaced: as in `clearance`.
+
+        Returns:
+          (...), in metres.
+        """
         if not len(self.world):
             return np.full(middles.shape[:-2], np.inf)
         if displaced is None or not displaced.any():
@@ -154,7 +198,15 @@ class Plant:
         return (found.reshape(middles.shape[:-1]) - self.radii).min(axis=-1)
 
     def record_of_balls(self, planned: Array, driven: Array) -> BallRecord | None:
-        """Where its balls are along a plan (T+1, n) and in runs (K, T+1, n), for pictures; None if it has none."""
+        """The places of the robot's balls along a plan and in runs, for pictures.
+
+        Args:
+          planned: states (T+1, n).
+          driven: states (K, T+1, n).
+
+        Returns:
+          The record; None if the robot has no balls.
+        """
         if self.balls is None:
             return None
         dynamics, anchors = self.robot.dynamics, np.full((len(self.balls), 4), np.nan)
@@ -169,7 +221,14 @@ class Plant:
         )
 
     def across(self, vectors: Array) -> Array:
-        """Vectors (..., 3) along the axes that `world` has, of vectors along those of the scene."""
+        """Vectors along the axes of `world`, of vectors along those of the scene.
+
+        Args:
+          vectors: (..., 3).
+
+        Returns:
+          (..., 2 or 3).
+        """
         space = self.robot.dynamics.state_coordinates
         if len(space.position) != 2 or (self.places is not None and not self.places.in_plane):
             return vectors
@@ -178,7 +237,12 @@ class Plant:
         return np.concatenate([seen, (vectors @ normal)[..., None]], axis=-1)
 
     def displace(self, simulations: batch.Batch, displaced: Array) -> None:
-        """Move the obstacles of each simulation by (K, obstacles, 3) metres, world axes; `set_const` must follow."""
+        """Move the obstacles of each simulation; `set_const` must follow.
+
+        Args:
+          simulations: K of them.
+          displaced: (K, obstacles, 3), in metres along the world's axes.
+        """
         places, drawn = simulations.expand("geom_pos"), mujoco.MjData(self.model)
         mujoco.mj_kinematics(self.model, drawn)
         for number, name in enumerate(self.world.names):

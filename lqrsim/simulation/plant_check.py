@@ -33,10 +33,17 @@ class PlantCheck:
     """How far MuJoCo moves a robot from where its dynamics say, over one control period.
 
     Attributes:
-      names, units: of the states. errors: (n,) the largest difference of each over the samples, in its unit.
-      changes: (n,) the largest change that the dynamics predict for it. period: in seconds.
-      state, control: where the worst state of all was furthest off. simulated, predicted: (n,) what came of it.
+      names: of the states.
+      units: of the states.
+      errors: (n,) the largest difference of each over the samples, in its unit.
+      changes: (n,) the largest change that the dynamics predict for it.
+      period: in seconds.
+      state: (n,), where the worst state of all was furthest off.
+      control: (m,), there.
+      simulated: (n,), the change of the state in MuJoCo there.
+      predicted: (n,), the change by the dynamics there.
       tolerance: what `relative` must not exceed.
+      samples: how many random states were compared.
       contacts: pairs of geoms that touched, and in how many of the `samples`, most often first: contacts that were not
         taken away, which the dynamics may know nothing of.
     """
@@ -132,12 +139,20 @@ def check_plant(
     other, are in the result, by the names of the geoms.
 
     Args:
+      robot: whose dynamics are compared.
+      scene: with the robot in its MJCF.
       period: in seconds, a multiple of the physics step; by default that nearest to 0.02 s.
-      around: (n,) the middle of the random states, zero by default. spread: their standard deviation in each unit.
+      around: (n,) the middle of the random states, zero by default.
+      spread: their standard deviation in each unit.
       controls: lowest and highest random control (m,); by default the dynamics' limits.
       settle: seconds under the control before the comparison, for velocities that MuJoCo has and the dynamics do not
         (those of wheels, say); by default 0.5 where MuJoCo has more of them than the dynamics have states, else 0.
-      samples: how many states. tolerance: of an error, relative to the largest change of that state. seed: of all.
+      samples: how many states.
+      tolerance: of an error, relative to the largest change of that state.
+      seed: of all.
+
+    Returns:
+      The PlantCheck.
 
     Raises:
       InputError: the robot is not in the scene, an argument is not as described, the controls have no limits, or the

@@ -5,7 +5,7 @@ import numpy as np
 from lqrsim.codegen import distances
 from lqrsim.errors import Array
 from lqrsim.problem.balls import clearances
-from lqrsim.problem.constraints import Clearance
+from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.costs import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
@@ -35,6 +35,8 @@ def assemble(
     candidates: tuple[Candidate, ...] = (),
 ) -> Solution:
     """The Solution of what a solver found."""
+    if problem.noise is not None:
+        options = options | {"noise": repr(problem.noise), "risk": problem.risk}
 
     def policy(gain: Array, offset: Array, nominal: Array) -> AffinePolicy:
         return AffinePolicy(
@@ -85,10 +87,10 @@ def clearance_of(problem: Problem, states: Array) -> Array | None:
     found = []
     for one in worlds.values():
         if one.balls is not None:
-            found.append(clearances(one.balls, problem.dynamics, one.world, states).min(axis=1))
+            found.append(clearances(one.balls, problem.dynamics, one.world, states, problem.times).min(axis=1))
         else:
             seen = one.world.seen_by(space.plane, space.offset)
-            found.append(distances.signed_distance(seen, place) - one.radius)
+            found.append(distances.signed_distance_at(seen, place[:, None], problem.times)[:, 0] - one.radius)
     return np.min(found, axis=0) if found else None
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import LOG, Plan, Policy, Rows, Settings
+from lqrsim.kernels.records import LOG, CostToGo, Plan, Policy, Rows, Settings
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers.certify import certified
@@ -158,6 +158,18 @@ class Attempt:
         self._loop(*self._damped_arguments(0, 0, log, 1, trial))
         return float(log["optimality"][0])
 
+    def fails_at(self, risk: float) -> int:
+        """The step at which a pass about the plan in the memory fails with another risk, or -1; with noise only.
+
+        The arrays of the passes are written over.
+        """
+        work, log = self.work, np.full(1, np.nan, LOG)
+        trial, own = Plan(np.zeros_like(work.states), np.zeros_like(work.controls)), self.problem.risk
+        work.model.noise[1][0] = risk
+        *_, failed = self._loop(*self._damped_arguments(0, 0, log, 1, trial))
+        work.model.noise[1][0] = own
+        return failed
+
     def rescue(self, found: AttemptResult, *, each: bool, callback: Callback | None = None) -> AttemptResult:
         """The safeguard: iterations from the best plan so far."""
         work, detail = self.work, f"the undamped method failed ({found.detail or found.status.meaning})"
@@ -242,8 +254,8 @@ class Attempt:
         violation = self.work.violation(values)
         value = found.values.get("cost_to_go")
         certificate, wrong = certified(
-            self.problem, lambda task, hessians, out: self._loop(*self._check_arguments(task, found, hessians, out)),
-            found.states, None if value is None else value.hessian, violation=violation, kept=self.work.keeps(values),
+            self.problem, lambda task, to_go, out: self._loop(*self._check_arguments(task, found, to_go, out)),
+            found.states, value, violation=violation, kept=self.work.keeps(values),
             claimed=found.iterations[-1].cost if found.success else None,
             tolerance=self.settings.tolerance if found.status is Status.CONVERGED else None,
         )  # fmt: skip
@@ -302,11 +314,11 @@ class Attempt:
         arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
         return declarations.DAMP, first, last, options, work.model, arrays, work.memory_rows, log
 
-    def _check_arguments(self, task: int, found: AttemptResult, hessians: Array, certificate: Rows) -> tuple[Any, ...]:
-        """What it takes to certify a plan and its policy, with these Hessians of a cost-to-go."""
+    def _check_arguments(self, task: int, found: AttemptResult, to_go: CostToGo, certificate: Rows) -> tuple[Any, ...]:
+        """What it takes to certify a plan and its policy, with this cost-to-go."""
         settings, work = self.settings, self.work
         arrays = work.arrays._replace(
-            to_go=work.arrays.to_go._replace(hessian=hessians), rollout=Plan(found.states, found.controls),
+            to_go=to_go, rollout=Plan(found.states, found.controls),
             kept=Policy(*found.law), certificate=certificate,
         )  # fmt: skip
         options = self._settings(0, settings.tolerance, settings.gap_tolerance)

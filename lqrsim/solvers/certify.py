@@ -8,11 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from lqrsim.codegen.jit import in_c_order
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import CERTIFICATE, Rows
+from lqrsim.kernels.records import CERTIFICATE, CostToGo, Rows
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Certificate
+from lqrsim.results.value_functions import Quadratic
 
 # What rounding may do. A policy's control is a sum of a few terms, and a step of the dynamics some hundred operations,
 # of which one amplifies what another has rounded.
@@ -24,14 +26,14 @@ REST = 1e-13
 SLACK = 2.0
 
 
-Work = Callable[[int, Array, Rows], object]
+Work = Callable[[int, CostToGo, Rows], object]
 
 
 def certified(
     problem: Problem,
     work: Work,
     states: Array,
-    hessians: Array | None,
+    value: Quadratic | None,
     *,
     violation: float,
     kept: bool = True,
@@ -41,26 +43,32 @@ def certified(
     """The certificate of a plan, and what of it contradicts a solver that says it converged.
 
     Args:
-      work: runs the compiled `certify`: of a task, Hessians (T+1, n, n) of the cost-to-go, and where to write (1,).
-      states: (T+1, n) of the plan. hessians: None where there are none.
+      work: runs the compiled `certify`: of a task, a cost-to-go, and where to write (1,).
+      states: (T+1, n) of the plan. value: the cost-to-go; None where there is none.
       violation: by how much the worst constraint is missed. kept: whether that is within the equalities' tolerance.
       claimed: the cost that the log ends with; None where success is not claimed, and nothing can contradict it.
       tolerance: of the optimality; None where only the cost was asked for.
     """
     numbers, n = np.zeros(1, CERTIFICATE), states.shape[1]
-    given = np.zeros((len(states), n, n)) if hessians is None else hessians
-    work(declarations.CERTIFY, given, numbers)
+    none = CostToGo(np.zeros((len(states), n, n)), np.zeros((len(states), n)), np.zeros(len(states)))
+    work(declarations.CERTIFY, none if value is None else CostToGo(*map(in_c_order, _parts(value))), numbers)
     certificate = certificate_of(problem, numbers[0], states, violation=violation)
-    if hessians is None:
+    if value is None:
         certificate = replace(certificate, optimality=np.inf)
     if claimed is None:
         return certificate, ""
     if tolerance is not None and not certificate.optimality < SLACK * tolerance:
         # Where controls stand at their limits, the Hessians of the Riccati pass are not those of the policy.
-        work(declarations.EVALUATE, np.zeros_like(given), numbers)
-        certificate = certificate_of(problem, numbers[0], states, violation=violation)
+        own = np.zeros(1, CERTIFICATE)
+        work(declarations.EVALUATE, none, own)
+        optimality = certificate_of(problem, own[0], states, violation=violation).optimality
+        certificate = replace(certificate, optimality=optimality)
     rest = REST * float(numbers["scale"][0])
     return certificate, faults(certificate, claimed=claimed, rest=rest, tolerance=tolerance, kept=kept)
+
+
+def _parts(value: Quadratic) -> tuple[Array, Array, Array]:
+    return value.hessian, value.gradient, np.asarray(value.constant)
 
 
 def certificate_of(problem: Problem, found: np.void, states: Array, *, violation: float) -> Certificate:

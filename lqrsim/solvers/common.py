@@ -26,6 +26,7 @@ from lqrsim.kernels import declarations
 from lqrsim.kernels.records import Rows
 from lqrsim.machine import processors
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
+from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
@@ -48,6 +49,7 @@ _STATUS = {
     declarations.CYCLING: Status.MAX_ITERATIONS,
     declarations.NO_PROGRESS: Status.MAX_ITERATIONS,
     declarations.TIMED_OUT: Status.TIME_LIMIT,
+    declarations.RISK_TOO_HIGH: Status.RISK_TOO_HIGH,
 }
 
 
@@ -176,7 +178,9 @@ class Termination:
     @property
     def pass_failed(self) -> bool:
         """Whether a pass of one more iteration was begun and not completed."""
-        return self.outcome in (declarations.NOT_POSITIVE_DEFINITE, declarations.NOT_FINITE)
+        return self.outcome in (
+            declarations.NOT_POSITIVE_DEFINITE, declarations.NOT_FINITE, declarations.RISK_TOO_HIGH
+        )  # fmt: skip
 
     def detail(self, steps: int) -> str:
         """What there is to say besides the status: where it ended, and what a user's function raised there."""
@@ -302,7 +306,7 @@ def workers(threads: int, functions: Iterable[UserFunction]) -> Iterator[ThreadP
 
 
 def check_callback(callback: Callback | None) -> None:
-    """Raises InputError for what can not be called."""
+    """Raises InputError for what cannot be called."""
     check_function("callback", callback, "a function of an Iteration", arguments=1)
 
 
@@ -319,6 +323,14 @@ def check_attempts(problem: Problem, starts: int) -> None:
 def list_of(problems: Iterable[Problem]) -> list[Problem]:
     """The problems as a list. Raises InputError for what is no collection."""
     return list(check_items("problems", problems, object, "a list of Problem"))
+
+
+def all_driven_by(problems: Iterable[Problem], noise: Noise | None, risk: float | None) -> list[Problem]:
+    """The problems as a list, under that noise and risk; of what is None, their own."""
+    listed = list_of(problems)
+    if noise is None and risk is None:
+        return listed
+    return [check_kind("problems", one, Problem, "Problems").driven_by(noise, risk) for one in listed]
 
 
 def check_problem(problem: Problem) -> None:

@@ -37,16 +37,20 @@ from lqrsim.kernels import (
     runge_kutta,
     signed_distance,
 )
+from lqrsim.kernels import noise as noise_kernel
 from lqrsim.kernels.records import Limits, Model, Plan, Policy
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import Term
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.noise import numbers_of
 from lqrsim.problem.problem import FixedState, Problem
 
 # The terms of a cost as far as they are structure: the source of each, and what it is not convex in (see `Term`).
 Structure = tuple[tuple[str, tuple[int, ...] | None], ...]
 # The constraints: the source of each, whether it uses the control, whether it is an equality, and of how many balls.
 Constraints = tuple[tuple[str, bool, bool, int], ...]
+# The noise: its source, and the constants that `kernels/noise.py` leaves open; none without noise.
+Noise = tuple[str, tuple[tuple[str, Any], ...]] | None
 
 _FIELDS = {"initial": "initial", "stage": "stage_cost", "final": "final_cost"}
 
@@ -57,7 +61,7 @@ FORMS = {"dual": cost_to_come_dual, "primal": cost_to_come_primal}
 
 def core(problem: Problem, form: str = "dual") -> Core:
     """The compiled passes for problems of this structure; `kernels/` has what it offers."""
-    with compiling:  # not only against doing it twice: Python 3.11 can not parse in two threads at once
+    with compiling:  # not only against doing it twice: Python 3.11 cannot parse in two threads at once
         return _core(form, *_structure(problem))
 
 
@@ -66,7 +70,9 @@ def _structure(problem: Problem) -> tuple[Any, ...]:
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     costs = [(name, tuple((t.source, t.nonconvex_in) for t in problem.terms(field))) for name, field in _FIELDS.items()]
     constraints = tuple((one.source, one.uses_control, one.equality, one.balls) for one in problem.constraint_terms)
-    return n, m, dynamics.source, tuple(costs), constraints, f"{dynamics.name} ({n} states, {m} controls)"
+    term = problem.noise_term
+    noise = None if term is None else (term.source, tuple(term.filled.items()))
+    return n, m, dynamics.source, tuple(costs), constraints, noise, f"{dynamics.name} ({n} states, {m} controls)"
 
 
 @cache
@@ -77,12 +83,16 @@ def _core(
     dynamics: str,
     costs: tuple[tuple[str, Structure], ...],
     constraints: Constraints,
+    noise: Noise,
     what: str,
 ) -> Core:
     parts = [source_of(module) for module in (*_BASE, FORMS[form], *_SHARED)]
     parts += [dynamics, _constraint_source(constraints, len(dict(costs)["stage"]))]
     parts += [_cost_source(name, terms, () if name == "initial" else constraints) for name, terms in costs]
-    return Core("\n\n".join(parts), {**_NAMES, "N": n, "M": m, "W": n + m}, what)
+    if noise is not None:
+        parts += [noise[0], source_of(noise_kernel, **dict(noise[1]))]
+    sizes = {"N": n, "M": m, "W": n + m, "NOISY": int(noise is not None)}
+    return Core("\n\n".join(parts), {**_NAMES, **sizes}, what)
 
 
 _BASE = rotation_ratios, signed_distance, linear_algebra, cost_to_go, runge_kutta
@@ -118,7 +128,8 @@ def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> Model:
     data["final"] += tuple(array for pair in pairs for array in pair)
     space = problem.control_coordinates
     limits = Limits(np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64))
-    return Model(numbers(problem.dynamics), float(problem.dt), limits=limits, **data)
+    noise = () if problem.noise_term is None else (numbers_of(problem.noise_term), np.array([problem.risk, 0.0]))
+    return Model(numbers(problem.dynamics), float(problem.dt), limits=limits, noise=noise, **data)
 
 
 def costs_of(problem: Problem, states: Array, controls: Array) -> Array:

@@ -225,7 +225,7 @@ def _rounds(
     each: bool,
     callback: Callback | None,
 ) -> AttemptResult:
-    """Damped iterations from the plan in the memory, and updated multipliers, until the constraints are met or can not
+    """Damped iterations from the plan in the memory, and updated multipliers, until the constraints are met or cannot
     be.
     """
     work = attempt.work

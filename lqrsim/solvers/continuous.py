@@ -51,9 +51,11 @@ def smooth_lq_continuous(
       stage: the dynamics and the cost of a second, without a leading axis; where they change with time, a function
         t [s] -> Stage. Where that jumps, the integrator takes many short steps.
       horizon: l, in seconds.
-      initial, final: c_0 and c_l: hessian (n, n), gradient (n,), constant. Together with the stage they must give every
-        state a total cost with one minimum.
-      rtol, atol: how accurately the Riccati equations are integrated, relative and absolute.
+      initial: c_0: hessian (n, n), gradient (n,), constant. Together, stage, initial and final must give every state a
+        total cost with one minimum.
+      final: c_l, likewise.
+      rtol: relative tolerance of the integration of the Riccati equations.
+      atol: absolute tolerance of it.
 
     Returns:
       A ContinuousSolution. A problem without a minimum does not raise: the status says where it was noticed.
@@ -145,7 +147,8 @@ def smooth_continuous(
       max_iterations: when to give up.
       start: (m,), the control that the first pass applies; the problem's nominal control by default. Or an
         InitialPrior, which adds to that. It has a say in which local optimum is found.
-      rtol, atol: how accurately everything is integrated, relative and absolute.
+      rtol: relative tolerance of all integrations.
+      atol: absolute tolerance of all integrations.
       callback: called with each `Iteration` as it ends.
 
     Returns:
@@ -164,6 +167,8 @@ def smooth_continuous(
         )
     if problem.constraints:
         raise InputError("constraints: got some, want none in continuous time; smooth keeps them")
+    if problem.noise is not None:
+        raise InputError("noise: got some, which is per control period, want none in continuous time; smooth has it")
     if problem.dynamics.discrete:
         raise InputError(f"dynamics: got {problem.dynamics.name}, whose steps have no rate, want `smooth` for it")
     limits = _Limits(

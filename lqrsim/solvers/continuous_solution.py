@@ -53,31 +53,82 @@ class ContinuousSolution:
         return float(self.total_cost(0.0).minimum())
 
     def policy(self, x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
-        """The control (..., m) to apply in the states (..., n) at time t, without saturation. Paper: Eq. (13)."""
+        """The control (..., m) to apply in the states (..., n) at time t, without saturation. Paper: Eq. (13).
+
+        Args:
+          x: states (..., n).
+          t: seconds, from 0 to the horizon.
+
+        Returns:
+          Controls (..., m).
+        """
         return self._law("policy", self._backward, x, t)
 
     def inverse_policy(self, x: npt.ArrayLike, t: npt.ArrayLike) -> Array:
-        """The control (..., m) that led to the states (..., n) at time t at least cost. Paper: Eq. (19)."""
+        """The control (..., m) that led to the states (..., n) at time t at least cost. Paper: Eq. (19).
+
+        Args:
+          x: states of arrival (..., n).
+          t: seconds, from 0 to the horizon.
+
+        Returns:
+          Controls (..., m).
+        """
         return self._law("inverse_policy", self._forward, x, t)
 
     def cost_to_go(self, t: npt.ArrayLike) -> Quadratic:
-        """v: the least cost from time t on, of the state then. Paper: Eqs. (8)-(11)."""
+        """v: the least cost from time t on, of the state then. Paper: Eqs. (8)-(11).
+
+        Args:
+          t: seconds, from 0 to the horizon.
+
+        Returns:
+          The quadratic at each time.
+        """
         return self._value("cost_to_go", self._backward, t)
 
     def cost_to_come(self, t: npt.ArrayLike) -> Quadratic:
-        """vbar: the least cost up to time t, of the state then. Paper: Eqs. (14)-(17)."""
+        """vbar: the least cost up to time t, of the state then. Paper: Eqs. (14)-(17).
+
+        Args:
+          t: seconds, from 0 to the horizon.
+
+        Returns:
+          The quadratic at each time.
+        """
         return self._value("cost_to_come", self._forward, t)
 
     def total_cost(self, t: npt.ArrayLike) -> Quadratic:
-        """vhat: the least cost of visiting a state at time t. Paper: Eq. (20)."""
+        """vhat: the least cost of visiting a state at time t. Paper: Eq. (20).
+
+        Args:
+          t: seconds, from 0 to the horizon.
+
+        Returns:
+          The quadratic at each time.
+        """
         return self.cost_to_go(t) + self.cost_to_come(t)
 
     def x_hat(self, t: npt.ArrayLike) -> Array:
-        """The state (..., n) of least total cost at time t. Paper: Eq. (21)."""
+        """The state (..., n) of least total cost at time t. Paper: Eq. (21).
+
+        Args:
+          t: seconds, from 0 to the horizon.
+
+        Returns:
+          States (..., n).
+        """
         return self.total_cost(t).minimizer()
 
     def u_hat(self, t: npt.ArrayLike) -> Array:
-        """The control (..., m) of the policy there; once converged also that of the inverse policy. Paper: Eq. (22)."""
+        """The control (..., m) of the policy there; once converged also that of the inverse policy. Paper: Eq. (22).
+
+        Args:
+          t: seconds, from 0 to the horizon.
+
+        Returns:
+          Controls (..., m).
+        """
         return self.policy(self.x_hat(t), t)
 
     def summary(self) -> str:

@@ -4,11 +4,12 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import InputError
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Plan, Policy, Rows
 from lqrsim.kernels.records import Settings as KernelSettings
 from lqrsim.problem.derivative_check import check_functions
+from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Status
@@ -19,15 +20,16 @@ from lqrsim.solvers.certify import certified
 from lqrsim.solvers.common import (
     Callback,
     Settings,
+    all_driven_by,
     check_callback,
     check_outcome,
     check_problem,
     check_threads,
     iterate,
-    list_of,
     solve_all,
 )
 from lqrsim.solvers.initial_guess import InitialPrior, StartLike, resolve
+from lqrsim.solvers.risk import named
 
 
 def ilqr(
@@ -38,6 +40,8 @@ def ilqr(
     max_iterations: int = 500,
     time_limit: float | None = None,
     start: StartLike = None,
+    noise: Noise | None = None,
+    risk: float | None = None,
     callback: Callback | None = None,
 ) -> Solution:
     """Compute a locally optimal feedback policy by iterative LQR with a line search that halves the step.
@@ -47,10 +51,16 @@ def ilqr(
     the controls are kept; constraints are not for this solver.
 
     Args:
-      stop, tolerance, max_iterations, time_limit, callback: as in `smooth`; the gap is zero here, for every iterate is
-        feasible.
+      problem: with a start that is given exactly, or by the initial cost.
+      stop: as in `smooth`; the gap is zero here, for every iterate is feasible.
+      tolerance: as in `smooth`; the gap is zero here, for every iterate is feasible.
+      max_iterations: as in `smooth`; the gap is zero here, for every iterate is feasible.
+      time_limit: as in `smooth`; the gap is zero here, for every iterate is feasible.
       start: what the first trajectory applies: controls (m,) or (T, m), by default the problem's nominal control; the
         controls of a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
+      callback: as in `smooth`; the gap is zero here, for every iterate is feasible.
+      noise: as in `smooth`; with noise this is iLQG.
+      risk: as in `smooth`.
 
     Returns:
       The same Solution as `smooth`, without cost-to-come and inverse policy. A hard problem does not raise.
@@ -62,6 +72,8 @@ def ilqr(
         stop=stop, tolerance=tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start
     )
     check_callback(callback)
+    check_problem(problem)
+    problem = problem.driven_by(noise, risk)
     _check(problem, settings)
     with problem.dynamics.solving(check_threads(None)):
         return _solve(problem, settings, each=True, callback=callback)
@@ -76,9 +88,24 @@ def ilqr_many(
     max_iterations: int = 500,
     time_limit: float | None = None,
     start: StartLike = None,
+    noise: Noise | None = None,
+    risk: float | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> list[Solution]:
     """Solve many problems as `ilqr` does, on several threads; see `smooth_many`.
+
+    Args:
+      problems: of one structure or of many; each structure is compiled once.
+      threads: how many to use; by default all processors that this process may run on.
+      stop: as in `ilqr`, for all.
+      tolerance: as in `ilqr`, for all.
+      max_iterations: as in `ilqr`, for all.
+      time_limit: as in `ilqr`, for all.
+      start: as in `ilqr`, for all.
+      progress: called with the numbers of solved and of all problems, as each solve ends.
+
+    Returns:
+      One Solution per problem, in their order.
 
     Raises:
       InputError: an argument is not as described; a problem that is refused is named by its place in the list.
@@ -86,7 +113,7 @@ def ilqr_many(
     settings = Settings(
         stop=stop, tolerance=tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start
     )
-    return solve_all(list_of(problems), settings, _check, _solve, threads=threads, progress=progress)
+    return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)
 
 
 _NO_PRIOR = "start: got an InitialPrior, want controls, a Trajectory, an AffinePolicy or a Solution: iLQR has no prior"
@@ -149,19 +176,24 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     offset = controls - np.einsum("tij,tj->ti", policy.gain, states[:-1]) if whole else controls.copy()
     status, detail = termination.status, termination.detail(problem.steps)
 
-    def check(task: int, hessians: Array, out: Rows) -> None:
-        checked = work._replace(
-            policy=Policy(policy.gain, offset), to_go=go._replace(hessian=hessians), certificate=out
-        )  # fmt: skip
+    def check(task: int, to_go: CostToGo, out: Rows) -> None:
+        checked = work._replace(policy=Policy(policy.gain, offset), to_go=to_go, certificate=out)
         loop(task, 0, 0, options, model, checked, log)
 
     certificate, wrong = certified(
-        problem, check, states, go.hessian if whole else None, violation=0.0,
+        problem, check, states, Quadratic(*go) if whole else None, violation=0.0,
         claimed=termination.iterations[-1].cost if status.success else None,
         tolerance=settings.tolerance if status is Status.CONVERGED else None,
     )  # fmt: skip
     if wrong:
         status, detail = Status.NOT_CERTIFIED, f"of the plan that converged: {wrong}"
+    if status is Status.RISK_TOO_HIGH:
+
+        def fails(risk: float) -> int:
+            model.noise[1][0] = risk
+            return loop(declarations.ITERATE, 1, 1, options, model, work, log)[3]
+
+        detail = "; ".join(part for part in (named(fails, problem.risk, steps), detail) if part)
     solution = assemble(
         problem, solver="ilqr", options=settings.options(initial_guess), status=status, detail=detail,
         iterations=termination.iterations, states=states, controls=controls, law=(policy.gain, offset),

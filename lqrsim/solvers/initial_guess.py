@@ -22,7 +22,8 @@ class InitialPrior:
     local optimum is found.
 
     Args:
-      weight: (n,) not negative. iterations: how many it acts in.
+      weight: (n,) not negative.
+      iterations: how many it acts in.
       about: where it is zero: (n,), or (T+1, n) for a trajectory to be drawn to.
       obstacles: the shares of the obstacle costs that the first iterations see, one an iteration; then it is all.
       controls: what the first pass applies, (m,) or (T, m); by default the problem's nominal control.
@@ -58,7 +59,17 @@ class InitialPrior:
             self.controls = numbers_of("InitialPrior: controls", controls, "controls (m,) or (T, m)")
 
     def at(self, step: float) -> Array:
-        """Where it is zero, (n,), at a step or between two. Raises InputError for what is none."""
+        """The state at which the prior is zero.
+
+        Args:
+          step: a step, or a number between two.
+
+        Returns:
+          (n,).
+
+        Raises:
+          InputError: no such step.
+        """
         most = None if self.about.ndim == 1 else len(self.about) - 1
         step = check_number("step", step, at_least=0.0, at_most=most)
         if self.about.ndim == 1:
@@ -68,7 +79,17 @@ class InitialPrior:
         return (1 - share) * self.about[before] + share * self.about[before + 1]
 
     def fitting(self, problem: Problem) -> "InitialPrior":
-        """Itself. Raises InputError if it does not fit the problem."""
+        """Check that the prior fits a problem.
+
+        Args:
+          problem: to be solved with it.
+
+        Returns:
+          The prior itself, with one entry per state.
+
+        Raises:
+          InputError: it does not fit.
+        """
         check_kind("problem", problem, Problem, "a Problem")
         n = len(problem.dynamics.state_coordinates)
         check_array("start: InitialPrior: weight", self.weight, (n,))

@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 
 from lqrsim.errors import Array, InputError
+from lqrsim.kernels import declarations
 from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, terms_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
@@ -260,6 +261,25 @@ class Search:
             # The same optimum once more, a little different within the tolerances, is no other way.
             other = found.rank < best.rank and (not best.success or found.cost < best.cost - 1e-3 * abs(best.cost))
             self._finished.insert(0 if other else len(self._finished), (attempt, found))
+
+    def calm(self, problem: Problem, settings: SmootherSettings, start: Array, stop: Stop, threads: int) -> None:
+        """Where the risk was too high on the way: search without a risk, and go on from that plan."""
+        if all(attempt.termination.outcome != declarations.RISK_TOO_HIGH for _, attempt in self._named):
+            return
+        calm = dataclasses.replace(problem, risk=0.0)
+        attempts = [Attempt(calm, settings, attempt.initial_guess, start, stop) for _, attempt in self._named]
+        found = finish(choose(attempts, self._advance, threads)[0], each=self._each)
+        if not found.success or stop.due:
+            return
+        summary = "a plan without a risk"
+        initial_guess = InitialGuess(
+            found.law[0].copy(), found.law[1].copy(), found.values["cost_to_go"], None, summary,
+            multipliers=found.multipliers,
+        )  # fmt: skip
+        attempt = Attempt(problem, settings, initial_guess, start, stop)
+        self._named.append((summary, attempt))
+        self._finished.append((attempt, finish(attempt, each=self._each, callback=self._callback)))
+        self._finished.sort(key=lambda pair: pair[1].rank)
 
     def candidates(self) -> tuple[Candidate, ...]:
         """What was tried, where it was more than one."""

@@ -34,7 +34,13 @@ def prepare(
 
     Args:
       problem: what is to be solved again and again, with other states, goals, obstacles and parameters.
-      tolerance, gap_tolerance, constraint_tolerance, max_iterations: as in `smooth`.
+      tolerance: as in `smooth`.
+      gap_tolerance: as in `smooth`.
+      constraint_tolerance: as in `smooth`.
+      max_iterations: as in `smooth`.
+
+    Returns:
+      A PreparedSolver.
 
     Raises:
       InputError: an argument is not as described.
@@ -51,7 +57,8 @@ class PreparedSolver:
     """Solves problems of one structure, from one state after the other; `prepare` makes it.
 
     Attributes:
-      problem: what is solved by default. settings: as `prepare` was told.
+      problem: what is solved by default.
+      settings: as `prepare` was told.
     """
 
     def __init__(self, problem: Problem, settings: SmootherSettings) -> None:
@@ -77,7 +84,17 @@ class PreparedSolver:
             attempt.work.constraint_slope(which, 0, state, control, 0)
 
     def check(self, problem: Problem) -> Problem:
-        """The problem. Raises InputError if it would have to be compiled: only numbers may differ from `problem`."""
+        """Check that solving a problem compiles nothing: only numbers may differ from the prepared one.
+
+        Args:
+          problem: to be solved.
+
+        Returns:
+          The problem.
+
+        Raises:
+          InputError: it would have to be compiled.
+        """
         check_problem(problem)
         if compiled.core(problem) is not self._core:
             raise InputError(
@@ -103,6 +120,9 @@ class PreparedSolver:
           problem: what to solve, the start apart; the prepared one, or one with other numbers.
           after: how many steps of it are over: what is left is solved.
           time_limit: seconds from this call to its end. An iteration that would probably end later is not begun.
+
+        Returns:
+          A Replan.
 
         Raises:
           InputError: an argument is not as described.

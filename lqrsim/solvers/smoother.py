@@ -6,23 +6,26 @@ import numpy as np
 
 from lqrsim.errors import InputError
 from lqrsim.problem.derivative_check import check_functions
+from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Status
 from lqrsim.solvers.assembly import assemble
 from lqrsim.solvers.attempt import Attempt
 from lqrsim.solvers.common import (
     Callback,
     SmootherSettings,
     Stop,
+    all_driven_by,
     check_attempts,
     check_callback,
     check_problem,
     check_threads,
-    list_of,
     solve_all,
 )
 from lqrsim.solvers.initial_guess import StartLike, resolve
 from lqrsim.solvers.multistart import STARTS, Search, check_starts, guides
+from lqrsim.solvers.risk import name_risk
 
 
 def smooth(
@@ -39,6 +42,8 @@ def smooth(
     start: StartLike = None,
     starts: int | None = None,
     constraint_tolerance: float = 1e-3,
+    noise: Noise | None = None,
+    risk: float | None = None,
     threads: int | None = None,
     callback: Callback | None = None,
 ) -> Solution:
@@ -76,6 +81,9 @@ def smooth(
       constraint_tolerance: how closely the problem's constraints are solved for, in their unit: for a clearance it is
         metres. So much to spare is aimed at; a plan that has converged keeps the constraints themselves, and equalities
         to 1e-6, or to this where it is smaller.
+      noise: replaces the problem's own; see `Noise`. The cost is then an expectation, in the log, line searches and
+        the choice among starts.
+      risk: replaces the problem's own; see `Problem`.
       threads: how many starts to run at once; by default as many as there are processors.
       callback: called with each `Iteration` as it ends; of a search, those of the starts that are run to their end.
         What it raises ends the solve, as Ctrl-C does, and is raised again with the best plan so far as its `solution`.
@@ -92,6 +100,8 @@ def smooth(
         constraint_tolerance=constraint_tolerance,
     )  # fmt: skip
     check_callback(callback)
+    check_problem(problem)
+    problem = problem.driven_by(noise, risk)
     _check(problem, settings)
     threads = check_threads(threads)
     return _solve(problem, settings, each=True, threads=threads, callback=callback)
@@ -112,6 +122,8 @@ def smooth_many(
     start: StartLike = None,
     starts: int | None = None,
     constraint_tolerance: float = 1e-3,
+    noise: Noise | None = None,
+    risk: float | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> list[Solution]:
     """Solve many problems as `smooth` does, on several threads, without Python between the iterations.
@@ -123,8 +135,19 @@ def smooth_many(
     Args:
       problems: of one structure or of many; each structure is compiled once.
       threads: how many to use; by default all processors that this process may run on.
-      form, first_pass, safeguard, stop, tolerance, gap_tolerance, max_iterations, time_limit, start, starts,
-        constraint_tolerance: as in `smooth`, for all.
+      form: as in `smooth`, for all.
+      first_pass: as in `smooth`, for all.
+      safeguard: as in `smooth`, for all.
+      stop: as in `smooth`, for all.
+      tolerance: as in `smooth`, for all.
+      gap_tolerance: as in `smooth`, for all.
+      max_iterations: as in `smooth`, for all.
+      time_limit: as in `smooth`, for all.
+      start: as in `smooth`, for all.
+      starts: as in `smooth`, for all.
+      constraint_tolerance: as in `smooth`, for all.
+      noise: as in `smooth`, for all.
+      risk: as in `smooth`, for all.
       progress: called with how many are done, of how many, as each one ends.
 
     Returns:
@@ -139,7 +162,7 @@ def smooth_many(
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start, starts=starts,
         constraint_tolerance=constraint_tolerance,
     )  # fmt: skip
-    return solve_all(list_of(problems), settings, _check, _solve, threads=threads, progress=progress)
+    return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)
 
 
 def _solve(
@@ -166,11 +189,14 @@ def _solve(
         default = settings.start is None and settings.starts is None and settings.safeguard
         if default and not stop.due and search.poor(problem):
             search.widen(problem, settings, start, stop, threads)
+        if problem.risk > 0 and settings.safeguard and not stop.due:
+            search.calm(problem, settings, start, stop, threads)
         chosen, found = search.best
     assert found.certificate is not None
+    detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
     solution = assemble(
         problem, solver="smooth", options=settings.options(chosen.initial_guess), status=found.status,
-        detail=found.detail, iterations=found.iterations, states=found.states, controls=found.controls,
+        detail=detail, iterations=found.iterations, states=found.states, controls=found.controls,
         law=found.law,
         certificate=found.certificate, gap=found.gap, candidates=search.candidates(), multipliers=found.multipliers,
         **found.values,

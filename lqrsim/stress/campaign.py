@@ -64,15 +64,19 @@ def run_campaign(
     """Run what is asked and not there yet; the same call goes on where it was stopped, and what is done stays.
 
     Args:
+      campaign: what to run.
       folder: takes everything.
       workers: processes on this machine; by default one a processor. 0: do it in this process.
       batch: how many trials a worker simulates together; changes nothing but time and memory.
       scheduler: address of a dask cluster that does the work in place of processes on this machine.
       progress: called with the number of trials that there are and of all: first, and after each shard.
 
+    Returns:
+      The Results.
+
     Raises:
-      InputError: something that is asked can not be run; the folder is another campaign's, no campaign's, being
-        written, or on a full disk; the cluster can not be reached; or a script calls this with workers, and not under
+      InputError: something that is asked cannot be run; the folder is another campaign's, no campaign's, being
+        written, or on a full disk; the cluster cannot be reached; or a script calls this with workers, and not under
         `if __name__ == "__main__":`, so that each of them would call it again.
     """
     executors.end_if_started_by_import()
@@ -240,7 +244,7 @@ def _is_intact(results: Results, shard: Shard) -> bool:
             aside.parent.mkdir(exist_ok=True)
             path.replace(aside)
         except OSError as problem:
-            raise InputError(f"shard: got {path}, which is damaged and can not be moved ({problem.strerror})") from None
+            raise InputError(f"shard: got {path}, which is damaged and cannot be moved ({problem.strerror})") from None
         _log.warning("%s was damaged (%s); moved to %s, and done again", path.name, error, aside)
         return False
     return True

@@ -23,7 +23,7 @@ from lqrsim.stress.trials import Job, failed_work, work
 from lqrsim.versions import versions
 
 _POLL = 0.5  # s between two looks at what takes too long
-RESUME = "run the same command again, it goes on from here"
+RESUME = "run the same command again to resume"
 _lock = threading.Lock()
 
 

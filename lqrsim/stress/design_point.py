@@ -79,12 +79,18 @@ def smallest_failure(
 
     Args:
       score: of vectors (K, size), (K,); positive is failure.
+      size: how many numbers a vector has.
       failures: (k, size) to begin with; by default those of a small splitting.
       rounds: at most; it ends earlier where the noise leaves less than `tolerance` of the distance to be gained, and
         five rounds together gain less than a tenth of that.
       pairs: scored in each round; by default half the size, and at least 250: with fewer the gradient is mostly noise.
       spread: of these, s; each number of e is standard normal, over the root of `size`.
+      tolerance: share of the distance to be gained below which the search ends.
+      seed: of all random numbers.
       progress: called with the rounds that are done, and all of them.
+
+    Returns:
+      The DesignPoint: its numbers and its distance from the origin.
 
     Raises:
       InputError: an option is out of range, or none of the failures is one.

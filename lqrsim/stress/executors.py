@@ -49,7 +49,7 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
     than the time limit, is one of failed trials.
 
     Raises:
-      InputError: processes can not be started.
+      InputError: processes cannot be started.
     """
     queue, attempts, failed_starts = deque(shards), Counter[Shard](), 0
     busy: list[_Worker] = []

@@ -56,11 +56,11 @@ class ReliabilityProblem:
       scenario: what is run, as `lqrsim solve` takes it.
       sweep: disturbances, as `lqrsim stress` names them; by default those of the scenario's demo.
       strength: what they are multiplied by.
-      policy: as in `Campaign`. stated: disturbances that "track" or "offset_free" is made for, by name like `sweep`; by
-        default as in `Campaign`.
+      policy: as in `Campaign`.
+      stated: disturbances that "track" or "offset_free" is made for, by name like `sweep`; by default as in `Campaign`.
       failure: "collision", with an obstacle, or lost; "miss", any trial that does not reach its goal.
-      goal_radius, goal_tolerance: how near the goal counts as having reached it, as in `simulate`; by default as the
-        scenario has it.
+      goal_radius: in metres, within which the goal counts as reached, as in `simulate`; by default the scenario's.
+      goal_tolerance: the same as a scaled error, for robots without a position; by default the scenario's.
 
     Raises:
       InputError: something is not as described.
@@ -145,10 +145,14 @@ class ReliabilityProblem:
         """How likely a failure is that is seldom seen, by multilevel splitting: see `split`.
 
         Args:
-          particles: trials that are kept at each level. repetitions: independent ones, of which the interval is made.
+          particles: trials that are kept at each level.
+          repetitions: independent ones, of which the interval is made.
           seed: of all random numbers.
           report: called with the summary, and with a line for each level as the pilot run finds it.
           progress: called with the repetitions that are done, and all of them.
+
+        Returns:
+          The probability with its interval, and the failures that were seen.
 
         Raises:
           InputError: an option is out of range, or as `score` does.
@@ -179,6 +183,9 @@ class ReliabilityProblem:
           seed: of all random numbers.
           report: called with the summary, and with a line for each level of the splitting that finds first failures.
           progress: called with the rounds that are done, and all of them.
+
+        Returns:
+          The failure, its distance and its parts.
 
         Raises:
           InputError: an option is out of range, the policy fails with nothing random, or as `score` does.
@@ -315,7 +322,7 @@ class SmallestFailure:
         """The distance, FORM's estimate, each disturbance's share, and what each is at its largest, a line each."""
         point = self.point
         lines = [
-            f"smallest failure: {point.distance:.3g} standard deviations from none, found with"
+            f"smallest failure: {point.distance:.3g} standard deviations from the undisturbed trial, found with"
             f" {self.simulations:,} trials"
         ]
         if not point.converged:

@@ -53,7 +53,7 @@ if sys.platform == "win32":
     import msvcrt
 
     def _lock(handle: int) -> None:
-        os.lseek(handle, 1 << 20, os.SEEK_SET)  # a byte that nobody reads, for locked ones can not be read
+        os.lseek(handle, 1 << 20, os.SEEK_SET)  # a byte that nobody reads, for locked ones cannot be read
         msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
 else:
     import fcntl

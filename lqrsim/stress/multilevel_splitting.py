@@ -83,11 +83,19 @@ def split(
 
     Args:
       score: of vectors (K, size), (K,); positive is failure.
-      particles: N of each repetition. keep: share that exceeds the next level. moves: of each particle at a level.
+      size: how many numbers a vector has.
+      particles: N of each repetition.
+      keep: share that exceeds the next level.
+      moves: of each particle at a level.
       repetitions: independent ones; the interval is made of how much they differ.
+      seed: of all random numbers.
+      confidence: of the interval.
       most_levels: with as many the pilot run gives up.
       level: called with each level as the pilot run finds it.
       progress: called with the repetitions that are done, and all of them.
+
+    Returns:
+      The probability with its interval, and the failures.
 
     Raises:
       InputError: an option is out of range, or a score is NaN.

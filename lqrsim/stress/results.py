@@ -35,7 +35,8 @@ class Results:
       scenario: the campaign's, where it is a function of yours: a file is data, and never chooses code to run.
 
     Attributes:
-      manifest: what the folder says of itself. cells: of the campaign.
+      manifest: what the folder says of itself.
+      cells: of the campaign.
 
     Raises:
       InputError: it is not a campaign's, damaged, or of another version.
@@ -77,7 +78,18 @@ class Results:
         return [(self.cells[shard.cell], shard.first, shard.count) for shard in self.shards() if shard not in on_disk]
 
     def outcomes(self, cell: Cell, *, partial: bool = False) -> Outcomes:
-        """All trials of a cell, in order. Raises InputError for what is damaged, or not finished unless `partial`."""
+        """All trials of a cell, in order.
+
+        Args:
+          cell: one of `cells`.
+          partial: whether to accept a cell that is not finished.
+
+        Returns:
+          The Outcomes.
+
+        Raises:
+          InputError: something is damaged, or not finished without `partial`.
+        """
         tables = [table for _, table in self.tables(cell, partial=partial)]
         if not tables:
             raise InputError(f"cell: got {cell}, of which there is nothing yet, want one that was begun")
@@ -86,7 +98,18 @@ class Results:
         return Outcomes(**columns)
 
     def tally(self, cell: Cell, *, partial: bool = False) -> Counter[str]:
-        """How many trials of a cell ended how; it reads the cell in parts. Raises InputError as `outcomes` does."""
+        """Counts of the outcomes of a cell's trials. It reads the cell in parts.
+
+        Args:
+          cell: one of `cells`.
+          partial: whether to accept a cell that is not finished.
+
+        Returns:
+          Outcome -> number of trials.
+
+        Raises:
+          InputError: as `outcomes` does.
+        """
         counts: Counter[str] = Counter()
         for _, table in self.tables(cell, partial=partial):
             counts.update(table["outcome"].tolist())
@@ -136,7 +159,14 @@ class Results:
         return lines
 
     def reasons(self, cell: Cell) -> dict[int, str]:
-        """Why trials of a cell are an "error", or have a filter that diverged, by their numbers."""
+        """Why trials of a cell are an "error", or have a filter that diverged.
+
+        Args:
+          cell: one of `cells`.
+
+        Returns:
+          Number of the trial -> reason.
+        """
         return {
             int(trial): str(reason)
             for _, table in self.tables(cell, partial=True)
@@ -145,7 +175,17 @@ class Results:
         }
 
     def solution(self, policy: str) -> Solution:
-        """What a policy was made from. Raises InputError if its file is damaged."""
+        """The solution from which a policy was made.
+
+        Args:
+          policy: its name.
+
+        Returns:
+          The Solution.
+
+        Raises:
+          InputError: its file is damaged.
+        """
         path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
         hashes, solution = self.manifest["policies"][policy], save_load.load_solution(path)
         if sha256(path.read_bytes()) != hashes["sha256"] or digest_of_solution(solution) != hashes["digest"]:
@@ -153,7 +193,14 @@ class Results:
         return solution
 
     def shards(self, cell: Cell | None = None) -> Iterator[Shard]:
-        """The work of a cell, or all of it."""
+        """The shards of a cell, or all of them.
+
+        Args:
+          cell: one of `cells`; None for all.
+
+        Returns:
+          Their descriptions.
+        """
         campaign = self.manifest["campaign"]
         for number in range(len(self.cells)) if cell is None else [self.number(cell)]:
             yield from shards_of(number, campaign["trials"], campaign["shard"])
@@ -165,7 +212,17 @@ class Results:
         return {shard for shard in self.shards() if shard.file in names}
 
     def number(self, cell: Cell) -> int:
-        """The place of a cell among `cells`. Raises InputError if it is none of them."""
+        """The index of a cell among `cells`.
+
+        Args:
+          cell: one of them.
+
+        Returns:
+          The index, from 0.
+
+        Raises:
+          InputError: it is none of them.
+        """
         check_kind("cell", cell, Cell, "a Cell of the campaign")
         if cell not in self.cells:
             first, last = self.cells[0], self.cells[-1]
@@ -173,24 +230,59 @@ class Results:
         return self.cells.index(cell)
 
     def path(self, shard: Shard) -> Path:
-        """Its file."""
+        """The file of a shard.
+
+        Args:
+          shard: one of `shards`.
+
+        Returns:
+          Its path.
+        """
         check_kind("shard", shard, Shard, "a Shard of the campaign")
         check_count("shard: cell", shard.cell, at_least=0, at_most=len(self.cells) - 1)
         return self.folder / "shards" / shard.file
 
     def read(self, shard: Shard) -> Table:
-        """The rows of a shard. Raises Damaged."""
+        """The rows of a shard. Raises Damaged.
+
+        Args:
+          shard: one of `shards`.
+
+        Returns:
+          Column -> values, one per trial.
+        """
         return read(self.path(shard), shard, self.manifest["digest"])
 
     def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[tuple[Shard, Table]]:
-        """The shards of a cell one by one. Raises InputError for what is damaged, or missing unless `partial`."""
+        """The shards of a cell one by one.
+
+        Args:
+          cell: one of `cells`.
+          partial: whether to skip shards that are missing.
+
+        Returns:
+          Pairs of a shard and its columns.
+
+        Raises:
+          InputError: something is damaged, or missing without `partial`.
+        """
         check_flag("partial", partial)
         for shard in self.shards(cell):
             if self.path(shard).is_file() or not partial:
                 yield shard, self.table(shard)
 
     def table(self, shard: Shard) -> Table:
-        """The rows of a shard. Raises InputError if it is missing or damaged."""
+        """The rows of a shard.
+
+        Args:
+          shard: one of `shards`.
+
+        Returns:
+          Column -> values, one per trial.
+
+        Raises:
+          InputError: it is missing or damaged.
+        """
         path = self.path(shard)
         if not path.is_file():
             trials = f"{shard.first} to {shard.first + shard.count - 1}"
@@ -207,7 +299,14 @@ class Results:
         return shlex.join(["lqrsim", "stress", reference, "--resume", "--out", str(self.folder.absolute())])
 
     def command_of(self, command: str, *options: str) -> str:
-        """`lqrsim report` or `lqrsim replay` of this campaign, which runs in any working directory.
+        """The command line of `lqrsim report` or `lqrsim replay` for this campaign. It runs in any working directory.
+
+        Args:
+          command: "report" or "replay".
+          *options: further words of the command line.
+
+        Returns:
+          The command line.
 
         Raises:
           InputError: another command, or options that are no text.
@@ -231,6 +330,16 @@ def replay(
     """The very trial of a campaign again, the same to the bit until it ends; to the plan's end without contacts.
 
     That is so on the kind of processor and with the versions that `results.manifest["versions"]` has.
+
+    Args:
+      results: the campaign.
+      cell: one of its cells.
+      trial: number of the trial, from 0.
+      frames: whether to record for drawing.
+      contacts: whether obstacles stop the robot.
+
+    Returns:
+      A Rollout of one trial.
 
     Raises:
       InputError: no such cell or trial, or the scenario is one of yours and `Results` was not given it.

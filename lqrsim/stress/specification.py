@@ -32,7 +32,16 @@ USUAL = tuple(policy for policy in POLICIES if policy not in TOLD)  # which are 
 
 @dataclass(frozen=True)
 class Cell:
-    """One combination. All cells share the trials' random numbers."""
+    """A combination of policy, sweep and strength. All cells share the trials' random numbers.
+
+    Attributes:
+      policy: its name; see `Campaign`.
+      sweep: name of the disturbances.
+      strength: factor by which they are scaled, 0 or more.
+
+    Raises:
+      InputError: a name is empty or no text, or the strength is negative or not finite.
+    """
 
     policy: str
     sweep: str
@@ -48,7 +57,18 @@ class Cell:
 
     @classmethod
     def named(cls, text: str, cells: Sequence["Cell"]) -> "Cell":
-        """One of `cells`, by its number or as policy,sweep,strength. Raises InputError if there is none."""
+        """One of `cells`, by its number or as policy,sweep,strength.
+
+        Args:
+          text: the number, from 0, or the three separated by commas.
+          cells: the cells to choose from.
+
+        Returns:
+          The Cell.
+
+        Raises:
+          InputError: there is no such cell.
+        """
         cells = check_items("cells", cells, Cell, "a list of Cell")
         if not cells:
             raise InputError("cells: got none, want at least one")
@@ -91,17 +111,20 @@ class Campaign:
 
     Attributes:
       scenario: what is run, as `lqrsim solve` takes it.
-      sweeps: name -> disturbances at strength 1. strengths: what they are multiplied by.
+      sweeps: name -> disturbances at strength 1.
+      strengths: what they are multiplied by.
       policies: which of POLICIES: "smooth" is lqrsim.smooth's, "ilqr" that of lqrsim.ilqr; "open_loop" is the plan of
         smooth without feedback; "replan" solves again and again as it goes; "track" and "offset_free" keep to the plan
         of smooth, by lqrsim.track and lqrsim.OffsetFree. By default the first four.
       stated: the disturbances that "track" and "offset_free" are made for, whatever they then meet; by default those of
         the preset "moderate", for one policy has to do for all strengths, and that is in the middle.
-      trials: of each cell. seed: of all random numbers.
+      trials: of each cell.
+      seed: of all random numbers.
       replan_every: seconds between two solves of "replan"; by default a tenth of the horizon.
-      goal_radius, goal_tolerance: how near the goal counts as having reached it, as in `simulate`; by default as the
-        scenario has it.
-      shard: trials of a file. time_limit: seconds that a shard may take before it counts as hung.
+      goal_radius: in metres, within which the goal counts as reached, as in `simulate`; by default the scenario's.
+      goal_tolerance: the same as a scaled error, for robots without a position; by default the scenario's.
+      shard: trials of a file.
+      time_limit: seconds that a shard may take before it counts as hung.
 
     Raises:
       InputError: something is not as described.
@@ -175,7 +198,17 @@ class Campaign:
             yield from shards_of(number, self.trials, self.shard)
 
     def disturbances(self, cell: Cell) -> list[Disturbance]:
-        """What a cell's trials meet. Raises InputError for a cell of another campaign."""
+        """The disturbances that the trials of a cell meet.
+
+        Args:
+          cell: one of the campaign's.
+
+        Returns:
+          The disturbances, scaled by the cell's strength.
+
+        Raises:
+          InputError: the cell belongs to another campaign.
+        """
         check_kind("cell", cell, Cell, "a Cell of the campaign")
         check_name("cell: sweep", cell.sweep, self.sweeps)
         return [disturbance.scaled(cell.strength) for disturbance in self.sweeps[cell.sweep]]
@@ -193,6 +226,12 @@ class Campaign:
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> "Campaign":
         """The campaign that `as_json` described; its scenario must have been resolved, if it has its own disturbances.
+
+        Args:
+          fields: what `as_json` returned.
+
+        Returns:
+          A Campaign equal to the one described.
 
         Raises:
           InputError: it is damaged, or has a disturbance that is not known here.

@@ -119,6 +119,12 @@ def collision(rollout: Rollout) -> Array:
     It is positive for all that collide or are lost, and only for them. How far is meant of runs without contacts, in
     which the robot goes on through what it has run into. What is lost, or what its controller fails, counts as
     infinitely far.
+
+    Args:
+      rollout: K trials.
+
+    Returns:
+      (K,), in metres; positive where the trial fails.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     depth = -np.where(np.isnan(rollout.clearance), np.inf, rollout.clearance).min(axis=1)
@@ -131,6 +137,12 @@ def miss(rollout: Rollout) -> Array:
     """Positive for each trial that does not reach its goal, (K,): it collides, or ends too far away.
 
     In metres; where the goal has no position, of the scaled error by which it is judged.
+
+    Args:
+      rollout: K trials.
+
+    Returns:
+      (K,); positive where the trial fails.
     """
     check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
     outside = np.nan_to_num(rollout.goal_distance - rollout.goal_radius, nan=-np.inf)
@@ -144,11 +156,20 @@ class TrialScore:
     A trial fails if its score is positive. Numbers that are standard normal give the trials that `simulate` gives.
 
     Args:
-      failure: scores a rollout's trials, (K,). goal_radius, goal_tolerance, contacts: as in `simulate`.
+      plant: what is run.
+      solution: with the plan, and the policy unless there is a controller.
+      disturbances: as in `simulate`.
+      controller: as in `simulate`.
+      failure: scores a rollout's trials, (K,).
+      goal_radius: as in `simulate`.
+      goal_tolerance: as in `simulate`.
+      contacts: as in `simulate`.
       batch: how many trials are run at once.
+      threads: as in `simulate`.
 
     Attributes:
-      sizes: how many numbers each disturbance draws. simulations: how many trials have been run.
+      sizes: how many numbers each disturbance draws.
+      simulations: how many trials have been run.
     """
 
     plant: Plant
@@ -180,6 +201,17 @@ class TrialScore:
         return sum(self.sizes)
 
     def __call__(self, numbers: npt.ArrayLike) -> Array:
+        """The scores of trials that draw the given numbers.
+
+        Args:
+          numbers: (K, size).
+
+        Returns:
+          (K,); positive is failure.
+
+        Raises:
+          InputError: not numbers of that shape, or the scores are not numbers.
+        """
         vectors = check_array("numbers", numbers, (None, self.size))
         parts: Iterable[Array] = (vectors[first : first + self.batch] for first in range(0, len(vectors), self.batch))
         scores = [self._score(self.rollout(part, frames=False)) for part in parts]
@@ -194,7 +226,15 @@ class TrialScore:
         return scores
 
     def rollout(self, numbers: npt.ArrayLike, *, frames: bool = True) -> Rollout:
-        """The trials with these numbers, (K, size), in full; their `seed` means nothing."""
+        """The trials with these numbers, (K, size), in full; their `seed` means nothing.
+
+        Args:
+          numbers: (K, size).
+          frames: whether to record for drawing.
+
+        Returns:
+          A Rollout of K trials.
+        """
         vectors = check_array("numbers", numbers, (None, self.size))
         ends = np.cumsum((0, *self.sizes))
 

@@ -57,7 +57,7 @@ def unpack(contents: bytes, shard: Shard, campaign: str) -> Table:
 
 
 def write(contents: bytes, path: Path) -> None:
-    """Have the file on the disk, whole or not at all. Raises InputError where it can not be, as on a full disk."""
+    """Have the file on the disk, whole or not at all. Raises InputError where it cannot be, as on a full disk."""
     with replacing(path) as unfinished, unfinished.open("wb") as file:
         file.write(contents)
         file.flush()
@@ -65,11 +65,11 @@ def write(contents: bytes, path: Path) -> None:
 
 
 def read(path: Path, shard: Shard, campaign: str) -> Table:
-    """The table of a file. Raises Damaged for what is not to be trusted, or can not be read."""
+    """The table of a file. Raises Damaged for what is not to be trusted, or cannot be read."""
     try:
         contents = path.read_bytes()
     except OSError as error:
-        raise Damaged(f"it can not be read ({error.strerror or error})") from None
+        raise Damaged(f"it cannot be read ({error.strerror or error})") from None
     return unpack(contents, shard, campaign)
 
 

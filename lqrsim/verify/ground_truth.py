@@ -77,7 +77,7 @@ def check_record(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: flo
 
 
 def check_plan(rollout: Rollout, solution: Solution | None) -> Test:
-    """Whether the plan is the solution's; untold where it was not the solution's policy that was run."""
+    """Whether the plan is the solution's; None (not checked) where another policy was run."""
     if solution is None:
         return Test("plan", None, "whether it is the one that was followed takes the solution")
     same = np.array_equal(rollout.plan.states, solution.trajectory.states)

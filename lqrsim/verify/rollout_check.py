@@ -40,9 +40,13 @@ def verify_run(
     Of a robot without a position it is where its last ball is that is read.
 
     Args:
+      rollout: what `simulate` returned, with frames.
       trial: row of the rollout.
       solution: of which the run is, to tell whether the plan in the rollout is the one that was followed.
       progress: called after each frame with the number of frames done and of all frames.
+
+    Returns:
+      The Verification.
 
     Raises:
       InputError: there is no such trial, nothing to draw, or no OpenGL.

@@ -9,7 +9,7 @@ from lqrsim.verify.diagnosis import diagnose
 
 HIDDEN = 0.05  # of the frames that may not show what is tracked
 SCALE = 0.002
-VERDICTS = {True: "passed", False: "FAILED", None: "untold"}
+VERDICTS = {True: "passed", False: "FAILED", None: "not checked"}
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,18 @@ class Verification:
     """A run's positions as pixels tell them, N frames with d coordinates, and what they prove.
 
     Attributes:
-      subject: what was verified. method: how its position was read from pixels.
+      subject: what was verified.
+      method: how its position was read from pixels.
       times: (N,) seconds after the run's start that the frames should show.
       seen: (N, d) positions from pixels in metres; NaN where the robot is hidden.
-      actual: (N, d) the simulator's. planned: (N, d) the plan's.
-      rms, worst: of the distance between seen and actual, in metres.
-      shift: by how many seconds the pictures are ahead of the run. scale: of the seen motion to the actual one.
-      tests: each with a verdict. likely: what is wrong, if one failed; empty if none did.
+      actual: (N, d) the simulator's.
+      planned: (N, d) the plan's.
+      rms: root mean square of the distance between seen and actual, in metres.
+      worst: largest distance between seen and actual, in metres.
+      shift: by how many seconds the pictures are ahead of the run.
+      scale: of the seen motion to the actual one.
+      tests: each with a verdict.
+      likely: what is wrong, if one failed; empty if none did.
     """
 
     subject: str

@@ -48,8 +48,13 @@ def verify_video(
     Args:
       path: what `lqrsim render` wrote with the camera `top`, for robots in a vertical plane `side`, and for those that
         move in space both, whatever else is in the picture.
+      rollout: the run that the video shows.
       trial: row of the rollout; by default the first that the video shows.
-      solution, progress: as for `verify_run`.
+      solution: as for `verify_run`.
+      progress: as for `verify_run`.
+
+    Returns:
+      The Verification.
 
     Raises:
       InputError: the file is not lqrsim's, or has not the panes that it takes.

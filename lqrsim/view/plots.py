@@ -35,9 +35,14 @@ def plot_run(
     be shown, and below it their chance of collision step by step.
 
     Args:
+      solution: whose plan the rollouts follow.
       rollouts: by what the legend calls them, for example `{"undisturbed": ..., "disturbed": ...}`; at most four.
+      path: FILE.png, .pdf or .svg.
       world: the obstacles, as the scene has them.
       trial: row of each rollout.
+
+    Returns:
+      The path.
 
     Raises:
       InputError: the rollouts are of other systems, or the file cannot be written.

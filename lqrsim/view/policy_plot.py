@@ -34,8 +34,14 @@ def plot_policy(
     robot in space is seen from above and from the side. Of one without a position, the plan's states are there instead.
 
     Args:
-      world: the obstacles, as the scene has them. radius: of the robot, in metres.
+      solution: with a policy.
+      path: FILE.png, .pdf or .svg.
+      world: the obstacles, as the scene has them.
+      radius: of the robot, in metres.
       tube: what `predict_tube` says of the solution and what runs it.
+
+    Returns:
+      The path.
 
     Raises:
       InputError: the solution has no policy, the tube is of another plan or has no position, or the file cannot be

@@ -47,26 +47,29 @@ def render(
     in its metadata what it shows, so that `lqrsim verify` can measure it.
 
     Args:
+      runs: one rollout, or several to be shown side by side.
+      path: FILE.mp4 or FILE.gif.
       trial: row of the rollout; several are shown side by side. With several rollouts, one for all or one each.
       camera: `overview`, `chase`, or the calibrated `top` and `side`, in any scene; or another of the model's.
       insets: more cameras, in panes of their own beside the first. In panes of `top` and `side` robots wear a marker.
       titles: of the runs, in the place of robot and scene.
-      overlays: what is drawn over the scene, of
-        plan, ghost: the planned path, and a disc or ball where the robot should be now;
-        trace: what was driven so far, coloured by tracking error;
-        forces: what pushes the robot, wind too, as an arrow: the mean over the last fifth of a second;
-        measured: the last states that the policy was shown, where they differ from the true ones;
-        tube: where the run was predicted to be under its disturbances, 2 standard deviations about the plan, as far as
-          that is not too wide to be shown; where there is a `rollout.tube`;
+      overlays: what is drawn over the scene, of plan, ghost: the planned path, and a disc or ball where the robot
+        should be now; trace: what was driven so far, coloured by tracking error; forces: what pushes the robot, wind
+        too, as an arrow: the mean over the last fifth of a second; measured: the last states that the policy was shown,
+        where they differ from the true ones; tube: where the run was predicted to be under its disturbances, 2 standard
+        deviations about the plan, as far as that is not too wide to be shown; where there is a `rollout.tube`;
         cost_tube: ellipsoids in which the total cost is near its least, whatever disturbs; only where it is asked for;
         caption: time, tracking error, clearance, what disturbs, and a legend.
       solution: of which the run is, for cost_tube; one for all, or one each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and how much the video is compressed.
-      size: width and height in pixels, both even; that of the quality by default, and half of it for a GIF, but
-        not less than 480 x 270.
+      size: width and height in pixels, both even; that of the quality by default, and half of it for a GIF, but not
+        less than 480 x 270.
       fps: frames a second, whatever the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
       speed: seconds of the run in a second of the video.
       progress: called after each frame with the number of frames done and of all frames.
+
+    Returns:
+      The path.
 
     Raises:
       InputError: an argument is wrong, the file cannot be written, or there is no OpenGL.
@@ -120,10 +123,30 @@ def still(
     quality: Quality = "standard",
     size: tuple[int, int] | None = None,
 ) -> Path:
-    """Writes a picture (png) of one moment, `time` seconds after the start (the end by default); returns its path.
+    """Write a picture (png) of one moment.
 
     With `every`, the robot is drawn also where it was at each multiple of that many seconds, as in the paper's figures.
     The rest, and what is raised, is as in `render`.
+
+    Args:
+      runs: one rollout, or several to be shown side by side.
+      path: FILE.png.
+      time: seconds after the start; by default the end.
+      every: seconds; the robot is also drawn at each multiple of it.
+      trial: as in `render`.
+      camera: as in `render`.
+      insets: as in `render`.
+      titles: as in `render`.
+      overlays: as in `render`.
+      solution: as in `render`.
+      quality: as in `render`.
+      size: as in `render`.
+
+    Returns:
+      The path.
+
+    Raises:
+      InputError: as in `render`.
     """
     path = _checked_path(path, ".png")
     options = PictureOptions(

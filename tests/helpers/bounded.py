@@ -14,7 +14,7 @@ DT, N, M = 0.2, 3, 2
 
 
 def random_problem(seed: int, *, steps: int = 10, limit: float = 0.5, fixed: bool = True) -> ls.Problem:
-    """A stable linear system of three states and two controls, pushed by wishes that it can not all meet."""
+    """A stable linear system of three states and two controls, pushed by wishes that it cannot all meet."""
     rng = np.random.default_rng(seed)
     a, b = rng.normal(size=(N, N)), rng.normal(size=(N, M))
     a -= (np.linalg.eigvals(a).real.max() + 0.1) * np.eye(N)

@@ -47,10 +47,11 @@ def slope(x, u, t, row, data, gradient):
         return ls.ConstraintTerm(source, numbers, 2, lambda row: ("effort", "power")[row], uses_control=True)
 
 
-def balls(*places: tuple[float, float, float]) -> ls.World:
-    """At x, y, with a radius."""
+def balls(*places: tuple[float, float, float], velocity: tuple[float, float] = (0.0, 0.0)) -> ls.World:
+    """At x, y, with a radius; all move with that velocity."""
     return ls.World(
-        [ls.Obstacle(f"ball {i}", "sphere", np.array([x, y, 0.0]), np.eye(3), np.array([radius, 0, 0]))
+        [ls.Obstacle(f"ball {i}", "sphere", np.array([x, y, 0.0]), np.eye(3), np.array([radius, 0, 0]),
+                     velocity=np.array([*velocity, 0.0]))
          for i, (x, y, radius) in enumerate(places)]
     )  # fmt: skip
 
@@ -93,6 +94,7 @@ class Oracle:
         for t in range(steps):
             self.slopes[t + 1], self.offset[t + 1] = A @ self.slopes[t], A @ self.offset[t]
             self.slopes[t + 1, :, self.free + 2 * t : self.free + 2 * t + 2] += B
+        self.times = problem.begin + DT * np.arange(steps + 1)
         self.problem, self.limit = problem, problem.control_coordinates.high[0]
 
     def unpack(self, z: Array) -> tuple[Array, Array]:
@@ -110,14 +112,16 @@ class Oracle:
         total = 0.05 * (controls**2).sum() + 50 * ((states[-1] - goal) ** 2).sum()
         total += 50 * ((states[0] - start) ** 2).sum()
         for cost in self.problem.obstacle_costs:
-            away = self.distances(states[1:-1], cost.world) - cost.radius
+            away = self.distances(states[1:-1], cost.world, self.times[1:-1]) - cost.radius
             total += cost.weight * np.exp(-10 * away).sum()
         return float(total)
 
     @staticmethod
-    def distances(states: Array, world: ls.World) -> Array:
-        """To each ball, from its centre and size."""
-        centres = np.array([ball.position[:2] for ball in world.obstacles]).reshape(-1, 2)
+    def distances(states: Array, world: ls.World, times: Array | float = 0.0) -> Array:
+        """To each ball, from its centre and size, at times (T,) in s."""
+        places = np.array([ball.position[:2] for ball in world.obstacles]).reshape(-1, 2)
+        velocities = np.array([ball.velocity[:2] for ball in world.obstacles]).reshape(-1, 2)
+        centres = places + np.reshape(times, (-1, 1, 1)) * velocities
         sizes = np.array([ball.size[0] for ball in world.obstacles])
         return np.linalg.norm(states[:, None, :2] - centres, axis=2) - sizes
 
@@ -127,18 +131,18 @@ class Oracle:
         values: list[Array] = []
         for one in self.problem.constraints:
             if isinstance(one, ls.Clearance):
-                values.append(self.distances(states, one.world) - one.radius - one.margin)
+                values.append(self.distances(states, one.world, self.times) - one.radius - one.margin)
             elif isinstance(one, Effort):
                 square = one.most**2 - (controls**2).sum(axis=1)
                 values.append(np.stack([square, one.power - (controls * states[:-1, 2:]).sum(axis=1)], axis=1))
-        if not self.soft:
+        if values and not self.soft:
             values[0] = values[0][1:]  # nothing can be done about a start that is given
         return values
 
     def least(self, z: Array) -> float:
         """What SLSQP finds from there."""
         bounds = [(None, None)] * self.free + [(-self.limit, self.limit)] * (len(z) - self.free)
-        kept = {"type": "ineq", "fun": lambda z: np.concatenate([one.ravel() for one in self.spare(z)])}
+        kept = {"type": "ineq", "fun": lambda z: np.concatenate([np.zeros(0), *(one.ravel() for one in self.spare(z))])}
         options = {"maxiter": 300, "ftol": 1e-10}
         return minimize(self.cost, z, method="SLSQP", constraints=kept, bounds=bounds, options=options).fun
 

@@ -1,10 +1,12 @@
 """A viewer that no one looks at, and `lqrsim view` in a process of its own."""
 
 import contextlib
+import itertools
 import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -38,13 +40,13 @@ class Recorder(Viewer):
 
 @contextlib.contextmanager
 def viewing(folder: Path, *arguments: str, before: str = "") -> Iterator[subprocess.Popen[str]]:
-    """`lqrsim view` in a process of its own, for a minute at most, and as it ends with Ctrl-C.
+    """`lqrsim view` in a process of its own, for three minutes at most, and as it ends with Ctrl-C.
 
     Args:
       before: what that process does first.
     """
     code = f"{before}\nimport sys; from lqrsim.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "view", *arguments, "--viewer", "browser", "--seconds", "100"]
+    command = [sys.executable, "-c", code, "view", *arguments, "--viewer", "browser", "--seconds", "200"]
     # MuJoCo keeps the layout of its panels in the home; what is compiled stays where it is.
     environment = {**os.environ, "HOME": str(folder), "LQRSIM_CACHE_DIR": str(disk_cache.folder())}
     outside = {"cwd": folder, "env": environment}
@@ -69,3 +71,25 @@ def said(process: subprocess.Popen[str], text: str) -> str:
         if text in line:
             return found
     raise AssertionError(f"{text!r} is not in {found}")
+
+
+def said_after(process: subprocess.Popen[str], text: str, act: Callable[[int], None]) -> str:
+    """What the process has written once it has written that: `act(i)` is done again every few seconds until it has.
+
+    A browser that has just begun on a busy machine loses keys.
+    """
+    done = threading.Event()
+
+    def again() -> None:
+        for i in itertools.count():
+            act(i)
+            if done.wait(3.0):
+                return
+
+    thread = threading.Thread(target=again, daemon=True)
+    thread.start()
+    try:
+        return said(process, text)
+    finally:
+        done.set()
+        thread.join()

@@ -44,7 +44,14 @@ class ControlDelay(Disturbance):
         return f"commands late by {counted(self.periods)}"
 
     def scaled(self, strength: float) -> "ControlDelay":
-        """Rounded to whole periods."""
+        """The same with `strength` times the periods, rounded to whole ones.
+
+        Args:
+          strength: factor, 0 or more.
+
+        Returns:
+          A ControlDelay.
+        """
         return replace(self, periods=int(times(self, self.periods, strength) + 0.5))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
@@ -109,7 +116,8 @@ class Saturation(Disturbance):
     """Limits of the controls that are narrower than the robot's own.
 
     Args:
-      lowest, highest: in the control's unit, within the robot's limits; one number, or one a control; None keeps it.
+      lowest: in the control's unit, within the robot's limits: a number, or one per control; None keeps the robot's.
+      highest: likewise.
       share: instead of them, share of the robot's own limits that is left, 0 to 1.
       strength: how far the limits go from the robot's own (0) to these (1), and beyond, until they meet.
     """
@@ -146,7 +154,17 @@ class Saturation(Disturbance):
         return replace(self, strength=times(self, self.strength, strength))
 
     def limits(self, plant: Plant) -> tuple[Array, Array]:
-        """Lowest and highest controls, each (m,). Raises InputError if the robot's own do not contain them."""
+        """Lowest and highest controls.
+
+        Args:
+          plant: whose robot has the wider limits.
+
+        Returns:
+          Two arrays (m,).
+
+        Raises:
+          InputError: the robot's own limits do not contain them.
+        """
         space = plant.robot.dynamics.control_coordinates
         own = np.array([space.low, space.high])
         if self.share is not None:
@@ -216,7 +234,14 @@ class ActuatorLoss(Disturbance):
         return f"{which} down to {100 * self.remaining:g} % from {self.at:g} s on"
 
     def scaled(self, strength: float) -> "ActuatorLoss":
-        """So many times as much is lost, at most all."""
+        """The same with `strength` times the loss, at most all of it.
+
+        Args:
+          strength: factor, 0 or more.
+
+        Returns:
+          An ActuatorLoss.
+        """
         lost = min(1.0, times(self, 1 - self.remaining, strength))
         return replace(self, remaining=self.remaining if strength == 1 else 1 - lost)
 

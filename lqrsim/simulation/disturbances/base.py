@@ -22,6 +22,7 @@ from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.plant import Plant
 
 Hook = Callable[[int, Array], Array]
+Kick = Callable[[int, Array, Array], Array]
 Numbers = float | Sequence[float]
 
 
@@ -39,6 +40,8 @@ class Effect:
       actuate: (step, controls (K, m)) -> the controls on their way to the actuators, (K, m), which then saturate.
       force: (step, true states (K, n)) -> force at the robot's centre of mass in N, world axes, (K, 3).
       torque: (step, true states (K, n)) -> torque on the robot in N m, world axes, (K, 3).
+      kick: (step, true states (K, n), controls (K, m) as the actuators get them) -> by how much the states jump at the
+        end of the control period, (K, n).
       displaced: (K, obstacles, 3), by how much each of the plant's obstacles is away from where the scene has it, in m.
     """
 
@@ -48,6 +51,7 @@ class Effect:
     actuate: Hook | None = None
     force: Hook | None = None
     torque: Hook | None = None
+    kick: Kick | None = None
     displaced: Array | None = None
 
     def __post_init__(self) -> None:
@@ -56,6 +60,8 @@ class Effect:
         for name in ("measure", "actuate", "force", "torque"):
             wanted = "a function of the step and an array, or None"
             check_function(f"Effect: {name}", getattr(self, name), wanted, arguments=2)
+        wanted = "a function of the step, states and controls, or None"
+        check_function("Effect: kick", self.kick, wanted, arguments=3)
         if self.displaced is not None:
             displaced = shaped("Effect: displaced", self.displaced, (None, None, 3))
             object.__setattr__(self, "displaced", displaced)
@@ -65,11 +71,24 @@ class Disturbance(abc.ABC):
     """Base class of all disturbances."""
 
     def describe(self, plant: Plant) -> str:
-        """In words and units, for the record; unless it is overridden, how the object is made."""
+        """The disturbance in words and units, for the record. By default, how the object is made.
+
+        Args:
+          plant: what is run.
+
+        Returns:
+          A line of text.
+        """
         return repr(self)
 
     def scaled(self, strength: float) -> "Disturbance":
-        """The same, so many times as strong: 0 has no effect, 1 is itself. For a sweep over strengths.
+        """The same disturbance with `strength` times its effect, for a sweep over strengths.
+
+        Args:
+          strength: factor; 0 has no effect, 1 is the disturbance itself.
+
+        Returns:
+          A Disturbance.
 
         Raises:
           InputError: nothing says what this is, or that much of it means nothing.
@@ -79,15 +98,37 @@ class Disturbance(abc.ABC):
         )
 
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
-        """Raise InputError if the plant cannot have this disturbance."""
+        """Check that the plant can have this disturbance.
+
+        Args:
+          plant: what is run.
+
+        Raises:
+          InputError: it cannot.
+        """
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """What it is in numbers, for `uncertainty_of`; unless it is overridden, it is left out, which is said."""
+        """The disturbance in numbers, for `uncertainty_of`. By default it is left out, and the result says so.
+
+        Args:
+          plant: what is run.
+
+        Returns:
+          An Uncertainty.
+        """
         return left_out(self, plant, f"{type(self).__name__} does not override `uncertainty`")
 
     @abc.abstractmethod
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        """Begin a run of one trial a generator. A trial's numbers may come from its own generator only.
+        """Begin a run with one trial per generator. A trial's random numbers must come from its own generator.
+
+        Args:
+          plant: what is run.
+          plan: the plan that the policy follows.
+          generators: K of them, one per trial.
+
+        Returns:
+          The Effect on the K trials.
 
         Raises:
           InputError: the disturbance does not fit the plant or the plan.

@@ -35,6 +35,13 @@ def preset(name: str, plant: Plant) -> list[Disturbance]:
     in whole control periods, while motion capture's 6 to 7 ms are less than half of one; a push, of which it matters
     when it comes and from where; and the loss of an actuator, which a quadrotor does not survive.
 
+    Args:
+      name: calm, light, moderate, strong or severe.
+      plant: which decides what disturbances it can have.
+
+    Returns:
+      The disturbances, in the order in which they act.
+
     Raises:
       InputError: there is none of that name.
     """

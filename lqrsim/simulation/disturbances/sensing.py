@@ -64,7 +64,14 @@ class MeasurementLatency(Disturbance):
         return f"measurements late by {counted(self.periods)}"
 
     def scaled(self, strength: float) -> "MeasurementLatency":
-        """Rounded to whole periods."""
+        """The same with `strength` times the periods, rounded to whole ones.
+
+        Args:
+          strength: factor, 0 or more.
+
+        Returns:
+          A MeasurementLatency.
+        """
         return replace(self, periods=int(times(self, self.periods, strength) + 0.5))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
@@ -85,8 +92,10 @@ class GilbertElliott:
     """A link that loses in bursts: it is good or bad, and begins in its stationary state.
 
     Args:
-      to_bad, to_good: probability a control period of turning bad while good, and good while bad.
-      lost_when_good, lost_when_bad: share that is lost in each.
+      to_bad: probability per control period of turning bad while good.
+      to_good: probability per control period of turning good while bad.
+      lost_when_good: share that is lost while good.
+      lost_when_bad: share that is lost while bad.
     """
 
     to_bad: float
@@ -112,7 +121,15 @@ class GilbertElliott:
         return (1 - self.bad) * self.lost_when_good + self.bad * self.lost_when_bad
 
     def draw(self, steps: int, generators: Sequence[np.random.Generator]) -> np.ndarray:
-        """Whether each of T things that are sent is lost, (K, T)."""
+        """Draw whether each of T items is lost.
+
+        Args:
+          steps: T.
+          generators: K of them, one per trial.
+
+        Returns:
+          (K, T), True where the item is lost.
+        """
         numbers = uniform(generators, steps, 2)
         bad, lost = numbers[:, 0, 0] < self.bad, np.empty(numbers.shape[:2], dtype=bool)
         for t in range(steps):
@@ -175,7 +192,14 @@ class MeasurementDropouts(Dropouts):
         self._check_loss()
 
     def scaled(self, strength: float) -> "MeasurementDropouts":
-        """So many times as many losses, or as many bad spells, at most all."""
+        """The same with `strength` times as many losses or bad spells, at most all.
+
+        Args:
+          strength: factor, 0 or more.
+
+        Returns:
+          A MeasurementDropouts.
+        """
         return replace(self, loss=self._scaled_loss(strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
@@ -189,7 +213,14 @@ class MeasurementDropouts(Dropouts):
         return Effect(measure=measure)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """As if each were lost on its own."""
+        """The share lost, as if each loss were independent.
+
+        Args:
+          plant: as in `uncertainty_of`.
+
+        Returns:
+          An Uncertainty with `loss`.
+        """
         return Uncertainty(loss=self.share)
 
 
@@ -207,7 +238,14 @@ class CommandDropouts(Dropouts):
         self._check_loss()
 
     def scaled(self, strength: float) -> "CommandDropouts":
-        """So many times as many losses, or as many bad spells, at most all."""
+        """The same with `strength` times as many losses or bad spells, at most all.
+
+        Args:
+          strength: factor, 0 or more.
+
+        Returns:
+          A CommandDropouts.
+        """
         return replace(self, loss=self._scaled_loss(strength))
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:

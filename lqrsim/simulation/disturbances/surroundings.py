@@ -59,6 +59,13 @@ class DisplacedObstacles(GaussianDisturbance):
         return Effect(displaced=displaced)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """One number for all axes: their rms, of those that count."""
+        """One standard deviation for all axes: the root mean square of those that count.
+
+        Args:
+          plant: as in `uncertainty_of`.
+
+        Returns:
+          An Uncertainty with `obstacles`.
+        """
         axes = 2 if plant.robot.dynamics.state_coordinates.from_above else 3
         return Uncertainty(obstacles=float(np.sqrt(np.mean(fit(self, self.std, "xyz")[:axes] ** 2))))

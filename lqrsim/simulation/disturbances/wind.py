@@ -67,7 +67,14 @@ class MeanWind(Wind):
         return self.blow(plant, np.broadcast_to(self.velocity, (len(generators), plan.steps, 3)))
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """A constant of mean zero whose standard deviation is this wind, as if it could blow the other way as well."""
+        """A constant of mean zero whose standard deviation is this wind, as if it could also blow the other way.
+
+        Args:
+          plant: as in `uncertainty_of`.
+
+        Returns:
+          An Uncertainty with the wind among its unknowns.
+        """
         winds = zip("xyz", self.velocity, strict=True)
         return unknowns_of(self, plant, [Unknown(f"wind_{axis}", abs(speed)) for axis, speed in winds])
 

@@ -1,0 +1,1 @@
+"""Sections of `noise_aware.py`."""

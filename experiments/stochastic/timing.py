@@ -1,0 +1,57 @@
+"""What an iteration takes with noise, against one without."""
+
+import time
+from statistics import median
+from typing import Any
+
+from paper.common import table
+
+import lqrsim as ls
+from stochastic.common import Config, drive, gusts, jolts, quadrotor, rotors, slip
+
+NOISES = {
+    "drive, slip": (drive, slip(0.1), 0.0),
+    "drive, displaced": (drive, jolts(0.004), 0.0),
+    "drive, displaced, risk": (drive, jolts(0.004), 0.1),
+    "quadrotor, rotors": (quadrotor, rotors(0.1), 0.0),
+    "quadrotor, gusts": (quadrotor, gusts(0.02), 0.0),
+    "quadrotor, gusts, risk": (quadrotor, gusts(0.02), 0.05),
+}
+SOLVERS = {
+    "smoother": lambda problem: ls.smooth_many([problem] * 5, starts=1, threads=1),
+    "iLQR": lambda problem: ls.ilqr_many([problem] * 5, threads=1),
+}
+
+
+def measure(config: Config) -> dict[str, Any]:
+    rows = []
+    names = list(NOISES)[:1] if config.quick else list(NOISES)
+    for name in names:
+        stated, noise, risk = NOISES[name]
+        for solver in list(SOLVERS)[:1] if config.quick or risk else SOLVERS:  # iLQR's first plans risk too much
+            plain, noisy = stated(), stated().driven_by(noise, risk)
+            each = [(iteration(solver, plain), iteration(solver, noisy)) for _ in range(config.rounds + 1)][1:]
+            rows.append({
+                "name": name, "solver": solver, "plain": 1e6 * median(one for one, _ in each),
+                "noisy": 1e6 * median(other for _, other in each), "ratio": median(b / a for a, b in each),
+            })  # fmt: skip
+    return {"rows": rows, "rounds": config.rounds}
+
+
+def iteration(solver: str, problem: ls.Problem) -> float:
+    """Seconds of the processor that an iteration takes, on one thread: what else runs does not count."""
+    clock = time.process_time()
+    solutions = SOLVERS[solver](problem)
+    return (time.process_time() - clock) / sum(len(one.iterations) for one in solutions)
+
+
+def report(found: dict[str, Any]) -> list[str]:
+    rows = [
+        [row["name"], row["solver"], f"{row['plain']:.0f}", f"{row['noisy']:.0f}", f"{row['ratio']:.2f}"]
+        for row in found["rows"]
+    ]
+    return [
+        "Time of the processor, all of a solve shared among its iterations; one thread, one start; with noise and"
+        f" without by turns, medians of {found['rounds']}.",
+        table(("noise", "solver", "plain, us", "with noise, us", "times"), rows),
+    ]

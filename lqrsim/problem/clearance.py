@@ -1,0 +1,95 @@
+"""The constraint that a robot keeps clear of obstacles."""
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen.kernel_source import source_of
+from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt, real
+from lqrsim.kernels import ball_clearance, clearance
+from lqrsim.problem.balls import Balls, bind_outline, check_outline
+from lqrsim.problem.constraints import Constraint, ConstraintTerm
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.scenes.world import World
+
+
+class Clearance(Constraint):
+    """A distance of at least `margin` between the robot and each obstacle, walls included, at the steps.
+
+    It does not act at a start that is given exactly. Between two steps a plan can come nearer, by `v^2 dt^2 / 8 r` at
+    the speed v along an obstacle of radius r, and it can step over obstacles thinner than a step. Add an ObstacleCost,
+    if only of a small weight: it tells the search which way round is better.
+
+    Args:
+      world: the obstacles; a robot in the plane sees them as for an ObstacleCost.
+      radius: of the robot in metres, as for an ObstacleCost; either this or `balls`.
+      balls: the robot's balls, as for an ObstacleCost; either this or `radius`.
+      margin: in metres; a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).
+    """
+
+    def __init__(
+        self,
+        world: World,
+        *,
+        radius: float | None = None,
+        balls: Balls | None = None,
+        margin: float | npt.ArrayLike = 0.0,
+    ) -> None:
+        if not isinstance(world, World):
+            raise InputError(f"Clearance: world: got {excerpt(world)}, want a World, such as scene.world")
+        self.world, self.balls = world, balls
+        self.radius = check_outline("Clearance", radius, balls)
+        given = real("Clearance: margin", margin)
+        if given.ndim == 0:
+            self.margin: float | Array = check_number("Clearance: margin", margin)
+        else:
+            self.margin = check_array("Clearance: margin", margin, (None,) * min(given.ndim, 2))
+            if not self.margin.size:
+                raise InputError("Clearance: margin: got no numbers, want one, or one for each knot")
+
+    def ahead(self, steps: int) -> "Clearance":
+        steps = check_count("steps", steps, at_least=0)
+        if not isinstance(self.margin, np.ndarray):
+            return self
+        left = self.margin[min(steps, len(self.margin) - 1) :]
+        return Clearance(self.world, radius=self.radius if self.balls is None else None, balls=self.balls, margin=left)
+
+    @property
+    def moving(self) -> bool:
+        return self.world.moving
+
+    def bind(self, dynamics: Dynamics) -> ConstraintTerm:
+        return self._bind_at(dynamics, np.zeros(len(np.atleast_1d(self.margin))))
+
+    def _bind_at(self, dynamics: Dynamics, times: Array) -> ConstraintTerm:
+        balls = self.balls
+        places, world = bind_outline("Clearance", balls, dynamics, self.world)
+        tables = world.tables(times)
+        margins = np.atleast_1d(self.margin).reshape(np.shape(self.margin)[0] if np.ndim(self.margin) else 1, -1)
+        if len(margins) not in (1, len(times)):
+            want = f"one, or one for each of {len(times)} knots"
+            raise InputError(f"Clearance: margin: got {len(margins)} numbers, want {want}")
+        if margins.shape[1] not in (1, len(world)):
+            want = f"{len(world)}, one an obstacle: {', '.join(world.names)}"
+            raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
+
+        def describe(row: int) -> str:
+            ball, place = divmod(row, len(world))
+            own, who = margins[:, place % margins.shape[1]], "" if balls is None else f" of {balls.names[ball]!r}"
+            low, high = f"{own.min():g}", f"{own.max():g}"
+            said = low if low == high else f"{low} to {high}"
+            return f"a clearance of {said} m{who} to obstacle {world.names[place]!r}"
+
+        if balls is None or places is None:
+            first = [*margins.shape, len(world), len(tables)]
+            data = np.concatenate([first, (self.radius + margins).ravel(), tables.ravel()])
+            source = source_of(clearance, AXES=dynamics.state_coordinates.position)
+            return ConstraintTerm(source, data, len(world), describe)
+        own = [*margins.shape, len(world), len(tables), *balls.radii, *margins.ravel(), *tables.ravel()]
+        return ConstraintTerm(
+            source=f"{places.source}\n\n{source_of(ball_clearance, AT=places.numbers, BALLS=len(balls))}",
+            data=np.concatenate([places.data, own]),
+            rows=len(balls) * len(world),
+            describe=describe,
+            balls=len(balls),
+            functions=places.functions,
+        )

@@ -1,0 +1,272 @@
+"""Noise that dynamics are driven by, which may depend on state and control: x' = g(x, u) + M(x, u) w, w ~ N(0, I).
+
+The same object is what a plan takes into account, `Problem(noise=...)`, and what a trial meets, as one of the
+disturbances of `simulate`.
+"""
+
+import copy
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen import symbolic
+from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order
+from lqrsim.codegen.kernel_source import source_of
+from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_count,
+    check_items,
+    check_kind,
+    check_name,
+    check_number,
+    excerpt,
+)
+from lqrsim.kernels import (
+    function_noise,
+    linear_algebra,
+    matrix_noise,
+    noise_differences,
+    noise_matrices,
+    rotation_ratios,
+)
+from lqrsim.problem.dynamics import Dynamics
+
+MOST = 100  # independent normal numbers
+
+
+@dataclass(frozen=True)
+class NoiseTerm:
+    """A noise, made for one system: what gets compiled, and the numbers it reads.
+
+    Attributes:
+      source: defines `noise_values(x, u, data, out)` and `noise_slopes(x, u, data, out, slopes)`; see
+        `kernels/declarations.py`.
+      data: (any,) the parameters or the matrix, then the strength.
+      rows: the states that noise acts on at once. size: of w.
+      active: the entries of (x, u), states before controls, that M depends on.
+      functions: what the source calls with `invoke`; their addresses come first in the data that it is given.
+    """
+
+    source: str
+    data: Array
+    rows: tuple[int, ...]
+    size: int
+    active: tuple[int, ...]
+    functions: tuple[UserFunction, ...] = ()
+
+    @property
+    def filled(self) -> dict[str, Any]:
+        """The constants that the kernels leave open."""
+        some = len(self.active)
+        return {
+            "ROWS": self.rows, "COUNT": len(self.rows), "FIRST": int(self.rows == tuple(range(len(self.rows)))),
+            "SIZE": self.size, "ACTIVE": self.active, "SOME": some, "WIDE": -4 * (some // -4),
+        }  # fmt: skip
+
+
+class Noise:
+    """White noise on the states: in each control period they get M(x, u) w more, w (k,) standard normal.
+
+    Thrust that varies by 5 % of itself, each rotor on its own, and gusts that are the stronger the faster a drone is:
+
+        def shaken(x, u, p):
+            speed = sqrt(x[3] ** 2 + x[4] ** 2 + 1e-6)
+            return [[0, 0], ..., [p.gust * speed, 0], ...]     # a row a state, an entry for each number in w
+
+        ls.Noise(shaken, size=2, parameters={"gust": 0.02})
+
+    M is in the state's unit, per control period, and not per second: what a disturbance that is white in time does to
+    the state in a period grows with the square root of dt. Who halves dt divides M by sqrt(2).
+
+    Args:
+      function: `function(x, u, p)` as in `Dynamics`: returns n rows of k entries, formulas of SymPy symbols, whose
+        derivatives follow; or numbers, of a numba or (level="plain") any Python function of arrays, whose derivatives
+        are central differences. Or the matrix itself, (n, k), where it is always the same.
+      size: k; of a matrix it is not asked for.
+      parameters: name -> value, as in `Dynamics`: to the function p has them as attributes. Values are data.
+      depends_on: names of the states and controls that M depends on, for numba and plain functions; all by default.
+        The fewer, the faster. Of formulas it is found out.
+      level: "symbolic", "compiled" or "plain"; by default compiled if it is a numba function, and symbolic otherwise.
+
+    Raises:
+      InputError: an argument is not as described. What the function returns is looked at when it is first needed.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any, Any, Any], Any] | npt.ArrayLike,
+        *,
+        size: int | None = None,
+        parameters: Mapping[str, float] | None = None,
+        depends_on: Sequence[str] | None = None,
+        level: str | None = None,
+    ) -> None:
+        self.parameters = symbolic.check_parameters(parameters)
+        self.strength = 1.0
+        self.depends_on = None
+        self.matrix, self.level = None, "symbolic"
+        if callable(function):
+            self.level = level_of(function, level)
+            check_signature(function, ("x", "u", "p"))
+            self.size = check_count("Noise: size", size, at_most=MOST)
+            if depends_on is not None:
+                if self.level == "symbolic" or isinstance(depends_on, str):
+                    wanted = "none: it is found out" if self.level == "symbolic" else "a tuple of names"
+                    raise InputError(f"Noise: depends_on: got {excerpt(depends_on)}, want {wanted}")
+                wanted = "a tuple of names of states and controls"
+                self.depends_on = check_items("Noise: depends_on", depends_on, str, wanted)
+        else:
+            self.matrix = check_array("Noise: function", function, (None, None))
+            if not self.matrix.size or self.matrix.shape[1] > MOST:
+                raise InputError(f"Noise: function: got shape {self.matrix.shape}, want (n, k), k from 1 to {MOST}")
+            self.size = self.matrix.shape[1]
+            given = {"size": size, "parameters": parameters, "depends_on": depends_on, "level": level}
+            for name, value in given.items():
+                if value is not None:
+                    raise InputError(f"Noise: {name}: got {excerpt(value)} beside a matrix, want none")
+        self.function: Any = function
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return "a matrix" if self.matrix is not None else f"{name_of(self.function)}(x, u, p)"
+
+    def __repr__(self) -> str:
+        times = "" if self.strength == 1 else f", {self.strength:g} times as strong"
+        return f"Noise({self.name}, size={self.size}{times})"
+
+    def scaled(self, strength: float) -> "Noise":
+        """The same, so many times as strong. Nothing compiles again.
+
+        Raises:
+          InputError: the strength is negative or not finite.
+        """
+        other = copy.copy(self)
+        other.strength = self.strength * check_number("Noise: strength", strength, at_least=0.0)
+        return other
+
+    def with_parameters(self, **values: float) -> "Noise":
+        """The same with other values of some parameters. Nothing compiles again.
+
+        Raises:
+          InputError: there is no such parameter, or the value is not finite.
+        """
+        for name in values:
+            check_name("parameters", name, self.parameters)
+        other = copy.copy(self)
+        other.parameters = self.parameters | symbolic.check_parameters(values)
+        return other
+
+    def bind(self, dynamics: Dynamics) -> NoiseTerm:
+        """The noise for a system. Raises InputError if it does not fit."""
+        check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
+        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        numbers = np.array([*self.parameters.values(), self.strength])
+        if self.matrix is not None:
+            if len(self.matrix) != n:
+                raise InputError(f"Noise: function: got a matrix of {len(self.matrix)} rows, want {n}, one a state")
+            source = source_of(matrix_noise, COUNT=n, SIZE=self.size)
+            return NoiseTerm(source, np.append(self.matrix.ravel(), numbers), tuple(range(n)), self.size, ())
+        if self.level != "symbolic":
+            return self._bind_function(dynamics, numbers)
+        details = ("noise", n, m, self.size, tuple(self.parameters))
+        made = symbolic.kept(self.function, details, lambda: self._trace(n, m))
+        return NoiseTerm(made["source"], numbers, tuple(made["rows"]), self.size, tuple(made["active"]))
+
+    def _trace(self, n: int, m: int) -> dict[str, Any]:
+        @functools.wraps(self.function)
+        def listed(x: Any, u: Any, p: Any) -> list[Any]:
+            return [entry for row in self._rows(self.function(x, u, p), n) for entry in row]
+
+        entries, x, u = symbolic.trace(listed, n, m, list(self.parameters))
+        import sympy
+
+        strength = sympy.Symbol(f"p{len(self.parameters)}", real=True)  # after the parameters, and without a name
+        table = [[strength * entry for entry in entries[i * self.size : (i + 1) * self.size]] for i in range(n)]
+        rows = [i for i, row in enumerate(table) if any(entry != 0 for entry in row)] or [0]
+        z = [*x, *u]
+        used = set().union(*(entry.free_symbols for entry in entries))
+        active = [a for a, symbol in enumerate(z) if symbol in used]
+        values = {f"out[{i}, {k}]": table[row][k] for i, row in enumerate(rows) for k in range(self.size)}
+        slopes = {
+            f"slopes[{k}, {i}, {a}]": table[row][k].diff(z[entry])
+            for k in range(self.size)
+            for i, row in enumerate(rows)
+            for a, entry in enumerate(active)
+        }
+        write = functools.partial(symbolic.write_function, data="data", of=self.name)
+        source = [
+            write("noise_values", "x, u, data, out", assignments=values),
+            write("noise_slopes", "x, u, data, out, slopes", assignments=values | slopes),
+        ]
+        return {"source": "\n\n".join(source), "rows": rows, "active": active}
+
+    def _rows(self, returned: Any, n: int) -> list[list[Any]]:
+        """What the function returned, as n rows. Raises InputError for another shape."""
+        wanted = f"{n} rows, one a state, of {self.size} entries"
+        if returned is None:
+            raise InputError(f"got None, want {wanted}: is a return missing?")
+        listed = returned.tolist() if hasattr(returned, "tolist") else returned
+        try:
+            rows = [row.tolist() if hasattr(row, "tolist") else list(row) for row in listed]
+        except TypeError:
+            raise InputError(f"got {excerpt(returned)}, want {wanted}") from None
+        if len(rows) != n:
+            raise InputError(f"got {len(rows)} rows, want {wanted}")
+        for row in rows:
+            if len(row) != self.size:
+                raise InputError(f"got a row of {len(row)} entries, want {wanted}")
+        return rows
+
+    def _bind_function(self, dynamics: Dynamics, numbers: Array) -> NoiseTerm:
+        states, controls = dynamics.state_coordinates.names, dynamics.control_coordinates.names
+        names = (*states, *controls)
+        wanted = names if self.depends_on is None else self.depends_on
+        active = tuple(sorted({names.index(check_name("Noise: depends_on", name, names)) for name in wanted}))
+        n, m = len(states), len(controls)
+        function = UserFunction(
+            function=self.function, level=self.level, states=n, controls=m, parameters=tuple(self.parameters), offset=1,
+            values=n * self.size, entries=states, columns=self.size,
+            unused=tuple((i, name) for i, name in enumerate(names) if i not in active),
+        )  # fmt: skip
+        source = source_of(function_noise, SIZE=self.size, STRENGTH=1 + len(self.parameters))
+        source += "\n\n" + source_of(noise_differences, SIZE=self.size, ACTIVE=active, SOME=len(active))
+        return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, (function,))
+
+    def matrices(self, dynamics: Dynamics, states: npt.ArrayLike, controls: npt.ArrayLike) -> Array:
+        """M (K, n, k) at states (K, n) and controls (K, m). Raises InputError if they do not fit."""
+        check_kind("dynamics", dynamics, Dynamics, "Dynamics(...), such as robot.dynamics")
+        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        x = check_array("states", states, (None, n), infinite=True)
+        u = check_array("controls", controls, (len(x), m), infinite=True)
+        term = self.bind(dynamics)
+        compact = np.zeros((len(x), len(term.rows), self.size))
+        with compiling:
+            core, data = _core(term.source, n, m), numbers_of(term)
+        core.matrices_of(len(x), in_c_order(x), in_c_order(u), data, compact)
+        for function in term.functions:
+            if function.raised is not None:
+                error = function.raised
+                function.forget()
+                raise error
+        found = np.zeros((len(x), n, self.size))
+        found[:, list(term.rows)] = compact
+        return found
+
+
+def numbers_of(term: NoiseTerm) -> Array:
+    """What its source reads: the addresses of its functions, then its own numbers."""
+    return np.array([*(address_of(function) for function in term.functions), *term.data], dtype=np.float64)
+
+
+@functools.cache
+def _core(source: str, n: int, m: int) -> Core:
+    parts = [source_of(rotation_ratios), source_of(linear_algebra, "clear"), source, source_of(noise_matrices)]
+    return Core("\n\n".join(parts), {"N": n, "M": m, "W": n + m}, f"noise ({n} states, {m} controls)")

@@ -1,0 +1,146 @@
+"""Public docstrings say what goes in, what comes out, and what is raised; the reference of the site is made of them."""
+
+import ast
+import inspect
+import re
+import textwrap
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import lqrsim as ls
+from lqrsim.errors import InputError
+
+SECTION = re.compile(r"^(Args|Attributes|Returns|Yields|Raises):$")
+MODULES = (ls.robots, ls.rotations, ls.scenarios)
+
+
+def sections(doc: str) -> dict[str, list[str]]:
+    """The lines of each section, without their common indentation."""
+    found: dict[str, list[str]] = {}
+    current = None
+    for line in inspect.cleandoc(doc).splitlines():
+        if match := SECTION.match(line):
+            current = found.setdefault(match[1], [])
+        elif line and not line.startswith(" "):
+            current = None
+        elif current is not None:
+            current.append(line[2:])
+    return found
+
+
+def documented(doc: str) -> set[str]:
+    """The names that have an entry of their own under Args or Attributes."""
+    parts = sections(doc)
+    lines = parts.get("Args", []) + parts.get("Attributes", [])
+    return {match[1] for line in lines if (match := re.match(r"\*{0,2}(\w+): \S", line))}
+
+
+def parameters(function: Callable[..., Any]) -> set[str]:
+    return {name for name in inspect.signature(function).parameters if name not in ("self", "cls")}
+
+
+def raises_input_error(function: Callable[..., Any]) -> bool:
+    """Whether its own text raises one; what it calls may raise others."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(inspect.unwrap(function))))
+    raised = [node.exc for node in ast.walk(tree) if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call)]
+    return any(isinstance(one.func, ast.Name) and one.func.id == "InputError" for one in raised)
+
+
+def missing(function: Callable[..., Any], doc: str, *, returns: bool) -> list[str]:
+    """What a docstring does not say."""
+    parts = sections(doc)
+    found = sorted(parameters(function) - documented(doc))
+    annotation = inspect.signature(function).return_annotation
+    if (
+        returns
+        and annotation not in (None, "None", inspect.Signature.empty)
+        and not parts.keys() & {"Returns", "Yields"}
+    ):
+        found.append("Returns")
+    if raises_input_error(function) and not any(line.startswith("InputError: ") for line in parts.get("Raises", [])):
+        found.append("Raises InputError")
+    if re.search(r"\bRaises InputError\b", doc):
+        found.append("InputError in the text, want it under Raises")
+    return found
+
+
+def functions() -> Iterator[tuple[str, Callable[..., Any]]]:
+    """Public functions, and those methods of public classes that have a docstring of their own and take something."""
+    for module in (ls, *MODULES):
+        own = getattr(module, "__all__", None) or [
+            name for name, item in vars(module).items()
+            if inspect.isfunction(item) and item.__module__ == module.__name__ and not name.startswith("_")
+        ]  # fmt: skip
+        for name in own:
+            item = getattr(module, name)
+            if inspect.isfunction(item):
+                yield f"{module.__name__}.{name}", item
+            elif inspect.isclass(item):
+                for key, member in vars(item).items():
+                    method = member.__func__ if isinstance(member, classmethod | staticmethod) else member
+                    public = key == "__call__" or not key.startswith("_")
+                    # One that overrides a method may leave the words to it.
+                    inherited = any(hasattr(base, key) for base in item.__mro__[1:-1])
+                    if (
+                        public
+                        and inspect.isfunction(method)
+                        and parameters(method)
+                        and (method.__doc__ or not inherited)
+                    ):
+                        yield f"{module.__name__}.{name}.{key}", method
+
+
+def classes() -> Iterator[tuple[str, type]]:
+    """Those that are made with arguments: not enumerations, nor exceptions."""
+    for module in (ls, *MODULES):
+        for name in getattr(module, "__all__", ()):
+            item = getattr(module, name)
+            if inspect.isclass(item) and not hasattr(item, "__members__") and not issubclass(item, Exception):
+                yield f"{module.__name__}.{name}", item
+
+
+@pytest.mark.parametrize(
+    ("name", "function"), [pytest.param(*one, id=one[0]) for one in sorted(dict(functions()).items())]
+)
+def test_functions_and_methods_say_everything(name: str, function: Callable[..., Any]) -> None:
+    assert missing(function, function.__doc__ or "", returns=True) == []
+
+
+@pytest.mark.parametrize(("name", "item"), [pytest.param(*one, id=one[0]) for one in sorted(dict(classes()).items())])
+def test_classes_say_what_they_are_made_of(name: str, item: type) -> None:
+    """In Args or Attributes of the class, or of the class in lqrsim that it inherits from."""
+    docs = [base.__doc__ or "" for base in item.__mro__ if base.__module__.startswith("lqrsim")]
+    entries = {entry for doc in docs for entry in documented(doc)}
+    made = item.__init__ if item.__init__ is not object.__init__ else item.__new__
+    wanted = set() if made is object.__new__ else {one for one in parameters(made) if not one.startswith("_")}
+    assert wanted - entries == set()
+
+
+def test_what_is_missing_is_noticed() -> None:
+    def complete(a: int, **b: int) -> int:
+        """A sum.
+
+        Args:
+          a: one.
+          **b: others,
+            see: above.
+
+        Returns:
+          Their sum.
+
+        Raises:
+          InputError: never.
+        """
+        if a < 0:
+            raise InputError("a: got less than 0")
+        return a
+
+    assert missing(complete, complete.__doc__ or "", returns=True) == []
+    assert documented(complete.__doc__ or "") == {"a", "b"}
+    bare = "A sum.\n\nArgs:\n  a, b: both.\n"
+    assert missing(complete, bare, returns=True) == ["a", "b", "Returns", "Raises InputError"]
+    assert missing(complete, bare + "\n\nRaises InputError.", returns=False)[2:] == [
+        "Raises InputError", "InputError in the text, want it under Raises"
+    ]  # fmt: skip

@@ -1,0 +1,143 @@
+"""Obstacles that move: plans for where they will be, against places, velocities and SLSQP; see `point_mass.py`."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from point_mass import DT, MARGIN, RADIUS, Oracle, balls, check, problem
+
+import lqrsim as ls
+from lqrsim.codegen import jit
+
+ACROSS = balls((0.0, -2.0, 0.5), velocity=(0.0, 2.0))  # in the middle of the way when the mass would be there
+
+
+class TestWorld:
+    @given(
+        velocity=st.lists(st.floats(-3, 3), min_size=3, max_size=3), seconds=st.floats(-5, 5),
+        plane=st.sampled_from(["xyz", "xy", "yx", "xz", "zy"]), seed=st.integers(0, 100),
+    )  # fmt: skip
+    def test_it_is_seen_as_it_moves(self, velocity: list[float], seconds: float, plane: str, seed: int) -> None:
+        """Moved and then seen in a plane is the same as seen and then moved, whatever the plane: to rounding."""
+        rng = np.random.default_rng(seed)
+        ball = ls.Obstacle(
+            "ball", "sphere", rng.uniform(-1, 1, 3), np.eye(3), np.array([0.3, 0, 0]), velocity=np.array(velocity)
+        )
+        world, offset = ls.World([ball]), None if plane in ("xyz", "xy", "yx") else 0.2
+        points = rng.uniform(-2, 2, (4, len(plane)))
+        first, last = world.moved(seconds).seen_by(plane, offset), world.seen_by(plane, offset).moved(seconds)
+        np.testing.assert_allclose(first.distance(points), last.distance(points), rtol=0, atol=1e-12)
+        by_tables = ls.World([replace(ball, position=world.tables([0.0, seconds])[-1, 0, 1:4])])
+        np.testing.assert_allclose(
+            by_tables.seen_by(plane, offset).distance(points), first.distance(points), rtol=0, atol=1e-12
+        )
+
+    def test_a_velocity_that_is_none_is_refused(self) -> None:
+        ball = balls((0, 0, 1)).obstacles[0]
+        with pytest.raises(ls.InputError, match="obstacle 'ball 0': velocity: got shape"):
+            replace(ball, velocity=np.zeros(2))
+        with pytest.raises(ls.InputError, match="seconds: got nan"):
+            ACROSS.moved(np.nan)
+
+
+class TestPlans:
+    @pytest.mark.parametrize("way", ["clearance", "cost", "both"])
+    def test_it_is_an_optimum_past_where_the_ball_will_be(self, way: str) -> None:
+        """By SLSQP, which has the ball's place at each knot; where a plan for a ball that stands still would hit it."""
+        stated = problem(ACROSS, weight=0.0 if way == "clearance" else 1.0)
+        if way == "cost":
+            stated = replace(stated, constraints=())
+        solution = ls.smooth(stated, tolerance=1e-6, constraint_tolerance=1e-5)
+        if way == "cost":
+            oracle = Oracle(stated)
+            z = oracle.pack(solution.trajectory)
+            assert solution.cost == pytest.approx(oracle.cost(z), rel=1e-9)
+            assert solution.cost < oracle.least(z) * (1 + 1e-3)
+        else:
+            check(solution, stated)
+        clearance = Oracle.distances(solution.trajectory.states, ACROSS, stated.times)[:, 0]
+        assert solution.clearance is not None
+        cost = stated.obstacle_costs[0].radius
+        radii = [cost] if way == "cost" else [cost, RADIUS]
+        np.testing.assert_allclose(solution.clearance, clearance - max(radii), rtol=0, atol=1e-9)
+        still = ls.smooth(problem(balls((0.0, -2.0, 0.5)), weight=1.0))
+        assert Oracle.distances(still.trajectory.states, ACROSS, stated.times).min() < 0
+
+    @settings(max_examples=15)
+    @given(
+        place=st.tuples(st.floats(-1, 1), st.floats(-1.5, 1.5)), velocity=st.tuples(st.floats(-1, 1), st.floats(-1, 1)),
+        begin=st.floats(-2, 2), after=st.integers(0, 10),
+    )  # fmt: skip
+    def test_the_rest_of_it_begins_later(
+        self, place: tuple[float, float], velocity: tuple[float, float], begin: float, after: int
+    ) -> None:
+        """What a plan of the rest costs and clears, by the oracle; and as if the ball had begun farther on.
+
+        To 1e-9 of the numbers: the times are sums in another order.
+        """
+        world, start = balls((*place, 0.3), velocity=velocity), np.array([[-2.0, 0, 0, 0]])
+        assume(min(Oracle.distances(start, world, begin + i * DT).min() for i in (0, after)) > 0.1)
+        stated = replace(problem(balls((9, 9, 0.3))), begin=begin)
+        stated = replace(
+            stated,
+            stage_cost=ls.ControlCost([0.1, 0.1]) + ls.ObstacleCost(world, radius=0.1),
+            constraints=[ls.Clearance(world.moved(-begin), radius=RADIUS, margin=MARGIN)],
+        ).from_state((-2, 0, 0, 0), after=after)  # fmt: skip
+        there = world.moved(begin + after * DT)
+        same = replace(
+            stated,
+            begin=0.0,
+            stage_cost=ls.ControlCost([0.1, 0.1]) + ls.ObstacleCost(there, radius=0.1),
+            constraints=[ls.Clearance(world.moved(after * DT), radius=RADIUS, margin=MARGIN)],
+        )
+        assert stated.steps == 20 - after
+        found = [ls.smooth(one, starts=1, max_iterations=1) for one in (stated, same)]
+        np.testing.assert_allclose(found[0].trajectory.states, found[1].trajectory.states, rtol=0, atol=1e-9)
+        oracle = Oracle(stated)
+        assert found[0].cost == pytest.approx(oracle.cost(oracle.pack(found[0].trajectory)), rel=1e-9)
+        for one, other in zip(stated.constraint_terms, same.constraint_terms, strict=True):
+            np.testing.assert_allclose(one.data, other.data, rtol=0, atol=1e-9)
+
+
+def ready(planner: ls.Planner) -> None:
+    """Wait for the answer that the planner's thread is at."""
+    solve = planner._solve
+    while solve is not None and solve.answer is None and solve.error is None:
+        time.sleep(1e-3)
+
+
+class TestReplanning:
+    @pytest.mark.parametrize("horizon", ["moving", "shrinking"])
+    def test_a_planner_takes_them_on(self, horizon: str) -> None:
+        """A ball that begins to move while the robot is on its way is passed, and nothing is compiled for it.
+
+        The loop is that of a robot, its motion the point mass's own; the ball is where its velocity takes it.
+        """
+        parked = balls((0.0, -2.0, 0.5))
+        stated = problem(parked, weight=1.0)
+        planner = ls.Planner(stated, ls.smooth(stated), every=DT, deadline=DT, horizon=horizon, clock=lambda: 0.0)
+        seen = balls((0.0, -2.0, 0.5), velocity=(0.0, 2.0)).moved(-0.2)  # it sets off at 0.2 s
+        made, state, clearances = len(jit.compilations), np.array([-2.0, 0, 0, 0]), []
+        with planner:
+            for step in range(20):
+                if step == 2:
+                    cost, clear = (
+                        ls.ObstacleCost(seen, radius=RADIUS / 2),
+                        ls.Clearance(seen, radius=RADIUS, margin=MARGIN),
+                    )
+                    planner.change(stage_cost=ls.ControlCost([0.1, 0.1]) + cost, constraints=[clear])
+                u = planner.step(state, step * DT)
+                ready(planner)
+                state = np.concatenate([state[:2] + DT * state[2:] + DT**2 / 2 * u, state[2:] + DT * u])
+                where = seen if step >= 1 else parked
+                clearances.append(float(Oracle.distances(state[None], where, (step + 1) * DT).min()) - RADIUS)
+        assert len(jit.compilations) == made
+        assert min(clearances) > 0
+
+    def test_chances_of_collision_are_for_what_stands_still(self) -> None:
+        stated = problem(ACROSS, weight=1.0)
+        with pytest.raises(ls.InputError, match="got obstacles that move, want none"):
+            ls.smooth_chance_constrained(stated, ls.Uncertainty(start=0.01), chance=0.01)

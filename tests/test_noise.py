@@ -1,0 +1,360 @@
+"""Plans under noise: against stochastic Riccati recursions in NumPy, finite differences, and runs that are drawn."""
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stochastic_lq import CONTROLS, SIZE, STATES, affine, draw, parameters_of_noise, problem_of, riccati
+
+import lqrsim as ls
+from lqrsim.codegen.jit import compilations
+from lqrsim.codegen.kernel_source import source_of
+from lqrsim.codegen.user_functions import plain_names
+from lqrsim.errors import InputError
+from lqrsim.kernels import noise as kernel
+from lqrsim.solvers.compiled import costs_of
+
+FORMS = [(True, "dual"), (False, "dual"), (False, "primal")]
+
+
+def off(found: Any, wanted: Any) -> float:
+    """The largest difference, relative to the largest entry."""
+    return float(np.abs(np.asarray(found) - wanted).max() / np.abs(wanted).max())
+
+
+def assert_is_oracles(solution: ls.Solution, numbers: Any, problem: ls.Problem, *, risk: float = 0.0) -> None:
+    oracle = riccati(numbers, problem, risk=risk)
+    assert solution.status is ls.Status.CONVERGED
+    value = solution.cost_to_go
+    assert value is not None
+    pairs = (value.hessian, oracle.S), (value.gradient, oracle.s), (value.constant, oracle.constant)
+    for found, wanted in (*pairs, (solution.policy.gain, oracle.gain), (solution.policy.offset, oracle.offset)):
+        assert off(found, wanted) < 1e-9
+    x = solution.trajectory.states[0]
+    cost = 0.5 * x @ oracle.S[0] @ x + oracle.s[0] @ x + oracle.constant[0]
+    if not isinstance(problem.initial, ls.FixedState):
+        cost += 0.5 * (x - numbers.start) @ numbers.end_weight @ (x - numbers.start)
+        # The start is the one of least expected cost.
+        slope = oracle.S[0] @ x + oracle.s[0] + numbers.end_weight @ (x - numbers.start)
+        assert np.abs(slope).max() < 1e-8 * np.abs(oracle.s[0]).max()
+    assert solution.cost == pytest.approx(cost, rel=1e-9)
+
+
+@pytest.mark.timeout(300)  # on a machine that has compiled nothing yet
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), strength=st.floats(0.0, 0.3), each=st.sampled_from(FORMS))
+def test_a_linear_quadratic_problem_with_multiplicative_noise(seed, strength, each):
+    """The stochastic Riccati recursion to 1e-9: cost-to-go, policy, start, expected cost; in both forms."""
+    numbers = draw(np.random.default_rng(seed), multiplicative=strength)
+    problem = problem_of(numbers, fixed=each[0])
+    assert_is_oracles(ls.smooth(problem, form=each[1]), numbers, problem)
+
+
+def test_ilqr_with_noise_is_the_same_there():
+    numbers = draw(np.random.default_rng(5))
+    problem = problem_of(numbers)
+    assert_is_oracles(ls.ilqr(problem), numbers, problem)
+
+
+def test_the_minimisers_are_the_means_of_the_closed_loop():
+    """And the mean of the cost is what is expected, by runs that are drawn: 20,000, to 5 standard errors."""
+    numbers = draw(np.random.default_rng(2))
+    problem = problem_of(numbers)
+    solution = ls.smooth(problem)
+    assert off(solution.total_cost.minimizer(), solution.trajectory.states) < 1e-9
+    costs = ls.sample_costs(problem, solution, trials=20_000, seed=1)
+    assert abs(costs.mean() - solution.cost) < 5 * costs.std() / np.sqrt(len(costs))
+    np.testing.assert_array_equal(ls.sample_costs(problem, solution, trials=30, seed=1), costs[:30])
+    # Who does not plan for it pays for it, on the same draws.
+    plain = ls.smooth(dataclasses.replace(problem, noise=None))
+    assert ls.sample_costs(problem, plain, trials=20_000, seed=1).mean() > costs.mean()
+
+
+@pytest.mark.parametrize(("fixed", "form"), FORMS)
+@pytest.mark.parametrize("share", [-3.0, 1e-3, 0.5, 0.99])
+def test_risk_in_a_linear_quadratic_problem(fixed, form, share):
+    """Against the Riccati recursion of LEQG, which is exact for noise that is always the same."""
+    numbers = draw(np.random.default_rng(3), multiplicative=0.0)
+    problem = problem_of(numbers, fixed=fixed, noise=ls.Noise(numbers.e.T))
+    most = ls.largest_risk(problem, ls.smooth(problem, form=form))
+    problem = problem.driven_by(None, share * most)
+    assert_is_oracles(ls.smooth(problem, form=form), numbers, problem, risk=problem.risk)
+
+
+def test_the_risk_that_is_too_high_is_named():
+    numbers = draw(np.random.default_rng(0), multiplicative=0.0)
+    problem = problem_of(numbers, noise=ls.Noise(numbers.e.T))
+    most = ls.largest_risk(problem, ls.smooth(problem))
+    low, high = 0.0, 10.0
+    while high - low > 1e-13 * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if riccati(numbers, problem, risk=middle).broken < 0 else (low, middle)
+    assert most == pytest.approx(low, rel=1e-9)
+    step = riccati(numbers, problem, risk=1.02 * most).broken
+    for solver in (ls.smooth, ls.ilqr):
+        solution = solver(problem, risk=1.02 * most)
+        assert solution.status is ls.Status.RISK_TOO_HIGH
+        said = f"about the best plan risk {1.02 * most:g} is too high at step {step} of 12, and at most "
+        assert solution.detail.startswith(said)
+        will_do = float(solution.detail.removeprefix(said).split()[0])
+        assert will_do == pytest.approx(most, rel=1e-4)
+        assert solver(problem, risk=will_do).success
+    # What has no noise to speak of is never too risky.
+    assert ls.largest_risk(problem_of(numbers, noise=ls.Noise(0 * numbers.e.T)), solution) == np.inf
+
+
+def shaken(x: Any, u: Any, p: Any) -> Any:
+    from sympy import sin
+
+    return [[0, 0, p.a * x[0]], [p.a * sin(x[1]) * u[0], p.b, 0], [x[2] * u[1], p.b * u[1] ** 2, p.a]]
+
+
+@pytest.mark.parametrize("risk", [0.0, 1e-7, 0.05, -0.4])
+def test_slopes_of_what_noise_costs(risk):
+    """Against central differences of its value, to 1e-7, and that against its formula, to 1e-9."""
+    rng = np.random.default_rng(0)
+    noise = ls.Noise(shaken, size=3, parameters={"a": 0.3, "b": 0.2}).scaled(0.7)
+    problem = problem_of(draw(rng), noise=noise)
+    term = problem.noise_term
+    assert term is not None
+    names = plain_names(STATES, CONTROLS, (), {})
+    exec(f"{term.source}\n\n{source_of(kernel, **term.filled)}", names)
+    root, s, jacobian, c = rng.normal(size=(3, 3)), rng.normal(size=3), rng.normal(size=(3, 5)), rng.normal(size=3)
+    S, model = root @ root.T, SimpleNamespace(noise=(term.data, np.array([risk, 0.0])))
+
+    def ahead(z: Any) -> Any:
+        return SimpleNamespace(hessian=S, gradient=s, arrived=jacobian @ z + c, jacobian=jacobian)
+
+    def value(z: Any) -> float:
+        return names["noise_value"](z[:3], z[3:], model, ahead(z))
+
+    for z in rng.normal(size=(5, 5)):
+        stage = SimpleNamespace(hessian=np.zeros((5, 5)), gradient=np.zeros(5))
+        found = names["noise_quadratic"](z[:3], z[3:], model, ahead(z), False, stage)
+        (M,) = noise.matrices(problem.dynamics, z[None, :3], z[None, 3:])
+        X, slope = M.T @ S @ M, M.T @ (S @ (jacobian @ z + c) + s)
+        wanted, inner = 0.5 * np.trace(X), np.eye(3) - risk * X
+        if abs(risk) > 1e-3:
+            wanted = 0.5 * risk * slope @ np.linalg.solve(inner, slope) - np.linalg.slogdet(inner)[1] / (2 * risk)
+        assert found == pytest.approx(value(z), rel=1e-12)
+        assert found == pytest.approx(wanted, rel=1e-9 if abs(risk) > 1e-3 or risk == 0 else 1e-4)
+        step = 1e-5 * np.eye(5)
+        differences = [(value(z + one) - value(z - one)) / 2e-5 for one in step]
+        np.testing.assert_allclose(stage.gradient, differences, rtol=1e-7, atol=1e-7)
+        if risk >= 0:
+            assert np.linalg.eigvalsh(stage.hessian)[0] > -1e-12
+
+
+def test_no_noise_and_noise_of_strength_zero():
+    numbers = draw(np.random.default_rng(1))
+    noise = ls.Noise(affine, size=SIZE, parameters=parameters_of_noise(numbers))
+    plain = dataclasses.replace(problem_of(numbers), noise=None)
+    none, same = ls.smooth(plain), ls.smooth(plain, noise=noise.scaled(0.0))
+    np.testing.assert_allclose(same.trajectory.states, none.trajectory.states, rtol=1e-12)
+    assert same.cost == pytest.approx(none.cost, rel=1e-12)
+    assert "noise" not in none.options
+    assert "the cost is an expectation" in same.summary()
+
+
+def test_numbers_are_data_and_belong_to_the_digest():
+    numbers = draw(np.random.default_rng(1))
+    problem = problem_of(numbers)
+    assert problem.noise is not None
+    ls.smooth(problem)
+    before = len(compilations)
+    others = [
+        problem.driven_by(problem.noise.scaled(0.5), None),
+        problem.driven_by(problem.noise.with_parameters(m000=0.7), None),
+        problem.driven_by(None, 0.01),
+    ]
+    for one in others:
+        ls.smooth(one)
+    assert len(compilations) == before
+    digests = {one.digest for one in (problem, *others, dataclasses.replace(problem, noise=None))}
+    assert len(digests) == 5
+
+
+@numba.njit
+def compiled_shaken(x, u, p):
+    return np.array([[0.0, 0.0], [p.a * x[0] * u[0], p.b], [0.0, p.a * u[1]]])
+
+
+def plain_shaken(x, u, p):
+    return [[0.0, 0.0], [p.a * x[0] * u[0], p.b], [0.0, p.a * u[1]]]
+
+
+def test_the_same_noise_at_three_levels():
+    """Formulas, a numba function and a plain one: derivatives by differences are good to some eight digits."""
+    numbers, values = draw(np.random.default_rng(4)), {"a": 0.2, "b": 0.1}
+    symbolic = ls.smooth(problem_of(numbers, noise=ls.Noise(plain_shaken, size=2, parameters=values)))
+    compiled = ls.Noise(compiled_shaken, size=2, parameters=values)
+    plain = ls.Noise(plain_shaken, size=2, parameters=values, level="plain", depends_on=("x0", "u0", "u1"))
+    for noise in (compiled, plain, compiled.scaled(2.0).scaled(0.5)):
+        solution = ls.smooth(problem_of(numbers, noise=noise))
+        assert off(solution.policy.gain, symbolic.policy.gain) < 1e-7
+        assert solution.cost == pytest.approx(symbolic.cost, rel=1e-8)
+    wrong = ls.Noise(plain_shaken, size=2, parameters=values, level="plain", depends_on=("x0", "u0"))
+    with pytest.raises(InputError, match="got a value that depends on u1, want it in depends_on"):
+        ls.smooth(problem_of(numbers, noise=wrong))
+
+
+def test_many_are_solved_as_one_is():
+    numbers = draw(np.random.default_rng(6))
+    problems = [dataclasses.replace(problem_of(numbers), noise=None), problem_of(numbers, fixed=False)]
+    noise = problem_of(numbers).noise
+    for solution, problem in zip(ls.smooth_many(problems, noise=noise, risk=0.001), problems, strict=True):
+        one = ls.smooth(problem, noise=noise, risk=0.001)
+        assert solution.success
+        np.testing.assert_array_equal(solution.policy.gain, one.policy.gain)
+        assert solution.problem_digest == one.problem_digest == problem.driven_by(noise, 0.001).digest
+
+
+def test_a_file_says_what_the_noise_was(tmp_path):
+    numbers = draw(np.random.default_rng(6))
+    solution = ls.smooth(problem_of(numbers, risk=0.002))
+    again = ls.load_solution(ls.save(solution, tmp_path / "solution.npz"))
+    assert again.options["noise"] == "Noise(affine(x, u, p), size=2)"
+    assert again.options["risk"] == 0.002
+    assert again.summary() == solution.summary()
+    assert "the cost is log E exp(risk cost) / risk, risk 0.002" in again.summary()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ls.Noise(shaken), "^Noise: size: got None, want a whole number >= 1"),
+        (lambda: ls.Noise([1.0, 2.0]), r"^Noise: function: got shape \(2,\), want"),
+        (lambda: ls.Noise(np.eye(2), size=2), "^Noise: size: got 2 beside a matrix, want none$"),
+        (lambda: ls.Noise(shaken, size=3, depends_on=("x0",)), "^Noise: depends_on: .* want none: it is found out$"),
+        (lambda: ls.Noise(shaken, size=3).scaled(-1.0), "^Noise: strength: got -1.0, want a finite number >= 0"),
+        (lambda: of(ls.Noise(np.eye(2))), "^Noise: function: got a matrix of 2 rows, want 3, one a state$"),
+        (lambda: of(ls.Noise(shaken, size=2, parameters={"a": 1, "b": 1})), "got a row of 3 entries, want 3 rows"),
+        (lambda: of(ls.Noise(shaken, size=3)), "^shaken.*parameter: got 'a', want one of: "),
+        (lambda: of("white"), "^noise: got 'white', want a Noise, or None$"),
+        (lambda: of(None, risk=1.0), "^risk: got 1 for a problem without noise, want noise=Noise"),
+        (lambda: ls.smooth(of(None), noise="white"), "^noise: got 'white', want a Noise"),  # pyright: ignore[reportArgumentType]
+        (
+            lambda: ls.smooth_continuous(problem_of(draw(np.random.default_rng(0)), fixed=False)),
+            "^noise: got some, which is per control period, want",
+        ),
+        (lambda: ls.sample_costs(of(None), None), "^problem: got one without noise, want"),  # pyright: ignore[reportArgumentType]
+    ],
+)
+def test_what_is_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def soft() -> ls.Problem:
+    return problem_of(draw(np.random.default_rng(0)), fixed=False)
+
+
+def of(noise: Any, *, risk: float = 0.0) -> ls.Problem:
+    problem = problem_of(draw(np.random.default_rng(0)))
+    return dataclasses.replace(problem, noise=noise, risk=risk)
+
+
+def slipping(x: Any, u: Any, p: Any) -> Any:
+    """Wheels of the drive that slip in proportion to their speed."""
+    from sympy import cos, sin
+
+    ahead = [[p.slip * wheel * share(x[2]) / 2 for wheel in u] for share in (cos, sin)]
+    return [*ahead, [-p.slip * u[0] / p.axle, p.slip * u[1] / p.axle]]
+
+
+SLIPPING = ls.Noise(slipping, size=2, parameters={"slip": 0.1 / 6, "axle": 0.258})
+
+
+@pytest.fixture(scope="module")
+def drive():
+    scenario = ls.scenarios.differential_drive()
+    problem = scenario.problem.driven_by(SLIPPING, None)
+    return scenario.plant(), problem, ls.smooth(problem)
+
+
+def test_a_run_meets_the_noise_that_it_was_planned_for(drive):
+    """The same object: state kicked by M(x, u) w, to rounding, and the cost that is expected, in MuJoCo."""
+    plant, problem, solution = drive
+    assert solution.success
+    rollout = ls.simulate(plant, solution, disturbances=[SLIPPING], trials=100, seed=3, frames=False)
+    assert rollout.disturbances == ("noise on the states, Noise(slipping(x, u, p), size=2)",)
+    costs = costs_of(problem, rollout.states, rollout.applied)
+    initial = solution.cost_to_come is not None and float(
+        0.5 * (d := solution.trajectory.states[0] - problem.start) @ problem.initial.weight @ d
+    )
+    assert costs.mean() + initial == pytest.approx(solution.cost, rel=0.02)
+    # The same bits, whatever runs beside it, and the stronger the noise the further off.
+    alone = ls.simulate(plant, solution, disturbances=[SLIPPING], first_trial=7, seed=3, frames=False)
+    np.testing.assert_array_equal(alone.states[0], rollout.states[7])
+    weak = ls.simulate(plant, solution, disturbances=[SLIPPING.scaled(0.5)], trials=100, seed=3, frames=False)
+    assert weak.states.std(axis=0).max() == pytest.approx(0.5 * rollout.states.std(axis=0).max(), rel=0.1)
+
+
+@pytest.mark.parametrize("robot", ["quadrotor", "differential_drive"])
+def test_a_kick_is_what_it_says(robot):
+    """After one period, kicked and not kicked differ by M w, to 1e-9; the wheels' angles stay."""
+    scenario = getattr(ls.scenarios, robot)()
+    plant, n = scenario.plant(), len(scenario.problem.dynamics.state_coordinates)
+    matrix = 0.05 * np.random.default_rng(0).normal(size=(n, 2))
+    solution = ls.smooth(dataclasses.replace(scenario.problem, steps=3), starts=1, max_iterations=3)
+    kicked = ls.simulate(plant, solution, disturbances=[ls.Noise(matrix)], trials=3, seed=1)
+    calm = ls.simulate(plant, solution, trials=3, seed=1)
+    for trial in range(3):
+        stream = np.random.SeedSequence(1, spawn_key=(trial, 0))
+        w = np.random.Generator(np.random.SFC64(stream)).standard_normal((3, 2))[0]
+        np.testing.assert_allclose(kicked.states[trial, 1] - calm.states[trial, 1], matrix @ w, atol=1e-9)
+        if robot == "differential_drive":  # what is after the free joint in MuJoCo's qpos
+            each = (calm.frames.shape[1] - 1) // 3
+            np.testing.assert_array_equal(kicked.frames[trial, each, 7:], calm.frames[trial, each, 7:])
+
+
+def test_limits_and_constraints_under_noise(drive):
+    """Plans keep both, as without noise."""
+    plant, problem, _ = drive
+    clear = ls.Clearance(plant.world, radius=plant.robot.radius, margin=0.15)
+    limited = dataclasses.replace(problem, control_limits=(0.0, 0.28), constraints=[clear])
+    solution = ls.smooth(limited)
+    assert solution.success
+    assert solution.violation == 0
+    assert 0.0 <= solution.trajectory.controls.min() <= solution.trajectory.controls.max() <= 0.28
+    assert solution.cost > ls.smooth(dataclasses.replace(limited, noise=None)).cost
+
+
+def test_solved_again_on_the_way_under_noise(drive):
+    """A prepared solver goes on from its own plan, and what it expects is no more than that costs."""
+    _, problem, solution = drive
+    solver = ls.prepare(problem)
+    state = solution.trajectory.states[1]
+    replan = solver.solve(state, solution.shifted(1, horizon="shrinking"), after=1)
+    assert replan.status.success
+    assert replan.cost <= replan.before * (1 + 1e-9)
+    np.testing.assert_allclose(replan.trajectory.states, solution.trajectory.states[1:], atol=1e-2)
+
+
+@pytest.mark.parametrize("share", [-2.0, 0.5, 0.9])
+def test_risk_averse_tracking(share):
+    """About a plan that stays at zero the law is LEQG's; and what is said of a risk that is too high is so."""
+    numbers = draw(np.random.default_rng(8), multiplicative=0.0)
+    zero = np.zeros(STATES)
+    tolerate, effort = np.array([0.5, 1.0, 2.0]), np.array([0.7, 1.5])
+    numbers = numbers._replace(
+        f=zero, start=zero, goal=zero, state_weight=np.diag(tolerate**-2), control_weight=np.diag(effort**-2),
+        end_weight=np.diag((0.3 * tolerate) ** -2),
+    )  # fmt: skip
+    problem = problem_of(numbers, noise=ls.Noise(numbers.e.T))
+    solution = ls.smooth(problem)
+    assert np.abs(solution.trajectory.states).max() < 1e-12
+    asked: dict[str, Any] = {"tolerate": tolerate.tolist(), "effort": effort.tolist(), "at_end": 0.3}
+    with pytest.raises(InputError, match=r"^track: risk: got 1000, want at most .*: with more there is no") as caught:
+        ls.track(problem, solution, **asked, risk=1000.0)
+    most = float(str(caught.value).split("at most ")[1].split(":")[0])
+    assert most == pytest.approx(ls.largest_risk(problem, solution), rel=1e-4)
+    law = ls.track(problem, solution, **asked, risk=share * most)
+    assert off(law.gain, riccati(numbers, problem, risk=share * most).gain) < 1e-9
+    with pytest.raises(InputError, match=r"^track: risk: got 1 and a problem without noise, want noise=Noise"):
+        ls.track(dataclasses.replace(problem, noise=None), solution, **asked, risk=1.0)
