@@ -42,10 +42,12 @@ from .problem.problem import FixedState as FixedState
 from .problem.problem import Problem as Problem
 from .reports.page import report as report
 from .results.coordinates import Coordinates as Coordinates
+from .results.funnel import Funnel as Funnel
 from .results.output_feedback import OutputFeedbackPolicy as OutputFeedbackPolicy
 from .results.policy import AffinePolicy as AffinePolicy
 from .results.replan import Replan as Replan
 from .results.rollout import Rollout as Rollout
+from .results.save_load import load_funnel as load_funnel
 from .results.save_load import load_policy as load_policy
 from .results.save_load import load_rollout as load_rollout
 from .results.save_load import load_solution as load_solution
@@ -119,6 +121,9 @@ from .solvers.smoother import smooth_many as smooth_many
 from .stress.campaign import run_campaign as run_campaign
 from .stress.design_point import smallest_failure as smallest_failure
 from .stress.failure_search import ReliabilityProblem as ReliabilityProblem
+from .stress.funnels import FunnelCheck as FunnelCheck
+from .stress.funnels import check_funnel as check_funnel
+from .stress.funnels import funnel as funnel
 from .stress.multilevel_splitting import NoFailure as NoFailure
 from .stress.multilevel_splitting import split as split
 from .stress.results import Results as Results

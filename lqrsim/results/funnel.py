@@ -45,17 +45,26 @@ class Funnel:
     T steps, n states, k knots; d of the states are off the plan, all others on it.
 
     Attributes:
-      plan: nominal states and controls. state_coordinates, control_coordinates: what they are.
+      plan: nominal states and controls.
+      state_coordinates: what the states are.
+      control_coordinates: what the controls are.
       states: names of the d states that may be off the plan.
-      shape: (T+1, d, d), of level 1, in these states' units. family: where it is from: "cost_to_go", the inverse of its
-        Hessian, so that level^2/2 is what being off the plan costs; "tube", the predicted covariance, so that levels
-        are standard deviations; or "given".
-      knots: (k,), in order. levels: (k,), 0 where there is none.
-      trials, successes: (k,) of the fresh trials that certify the level; 0 where there is none.
+      shape: (T+1, d, d), of level 1, in these states' units.
+      family: where the shape is from: "cost_to_go", the inverse of its Hessian, so that level^2/2 is what being off the
+        plan costs; "tube", the predicted covariance, so that levels are standard deviations; or "given".
+      knots: (k,), in order.
+      levels: (k,), 0 where there is none.
+      trials: (k,) of the fresh trials that certify the level; 0 where there is none.
+      successes: (k,), of these trials.
       reasons: (k) why a level is 0, or what kept larger ones from being tried; else empty.
-      rate, confidence: as asked for. simulated: trials that were run in all.
-      policy_digest: of what decided on the controls. goal_radius: within which the goal counts as reached, as in
-        `Rollout`. disturbances: a description of each. seed: of all draws. options: the settings of the search.
+      rate: as asked for.
+      confidence: as asked for.
+      simulated: trials that were run in all.
+      policy_digest: of what decided on the controls.
+      goal_radius: within which the goal counts as reached, as in `Rollout`.
+      disturbances: a description of each.
+      seed: of all draws.
+      options: the settings of the search.
       versions: of lqrsim and the libraries that the bits depend on, and the processor.
 
     Raises:
@@ -152,6 +161,12 @@ class Funnel:
 
         Only at `knots` is it certified. Before the first and after the last of them, theirs is held.
 
+        Args:
+          t: seconds since the start of the plan.
+
+        Returns:
+          A level.
+
         Raises:
           InputError: `t` is negative or not finite.
         """
@@ -164,7 +179,12 @@ class Funnel:
         finite.
 
         Args:
+          x: (..., n).
+          t: seconds since the start of the plan.
           about: (n,), the state to which they are compared, in place of the plan's.
+
+        Returns:
+          (...).
 
         Raises:
           InputError: states of another size; `t` is negative or not finite.
@@ -181,13 +201,30 @@ class Funnel:
     def contains(self, x: npt.ArrayLike, t: float, *, about: npt.ArrayLike | None = None) -> npt.NDArray[np.bool_]:
         """Whether states (..., n) are in the funnel `t` seconds after the start of the plan, (...).
 
-        None is where the level is 0. Arguments as of `deviation`.
+        None is where the level is 0.
+
+        Args:
+          x: (..., n).
+          t: seconds since the start of the plan.
+          about: (n,), the state to which they are compared, in place of the plan's.
+
+        Returns:
+          (...), True or False.
+
+        Raises:
+          InputError: as `deviation`.
         """
         level = self.level(t)
         return (self.deviation(x, t, about=about) <= level) & (level > 0)
 
     def left_at(self, rollout: Rollout) -> Array:
         """When each run first was outside, (K,), in seconds; infinite where it never was.
+
+        Args:
+          rollout: a run of the funnel's plan, K trials.
+
+        Returns:
+          (K,).
 
         Raises:
           InputError: it is no run of the funnel's plan.
@@ -200,6 +237,14 @@ class Funnel:
 
     def states_at(self, knot: int, points: npt.ArrayLike, level: float) -> Array:
         """The states (..., n) that points (..., d) of the unit ball are in the ellipsoid of a level at a knot.
+
+        Args:
+          knot: number of it.
+          points: (..., d), of the unit ball for states in the ellipsoid.
+          level: of the ellipsoid.
+
+        Returns:
+          (..., n).
 
         Raises:
           InputError: no such knot, no such points, or the ellipsoid is flat there.

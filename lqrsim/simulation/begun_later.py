@@ -12,13 +12,15 @@ from typing import Any
 import numpy as np
 
 from lqrsim.control.controllers import Control, Controller, Feedback
-from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_kind
+from lqrsim.errors import Array, InputError, check_array, check_count, check_kind
+from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
+from lqrsim.simulation.disturbances.state_noise import as_disturbances
 from lqrsim.simulation.plant import Plant
 
 
@@ -28,7 +30,7 @@ def simulate_from(
     states: Array,
     *,
     knot: int = 0,
-    disturbances: Sequence[Disturbance] = (),
+    disturbances: Sequence[Disturbance | Noise] = (),
     controller: Controller | None = None,
     **options: Any,
 ) -> Rollout:
@@ -51,8 +53,7 @@ def simulate_from(
     kinds = (Controller, type(None))
     law = check_kind("controller", controller, kinds, "a Controller, such as Feedback(solution.policy), or None")
     law = Feedback(solution.policy) if law is None else law
-    wanted = "disturbances, such as ControlNoise(0.05)"
-    given = check_items("disturbances", disturbances, Disturbance, wanted)
+    given = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
     wrong: list[Disturbance] = [_Later(one, whole, knot) for one in given]
     return simulate(
         plant,
@@ -92,8 +93,12 @@ class _Later(Disturbance):
         effect = self.of.start(plant, self.plan, generators)
         if self.knot == 0 or not isinstance(effect, Effect):  # which is refused where it is looked at
             return effect
-        shown = {"measure": self.plan.states, "actuate": self.plan.controls, "force": self.plan.states}
-        hooks = {name: hook for name in (*shown, "torque") if (hook := getattr(effect, name)) is not None}
+        states, controls = self.plan.states, self.plan.controls
+        shown: dict[str, tuple[Array, ...]] = {  # in the order of a control period
+            "measure": (states,), "actuate": (controls,), "force": (states,), "torque": (states,),
+            "kick": (states, controls),
+        }  # fmt: skip
+        hooks = {name: hook for name in shown if (hook := getattr(effect, name)) is not None}
         led = [False]
 
         def lead() -> None:
@@ -101,13 +106,13 @@ class _Later(Disturbance):
             led[0] = True
             for step in range(self.knot):
                 for name, hook in hooks.items():
-                    hook(step, np.tile(shown.get(name, self.plan.states)[step], (len(generators), 1)))
+                    hook(step, *(np.tile(values[step], (len(generators), 1)) for values in shown[name]))
 
-        def later(hook: Callable[[int, Array], Array]) -> Callable[[int, Array], Array]:
-            def called(step: int, values: Array) -> Array:
+        def later(hook: Callable[..., Array]) -> Callable[..., Array]:
+            def called(step: int, *values: Array) -> Array:
                 if not led[0]:
                     lead()
-                return hook(step + self.knot, values)
+                return hook(step + self.knot, *values)
 
             return called
 

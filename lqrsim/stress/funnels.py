@@ -22,6 +22,7 @@ from lqrsim.errors import (
     excerpt,
     numbers_of,
 )
+from lqrsim.problem.noise import Noise
 from lqrsim.results.funnel import Funnel, flat
 from lqrsim.results.goal import Target
 from lqrsim.results.rollout import Rollout
@@ -29,6 +30,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.results.trial_outcome import endings
 from lqrsim.simulation.begun_later import simulate_from
 from lqrsim.simulation.disturbances import Disturbance
+from lqrsim.simulation.disturbances.state_noise import as_disturbances
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.common import check_threads
 from lqrsim.stress.levels import MOST_TRIALS, find_level, test_of
@@ -46,7 +48,7 @@ def funnel(
     plant: Plant,
     solution: Solution,
     *,
-    disturbances: Sequence[Disturbance] = (),
+    disturbances: Sequence[Disturbance | Noise] = (),
     controller: Controller | None = None,
     rate: float = 0.99,
     confidence: float = CONFIDENCE,
@@ -71,19 +73,30 @@ def funnel(
     A run that begins at a later knot is taken to have been as planned until then: see `simulate_from`.
 
     Args:
-      plant, solution, disturbances, controller, goal_radius, goal_tolerance, threads: as in `simulate`. What an
-        `InitialStateError` draws does not count.
-      rate: wished success rate. confidence: at least 0.5.
+      plant: as in `simulate`.
+      solution: as in `simulate`.
+      disturbances: as in `simulate`. What an `InitialStateError` draws does not count.
+      controller: as in `simulate`; by default the solution's policy.
+      rate: wished success rate, above 0 and below 1.
+      confidence: that all levels are right, at least 0.5 and below 1.
       knots: numbers of those at which runs begin; by default 5, from the first on.
       states: names of those that may be off the plan, the others being on it; by default all.
-      shape: the ellipsoids' family: by default by the solution's cost-to-go; or a `Tube`, whose covariance it is; or a
-        covariance (n, n), or one a knot, (T+1, n, n). What is certified does not depend on it, but how much that is.
+      shape: the ellipsoids' family: by default that of the solution's cost-to-go; or a `Tube`, whose covariance it is;
+        or a covariance (n, n), or one a knot, (T+1, n, n). What is certified does not depend on it, but how much does.
       largest: level beyond which none is tried; by default where an angle could be off by half a turn.
       failures: how many trials of a test may fail. With more, there are more trials, and levels come out larger.
-      seed: of all draws. progress: called with the knots that are done, and all of them.
+      seed: of all draws.
+      goal_radius: as in `simulate`.
+      goal_tolerance: as in `simulate`.
+      threads: as in `simulate`.
+      progress: called with the number of knots that are done, and of all.
+
+    Returns:
+      A Funnel.
 
     Raises:
-      InputError: as `simulate`; an option is out of range; there is no cost-to-go and no shape; or an ellipsoid is flat.
+      InputError: as `simulate`; an option is out of range; there is no cost-to-go and no shape; or an ellipsoid is
+        flat.
     """
     trials = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
     plan, seed = solution.trajectory, check_seed("seed", seed)
@@ -144,8 +157,10 @@ class FunnelCheck(NamedTuple):
     """How new trials went.
 
     Attributes:
-      knot: at which they began. level: about which. reached: the share that did, with its exact interval. successes:
-        which of them did, (K,).
+      knot: at which they began.
+      level: of the funnel there.
+      reached: the share that succeeded, with its exact interval.
+      successes: which of them did, (K,).
     """
 
     knot: int
@@ -159,7 +174,7 @@ def check_funnel(
     plant: Plant,
     solution: Solution,
     *,
-    disturbances: Sequence[Disturbance] = (),
+    disturbances: Sequence[Disturbance | Noise] = (),
     controller: Controller | None = None,
     trials: int = 1000,
     between: tuple[float, float] = (0.0, 1.0),
@@ -171,9 +186,20 @@ def check_funnel(
     """New trials from states drawn uniformly in a funnel, or just outside, at each knot that has a level.
 
     Args:
-      plant, solution, disturbances, controller, goal_radius, goal_tolerance, threads: as for `funnel`.
-      trials: at each knot. between: shares of the level: (0, 1) is inside, (1, 1.5) a shell outside.
+      funnel: that is checked.
+      plant: as for `funnel`.
+      solution: as for `funnel`.
+      disturbances: as for `funnel`.
+      controller: as for `funnel`.
+      trials: at each knot.
+      between: shares of the level: (0, 1) is inside, (1, 1.5) a shell outside.
       seed: of all draws; another than the funnel's, or the trials are not new.
+      goal_radius: as for `funnel`.
+      goal_tolerance: as for `funnel`.
+      threads: as for `funnel`.
+
+    Returns:
+      A FunnelCheck of each such knot.
 
     Raises:
       InputError: as `funnel`; the seed is the funnel's; or the solution has another plan.
@@ -217,16 +243,15 @@ class _Trials:
     """Runs trials from states at a knot; see `simulate_from`."""
 
     def __init__(
-        self, plant: Plant, solution: Solution, disturbances: Sequence[Disturbance], controller: Controller | None,
-        near: tuple[float | None, float | None], threads: int | None,
+        self, plant: Plant, solution: Solution, disturbances: Sequence[Disturbance | Noise],
+        controller: Controller | None, near: tuple[float | None, float | None], threads: int | None,
     ) -> None:  # fmt: skip
         self.plant = check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
         self.solution = check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
         kinds = (Controller, type(None))
         law = check_kind("controller", controller, kinds, "a Controller, such as Feedback(solution.policy), or None")
         self.law: Controller = Feedback(solution.policy) if law is None else law
-        wanted = "disturbances, such as ControlNoise(0.05)"
-        self.disturbances: tuple[Disturbance, ...] = check_items("disturbances", disturbances, Disturbance, wanted)
+        self.disturbances = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
         # A rest of the plan has another range, which goals without a position are measured by.
         self.target = Target(solution.policy.state_coordinates, solution.goal, solution.trajectory.states)
         self.radius = self.target.radius(plant.robot.radius, *near)

@@ -107,8 +107,8 @@ def find_level(runs: Runs, test: Test, *, guess: float, largest: float, rate: fl
         failed, done = counted.failures(0.0, 0, test.trials, test.aim)
         if failed > test.aim:
             reason = (
-                f"begun on the plan itself, {failed} of {done} trials fail, and no more than {test.aim} of {test.trials}"
-                f" may for {rate:g} to be shown"
+                f"begun on the plan itself, {failed} of {done} trials fail, and no more than {test.aim} of"
+                f" {test.trials} may for {rate:g} to be shown"
             )
         else:
             reason = "too many trials fail at every level that was tried, however small"
@@ -117,7 +117,7 @@ def find_level(runs: Runs, test: Test, *, guess: float, largest: float, rate: fl
     for level in dict.fromkeys(min(share * pilot, largest) for share in SHARES):
         failed, done = counted.failures(level, test.trials, test.trials, test.failures)
         if failed > test.failures:
-            stopped = f"{failed} of {done} fresh trials fail at level {level:.4g}, and {test.failures} of {test.trials} may"
+            stopped = f"{failed} of {done} fresh trials fail at level {level:.4g}; {test.failures} of {test.trials} may"
             break
         found = level, test.trials, test.trials - failed
     reason = stopped if found[0] == 0 else f"levels beyond {largest:.4g} were not tried" if found[0] == largest else ""
