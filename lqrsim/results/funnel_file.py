@@ -38,11 +38,12 @@ def parts(funnel: Funnel) -> tuple[Arrays, dict[str, Any]]:
 
 def funnel_of(arrays: Arrays, meta: dict[str, Any]) -> Funnel:
     """The funnel of a file. Raises InputError for parts that do not fit together."""
+    found: dict[str, Any] = {name: arrays[name] for name in ARRAYS if "." not in name}
+    found |= {name: tuple(meta[name]) if isinstance(meta[name], list) else meta[name] for name in TEXTS}
     return Funnel(
         plan=Trajectory(arrays["trajectory.states"], arrays["trajectory.controls"], float(meta["dt"])),
         state_coordinates=coordinates_of(meta["states"]),
         control_coordinates=coordinates_of(meta["controls"]),
         states=tuple(meta["off_plan"]),
-        **{name: arrays[name] for name in ARRAYS if "." not in name},
-        **{name: tuple(meta[name]) if isinstance(meta[name], list) else meta[name] for name in TEXTS},
+        **found,
     )

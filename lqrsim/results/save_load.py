@@ -61,7 +61,7 @@ _POLICY_ARRAYS = {  # of each kind; of the same names in the classes
     "output feedback": OUTPUT_FEEDBACK,
 }
 _CERTIFICATE = tuple(field.name for field in fields(Certificate))  # before the gap, in the array of that name
-_DTYPES = dict.fromkeys(("contacts", *funnel_file.WHOLE_NUMBERS), "<i8")  # all others are <f8
+_DTYPES: Mapping[str, str] = dict.fromkeys(("contacts", *funnel_file.WHOLE_NUMBERS), "<i8")  # all others are <f8
 
 _COMMON = {
     "format": schema.line, "version": schema.count, "sha256": schema.line,

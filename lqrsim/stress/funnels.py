@@ -31,9 +31,10 @@ from lqrsim.results.trial_outcome import endings
 from lqrsim.simulation.begun_later import simulate_from
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.disturbances.state_noise import as_disturbances
+from lqrsim.simulation.effects import seeded
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.common import check_threads
-from lqrsim.stress.levels import MOST_TRIALS, find_level, test_of
+from lqrsim.stress.levels import BATCH, MOST_TRIALS, FoundLevel, Test, find_level, smallest_test
 from lqrsim.stress.statistics import CONFIDENCE, Estimate
 from lqrsim.stress.statistics import rate as rate_of
 from lqrsim.versions import versions
@@ -41,7 +42,7 @@ from lqrsim.versions import versions
 KNOTS = 5  # by default
 FAR = 2.0**20  # times the level that the search begins with, beyond which it does not look
 DRAWN = 2**31  # the stream of a trial that its point is drawn from; disturbances have the first ones
-FAILURES = 5
+FAILURES = 3
 
 
 def funnel(
@@ -104,45 +105,28 @@ def funnel(
     begun = _knots(knots, plan.steps)
     rate = check_number("rate", rate, above=0.0, below=1.0)
     confidence = check_number("confidence", confidence, at_least=0.5, below=1.0)
-    test = test_of(rate, 1 - (1 - confidence) / len(begun), failures)
+    test = smallest_test(rate, 1 - (1 - confidence) / len(begun), failures)
     if largest is not None:
         largest = check_number("largest", largest, above=0.0)
-    space = solution.policy.state_coordinates
-    wanted = "names of states"
-    names = space.names if states is None else check_items("states", states, str, wanted)
-    chosen = [space.names.index(check_name("states", name, space.names)) for name in names]
-    if not chosen or len(set(chosen)) < len(chosen):
-        raise InputError(f"states: got {excerpt(names)}, want different names, at least one")
-    family = _family(solution, shape)
+    names = _states(states, solution)
+    chosen = [solution.policy.state_coordinates.names.index(name) for name in names]
     shapes = _shapes(solution, shape, chosen)
     for knot in begun:
         if flat(shapes[knot]):
             raise InputError(
                 f"shape: got an ellipsoid that is flat at knot {knot}, want other knots or states, or another shape"
             )
-    empty = np.zeros(len(begun))
     blank: dict[str, Any] = {
-        "plan": plan, "state_coordinates": space, "control_coordinates": solution.policy.control_coordinates,
-        "states": tuple(names), "shape": shapes, "family": family, "knots": np.array(begun), "rate": rate,
-        "confidence": confidence, "policy_digest": trials.law.digest, "goal_radius": trials.radius, "seed": seed,
-        "disturbances": tuple(one.describe(plant) for one in trials.disturbances), "versions": versions(),
+        "plan": plan, "state_coordinates": solution.policy.state_coordinates,
+        "control_coordinates": solution.policy.control_coordinates, "states": names, "shape": shapes,
+        "family": _family(shape), "knots": np.array(begun), "rate": rate, "confidence": confidence,
+        "policy_digest": trials.law.digest, "goal_radius": trials.radius, "seed": seed, "versions": versions(),
+        "disturbances": tuple(one.describe(plant) for one in trials.disturbances),
         "options": {"failures": failures, "largest": largest},
     }  # fmt: skip
-    whole = Funnel(**blank, levels=empty, trials=empty, successes=empty, reasons=("",) * len(begun), simulated=0)
-    found = []
-    for done, knot in enumerate(begun):
-        if progress is not None:
-            progress(done, len(begun))
-        guess, end = _reach(plant, space.position, chosen, shapes[knot]), _half_turn(solution, chosen, shapes[knot])
-        end = min(end, guess * FAR if largest is None else largest)
-
-        def runs(level: float, numbers: range, knot: int = knot) -> npt.NDArray[np.bool_]:
-            points = points_of(numbers, seed, len(chosen))
-            return trials.reached(whole.states_at(knot, points, level), knot, seed, numbers.start)
-
-        found.append(find_level(runs, test, guess=guess, largest=end, rate=rate))
-    if progress is not None:
-        progress(len(begun), len(begun))
+    none = np.zeros(len(begun), dtype=np.int64)
+    whole = Funnel(**blank, levels=none * 1.0, trials=none, successes=none, reasons=("",) * len(begun), simulated=0)
+    found = _search(whole, trials, test, largest, progress)
     return Funnel(
         **blank,
         levels=np.array([one.level for one in found]),
@@ -151,6 +135,30 @@ def funnel(
         reasons=tuple(one.reason for one in found),
         simulated=sum(one.simulated for one in found),
     )
+
+
+def _search(
+    whole: Funnel, trials: "_Trials", test: Test, largest: float | None,
+    progress: Callable[[int, int], object] | None,
+) -> list[FoundLevel]:  # fmt: skip
+    """The level at each knot of a funnel that has none yet."""
+    found: list[FoundLevel] = []
+    size, chosen = len(whole.knots), whole.chosen
+    for done, knot in enumerate(whole.knots.tolist()):
+        if progress is not None:
+            progress(done, size)
+        shape = whole.shape[knot]
+        guess = _reach(trials.plant, whole.state_coordinates.position, chosen, shape)
+        end = min(_half_turn(trials.solution, chosen, shape), guess * FAR if largest is None else largest)
+
+        def runs(level: float, numbers: npt.NDArray[np.intp], knot: int = knot) -> npt.NDArray[np.bool_]:
+            points = points_of(numbers, whole.seed, len(chosen))
+            return trials.reached(whole.states_at(knot, points, level), knot, whole.seed, numbers)
+
+        found.append(find_level(runs, test, guess=guess, largest=end, rate=whole.rate))
+    if progress is not None:
+        progress(size, size)
+    return found
 
 
 class FunnelCheck(NamedTuple):
@@ -219,20 +227,20 @@ def check_funnel(
         if level == 0:
             continue
         parts = []
-        for first in range(0, trials, 512):
-            numbers = range(first, min(first + 512, trials))
+        for first in range(0, trials, BATCH):
+            numbers = np.arange(first, min(first + BATCH, trials))
             begun = funnel.states_at(knot, points_of(numbers, seed, size, (shares[0], shares[1])), level)
-            parts.append(runner.reached(begun, knot, seed, first))
+            parts.append(runner.reached(begun, knot, seed, numbers))
         reached = np.concatenate(parts)
         found.append(FunnelCheck(knot, level, rate_of(int(reached.sum()), trials), reached))
     return tuple(found)
 
 
-def points_of(numbers: range, seed: int, size: int, between: tuple[float, float] = (0.0, 1.0)) -> Array:
+def points_of(numbers: npt.NDArray[np.intp], seed: int, size: int, between: tuple[float, float] = (0.0, 1.0)) -> Array:
     """A point (K, size) for each trial, uniform by volume between two balls about 0, of its own stream."""
     points = np.empty((len(numbers), size))
     low, high = (share**size for share in between)
-    for row, trial in enumerate(numbers):
+    for row, trial in enumerate(numbers.tolist()):
         rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(trial, DRAWN))))
         direction = rng.standard_normal(size)
         points[row] = direction / np.linalg.norm(direction) * (low + (high - low) * rng.random()) ** (1 / size)
@@ -258,11 +266,12 @@ class _Trials:
         self.options: Mapping[str, Any] = {"goal_radius": near[0], "goal_tolerance": near[1], "frames": False,
                                            "contacts": False, "threads": check_threads(threads)}  # fmt: skip
 
-    def reached(self, states: Array, knot: int, seed: int, first: int) -> npt.NDArray[np.bool_]:
-        """Which trials that begin in the states (K, n) reach the goal, (K,)."""
+    def reached(self, states: Array, knot: int, seed: int, numbers: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
+        """Which trials of these numbers (K,), that begin in the states (K, n), reach the goal, (K,)."""
+        streams = seeded(seed)
         run = simulate_from(
             self.plant, self.solution, states, knot=knot, disturbances=self.disturbances, controller=self.law,
-            seed=seed, first_trial=first, **self.options,
+            generators=lambda trial, stream: streams(int(numbers[trial]), stream), **self.options,
         )  # fmt: skip
         return self.outcome(run) == "reached"
 
@@ -285,12 +294,19 @@ def _knots(knots: Sequence[int] | None, steps: int) -> list[int]:
     return found
 
 
-def _family(solution: Solution, shape: object) -> str:
-    if shape is not None:
-        return "tube" if isinstance(shape, Tube) else "given"
-    if solution.cost_to_go is None:
-        raise InputError(f"shape: got none, and a solution without a cost-to-go ({solution.status.name}), want a shape")
-    return "cost_to_go"
+def _states(states: Sequence[str] | None, solution: Solution) -> tuple[str, ...]:
+    """Names of those that may be off the plan. Raises InputError for others than there are."""
+    known = solution.policy.state_coordinates.names
+    if states is None:
+        return known
+    given = check_items("states", states, str, "names of states")
+    if not given or len(set(given)) < len(given):
+        raise InputError(f"states: got {excerpt(given)}, want different names, at least one")
+    return tuple(check_name("states", name, known) for name in given)
+
+
+def _family(shape: object) -> str:
+    return "cost_to_go" if shape is None else "tube" if isinstance(shape, Tube) else "given"
 
 
 def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list[int]) -> Array:
@@ -298,7 +314,8 @@ def _shapes(solution: Solution, shape: Tube | npt.ArrayLike | None, chosen: list
     plan = solution.trajectory
     knots, n = plan.states.shape
     if shape is None:
-        assert solution.cost_to_go is not None
+        if solution.cost_to_go is None:
+            raise InputError(f"shape: got none, and a solution without a cost-to-go ({solution.status.name}), want one")
         curve = solution.cost_to_go.hessian[:, chosen][:, :, chosen]
         return np.array([_inverse(one) for one in curve])
     if isinstance(shape, Tube):
