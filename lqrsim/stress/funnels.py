@@ -1,6 +1,7 @@
 """`funnel`: from where a policy works. `levels.py` says how a level is found, and what its confidence rests on."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -100,41 +101,46 @@ def funnel(
         flat.
     """
     trials = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads)
-    plan, seed = solution.trajectory, check_seed("seed", seed)
     check_function("progress", progress, "a function of how many knots are done, of how many", arguments=2)
-    begun = _knots(knots, plan.steps)
-    rate = check_number("rate", rate, above=0.0, below=1.0)
-    confidence = check_number("confidence", confidence, at_least=0.5, below=1.0)
-    test = smallest_test(rate, 1 - (1 - confidence) / len(begun), failures)
     if largest is not None:
         largest = check_number("largest", largest, above=0.0)
-    names = _states(states, solution)
-    chosen = [solution.policy.state_coordinates.names.index(name) for name in names]
-    shapes = _shapes(solution, shape, chosen)
-    for knot in begun:
-        if flat(shapes[knot]):
-            raise InputError(
-                f"shape: got an ellipsoid that is flat at knot {knot}, want other knots or states, or another shape"
-            )
-    blank: dict[str, Any] = {
-        "plan": plan, "state_coordinates": solution.policy.state_coordinates,
-        "control_coordinates": solution.policy.control_coordinates, "states": names, "shape": shapes,
-        "family": _family(shape), "knots": np.array(begun), "rate": rate, "confidence": confidence,
-        "policy_digest": trials.law.digest, "goal_radius": trials.radius, "seed": seed, "versions": versions(),
-        "disturbances": tuple(one.describe(plant) for one in trials.disturbances),
-        "options": {"failures": failures, "largest": largest},
-    }  # fmt: skip
-    none = np.zeros(len(begun), dtype=np.int64)
-    whole = Funnel(**blank, levels=none * 1.0, trials=none, successes=none, reasons=("",) * len(begun), simulated=0)
-    found = _search(whole, trials, test, largest, progress)
-    return Funnel(
-        **blank,
+    options = {"failures": failures, "largest": largest}
+    asked = {"rate": rate, "confidence": confidence, "seed": check_seed("seed", seed), "options": options}
+    blank = _blank(trials, asked, knots, states, shape)
+    test = smallest_test(blank.rate, 1 - (1 - blank.confidence) / len(blank.knots), failures)
+    found = _search(blank, trials, test, largest, progress)
+    return replace(
+        blank,
         levels=np.array([one.level for one in found]),
         trials=np.array([one.trials for one in found]),
         successes=np.array([one.successes for one in found]),
         reasons=tuple(one.reason for one in found),
         simulated=sum(one.simulated for one in found),
     )
+
+
+def _blank(
+    trials: "_Trials", asked: dict[str, Any], knots: Sequence[int] | None, states: Sequence[str] | None,
+    shape: Tube | npt.ArrayLike | None,
+) -> Funnel:  # fmt: skip
+    """A funnel without levels. Raises InputError for what cannot be one."""
+    solution = trials.solution
+    plan, law = solution.trajectory, solution.policy
+    asked["confidence"] = check_number("confidence", asked["confidence"], at_least=0.5, below=1.0)
+    begun, names = _knots(knots, plan.steps), _states(states, solution)
+    shapes = _shapes(solution, shape, [law.state_coordinates.names.index(name) for name in names])
+    for knot in begun:
+        if flat(shapes[knot]):
+            raise InputError(
+                f"shape: got an ellipsoid that is flat at knot {knot}, want other knots or states, or another shape"
+            )
+    none = np.zeros(len(begun), dtype=np.int64)
+    return Funnel(
+        plan=plan, state_coordinates=law.state_coordinates, control_coordinates=law.control_coordinates, states=names,
+        shape=shapes, family=_family(shape), knots=np.array(begun), levels=none * 1.0, trials=none, successes=none,
+        reasons=("",) * len(begun), simulated=0, policy_digest=trials.law.digest, goal_radius=trials.radius,
+        disturbances=tuple(one.describe(trials.plant) for one in trials.disturbances), versions=versions(), **asked,
+    )  # fmt: skip
 
 
 def _search(
