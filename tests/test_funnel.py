@@ -271,3 +271,53 @@ class TestBegunLater:
         shell = np.linalg.norm(points_of(np.arange(200), 3, 4, (1.0, 1.3)), axis=1)
         assert shell.min() >= 1.0
         assert shell.max() <= 1.3
+
+
+@pytest.fixture(scope="module")
+def funnel(quadrotor_solution: ls.Solution) -> ls.Funnel:
+    """About the packaged quadrotor's plan, of level 1 throughout, which nothing has certified."""
+    found = ls.funnel(
+        ls.scenarios.quadrotor().plant(), quadrotor_solution, knots=(0,), rate=0.5, confidence=0.5, failures=0,
+        largest=0.1,
+    )  # fmt: skip
+    return replace(found, levels=np.array([1.0]))
+
+
+class TestReplanningWhenLeft:
+    """`Replanning(when=funnel)` solves where a trial is outside, and only there."""
+
+    def test_only_who_is_outside(self, quadrotor: ls.Scenario, quadrotor_solution: Any, funnel: ls.Funnel) -> None:
+        """Of runs that begin on and far off the plan, only the latter are solved for, at the first time they can be."""
+        law = ls.Replanning(quadrotor.problem, quadrotor_solution, every=1.0, when=funnel)
+        begun = funnel.states_at(0, np.eye(12)[[0, 0]], 1.0)
+        begun[1] += 10 * (begun[1] - funnel.plan.states[0])
+        begun[0] = funnel.plan.states[0]
+        run = simulate_from(quadrotor.plant(), quadrotor_solution, begun, controller=law, frames=False)
+        whole = funnel.deviation(run.measured[:, 30], 1.0)
+        assert whole[0] < 1 < whole[1]
+        assert {(one.step, one.trial) for one in law.records if one.step == 30} == {(30, 1)}
+        assert all(one.trial == 1 for one in law.records)
+        plain = ls.simulate(quadrotor.plant(), quadrotor_solution, frames=False)
+        np.testing.assert_array_equal(run.commanded[0], plain.commanded[0])
+
+    def test_a_funnel_without_levels_is_always_left(self, quadrotor: Any, quadrotor_solution: Any, funnel: Any) -> None:
+        """Then it is what it is without: the same solves, and the same controls to the bit."""
+        none = replace(funnel, levels=np.zeros(1), trials=np.zeros(1), successes=np.zeros(1), reasons=("none",))
+        runs, laws = [], [
+            ls.Replanning(quadrotor.problem, quadrotor_solution, every=1.5, when=when) for when in (None, none)
+        ]  # fmt: skip
+        for law in laws:
+            runs.append(ls.simulate(quadrotor.plant(), quadrotor_solution, controller=law, trials=2, frames=False))
+        np.testing.assert_array_equal(runs[0].commanded, runs[1].commanded)
+        assert [one.step for one in laws[0].records] == [one.step for one in laws[1].records]
+        assert laws[0].digest != laws[1].digest
+
+    def test_bad_input(self, quadrotor: Any, quadrotor_solution: Any, funnel: ls.Funnel) -> None:
+        moved = replace(funnel, plan=ls.Trajectory(funnel.plan.states + 1, funnel.plan.controls, funnel.plan.dt))
+        for wrong, said in (
+            ({"when": 3}, "when: got 3"),
+            ({"when": moved}, "when: got a funnel of another plan"),
+            ({"when": funnel, "horizon": "moving"}, 'want "shrinking"'),
+        ):
+            with pytest.raises(InputError, match=said):
+                ls.Replanning(quadrotor.problem, quadrotor_solution, every=1.0, **wrong)

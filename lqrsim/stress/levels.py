@@ -116,7 +116,7 @@ def find_level(runs: Runs, test: Test, *, guess: float, largest: float, rate: fl
         return FoundLevel(0.0, 0, 0, reason, 0.0, pilot.simulated)
     found, stopped, simulated = (0.0, 0, 0), "", pilot.simulated
     for level in dict.fromkeys(min(share * aimed, largest) for share in SHARES):
-        failed, done = _fresh(runs, level, test)
+        failed, done = fresh(runs, level, test)
         simulated += done
         if failed > test.failures:
             stopped = f"{failed} of {done} fresh trials fail at level {level:.4g}; {test.failures} of {test.trials} may"
@@ -126,8 +126,11 @@ def find_level(runs: Runs, test: Test, *, guess: float, largest: float, rate: fl
     return FoundLevel(*found, reason, aimed, simulated)
 
 
-def _fresh(runs: Runs, level: float, test: Test) -> tuple[int, int]:
-    """How many of the test's own trials fail, and of how many: no more are run once it is more than allowed."""
+def fresh(runs: Runs, level: float, test: Test) -> tuple[int, int]:
+    """How many of the test's own trials fail, and of how many; no more are run once it is more than allowed.
+
+    No pilot has seen these trials.
+    """
     failed, done = 0, 0
     while done < test.trials and failed <= test.failures:
         count = min(BATCH, test.trials - done)
