@@ -136,6 +136,7 @@ from .stress.trial_score import miss as miss
 from .verify.rollout_check import verify_run as verify_run
 from .verify.verdict import Verification as Verification
 from .verify.video_check import verify_video as verify_video
+from .view.funnel_plot import plot_funnel as plot_funnel
 from .view.plots import plot_run as plot_run
 from .view.policy_plot import plot_policy as plot_policy
 from .view.render import render as render

@@ -77,6 +77,10 @@ def funnels(place: Place) -> dict[str, tuple[Any, ...]]:
         "Funnel.states_at": ({"self": funnel, "knot": 0, "points": np.zeros((2, 2)), "level": 0.1},),
         "check_funnel": ({"funnel": funnel} | common | check, 0.3),
         "FunnelCheck": ({"knot": 0, "level": 1.0, "reached": None, "successes": np.ones(2, dtype=bool)},),
+        "plot_funnel": (
+            {"funnel": funnel, "path": place.folder / "funnel.png", "world": place.plant.world, "radius": 0.1},
+            0.3,
+        ),
         "load_funnel": ({"path": ls.save(funnel, place.folder / "funnel.npz")},),
     }
 

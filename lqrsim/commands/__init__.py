@@ -6,6 +6,7 @@ Heavy modules are imported inside `run`, so that `--help` answers at once.
 import inspect
 from typing import get_args
 
+from lqrsim.commands.certifying import Funnel
 from lqrsim.commands.failures import Break, Rare
 from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
 from lqrsim.commands.solving import List, Simulate, Solve
@@ -26,6 +27,7 @@ Command = (
     | Report
     | Rare
     | Break
+    | Funnel
     | Reproduce
     | Cache
 )
