@@ -13,6 +13,7 @@ from pucks import RADIUS, STEPS, left, plant, solution
 from scipy import stats
 
 import lqrsim as ls
+from lqrsim.cli import main
 from lqrsim.errors import InputError
 from lqrsim.simulation.begun_later import simulate_from
 from lqrsim.stress.funnels import points_of
@@ -281,6 +282,36 @@ def funnel(quadrotor_solution: ls.Solution) -> ls.Funnel:
         largest=0.1,
     )  # fmt: skip
     return replace(found, levels=np.array([1.0]))
+
+
+def test_its_picture(funnel: ls.Funnel, tmp_path: Path) -> None:
+    """The shadow on the position is as wide as the states on the boundary reach, in each direction."""
+    rng = np.random.default_rng(0)
+    points = rng.standard_normal((40_000, 12))
+    points[:20_000, 3:] *= 0.1  # that some are near each edge of the shadow
+    points /= np.linalg.norm(points, axis=1)[:, None]
+    off = funnel.states_at(30, points, 1.0)[:, :3] - funnel.plan.states[30, :3]
+    for direction in np.eye(3):
+        reached = (off @ direction).max() / np.sqrt(direction @ funnel.position_covariance[30] @ direction)
+        assert 0.85 < reached <= 1 + 1e-12
+    scenario = ls.scenarios.quadrotor()
+    options: dict[str, Any] = {"world": scenario.scene.world, "radius": scenario.robot.radius}
+    assert ls.plot_funnel(funnel, tmp_path / "funnel.png", **options).stat().st_size > 10_000
+    some = replace(funnel, states=("x", "y"), shape=funnel.shape[:, :2, :2])
+    with pytest.raises(InputError, match="want the position among them"):
+        ls.plot_funnel(some, tmp_path / "funnel.png", **options)
+
+
+def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--rate", "0.5", "--confidence", "0.6", "--failures", "1", "--knots", "140", "--disturbances", "calm"]
+    assert main(["funnel", "quadrotor", *options, "--out", str(tmp_path)]) == 0
+    found = ls.load_funnel(tmp_path / "funnel.npz")
+    said = capsys.readouterr().out
+    assert found.summary() in said
+    assert found.knots.tolist() == [140]
+    assert (tmp_path / "funnel.png").stat().st_size > 0
+    assert main(["funnel", "quadrotor", "--knots", "150", "--out", str(tmp_path)]) == 2
+    assert "want some of 0 to 149" in capsys.readouterr().err
 
 
 class TestReplanningWhenLeft:

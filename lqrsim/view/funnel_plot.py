@@ -42,16 +42,14 @@ def plot_funnel(funnel: Funnel, path: str | os.PathLike[str], *, world: World, r
     covariances = funnel.position_covariance
     space = funnel.state_coordinates
     planes = [(0, 1)] if len(space.position) == 2 else [(0, 1), (0, 2)]
-    with style.figure(path, size=(11, 3.8 + 2.7 * (len(planes) - 1))) as figure:
-        grid = figure.add_gridspec(
-            1, 2, left=0.07, right=0.97, bottom=0.17, top=0.93, wspace=0.2, width_ratios=(1.3, 1)
-        )
-        places = grid[0].subgridspec(len(planes), 1, hspace=0.3)
-        drawn = [figure.add_subplot(place) for place in places]
+    columns = len(planes) + 1
+    with style.figure(path, size=(4 * columns, 5.2 if columns == 2 else 4.6)) as figure:
+        grid = figure.add_gridspec(1, columns, left=0.06, right=0.98, bottom=0.2, top=0.92, wspace=0.24)
+        drawn = [figure.add_subplot(grid[i]) for i in range(len(planes))]
         for axes, plane in zip(drawn, planes, strict=True):
             _shadow(axes, funnel, covariances, world, radius, plane)
         figure.legend(*drawn[0].get_legend_handles_labels(), loc="lower center", ncols=5)
-        _levels(figure.add_subplot(grid[1]), funnel)
+        _levels(figure.add_subplot(grid[len(planes)]), funnel)
     return Path(path)
 
 
@@ -65,7 +63,7 @@ def _shadow(
         flat = world.seen_by(space.plane, space.offset)
         corners = obstacle_plots.bounds(plan, flat, 1.5 * radius)
         obstacle_plots.draw_in_plane(axes, flat, *corners, radius, plane=space.plane)
-        axes.set_title("funnel (grey: closer than the robot's radius)")
+        axes.set_title("funnel (pale grey: within a radius)")
     else:
         corners = obstacle_plots.bounds(plan, world, 1.5 * radius)
         obstacle_plots.draw_projected(axes, world, *corners, *plane)
