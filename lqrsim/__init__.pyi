@@ -128,6 +128,9 @@ from .stress.multilevel_splitting import NoFailure as NoFailure
 from .stress.multilevel_splitting import split as split
 from .stress.results import Results as Results
 from .stress.results import replay as replay
+from .stress.safest import SafestPlan as SafestPlan
+from .stress.safest import Way as Way
+from .stress.safest import smooth_safest as smooth_safest
 from .stress.specification import Campaign as Campaign
 from .stress.specification import Cell as Cell
 from .stress.trial_score import TrialScore as TrialScore

@@ -200,6 +200,7 @@ def test_funnels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (names["funnel"].levels > 0).all()
     assert (names["places"].levels > 0).all()
     assert 0 < len(names["law"].records) < 9
+    assert names["chosen"].reached.value > 0.5
     assert Path("funnel.png").stat().st_size > 0
 
 

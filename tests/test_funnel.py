@@ -352,3 +352,25 @@ class TestReplanningWhenLeft:
         ):
             with pytest.raises(InputError, match=said):
                 ls.Replanning(quadrotor.problem, quadrotor_solution, every=1.0, **wrong)
+
+
+def test_the_safest_way(quadrotor: ls.Scenario) -> None:
+    """It is the way that most of the same trials succeed by, counted again here; then new trials are run."""
+    plant, gusts = quadrotor.plant(), [ls.Gusts(0.5)]
+    found = ls.smooth_safest(quadrotor.problem, plant, gusts, trials=20, starts=4, seed=3)
+
+    def counted(solution: ls.Solution, first: int) -> int:
+        run = ls.simulate(plant, solution, disturbances=gusts, seed=3, trials=20, first_trial=first, frames=False)
+        return run.outcome.count("reached")
+
+    succeeded = [counted(way.solution, 0) for way in found.ways]
+    assert succeeded == [int(way.successes.sum()) for way in found.ways]
+    assert succeeded[0] > succeeded[-1]
+    assert succeeded == sorted(succeeded, reverse=True)
+    assert found.solution is found.ways[0].solution
+    assert found.reached.value == counted(found.solution, 20) / 20
+    assert min(way.solution.cost for way in found.ways) == pytest.approx(ls.smooth(quadrotor.problem, starts=4).cost)
+    for one, other in zip(found.ways, found.ways[1:], strict=False):
+        assert np.abs(one.solution.trajectory.states - other.solution.trajectory.states).max() > 0.05
+    with pytest.raises(InputError, match="trials: got 0"):
+        ls.smooth_safest(quadrotor.problem, plant, gusts, trials=0)
