@@ -344,6 +344,7 @@ class TestReplanningWhenLeft:
         assert laws[0].digest != laws[1].digest
 
     def test_bad_input(self, quadrotor: Any, quadrotor_solution: Any, funnel: ls.Funnel) -> None:
+        unchecked: Any = ls.Replanning
         moved = replace(funnel, plan=ls.Trajectory(funnel.plan.states + 1, funnel.plan.controls, funnel.plan.dt))
         for wrong, said in (
             ({"when": 3}, "when: got 3"),
@@ -351,7 +352,7 @@ class TestReplanningWhenLeft:
             ({"when": funnel, "horizon": "moving"}, 'want "shrinking"'),
         ):
             with pytest.raises(InputError, match=said):
-                ls.Replanning(quadrotor.problem, quadrotor_solution, every=1.0, **wrong)
+                unchecked(quadrotor.problem, quadrotor_solution, every=1.0, **wrong)
 
 
 def test_the_safest_way(quadrotor: ls.Scenario) -> None:
