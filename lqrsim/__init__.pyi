@@ -42,10 +42,12 @@ from .problem.problem import FixedState as FixedState
 from .problem.problem import Problem as Problem
 from .reports.page import report as report
 from .results.coordinates import Coordinates as Coordinates
+from .results.funnel import Funnel as Funnel
 from .results.output_feedback import OutputFeedbackPolicy as OutputFeedbackPolicy
 from .results.policy import AffinePolicy as AffinePolicy
 from .results.replan import Replan as Replan
 from .results.rollout import Rollout as Rollout
+from .results.save_load import load_funnel as load_funnel
 from .results.save_load import load_policy as load_policy
 from .results.save_load import load_rollout as load_rollout
 from .results.save_load import load_solution as load_solution
@@ -119,10 +121,16 @@ from .solvers.smoother import smooth_many as smooth_many
 from .stress.campaign import run_campaign as run_campaign
 from .stress.design_point import smallest_failure as smallest_failure
 from .stress.failure_search import ReliabilityProblem as ReliabilityProblem
+from .stress.funnels import FunnelCheck as FunnelCheck
+from .stress.funnels import check_funnel as check_funnel
+from .stress.funnels import funnel as funnel
 from .stress.multilevel_splitting import NoFailure as NoFailure
 from .stress.multilevel_splitting import split as split
 from .stress.results import Results as Results
 from .stress.results import replay as replay
+from .stress.safest import SafestPlan as SafestPlan
+from .stress.safest import Way as Way
+from .stress.safest import smooth_safest as smooth_safest
 from .stress.specification import Campaign as Campaign
 from .stress.specification import Cell as Cell
 from .stress.trial_score import TrialScore as TrialScore
@@ -131,6 +139,7 @@ from .stress.trial_score import miss as miss
 from .verify.rollout_check import verify_run as verify_run
 from .verify.verdict import Verification as Verification
 from .verify.video_check import verify_video as verify_video
+from .view.funnel_plot import plot_funnel as plot_funnel
 from .view.plots import plot_run as plot_run
 from .view.policy_plot import plot_policy as plot_policy
 from .view.render import render as render

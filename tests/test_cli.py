@@ -275,7 +275,7 @@ def test_help_of_reproduce_lists_all_results(capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.parametrize(
-    "command", ["", "list", "solve", "simulate", "render", "demo", "stress", "replay", "rare", "break"]
+    "command", ["", "list", "solve", "simulate", "render", "demo", "stress", "replay", "rare", "break", "funnel"]
 )
 def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:

@@ -205,6 +205,16 @@ def test_replanning_in_simulations_and_on_a_robot() -> None:
     assert names["planner"].problem.dynamics.parameters["wind_x"] == 2.0
 
 
+def test_funnels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_page("funnels.md")
+    assert (names["funnel"].levels > 0).all()
+    assert (names["places"].levels > 0).all()
+    assert 0 < len(names["law"].records) < 9
+    assert names["chosen"].reached.value > 0.5
+    assert Path("funnel.png").stat().st_size > 0
+
+
 @pytest.mark.long
 def test_noise_in_the_plan() -> None:
     names = run_page("noise.md")

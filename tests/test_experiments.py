@@ -118,6 +118,16 @@ def test_benchmark_says_what_it_skips(tmp_path: Path) -> None:
     assert script.report({"peers": {"skipped": "no such thing"}}) == "peers: skipped: no such thing"
 
 
+def test_funnels_of_known_truth() -> None:
+    """A small part: levels are right at least as often as is stated, to 3 standard deviations of so few searches."""
+    script = import_module("funnels")
+    found = script.coverage(script.Config(repetitions=100))
+    assert all(one["right"][0] >= 95 - 3 * 2.2 for one in found["known"].values())
+    assert all(0.5 < one["of the largest"] <= 1.1 for one in found["known"].values())
+    assert found["test"][0] == pytest.approx(95, abs=6.6)
+    assert "known in closed form" in script.report({"coverage": found})
+
+
 def test_benchmark_of_intervals() -> None:
     """A small part: differences cover exactly computed 93 % or more; so few rare studies only that it counts them."""
     script = import_module("benchmark_intervals")

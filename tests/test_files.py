@@ -409,7 +409,7 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path: Path, drive_solut
         changed = dataclasses.replace(drive_solution, **change)
         with pytest.raises(ls.InputError, match="result: got a solution that cannot be written"):
             ls.save(changed, path)
-    with pytest.raises(ls.InputError, match="result: got 'it', want a Solution, a Rollout, an AffinePolicy or an Out"):
+    with pytest.raises(ls.InputError, match="result: got 'it', want a Solution, a Rollout, an AffinePolicy, an Out"):
         ls.save("it", path)  # pyright: ignore[reportArgumentType]
     assert not path.exists()
 

@@ -54,6 +54,40 @@ def policies(place: Place) -> dict[str, tuple[Any, ...]]:
         "Tube.added_to": ({"self": tube, "rollout": place.rollout},),
         "load_policy": ({"path": saved},),
         **replanning(place),
+        **funnels(place),
+    }
+
+
+def funnels(place: Place) -> dict[str, tuple[Any, ...]]:
+    common = {"plant": place.plant, "solution": place.solution, "disturbances": [ls.ControlNoise(0.01)], "threads": 1,
+              "controller": ls.Feedback(place.solution.policy), "goal_radius": 1.0, "goal_tolerance": None}  # fmt: skip
+    asked = {"rate": 0.5, "confidence": 0.8, "knots": (0, 2), "states": ("x", "y"), "shape": None, "largest": 0.5,
+             "failures": 2, "seed": 0, "progress": lambda done, of: None}  # fmt: skip
+    funnel = ls.funnel(**common, **asked)
+    check = {"trials": 3, "between": (0.0, 0.5), "seed": 1}
+    chosen = {"problem": place.problem, "plant": place.plant, "disturbances": [ls.ControlNoise(0.01)], "trials": 2,
+              "starts": 2, "seed": 0, "goal_radius": 1.0, "goal_tolerance": None, "threads": 1}  # fmt: skip
+    safest = ls.smooth_safest(**chosen)
+    state = place.solution.trajectory.states[0]
+    where = {"self": funnel, "x": state, "t": 0.2, "about": state}
+    return {
+        "funnel": (common | asked, 0.3),
+        "Funnel": ({field.name: getattr(funnel, field.name) for field in dataclasses.fields(funnel)},),
+        "Funnel.level": ({"self": funnel, "t": 0.2},),
+        "Funnel.contains": (dict(where),),
+        "Funnel.deviation": (dict(where),),
+        "Funnel.left_at": ({"self": funnel, "rollout": place.rollout},),
+        "Funnel.states_at": ({"self": funnel, "knot": 0, "points": np.zeros((2, 2)), "level": 0.1},),
+        "check_funnel": ({"funnel": funnel} | common | check, 0.3),
+        "FunnelCheck": ({"knot": 0, "level": 1.0, "reached": None, "successes": np.ones(2, dtype=bool)},),
+        "smooth_safest": (chosen, 0.1),
+        "SafestPlan": ({"solution": safest.solution, "ways": safest.ways, "reached": safest.reached},),
+        "Way": (safest.ways[0]._asdict(),),
+        "plot_funnel": (
+            {"funnel": funnel, "path": place.folder / "funnel.png", "world": place.plant.world, "radius": 0.1},
+            0.3,
+        ),
+        "load_funnel": ({"path": ls.save(funnel, place.folder / "funnel.npz")},),
     }
 
 

@@ -6,6 +6,7 @@ Heavy modules are imported inside `run`, so that `--help` answers at once.
 import inspect
 from typing import get_args
 
+from lqrsim.commands.certifying import Funnel
 from lqrsim.commands.creating import New
 from lqrsim.commands.failures import Break, Rare
 from lqrsim.commands.housekeeping import Cache, Demo, Reproduce
@@ -28,6 +29,7 @@ Command = (
     | Report
     | Rare
     | Break
+    | Funnel
     | Reproduce
     | Cache
 )

@@ -9,10 +9,11 @@ from lqrsim.codegen.fingerprint import fingerprint
 from lqrsim.control.controllers import Control, Controller
 from lqrsim.control.law import evaluator
 from lqrsim.control.replanner import Law, Replanner, ReplanRecord, Task
-from lqrsim.errors import Array, InputError, check_count, check_function, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_count, check_function, check_kind, check_number, excerpt
 from lqrsim.machine import processors
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.funnel import Funnel
 from lqrsim.results.hashing import sha256
 from lqrsim.results.replan import Replan
 from lqrsim.results.solution import Solution
@@ -45,6 +46,8 @@ class Replanning(Controller):
       changes: a function of the time in seconds and the problem that returns the problem as it is known by then: other
         goals, obstacles or parameters, but nothing that would have to be compiled.
       seed: of what `computing` draws.
+      when: a funnel of the solution: solve only for trials that are outside at the time, about the plan in force. What
+        is certified is the first plan's; about a later one the same ellipsoids are a rule of thumb.
 
     Attributes:
       records: a `ReplanRecord` of each solve of the last run.
@@ -67,6 +70,7 @@ class Replanning(Controller):
         predict: bool = True,
         changes: Callable[[float, Problem], Problem] | None = None,
         seed: int = 0,
+        when: Funnel | None = None,
     ) -> None:
         who = "Replanning"
         if callable(computing):
@@ -79,7 +83,14 @@ class Replanning(Controller):
             deadline = computing
         check_function(f"{who}: changes", changes, "a function of the time and the problem", arguments=2)
         self._replanner = Replanner(who, problem, solution, every, deadline=deadline, horizon=horizon, predict=predict)
-        self.problem, self.solution = problem, solution
+        check_kind(f"{who}: when", when, (Funnel, type(None)), "a Funnel, such as funnel(...) returns")
+        if when is not None and not np.array_equal(when.plan.states, solution.trajectory.states):
+            raise InputError(f"{who}: when: got a funnel of another plan, want that of the solution")
+        if when is not None and horizon != "shrinking":
+            raise InputError(
+                f'{who}: when: got a funnel with horizon={excerpt(horizon)}, want "shrinking": it has an end'
+            )
+        self.problem, self.solution, self.when = problem, solution, when
         self.every, self.deadline, self.horizon = self._replanner.every, self._replanner.deadline, horizon
         self.computing, self.changes, self.seed = computing, changes, check_count(f"{who}: seed", seed, at_least=0)
 
@@ -106,8 +117,9 @@ class Replanning(Controller):
                     laws[trial], waiting[trial] = law, None
             if replanner.due(step):
                 problem = self._problem_at(step)
-                tasks = [replanner.task(law, step, state, problem) for law, state in zip(laws, shown, strict=True)]
-                for trial, (task, replan) in enumerate(zip(tasks, self._solve(tasks), strict=True)):
+                left = [trial for trial, law in enumerate(laws) if self._left(law, step, shown[trial])]
+                tasks = [replanner.task(laws[trial], step, shown[trial], problem) for trial in left]
+                for trial, task, replan in zip(left, tasks, self._solve(tasks), strict=True):
                     if replanner.account.enter(step, trial, replan, late=self._late(shown[trial], step, replan)):
                         waiting[trial] = Law(replan, task.first)
                 if replanner.delay == 0:
@@ -121,6 +133,13 @@ class Replanning(Controller):
 
         return control
 
+    def _left(self, law: Law, step: int, state: Array) -> bool:
+        """Whether to solve for a trial."""
+        if self.when is None:
+            return True
+        about = law.plan.trajectory.states[law.row(step)]
+        return not self.when.contains(state, step * self.problem.dt, about=about)
+
     def _problem_at(self, step: int) -> Problem:
         if self.changes is None:
             return self.problem
@@ -129,7 +148,7 @@ class Replanning(Controller):
     def _solve(self, tasks: list[Task]) -> list[Replan]:
         """All at once; one after the other where it matters how long each takes."""
         replanner = self._replanner
-        if len(tasks) == 1 or self.computing == MEASURED:
+        if len(tasks) <= 1 or self.computing == MEASURED:
             limit = max(self.deadline, 1e-3) if self.computing == MEASURED else None
             return [replanner.solve(task, limit) for task in tasks]
         with workers(min(processors(), len(tasks)), self.problem.dynamics.functions) as pool:
@@ -157,8 +176,9 @@ class Replanning(Controller):
     def digest(self) -> str:
         computing = fingerprint(self.computing) if callable(self.computing) else repr(self.computing)
         changes = fingerprint(self.changes) if self.changes is not None else ""
+        when = "" if self.when is None else self.when.digest
         parts = self._replanner.periods, self._replanner.delay, self.horizon, self._replanner.predict, self.seed
-        return sha256(f"{self.solution.policy.digest} {self.problem.digest} {parts} {computing} {changes}")[:16]
+        return sha256(f"{self.solution.policy.digest} {self.problem.digest} {parts} {computing} {changes}{when}")[:16]
 
     @property
     def spaces(self) -> tuple[Coordinates, Coordinates]:

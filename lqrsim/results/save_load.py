@@ -1,11 +1,11 @@
-"""Solutions, policies and rollouts on disk: arrays by name, and everything that is not an array in one JSON text.
+"""Results on disk: arrays by name, and everything that is not an array in one JSON text.
 
 `docs/file_format.md` says what is in them and loads a policy elsewhere, with NumPy alone; `results/archive.py` has the
 rest. The tables here say what belongs into a file. What is saved and what is loaded are both held to them.
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, astuple, fields
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import InputError, check_array, check_kind, check_path, excerpt
-from lqrsim.results import schema
+from lqrsim.results import funnel_file, schema
 from lqrsim.results.archive import Arrays, Header, opened, write
 from lqrsim.results.archive import replacing as replacing
 from lqrsim.results.ball_record import BallRecord
-from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.coordinates_file import COORDINATES, coordinates_of
+from lqrsim.results.funnel import Funnel
 from lqrsim.results.output_feedback import SHAPES as OUTPUT_FEEDBACK
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.policy import AffinePolicy
@@ -27,7 +28,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Moments, Quadratic
 
-VERSIONS = {"solution": 5, "rollout": 4, "policy": 1}
+VERSIONS = {"solution": 5, "rollout": 4, "policy": 1, "funnel": 1}
 
 # Shapes in letters: T steps, n states, m controls; the others stand for whatever it is, but the same in all of a file.
 _PLAN = {"trajectory.controls": "T m", "trajectory.states": "T+1 n"}
@@ -60,17 +61,11 @@ _POLICY_ARRAYS = {  # of each kind; of the same names in the classes
     "output feedback": OUTPUT_FEEDBACK,
 }
 _CERTIFICATE = tuple(field.name for field in fields(Certificate))  # before the gap, in the array of that name
-_DTYPES = {"contacts": "<i8"}  # all others are <f8
+_DTYPES: Mapping[str, str] = dict.fromkeys(("contacts", *funnel_file.WHOLE_NUMBERS), "<i8")  # all others are <f8
 
-_COORDINATES = {  # of the same names in Coordinates
-    "names": schema.listed(schema.line), "units": schema.listed(schema.line), "position": schema.listed(schema.count),
-    "angles": schema.listed(schema.count), "rotation_vectors": schema.listed(schema.count),
-    "low": schema.listed(schema.any_number), "high": schema.listed(schema.any_number),
-    "plane": schema.line, "offset": schema.optional(schema.number()),
-}  # fmt: skip
 _COMMON = {
     "format": schema.line, "version": schema.count, "sha256": schema.line,
-    "states": schema.record(_COORDINATES), "controls": schema.record(_COORDINATES),
+    "states": COORDINATES, "controls": COORDINATES,
     "dt": schema.number(at_least=1e-9, at_most=1e9),
 }  # fmt: skip
 _STATUS = schema.one_of(Status)
@@ -90,17 +85,17 @@ _ROLLOUT_TEXTS: dict[str, schema.Check] = {  # of the same names in a Rollout
     "obstacles": schema.listed(schema.line), "reasons": schema.listed(schema.line),
 }  # fmt: skip
 _POLICY_TEXTS: dict[str, schema.Check] = {
-    "kind": schema.one_of(_POLICY_ARRAYS), "measured": schema.optional(schema.record(_COORDINATES)),
+    "kind": schema.one_of(_POLICY_ARRAYS), "measured": schema.optional(COORDINATES),
 }  # fmt: skip
 
-Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy
+Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy | Funnel
 
 
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:
-    """Write a solution, a rollout or a policy alone; the file is whole or not there. Returns its path.
+    """Write a solution, a rollout, a policy alone or a funnel; the file is whole or not there. Returns its path.
 
     Args:
-      result: a Solution, a Rollout or a policy.
+      result: a Solution, a Rollout, a policy or a Funnel.
       path: FILE.npz.
 
     Returns:
@@ -110,14 +105,11 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
       InputError: the file cannot be written; or what it would hold could not be read again.
     """
     path = check_path("output", path)
-    wanted = "a Solution, a Rollout, an AffinePolicy or an OutputFeedbackPolicy"
-    check_kind("result", result, (Solution, Rollout, AffinePolicy, OutputFeedbackPolicy), wanted)
-    kind = "solution" if isinstance(result, Solution) else "rollout" if isinstance(result, Rollout) else "policy"
+    wanted = "a Solution, a Rollout, an AffinePolicy, an OutputFeedbackPolicy or a Funnel"
+    check_kind("result", result, tuple(_PARTS), wanted)
+    kind, parts = next(found for one, found in _PARTS.items() if isinstance(result, one))
     try:
-        if isinstance(result, Solution):
-            arrays, texts = _solution_parts(result)
-        else:
-            arrays, texts = _rollout_parts(result) if isinstance(result, Rollout) else _policy_parts(result)
+        arrays, texts = parts(result)
         meta = schema.parse(schema.canonical({"format": f"lqrsim {kind}", "version": VERSIONS[kind], **texts}))
         arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         headers = {name: Header(array.dtype.str, array.shape) for name, array in arrays.items()}
@@ -176,6 +168,21 @@ def load_policy(path: str | os.PathLike[str]) -> AffinePolicy | OutputFeedbackPo
     return _load(path, "policy")
 
 
+def load_funnel(path: str | os.PathLike[str]) -> Funnel:
+    """Read what `save` wrote of a Funnel.
+
+    Args:
+      path: of a file that `save` wrote.
+
+    Returns:
+      The Funnel.
+
+    Raises:
+      InputError: the file is missing, damaged or of another kind.
+    """
+    return _load(path, "funnel")
+
+
 def _load(path: str | os.PathLike[str], kind: str) -> Any:
     with opened(check_path(kind, path), kind, VERSIONS[kind]) as archive:
         _check(kind, archive.headers, archive.meta)
@@ -194,6 +201,9 @@ def _check(kind: str, headers: Mapping[str, Header], meta: dict[str, Any]) -> No
         if (meta["measured"] is None) != (meta["kind"] == "affine"):
             raise InputError("meta.measured: got none of output feedback, or some of an affine policy")
         sizes |= {"Y": len(meta["measured"]["names"])} if meta["measured"] else {}
+    elif kind == "funnel":
+        wanted, groups = funnel_file.ARRAYS, ()
+        sizes |= {"d": len(meta["off_plan"]), "k": len(meta["reasons"])}
     else:
         sizes |= {"iterations": len(meta["methods"]), "candidates": len(meta["candidates"])}
         wanted = _SOLUTION_ARRAYS | {f"multipliers.{i}": f"T+1 rows{i}" for i in range(len(meta["penalties"]))}
@@ -267,7 +277,7 @@ def _solution_parts(solution: Solution) -> tuple[Arrays, dict[str, Any]]:
 
 
 def _solution(arrays: Arrays, meta: dict[str, Any]) -> Solution:
-    states, controls, dt = _coordinates(meta["states"]), _coordinates(meta["controls"]), float(meta["dt"])
+    states, controls, dt = coordinates_of(meta["states"]), coordinates_of(meta["controls"]), float(meta["dt"])
 
     def policy(name: str) -> AffinePolicy | None:
         if f"{name}.gain" not in arrays:
@@ -339,8 +349,8 @@ def _rollout(arrays: Arrays, meta: dict[str, Any]) -> Rollout:
         **{name: arrays.get(name) for group in _ROLLOUT_OPTIONAL for name in group if "." not in name},
         balls=BallRecord(**{name.split(".")[1]: arrays[name] for name in _BALLS}) if "balls.radii" in arrays else None,
         plan=Trajectory(arrays["trajectory.states"], arrays["trajectory.controls"], float(meta["dt"])),
-        state_coordinates=_coordinates(meta["states"]),
-        control_coordinates=_coordinates(meta["controls"]),
+        state_coordinates=coordinates_of(meta["states"]),
+        control_coordinates=coordinates_of(meta["controls"]),
         **{name: meta[name] for name in _ROLLOUT_TEXTS},
     )
 
@@ -357,19 +367,22 @@ def _policy_parts(policy: AffinePolicy | OutputFeedbackPolicy) -> tuple[Arrays, 
 
 
 def _policy(arrays: Arrays, meta: dict[str, Any]) -> AffinePolicy | OutputFeedbackPolicy:
-    states, controls = _coordinates(meta["states"]), _coordinates(meta["controls"])
+    states, controls = coordinates_of(meta["states"]), coordinates_of(meta["controls"])
     rest: dict[str, Any] = {"dt": float(meta["dt"]), "state_coordinates": states, "control_coordinates": controls}
     for name, array in arrays.items():
         check_array(name, array, (None,) * array.ndim, infinite=name == "nominal")
     if meta["kind"] == "affine":
         return AffinePolicy(**arrays, **rest)
-    return OutputFeedbackPolicy(**arrays, **rest, measured_coordinates=_coordinates(meta["measured"]))
+    return OutputFeedbackPolicy(**arrays, **rest, measured_coordinates=coordinates_of(meta["measured"]))
 
 
-_MAKERS = {"solution": _solution, "rollout": _rollout, "policy": _policy}
-_TEXTS = {"solution": _SOLUTION_TEXTS | _SOLUTION_LISTS, "rollout": _ROLLOUT_TEXTS, "policy": _POLICY_TEXTS}
-
-
-def _coordinates(texts: Mapping[str, Any]) -> Coordinates:
-    given: dict[str, Any] = {name: tuple(one) if isinstance(one, list) else one for name, one in texts.items()}
-    return Coordinates(**given)
+_PARTS: Mapping[type, tuple[str, Callable[[Any], tuple[Arrays, dict[str, Any]]]]] = {
+    Solution: ("solution", _solution_parts), Rollout: ("rollout", _rollout_parts),
+    AffinePolicy: ("policy", _policy_parts), OutputFeedbackPolicy: ("policy", _policy_parts),
+    Funnel: ("funnel", funnel_file.parts),
+}  # fmt: skip
+_MAKERS = {"solution": _solution, "rollout": _rollout, "policy": _policy, "funnel": funnel_file.funnel_of}
+_TEXTS = {
+    "solution": _SOLUTION_TEXTS | _SOLUTION_LISTS, "rollout": _ROLLOUT_TEXTS, "policy": _POLICY_TEXTS,
+    "funnel": funnel_file.TEXTS | funnel_file.CHOSEN,
+}  # fmt: skip

@@ -1,0 +1,257 @@
+"""Funnels: whether their confidence is what it says, where the packaged robots' policies work, and how long it takes.
+
+    python experiments/funnels.py                              # everything, some ten minutes
+    python experiments/funnels.py --sections coverage          # some of it
+    python experiments/funnels.py --quick                      # as little as shows how it works
+
+coverage    How often a stated level is right where the share of successes at each level is known.
+robots      Both robots: levels, fresh trials inside and just outside, and how long it takes.
+replanning  Planning again when the funnel is left, against planning again at every period.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from paper.common import Result, Settings, between, counting, interval, opening, run, table
+from replan.common import scenario_of
+from replan.delay import firm
+
+import lqrsim as ls
+from lqrsim.stress.levels import find_level, fresh, smallest_test
+from lqrsim.stress.statistics import compare
+from lqrsim.stress.statistics import rate as rate_of
+
+ROBOTS = ("differential_drive", "quadrotor")
+NOISE = 0.05  # of the controls, relative
+SHELLS = ((0.0, 1.0), (1.0, 1.3), (1.3, 1.6))  # of the level, where fresh trials begin
+EVERY = 0.1  # s, between two plans
+EACH = "at every period"
+GUSTS = 1.25  # m/s, standard deviation, in which it is planned again
+WATCHED = (0.8, 0.85, 0.9)  # rates of the funnels that are watched
+LOOSE: dict[str, Any] = {"confidence": 0.9, "failures": 40}  # of these funnels
+
+Section = Literal["coverage", "robots", "replanning"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(Settings):
+    sections: tuple[Section, ...] = ("coverage", "robots", "replanning")
+    """Which of them."""
+    repetitions: int = 2000
+    """Searches whose answer is known."""
+    rate: float = 0.99
+    """Wished share of successes."""
+    confidence: float = 0.95
+    """Of all levels of a funnel at once."""
+    trials: int = 1000
+    """Fresh ones at each knot, inside and in each shell outside."""
+    replanned: int = 200
+    """Trials of each way of planning again."""
+    seed: int = 0
+    """Of all draws."""
+
+
+def few(config: Config) -> Config:
+    """What `--quick` comes to."""
+    return replace(config, repetitions=20, rate=0.8, confidence=0.8, trials=20, replanned=4)
+
+
+# The share of successes at a level: all succeed up to level 1. In a ball of d states of which those in a smaller ball
+# succeed, and where disturbances decide, from a level on more and more often.
+KNOWN: dict[str, Callable[[float], float]] = {
+    "1 state": lambda level: min(1.0, 1 / level) if level > 0 else 1.0,
+    "12 states": lambda level: min(1.0, level**-12.0) if level > 0 else 1.0,
+    "disturbed": lambda level: 1 / (1 + 1e-3 * (1 + level**6)),
+}
+
+
+def coverage(config: Config) -> dict[str, Any]:
+    """How often the share at the level that is found is at least the rate."""
+    test = smallest_test(config.rate, config.confidence, 3)
+    right: dict[str, Any] = {}
+    for name, share in KNOWN.items():
+        held, ratios = 0, []
+        most = _edge(share, config.rate)
+        for number in range(config.repetitions):
+            drawn = np.random.default_rng([config.seed, number]).random(2 * test.trials)
+            found = find_level(
+                lambda level, which, drawn=drawn, share=share: drawn[which] < share(level),
+                test, guess=0.3, largest=1e6, rate=config.rate,
+            )  # fmt: skip
+            held += share(found.level) >= config.rate
+            ratios.append(found.level / most)
+        right[name] = {
+            "right": interval(_percent(held, config.repetitions)), "of the largest": float(np.median(ratios)),
+            "none": float(np.mean(np.array(ratios) == 0)),
+        }  # fmt: skip
+    # One level alone whose share is just the rate: how often the test of it does not pass, as it must not.
+    refused = 0
+    for number in range(config.repetitions):
+        drawn = np.random.default_rng([config.seed, number, 1]).random(2 * test.trials)
+        failed, _ = fresh(lambda level, which, drawn=drawn: drawn[which] < config.rate, 1.0, test)
+        refused += failed > test.failures
+    return {
+        "known": right, "test": interval(_percent(refused, config.repetitions)), "trials": test.trials,
+        "repetitions": config.repetitions, "rate": config.rate, "confidence": config.confidence,
+    }  # fmt: skip
+
+
+def _edge(share: Callable[[float], float], rate: float) -> float:
+    """The largest level at which the share is the rate."""
+    low, high = 0.0, 1e3
+    for _ in range(100):
+        middle = (low + high) / 2
+        low, high = (middle, high) if share(middle) >= rate else (low, middle)
+    return low
+
+
+def _percent(successes: int, trials: int) -> Any:
+    found = rate_of(successes, trials)
+    return replace(found, value=100 * found.value, low=100 * found.low, high=100 * found.high)
+
+
+def robots(config: Config) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for robot in ROBOTS:
+        scenario = ls.scenarios.get(robot)
+        solution, plant = ls.smooth(scenario.problem), scenario.plant()
+        how: dict[str, Any] = {"disturbances": [ls.ControlNoise(NOISE)]}
+        begun, used = time.perf_counter(), time.process_time()
+        with counting(f"funnel of the {robot}") as progress:
+            funnel = ls.funnel(
+                plant, solution, rate=config.rate, confidence=config.confidence, seed=config.seed, progress=progress,
+                **how,
+            )  # fmt: skip
+        took, busy = time.perf_counter() - begun, time.process_time() - used
+        checks = [
+            ls.check_funnel(
+                funnel, plant, solution, trials=config.trials, between=shell, seed=config.seed + 1 + i, **how
+            )
+            for i, shell in enumerate(SHELLS)
+        ]
+        found[robot] = {
+            "seconds": took, "processor seconds": busy, "simulated": funnel.simulated, "times": funnel.times.tolist(),
+            "levels": funnel.levels.tolist(), "summary": funnel.summary(),
+            "reached": [
+                [interval(_percent(int(one.successes.sum()), config.trials)) for one in shell] for shell in checks
+            ],
+        }  # fmt: skip
+    return {"robots": found, "trials": config.trials, "rate": config.rate, "confidence": config.confidence}
+
+
+def replanning(config: Config) -> dict[str, Any]:
+    """The same trials by three laws: the policy, plans at every period, and plans when the funnel is left."""
+    scenario = scenario_of("quadrotor", 0)
+    problem = firm(scenario)
+    solution, plant = ls.smooth(problem), scenario.plant()
+    wrong = [ls.Gusts(GUSTS)]
+    laws: dict[str, ls.Replanning | None] = {
+        "the policy": None, EACH: ls.Replanning(problem, solution, every=EVERY),
+    }  # fmt: skip
+    funnels: list[str] = []
+    for rate in WATCHED[: 1 if config.quick else None]:
+        funnel = ls.funnel(plant, solution, disturbances=wrong, seed=config.seed, rate=rate, **LOOSE)
+        laws[f"outside the funnel of rate {rate:g}"] = ls.Replanning(problem, solution, every=EVERY, when=funnel)
+        funnels.append(funnel.summary())
+    found: dict[str, Any] = {}
+    ended: dict[str, Any] = {}
+    for name, law in laws.items():
+        run = ls.simulate(
+            plant, solution, controller=law, disturbances=wrong, trials=config.replanned, seed=config.seed + 10,
+            frames=False, contacts=False,
+        )  # fmt: skip
+        ended[name] = np.array([one == "reached" for one in run.outcome])
+        found[name] = {
+            "reached": interval(_percent(int(ended[name].sum()), config.replanned)),
+            "solves": 0 if law is None else len(law.records),
+        }  # fmt: skip
+    for name, one in found.items():
+        pairs = compare(ended[name], ended[EACH])
+        one["apart"], one["p"] = [pairs.only_first, pairs.only_second], pairs.p_value
+    return {"laws": found, "funnels": funnels, "trials": config.replanned}
+
+
+def report_replanning(found: dict[str, Any]) -> list[str]:
+    rows = [
+        [
+            name, between(one["reached"], ".1f"), f"{one['solves'] / found['trials']:.1f}",
+            *one["apart"], f"{one['p']:.2g}",
+        ]
+        for name, one in found["laws"].items()
+    ]  # fmt: skip
+    head = ("planned again", "reached (%)", "solves a trial", f"only it, not {EACH}", "only that, not it", "p")
+    return [
+        f"The quadrotor in gusts of {GUSTS:g} m/s, with room beside obstacles; {found['trials']} trials, planned again"
+        f" every {EVERY:g} s, or only where the trial is outside a funnel then; p is of the exact McNemar test.",
+        table(head, rows),
+        *(f"```\n{one}\n```" for one in found["funnels"]),
+    ]
+
+
+def report_coverage(found: dict[str, Any]) -> list[str]:
+    rows = [
+        [name, between(one["right"], ".1f"), f"{one['of the largest']:.2f}", f"{100 * one['none']:.1f}"]
+        for name, one in found["known"].items()
+    ]
+    return [
+        f"{found['repetitions']:,} searches for the largest level with a share of successes of {found['rate']:g} at"
+        f" confidence {found['confidence']:g}, where the share at each level is known. A test has {found['trials']}"
+        " trials.",
+        table(("share known in closed form", "right (%)", "of the largest such level, median", "no level (%)"), rows),
+        f"A level whose share is just the rate is refused by its test in {between(found['test'], '.1f')} %. The whole"
+        " search is right more often, for it seldom aims so high.",
+    ]
+
+
+def report_robots(found: dict[str, Any]) -> list[str]:
+    said = [
+        f"Controls with a noise of {100 * NOISE:g} % of themselves; rate {found['rate']:g}, confidence"
+        f" {found['confidence']:g} at all knots at once; {found['trials']:,} fresh trials at each knot and in each"
+        " shell."
+    ]
+    for robot, one in found["robots"].items():
+        kept = [i for i, level in enumerate(one["levels"]) if level > 0]
+        rows = [
+            [
+                f"{one['times'][i]:.2f}",
+                f"{one['levels'][i]:.3g}",
+                *(between(shell[row], ".1f") for shell in one["reached"]),
+            ]
+            for row, i in enumerate(kept)
+        ]
+        head = ("s", "level", *(f"{low:g} to {high:g} of the level: reached (%)" for low, high in SHELLS))
+        said += [
+            f"{robot}: {one['simulated']:,} trials in {one['seconds']:.0f} s, of which"
+            f" {one['processor seconds']:.0f} s of processors.",
+            table(head, rows),
+        ]
+    return said
+
+
+SECTIONS: dict[Section, tuple[Any, Any, str]] = {
+    "coverage": (coverage, report_coverage, "Whether the confidence is what it says"),
+    "robots": (robots, report_robots, "Where the packaged robots' policies work"),
+    "replanning": (replanning, report_replanning, "Planning again when the funnel is left"),
+}
+
+
+def main(config: Config) -> Result:
+    result, asked = opening(config), few(config) if config.quick else config
+    for name in config.sections:
+        result[name] = SECTIONS[name][0](asked)
+    return result
+
+
+def report(result: Result) -> str:
+    parts = ["## Funnels"]
+    for name, (_, told, title) in SECTIONS.items():
+        if name in result:
+            parts += [f"### {title}", *told(result[name])]
+    return "\n\n".join(parts)
+
+
+if __name__ == "__main__":
+    run(Config, main, report, lambda result: [], __doc__)  # of the paper's statements, for it has no funnels

@@ -1,0 +1,147 @@
+"""Runs that begin at a knot of the plan, in states that somebody chose: the rest of a run that went as planned so far.
+
+What has a memory is led there: disturbances and controller are shown the plan, period by period, before the run begins.
+So a delay has its past, a filter its estimate, and what happens at a time happens at that time. The physics begins at
+the knot.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lqrsim.control.controllers import Control, Controller, Feedback
+from lqrsim.errors import Array, InputError, check_array, check_count, check_kind
+from lqrsim.problem.noise import Noise
+from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Trajectory
+from lqrsim.simulation.closed_loop import simulate
+from lqrsim.simulation.disturbances import Disturbance, Effect
+from lqrsim.simulation.disturbances.state_noise import as_disturbances
+from lqrsim.simulation.plant import Plant
+
+
+def simulate_from(
+    plant: Plant,
+    solution: Solution,
+    states: Array,
+    *,
+    knot: int = 0,
+    disturbances: Sequence[Disturbance | Noise] = (),
+    controller: Controller | None = None,
+    **options: Any,
+) -> Rollout:
+    """One trial of what is left of a plan after `knot` periods from each of the states (K, n).
+
+    What an `InitialStateError` draws is replaced by the states. Until the knot the run is taken to have been as
+    planned, and measured so.
+
+    Args:
+      options: the other ones of `simulate`, but for `trials`. Times of the rollout count from the knot.
+
+    Raises:
+      InputError: as `simulate`; or the knot is not one before the plan's end.
+    """
+    check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
+    whole = solution.trajectory
+    if check_count("knot", knot, at_least=0) >= whole.steps:
+        raise InputError(f"knot: got {knot}, want one from 0 to {whole.steps - 1}, before the plan's end")
+    begun = check_array("states", states, (None, whole.states.shape[1]))
+    kinds = (Controller, type(None))
+    law = check_kind("controller", controller, kinds, "a Controller, such as Feedback(solution.policy), or None")
+    law = Feedback(solution.policy) if law is None else law
+    given = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
+    wrong: list[Disturbance] = [_Later(one, whole, knot) for one in given]
+    return simulate(
+        plant,
+        solution.shifted(knot, horizon="shrinking"),
+        disturbances=[*wrong, _Begin(begun)],
+        controller=_LaterController(law, whole, knot) if knot else law,
+        trials=len(begun),
+        **options,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Begin(Disturbance):
+    """Puts the trials where they are to begin."""
+
+    states: Array
+
+    def describe(self, plant: Plant) -> str:
+        return "begun off the plan"
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        return Effect(initial_states=lambda planned: self.states)
+
+
+@dataclass(frozen=True, eq=False)
+class _Later(Disturbance):
+    """A disturbance of the whole plan, in a run that begins at one of its knots."""
+
+    of: Disturbance
+    plan: Trajectory
+    knot: int
+
+    def describe(self, plant: Plant) -> str:
+        return self.of.describe(plant)
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        effect = self.of.start(plant, self.plan, generators)
+        if self.knot == 0 or not isinstance(effect, Effect):  # which is refused where it is looked at
+            return effect
+        states, controls = self.plan.states, self.plan.controls
+        shown: dict[str, tuple[Array, ...]] = {  # in the order of a control period
+            "measure": (states,), "actuate": (controls,), "force": (states,), "torque": (states,),
+            "kick": (states, controls),
+        }  # fmt: skip
+        hooks = {name: hook for name in shown if (hook := getattr(effect, name)) is not None}
+        led = [False]
+
+        def lead() -> None:
+            """Once the models are altered, and before anything else: what was until the knot."""
+            led[0] = True
+            for step in range(self.knot):
+                for name, hook in hooks.items():
+                    hook(step, *(np.tile(values[step], (len(generators), 1)) for values in shown[name]))
+
+        def later(hook: Callable[..., Array]) -> Callable[..., Array]:
+            def called(step: int, *values: Array) -> Array:
+                if not led[0]:
+                    lead()
+                return hook(step + self.knot, *values)
+
+            return called
+
+        return replace(effect, initial_states=None, **{name: later(hook) for name, hook in hooks.items()})
+
+
+class _LaterController(Controller):
+    """A controller of the whole plan, in a run that begins at one of its knots."""
+
+    def __init__(self, of: Controller, plan: Trajectory, knot: int) -> None:
+        self.of, self.plan, self.knot = of, plan, knot
+
+    def start(self, trials: int) -> Control:
+        control = self.of.start(trials)
+        if not isinstance(self.of, Feedback):  # which remembers nothing
+            for step in range(self.knot):
+                control(step, np.tile(self.plan.states[step], (trials, 1)))
+        return lambda step, shown: control(step + self.knot, shown)
+
+    @property
+    def digest(self) -> str:
+        return self.of.digest
+
+    @property
+    def spaces(self) -> tuple[Coordinates, Coordinates]:
+        return self.of.spaces
+
+    def lost(self) -> Mapping[int, str]:
+        return self.of.lost()
+
+    def summary(self) -> str:
+        return self.of.summary()
