@@ -1,5 +1,6 @@
 """Funnels: against the closed form of a linear system's region of success, and how runs begin on the way."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -310,6 +311,13 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert found.summary() in said
     assert found.knots.tolist() == [140]
     assert (tmp_path / "funnel.png").stat().st_size > 0
+    assert main(["funnel", "quadrotor", *options, "--out", str(tmp_path), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["wrote"] == [str(tmp_path / name) for name in ("funnel.npz", "funnel.png")]
+    assert printed["funnel"]["rate"] == 0.5
+    (knot,) = printed["funnel"]["knots"]
+    assert (knot["knot"], knot["level"], knot["trials"]) == (140, found.levels[0], found.trials[0])
+    assert knot["time"] == pytest.approx(140 / 30)
     assert main(["funnel", "quadrotor", "--knots", "150", "--out", str(tmp_path)]) == 2
     assert "want some of 0 to 149" in capsys.readouterr().err
 

@@ -13,6 +13,7 @@ import numpy as np
 if TYPE_CHECKING:
     from lqrsim.problem.problem import Problem
     from lqrsim.results.coordinates import Coordinates
+    from lqrsim.results.funnel import Funnel
     from lqrsim.results.rollout import Rollout
     from lqrsim.results.solution import Solution
     from lqrsim.scenarios.packaged import Scenario
@@ -40,6 +41,29 @@ def of_scenario(name: str, scenario: "Scenario") -> Object:
         "states": _named(problem.dynamics.state_coordinates),
         "controls": _named(problem.dynamics.control_coordinates),
     }
+
+
+def of_funnel(funnel: "Funnel") -> Object:
+    """What is certified at each knot; not the ellipsoids, which its file has."""
+    columns = zip(funnel.knots, funnel.levels, funnel.trials, funnel.successes, funnel.reasons, strict=True)
+    return {
+        "rate": funnel.rate,
+        "confidence": funnel.confidence,
+        "states": funnel.states,
+        "family": funnel.family,
+        "goal_radius": funnel.goal_radius,
+        "disturbances": funnel.disturbances,
+        "seed": funnel.seed,
+        "options": funnel.options,
+        "simulated": funnel.simulated,
+        "knots": [
+            {"knot": knot, "time": knot * funnel.plan.dt, "level": level, "trials": trials, "successes": successes,
+             "reason": reason}
+            for knot, level, trials, successes, reason in columns
+        ],
+        "policy_digest": funnel.policy_digest,
+        "versions": funnel.versions,
+    }  # fmt: skip
 
 
 def of_solution(solution: "Solution") -> Object:

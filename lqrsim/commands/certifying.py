@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Folder, Policy, optional
+from lqrsim.commands.options import Folder, Json, Policy, optional
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,10 +51,12 @@ class Funnel:
     """Seed of all random numbers. The same seed gives the same output."""
     out: Folder = None
     """Output folder. By default runs/funnel/ and the name of the scenario."""
+    json: Json = False
+    """Print the result as one JSON object, and everything else to stderr; see docs/json.md."""
 
     def run(self) -> int:
         """Run the command. Returns the exit code."""
-        from lqrsim.commands import console
+        from lqrsim.commands import as_json, console
         from lqrsim.results import save_load
         from lqrsim.scenarios.references import folder_name, resolve
         from lqrsim.stress.funnels import funnel
@@ -84,9 +86,10 @@ class Funnel:
                 **scenario.near_enough(self.goal_radius, self.goal_tolerance),
             )
         console.say(found.summary())
-        console.say(f"wrote {save_load.save(found, folder / 'funnel.npz')}")
+        console.result(funnel=as_json.of_funnel(found))
+        console.wrote(save_load.save(found, folder / "funnel.npz"))
         place = scenario.problem.dynamics.state_coordinates.position
         if place and set(place) <= set(found.chosen):
             world, radius = scenario.scene.world, scenario.robot.radius
-            console.say(f"wrote {plot_funnel(found, folder / 'funnel.png', world=world, radius=radius)}")
+            console.wrote(plot_funnel(found, folder / "funnel.png", world=world, radius=radius))
         return 0 if found.levels.any() else 1
