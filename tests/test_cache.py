@@ -99,6 +99,7 @@ def test_what_two_processes_have_kept_does_not_run_each_other(tmp_path: Path) ->
 OTHER = SYSTEM.replace("import sys\n", "import sys\nfrom lqrsim.codegen import kept_parts\nkept_parts.WORTH = 0.0\n", 1)
 
 
+@pytest.mark.long
 def test_another_problem_compiles_only_what_is_new_and_has_the_same_bits(tmp_path: Path) -> None:
     def solve(system: str, folder: str) -> tuple[str, int]:
         before = len(list((tmp_path / folder).glob("*.item")))

@@ -213,6 +213,7 @@ def test_finished_is_finished(reference: Results, monkeypatch: pytest.MonkeyPatc
 
 
 @LINUX
+@pytest.mark.long
 def test_dask_does_the_same(reference: Results, tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
     killed = []
@@ -291,6 +292,7 @@ def test_an_exception_costs_its_own_trials_only(own: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("kind", "says"), [("sleep", "took longer than 2 s"), ("die", "its worker ended 3 times, at last with signal 9")]
 )
+@pytest.mark.long
 def test_what_hangs_or_kills_its_worker_costs_its_shard(own: Path, tmp_path: Path, kind: str, says: str) -> None:
     healthy = run_campaign(troubled(own, "none"), tmp_path / "healthy", workers=0)
     results = run_campaign(troubled(own, kind, time_limit=2.0), tmp_path / kind, workers=2)

@@ -198,6 +198,7 @@ def test_commands_of_pages_exist() -> None:
         )
 
 
+@pytest.mark.long
 def test_replanning_in_simulations_and_on_a_robot() -> None:
     names = run_page("replanning.md")
     assert names["replan"].trajectory.steps == 150
@@ -205,6 +206,7 @@ def test_replanning_in_simulations_and_on_a_robot() -> None:
     assert names["planner"].problem.dynamics.parameters["wind_x"] == 2.0
 
 
+@pytest.mark.long
 def test_funnels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names = run_page("funnels.md")

@@ -117,6 +117,7 @@ def test_rare_measures_a_probability_that_is_known(
     np.testing.assert_array_equal(again.states, rollout.states)
 
 
+@pytest.mark.long
 def test_break_finds_a_distance_that_is_known(own: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     reference = f"{own}:shifted,std=0.04"
     distance = exact(resolve(reference)) / 2

@@ -31,6 +31,7 @@ def rolled(solution: ls.Solution, problem: ls.Problem) -> Array:
 
 class TestInfiniteCosts:
     @pytest.mark.parametrize("stop", ["optimal", "cost"])
+    @pytest.mark.long
     def test_two_of_them_are_not_the_same(self, stop: str) -> None:
         """The first two rollouts escape; inf - inf is no small change."""
         solution = ls.smooth(cubic(effort=1000.0), stop=stop)
@@ -112,6 +113,7 @@ def test_weights_of_a_soft_start_may_differ_by_any_factor(form: str, weights: tu
         np.testing.assert_allclose(np.diag(solution.cost_to_come.covariance[0]) * weights, 1.0, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_a_state_that_nothing_weighs_may_be_anywhere() -> None:
     problem = ls.Problem(
         dynamics=systems.linear(np.zeros((2, 2)), [[1.0], [0.0]]), dt=0.1, steps=10,

@@ -322,6 +322,7 @@ def _shrinking(x, u, p):
 
 
 @pytest.mark.parametrize("level", ["compiled", "plain"])
+@pytest.mark.long
 def test_what_a_function_does_only_later_is_not_taken_for_numbers(level: str) -> None:
     """A Jacobian that raises, and an array of another length: not finite, at either level."""
     raising = ls.Dynamics(pendulum, jacobian=_raising_jacobian, level=level, **FIELDS)

@@ -329,6 +329,7 @@ def test_limits_and_constraints_under_noise(drive):
     assert solution.cost > ls.smooth(dataclasses.replace(limited, noise=None)).cost
 
 
+@pytest.mark.long
 def test_solved_again_on_the_way_under_noise(drive):
     """A prepared solver goes on from its own plan, and what it expects is no more than that costs."""
     _, problem, solution = drive

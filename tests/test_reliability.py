@@ -85,9 +85,8 @@ def test_a_problem_does_not_depend_on_how_many_there_are(problems: ModuleType) -
     assert sum(problems.COUNTS.values()) == 1000
 
 
-@pytest.mark.parametrize(
-    ("family", "least"), [pytest.param("linear", 1.0, marks=pytest.mark.long), ("world", 0.95), ("classic", 0.9)]
-)
+@pytest.mark.parametrize(("family", "least"), [("linear", 1.0), ("world", 0.95), ("classic", 0.9)])
+@pytest.mark.long
 def test_nearly_all_are_solved(problems: ModuleType, cases: list[Case], family: str, least: float) -> None:
     mine = [case for case in cases if problems.family(case.kind) == family]
     failed = [str(case) for case in mine if not case.converged]

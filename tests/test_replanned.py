@@ -168,6 +168,7 @@ def thrust(controls: Array, states: Array) -> npt.NDArray[np.float64]:
     return controls.sum(axis=1)[:, None] * upward
 
 
+@pytest.mark.long
 def test_in_a_steady_wind_the_new_plan_leans_into_it(
     quadrotor: ls.Scenario, flown: tuple[ls.Solution, ls.OffsetFree]
 ) -> None:

@@ -149,6 +149,7 @@ class TestEquality:
         assert contradictions(case, solution) == []
 
     @pytest.mark.parametrize("soft", [False, pytest.param(True, marks=pytest.mark.long)])
+    @pytest.mark.long
     def test_of_state_and_control_is_the_dense_kkt_solution(self, soft: bool) -> None:
         """At all steps but the last, which has no control. From a given start it leaves nothing free."""
         constraint = ls.SymbolicConstraint(steered, parameters={"gain": 0.4}, equality=True)
@@ -178,6 +179,7 @@ class TestInequality:
     @pytest.mark.parametrize(
         ("soft", "most", "room"), [(False, 1.35, 0.35), pytest.param(True, 1.1, 0.25, marks=pytest.mark.long)]
     )
+    @pytest.mark.long
     def test_of_state_and_control_with_a_goal(self, soft: bool, most: float, room: float) -> None:
         kept = [
             ls.GoalState([1, 0]),

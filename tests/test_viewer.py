@@ -330,6 +330,7 @@ def test_a_browser_draws_the_run(served: int, rollout: ls.Rollout, tmp_path: Pat
 
 
 @needs_browser
+@pytest.mark.long
 def test_keys_and_the_mouse_reach_the_robot(tmp_path: Path) -> None:
     """In the browser: an arrow key pushes the robot, and Ctrl with the right mouse button drags it."""
     before = """import lqrsim.view.viewer as viewer, lqrsim.view.viewer_base as viewer_base
