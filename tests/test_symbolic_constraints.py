@@ -89,6 +89,39 @@ class TestGoalState:
         assert not solution.multipliers[0].values[:-1].any()
         assert solution.violation <= 1e-9
 
+    @pytest.mark.parametrize("penalty", [0.1, 10.0, 1e4])
+    def test_any_penalty_leads_there(self, penalty: float) -> None:
+        """From the first iteration on; whatever it is, the optimum is that of the KKT conditions."""
+        case = problem(ls.GoalState([1, -0.5]), soft=False, weight=0.3)
+        logged: list[ls.Iteration] = []
+        start = np.zeros((case.steps, 1))
+        solution = ls.smooth(case, start=start, penalty=penalty, callback=logged.append, **EXACT)
+        dense = Dense(case)
+        z, multipliers = dense.optimum(dense.states[-1], np.array([1, -0.5]))
+        assert solution.status is Status.CONVERGED, solution.summary()
+        np.testing.assert_allclose(dense.pack(solution.trajectory), z, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(solution.multipliers[0].values[-1], multipliers, rtol=1e-6)
+        assert solution.options["penalty"] == penalty
+        # The first plan is the optimum of the cost with the penalty.
+        end = dense.states[-1]
+        penalised = dense.H + penalty * end.T @ end, dense.g - penalty * end.T @ [1, -0.5]
+        missed = np.abs(end @ np.linalg.solve(penalised[0], -penalised[1]) - [1, -0.5]).max()
+        assert logged[0].violation == pytest.approx(missed, rel=1e-6)
+
+    def test_a_penalty_that_does_not_fit_is_refused(self) -> None:
+        case = problem(ls.GoalState([1, -0.5]), soft=False)
+        start = np.zeros((case.steps, 1))
+        for options, line in (
+            ({"penalty": 3.0}, "penalty: got 3 without a start, want start=... beside it"),
+            ({"penalty": 0.0, "start": start}, "penalty: got 0.0, want a finite number > 0"),
+            ({"penalty": 3.0, "start": ls.InitialPrior([1, 1], about=[0, 0])}, "penalty: got 3 beside an InitialPrior"),
+        ):
+            with pytest.raises(InputError) as caught:
+                ls.smooth(case, **options)
+            assert str(caught.value).startswith(line)
+        with pytest.raises(InputError, match="penalty: got 3 for a problem without constraints, want None"):
+            ls.smooth(dataclasses.replace(case, constraints=()), start=start, penalty=3.0)
+
     def test_is_the_cubic_of_least_energy(self) -> None:
         """From rest to rest x = 3 s^2 - 2 s^3; held controls approach it with the square of the step."""
         steps = 100

@@ -241,7 +241,7 @@ def solving(place: Place) -> dict[str, tuple[Any, ...]]:
     tests = {"stop": "cost", "tolerance": 1e-3, "max_iterations": 2}
     both = tests | {
         "form": "dual", "first_pass": "forward", "safeguard": False, "gap_tolerance": 1e-3, "starts": 1,
-        "constraint_tolerance": 1e-3, "threads": 1, "noise": ls.Noise(0.01 * np.eye(3)), "risk": 0.01,
+        "constraint_tolerance": 1e-3, "penalty": None, "threads": 1, "noise": ls.Noise(0.01 * np.eye(3)), "risk": 0.01,
     }  # fmt: skip
     noisy = place.problem.driven_by(both["noise"], 0.01)
     prior = ls.InitialPrior(np.ones(n), about=np.zeros(n))

@@ -108,6 +108,7 @@ class SmootherSettings(Settings):
     safeguard: bool
     starts: int | None
     constraint_tolerance: float
+    penalty: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -118,6 +119,10 @@ class SmootherSettings(Settings):
         object.__setattr__(self, "gap_tolerance", check_number("gap_tolerance", self.gap_tolerance, above=0.0))
         number = check_number("constraint_tolerance", self.constraint_tolerance, above=0.0)
         object.__setattr__(self, "constraint_tolerance", number)
+        if self.penalty is not None:
+            object.__setattr__(self, "penalty", check_number("penalty", self.penalty, above=0.0))
+            if self.start is None:
+                raise InputError(f"penalty: got {self.penalty:g} without a start, want start=... beside it")
         check_name("form", self.form, tuple(compiled.FORMS))
         check_name("first_pass", self.first_pass, ("forward", "backward"))
         object.__setattr__(self, "safeguard", check_flag("safeguard", self.safeguard))

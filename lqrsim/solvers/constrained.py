@@ -24,6 +24,7 @@ STUCK = 3  # how often the penalty grows to no avail at all before that is given
 ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
 ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to update the multipliers, and when anyway
 ROUGHEST_GAP = 3e-2  # and of damped iterations, which come to their minimum slowly
+STALE, CLOSER = 20, 0.9  # undamped iterations that come no closer, before these are given up; what counts as closer
 
 
 def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
@@ -143,7 +144,7 @@ def _undamped(
     work.memory["plan_cost"] = -np.inf  # of lower cost is not better now
     log = np.zeros(min(ITERATIONS, max(attempt.iterations_left(before), 1)), LOG)
     done: tuple[Iteration, ...] = ()
-    since = 0
+    since, stale, nearest = 0, 0, np.inf
     while True:
         termination = attempt.run_on(log, len(done) + 1, done=done, each=each, callback=callback)
         done, since = termination.iterations, since + 1
@@ -153,6 +154,13 @@ def _undamped(
         lagrangian.evaluate(work.states, work.controls)
         settled = termination.outcome in (declarations.CONVERGED, declarations.COST_CONVERGED)
         if len(done) == len(log) or (settled and lagrangian.solved):
+            break
+        # From the optimum without constraints they soon settle, or cycle: then damped ones are far quicker.
+        last, limits = done[-1], attempt.settings
+        off = max(last.gap / limits.gap_tolerance, last.violation / limits.constraint_tolerance)
+        stale = 0 if off < CLOSER * nearest else stale + 1
+        nearest = min(off, nearest)
+        if stale == STALE and before and limits.safeguard:
             break
         rough = abs(done[-1].improvement) < ROUGH and done[-1].gap < ROUGH_GAP
         if settled or rough or since == PATIENCE:

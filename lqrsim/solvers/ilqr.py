@@ -53,12 +53,12 @@ def ilqr(
     Args:
       problem: with a start that is given exactly, or by the initial cost.
       stop: as in `smooth`; the gap is zero here, for every iterate is feasible.
-      tolerance: as in `smooth`; the gap is zero here, for every iterate is feasible.
-      max_iterations: as in `smooth`; the gap is zero here, for every iterate is feasible.
-      time_limit: as in `smooth`; the gap is zero here, for every iterate is feasible.
+      tolerance: of the relative change of cost, and of the optimality, as in `smooth`.
+      max_iterations: the most iterations.
+      time_limit: as in `smooth`.
       start: what the first trajectory applies: controls (m,) or (T, m), by default the problem's nominal control; the
         controls of a Trajectory; or the policy of a Solution, or an AffinePolicy, run from the start.
-      callback: as in `smooth`; the gap is zero here, for every iterate is feasible.
+      callback: as in `smooth`.
       noise: as in `smooth`; with noise this is iLQG.
       risk: as in `smooth`.
 

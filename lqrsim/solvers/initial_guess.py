@@ -141,6 +141,22 @@ class InitialGuess:
                 states.append(state if finite else states[-1])
         return replace(self, trajectory=Trajectory(np.array(states), np.array(controls), problem.dt))
 
+    def penalised(self, problem: Problem, penalty: float | None) -> "InitialGuess":
+        """With this penalty of all constraints from the first iteration on; None for as it is.
+
+        Raises:
+          InputError: there are no constraints, or there is a prior, which is for the iterations without them.
+        """
+        if penalty is None:
+            return self
+        if not problem.constraints:
+            raise InputError(f"penalty: got {penalty:g} for a problem without constraints, want None")
+        if self.prior is not None:
+            raise InputError(f"penalty: got {penalty:g} beside an InitialPrior, want another start")
+        known = [one.values for one in self.multipliers]
+        values = known or [np.zeros((problem.steps + 1, term.rows)) for term in problem.constraint_terms]
+        return replace(self, multipliers=tuple(Multipliers(one, penalty) for one in values))
+
 
 def resolve(start: StartLike, problem: Problem) -> InitialGuess:
     """The beginning that a caller asked for; by default the problem's nominal control, held.

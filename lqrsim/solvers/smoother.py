@@ -42,6 +42,7 @@ def smooth(
     start: StartLike = None,
     starts: int | None = None,
     constraint_tolerance: float = 1e-3,
+    penalty: float | None = None,
     noise: Noise | None = None,
     risk: float | None = None,
     threads: int | None = None,
@@ -81,6 +82,9 @@ def smooth(
       constraint_tolerance: how closely the problem's constraints are solved for, in their unit: for a clearance it is
         metres. So much to spare is aimed at; a plan that has converged keeps the constraints themselves, and equalities
         to 1e-6, or to this where it is smaller.
+      penalty: the initial penalty of all constraints, in units of the cost per square of a constraint's unit. They then
+        act from the first iteration, which takes fewer where the start is near and the penalty suits the problem. It
+        needs a start. By default the problem is first solved without its constraints, and penalties are computed.
       noise: replaces the problem's own; see `Noise`. The cost is then an expectation, in the log, line searches and
         the choice among starts.
       risk: replaces the problem's own; see `Problem`.
@@ -97,7 +101,7 @@ def smooth(
     settings = SmootherSettings(
         form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start, starts=starts,
-        constraint_tolerance=constraint_tolerance,
+        constraint_tolerance=constraint_tolerance, penalty=penalty,
     )  # fmt: skip
     check_callback(callback)
     check_problem(problem)
@@ -122,6 +126,7 @@ def smooth_many(
     start: StartLike = None,
     starts: int | None = None,
     constraint_tolerance: float = 1e-3,
+    penalty: float | None = None,
     noise: Noise | None = None,
     risk: float | None = None,
     progress: Callable[[int, int], object] | None = None,
@@ -146,6 +151,7 @@ def smooth_many(
       start: as in `smooth`, for all.
       starts: as in `smooth`, for all.
       constraint_tolerance: as in `smooth`, for all.
+      penalty: as in `smooth`, for all.
       noise: as in `smooth`, for all.
       risk: as in `smooth`, for all.
       progress: called with how many are done, of how many, as each one ends.
@@ -160,7 +166,7 @@ def smooth_many(
     settings = SmootherSettings(
         form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start, starts=starts,
-        constraint_tolerance=constraint_tolerance,
+        constraint_tolerance=constraint_tolerance, penalty=penalty,
     )  # fmt: skip
     return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)
 
@@ -176,7 +182,7 @@ def _solve(
     """Solve; with `each`, a look after each iteration (see `iterate`)."""
     given = [("", settings.start)] if settings.start is not None else guides(problem, settings.starts)
     start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
-    first = resolve(given[0][1], problem)
+    first = resolve(given[0][1], problem).penalised(problem, settings.penalty)
     check_functions(problem, start, first.offset[0].copy())
     initial_guesses = [first, *(resolve(one, problem) for _, one in given[1:])]
     attempts = [Attempt(problem, settings, initial_guess, start, Stop()) for initial_guess in initial_guesses]
