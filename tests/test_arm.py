@@ -15,6 +15,8 @@ from lqrsim.errors import Array
 from lqrsim.results.goal import OF_RANGE
 from lqrsim.simulation.tube_under import tube_under
 
+pytestmark = pytest.mark.long  # test_balls.py has what is quick of robots of several balls
+
 START, GOAL = (-0.6, 0.1, 0.1, 0.0, 0.0, 0.0), (1.6, 0.2, -0.3, 0.0, 0.0, 0.0)
 
 

@@ -81,6 +81,7 @@ def test_what_it_finds_fails_and_simulations_are_counted() -> None:
     np.testing.assert_array_equal(one.numbers, again.numbers)
 
 
+@pytest.mark.long
 def test_a_quadrotor_is_broken_by_less_than_what_broke_it(
     quadrotor: ls.Scenario, quadrotor_solution: ls.Solution
 ) -> None:

@@ -388,7 +388,11 @@ ls.run_campaign(campaign, sys.argv[1], workers=1)
     ("dies", "got"),
     [
         (False, "a script that each worker runs as it starts"),
-        (True, "processes that do not start (its worker ended 3 times, at last with exit code 3)"),
+        pytest.param(
+            True,
+            "processes that do not start (its worker ended 3 times, at last with exit code 3)",
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_a_script_that_its_workers_run_too_is_refused(dies: bool, got: str, tmp_path: Path) -> None:

@@ -37,6 +37,7 @@ def drive_in_steps_of(problem: ls.Problem, parts: int) -> ls.Problem:
     )
 
 
+@pytest.mark.long
 def test_the_discrete_solution_of_the_differential_drive_comes_closer_at_first_order(
     differential_drive: ls.Scenario,
 ) -> None:

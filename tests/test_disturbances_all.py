@@ -83,7 +83,7 @@ def test_a_trial_is_the_same_alone_and_among_nine_and_each_trial_is_its_own(plan
     assert changed or isinstance(one, ls.Saturation)  # whose limits these plans keep
 
 
-@pytest.mark.parametrize("fixture", ["arena", "cage"])
+@pytest.mark.parametrize("fixture", ["arena", pytest.param("cage", marks=pytest.mark.long)])
 def test_all_compose(plants, solutions, fixture):
     plant, solution, every = plants[fixture], solutions[fixture], [*BOTH, *OWN[fixture]]
     together = simulate(plant, solution, disturbances=every, seed=1, trials=9)

@@ -40,6 +40,7 @@ class TestInfiniteCosts:
         assert len(solution.iterations) > 1
 
     @pytest.mark.parametrize("constant", [1e308, -1e308])
+    @pytest.mark.long
     def test_a_cost_beyond_all_numbers_is_no_success(self, constant: float) -> None:
         solution = ls.smooth(cubic(constant=constant), max_iterations=20)
         assert solution.status is Status.DIVERGED
@@ -80,6 +81,7 @@ def unicycle(offset: float, weight: float, effort: float) -> ls.Problem:
 
 
 @pytest.mark.parametrize("offset", [5e6, 1e8])
+@pytest.mark.long
 def test_far_from_the_origin_converged_means_what_it_does_near(offset: float) -> None:
     """As in a survey: what rounding leaves there must not pass for a cost of zero. 0.1 %, for 1e-4 promised."""
     near, far = (ls.smooth(unicycle(where, 1e8, 1e-3)) for where in (0.0, offset))

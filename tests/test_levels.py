@@ -91,7 +91,7 @@ def swing(dynamics: ls.Dynamics, cost: ls.Cost, **changes: object) -> ls.Problem
 # Every level of dynamics with one level of cost, and the other way round: each pair is a structure to compile.
 PAIRS = [
     ("symbolic", "symbolic"),
-    ("compiled", "compiled"),
+    pytest.param("compiled", "compiled", marks=pytest.mark.long),
     ("compiled here", "compiled"),
     ("plain", "compiled"),
     pytest.param("compiled with Jacobian", "plain with derivatives", marks=pytest.mark.long),

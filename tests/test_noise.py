@@ -62,6 +62,7 @@ def test_ilqr_with_noise_is_the_same_there():
     assert_is_oracles(ls.ilqr(problem), numbers, problem)
 
 
+@pytest.mark.long
 def test_the_minimisers_are_the_means_of_the_closed_loop():
     """And the mean of the cost is what is expected, by runs that are drawn: 20,000, to 5 standard errors."""
     numbers = draw(np.random.default_rng(2))

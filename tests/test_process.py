@@ -158,7 +158,7 @@ def test_a_worker_starts_no_other_process(tmp_path: Path) -> None:
     assert done.stdout.split() == ["True"]
 
 
-@pytest.mark.parametrize("ready", ["manifest.json", "shards/*.parquet"])
+@pytest.mark.parametrize("ready", ["manifest.json", pytest.param("shards/*.parquet", marks=pytest.mark.long)])
 def test_ctrl_c_in_a_stress_test_is_one_line(ready: str, tmp_path: Path) -> None:
     """To all processes at once, as a terminal does: while workers start, and while they work."""
     asked = "--policies smooth --trials 2000 --shard 20 --strengths 1 --workers 2 --out"

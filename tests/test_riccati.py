@@ -65,7 +65,7 @@ def assert_solves(problem: LinearQuadratic, form: str) -> ls.Solution:
     return solution
 
 
-SIZES = [(1, 1), (3, 2), (2, 3), (5, 2)]
+SIZES = [(1, 1), (3, 2), (2, 3), pytest.param(5, 2, marks=pytest.mark.long)]
 
 
 @pytest.mark.parametrize(("n", "m"), SIZES)

@@ -201,6 +201,7 @@ def optimum(singular: bool) -> tuple[float, Array]:
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("singular", [False, True], ids=["whole", "singular"])
+@pytest.mark.long
 def test_ends_that_are_not_quadratic_or_leave_a_state_free(form: str, singular: bool) -> None:
     """Eqs. (23), (31). SciPy's optimum to 1e-6, its own accuracy at finite differences."""
     problem = smooth_ends(curved=True, singular=singular)
@@ -213,7 +214,7 @@ def test_ends_that_are_not_quadratic_or_leave_a_state_free(form: str, singular: 
 
 
 class TestSafeguard:
-    @pytest.mark.parametrize("form", FORMS)
+    @pytest.mark.parametrize("form", ["dual", pytest.param("primal", marks=pytest.mark.long)])
     def test_it_changes_nothing_where_the_method_converges(self, form: str) -> None:
         problems = [ls.scenarios.quadrotor(query=query).problem for query in range(8)]
         bare = ls.smooth_many(problems, form=form, safeguard=False)

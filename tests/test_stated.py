@@ -48,6 +48,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory, differential_drive: ls.Scen
 
 
 @pytest.mark.parametrize(("workers", "batch"), [pytest.param(1, 3, marks=pytest.mark.long), (2, 1)])
+@pytest.mark.long
 def test_all_six_have_the_same_bits_in_other_processes_and_in_any_batch(
     results: ls.Results, tmp_path: Path, workers: int, batch: int
 ) -> None:

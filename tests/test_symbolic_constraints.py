@@ -236,6 +236,7 @@ class TestInequality:
         assert all((one.values >= 0).all() for one in solution.multipliers[1:])
         assert contradictions(case, solution) == []
 
+    @pytest.mark.long
     def test_at_the_final_step_alone(self) -> None:
         case = problem(ls.SymbolicConstraint(past, parameters={"least": 1.0}, at="final"))
         solution, dense = ls.smooth(case, constraint_tolerance=1e-6), Dense(case)
@@ -397,6 +398,7 @@ def test_what_does_not_fit_is_refused_in_a_line(state: Callable[[], object], lin
     assert len(str(caught.value).splitlines()) == 1
 
 
+@pytest.mark.long
 def test_a_constraint_that_is_kept_anyway_changes_nothing() -> None:
     bare = problem(weight=10.0)
     kept = dataclasses.replace(bare, constraints=[ls.SymbolicConstraint(past, parameters={"least": -5.0})])

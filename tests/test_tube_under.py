@@ -75,6 +75,7 @@ def test_a_tube_is_added_to_runs_of_its_plan_alone(
         dataclasses.replace(run, tube=np.eye(2))
 
 
+@pytest.mark.long
 def test_four_hundred_runs_are_within_their_tube(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
     """2 sigma: 95.4 % along each direction. 400 runs at a knot have a standard error of 1 %."""
     problem, plant = differential_drive.problem, differential_drive.plant()

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.timeout(900)
 
 
 @pytest.mark.parametrize(
-    ("kinds", "examples"), [(KINDS[-3:], 30), pytest.param(KINDS, 200, marks=pytest.mark.long)], ids=("some", "all")
+    ("kinds", "examples"), [(KINDS[-3:], 15), pytest.param(KINDS, 200, marks=pytest.mark.long)], ids=("some", "all")
 )
 def test_nothing_that_a_solution_claims_is_false(kinds: tuple[str, ...], examples: int) -> None:
     @settings(max_examples=examples, suppress_health_check=[HealthCheck.too_slow])

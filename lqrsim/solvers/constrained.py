@@ -24,7 +24,7 @@ STUCK = 3  # how often the penalty grows to no avail at all before that is given
 ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
 ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to update the multipliers, and when anyway
 ROUGHEST_GAP = 3e-2  # and of damped iterations, which come to their minimum slowly
-STALE, CLOSER = 20, 0.9  # undamped iterations that come no closer, before these are given up; what counts as closer
+STALE, CLOSER = 40, 0.9  # undamped iterations that come no closer, before these are given up; what counts as closer
 
 
 def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
