@@ -1,11 +1,15 @@
 """What results show of themselves in a notebook: well-formed, their numbers, and no text of a file as HTML."""
 
+import base64
+import pickle
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from linear_plans import double_integrator
+from scipy.stats import binomtest
 
 import lqrsim as ls
 from lqrsim.results.solution_parts import Trajectory
@@ -100,6 +104,46 @@ def test_states_are_drawn_over_time_without_a_position() -> None:
         assert heights.argmin() == values.argmax()  # up is more
         np.testing.assert_allclose([heights.min(), heights.max()], [12, 228], atol=0.1)
     assert not list(page.iter(f"{SVG}circle"))
+
+
+def test_results_show_a_row_for_each_cell(tmp_path: Path) -> None:
+    campaign = ls.Campaign(
+        scenario="differential_drive", sweeps={"own": (ls.ControlNoise(0.1),)}, strengths=(0, 2), trials=4
+    )
+    results = ls.run_campaign(campaign, tmp_path / "there", workers=0)
+    page = parsed(results._repr_html_())
+    head, *rows = texts(page)
+    assert len(rows) == len(results.cells)
+    for row, cell in zip(rows, results.cells, strict=True):
+        shown, ends = dict(zip(head, row, strict=True)), results.outcomes(cell)
+        assert (shown["sweep"], float(shown["strength"]), shown["policy"]) == (cell.sweep, cell.strength, cell.policy)
+        assert shown["trials"] == "4"
+        assert float(shown["reached (%)"]) == pytest.approx(100 * np.mean(ends.outcome == "reached"), abs=0.05)
+        low, high = binomtest(int(np.sum(ends.outcome == "reached")), 4).proportion_ci(0.95)
+        assert shown["95 % interval"] == f"{100 * low:.1f} to {100 * high:.1f}"
+        assert int(shown["collided"]) == np.sum(ends.outcome == "collided")
+    next((tmp_path / "there" / "shards").iterdir()).unlink()
+    unfinished = parsed(ls.Results(tmp_path / "there")._repr_html_())
+    assert "not finished: 4 of 8 trials are missing" in "".join(unfinished.itertext())
+
+
+def test_a_video_and_a_picture_show_themselves(rollout: ls.Rollout, tmp_path: Path) -> None:
+    options = {"size": (480, 270), "quality": "draft"}
+    for path, tag, kind in (
+        (ls.render(rollout, tmp_path / "run.mp4", fps=1, **options), "video", "video/mp4"),
+        (ls.still(rollout, tmp_path / "run.png", **options), "img", "image/png"),
+    ):
+        shown = parsed(path._repr_html_())
+        assert shown.tag == tag
+        start, data = shown.attrib["src"].split(",")
+        assert start == f"data:{kind};base64"
+        assert base64.b64decode(data) == path.read_bytes()
+        # It is a path like any other.
+        assert path == Path(path)
+        assert pickle.loads(pickle.dumps(path)) == path
+        assert (path.parent / path.name).is_file()
+        path.unlink()
+        assert path._repr_html_() is None
 
 
 def test_text_of_files_is_escaped(solution: ls.Solution, rollout: ls.Rollout) -> None:

@@ -111,11 +111,12 @@ class TestGoalState:
     def test_a_penalty_that_does_not_fit_is_refused(self) -> None:
         case = problem(ls.GoalState([1, -0.5]), soft=False)
         start = np.zeros((case.steps, 1))
-        for options, line in (
+        refused: tuple[tuple[dict[str, Any], str], ...] = (
             ({"penalty": 3.0}, "penalty: got 3 without a start, want start=... beside it"),
             ({"penalty": 0.0, "start": start}, "penalty: got 0.0, want a finite number > 0"),
             ({"penalty": 3.0, "start": ls.InitialPrior([1, 1], about=[0, 0])}, "penalty: got 3 beside an InitialPrior"),
-        ):
+        )
+        for options, line in refused:
             with pytest.raises(InputError) as caught:
                 ls.smooth(case, **options)
             assert str(caught.value).startswith(line)

@@ -33,6 +33,7 @@ SCRIPTS = (
     "stress_test",
     "robust_policies",
     "noise_aware",
+    "funnels",
 )
 
 TIDYING = 20.0  # s

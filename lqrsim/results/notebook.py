@@ -57,6 +57,11 @@ def of_rollout(rollout: "Rollout") -> str:
     return _page(f"{rollout.robot} in {rollout.scene}, seed {rollout.seed}", remarks, rows, picture, head=True)
 
 
+def of_table(heading: str, remarks: Iterable[str], rows: Sequence[Sequence[str]]) -> str:
+    """A heading, remarks, and a table whose first row names the columns."""
+    return _page(heading, remarks, rows, "", head=True)
+
+
 def _number(value: float) -> str:
     """Four digits of it; a dash where there is none."""
     return f"{value:.4g}" if np.isfinite(value) else "-"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import InputError, check_count, check_flag, check_kind, check_name, check_path, check_text, excerpt
-from lqrsim.results import save_load
+from lqrsim.results import notebook, save_load
 from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -137,6 +137,22 @@ class Results:
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
         lines += self.plans()
         return "\n".join(lines + self.came_to_nothing())
+
+    def _repr_html_(self) -> str:
+        others = [name for name in OUTCOMES if name != "reached"]
+        rows = [("sweep", "strength", "policy", "trials", "reached (%)", f"{100 * CONFIDENCE:g} % interval", *others)]
+        for cell in self.cells:
+            ends = self.tally(cell, partial=True)
+            share, interval = "-", "-"
+            if total := ends.total():
+                sure = rate(ends["reached"], total)
+                share, interval = f"{100 * sure.value:.1f}", f"{100 * sure.low:.1f} to {100 * sure.high:.1f}"
+            counts = [str(ends[name]) for name in others]
+            rows.append((cell.sweep, f"{cell.strength:g}", cell.policy, str(total), share, interval, *counts))
+        campaign, missing = self.manifest["campaign"], sum(count for _, _, count in self.missing)
+        of = campaign["trials"] * len(self.cells)
+        remarks = [f"not finished: {missing} of {of} trials are missing"] if missing else []
+        return notebook.of_table(f"{campaign['scenario']}, seed {campaign['seed']}", remarks, rows)
 
     def came_to_nothing(self) -> list[str]:
         """A line for each of the most frequent reasons why trials are an "error", or have a filter that diverged."""

@@ -15,6 +15,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.view import video_metadata
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 from lqrsim.view.picture import QUALITIES, Picture, PictureOptions, open_picture
+from lqrsim.view.picture_file import PictureFile
 from lqrsim.view.scene_renderer import MOST_ROBOTS
 from lqrsim.view.video import encoder, gif
 
@@ -39,7 +40,7 @@ def render(
     fps: float | None = None,
     speed: float = 1.0,
     progress: Callable[[int, int], None] | None = None,
-) -> Path:
+) -> PictureFile:
     """Writes a video of a run, or of several side by side and in step: mp4 (h264) or GIF, by the suffix.
 
     What stands between a camera and the robot fades. A trial that diverged stands still from there on. The file is
@@ -66,7 +67,7 @@ def render(
       progress: called after each frame with the number of frames done and of all frames.
 
     Returns:
-      The path.
+      The path. A notebook shows the video if the call is a cell's last expression.
 
     Raises:
       InputError: an argument is wrong, the file cannot be written, or there is no OpenGL.
@@ -102,7 +103,7 @@ def render(
                 encode(drawn.draw(float(number / rate) * speed, fade=fade))
                 if progress:
                     progress(number + 1, count)
-    return path
+    return PictureFile(path)
 
 
 def still(
@@ -119,7 +120,7 @@ def still(
     solution: Solution | Sequence[Solution | None] | None = None,
     quality: Quality = "standard",
     size: tuple[int, int] | None = None,
-) -> Path:
+) -> PictureFile:
     """Write a picture (png) of one moment.
 
     With `every`, the robot is drawn also where it was at each multiple of that many seconds, as in the paper's figures.
@@ -140,7 +141,7 @@ def still(
       size: as in `render`.
 
     Returns:
-      The path.
+      The path. A notebook shows the picture if the call is a cell's last expression.
 
     Raises:
       InputError: as in `render`.
@@ -154,7 +155,7 @@ def still(
         time = drawn.end if time is None else check_number("time", time, at_least=0, at_most=drawn.end)
         earlier = [] if every is None else _multiples(every, time, drawn)
         Image.fromarray(drawn.draw(time, earlier=earlier)).save(unfinished)
-    return path
+    return PictureFile(path)
 
 
 def _multiples(every: float, time: float, drawn: Picture) -> list[float]:
