@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from funnels_by_hand import funnel_by_hand
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from point_mass import RADIUS, Oracle, balls, problem
@@ -260,18 +261,6 @@ def ready(planner: ls.Planner) -> None:
         time.sleep(1e-3)
 
 
-def disc(solution: ls.Solution, level: float) -> ls.Funnel:
-    """Positions within so many metres of the plan, which nothing has certified."""
-    steps, tried = solution.trajectory.steps, np.array([int(level > 0)])
-    return ls.Funnel(
-        plan=solution.trajectory, state_coordinates=solution.policy.state_coordinates,
-        control_coordinates=solution.policy.control_coordinates,
-        states=tuple(solution.policy.state_coordinates.names[:2]), shape=np.tile(np.eye(2), (steps + 1, 1, 1)),
-        family="given", knots=np.array([0]), levels=np.array([level]), trials=tried, successes=tried, reasons=("",),
-        rate=0.9, confidence=0.9, simulated=1, policy_digest="", goal_radius=0.1, disturbances=(), seed=0,
-    )  # fmt: skip
-
-
 class TestPlanner:
     def test_answers_come_into_force_at_their_deadline(self, stated: ls.Problem, solution: ls.Solution) -> None:
         """The loop is ten times as fast as the plan; the robot is the point mass itself, which the model knows."""
@@ -344,7 +333,7 @@ class TestPlanner:
         Its new plan begins where it is, so that it is in the funnel about that. Without levels all is outside.
         """
         for level, begun in ((0.05, [8]), (0.0, [0, 4, 8, 12, 16])):
-            state, when = solution.trajectory.states[0], disc(solution, level)
+            state, when = solution.trajectory.states[0], funnel_by_hand(solution, np.eye(2), levels=[level])
             options: dict[str, Any] = {"every": 4 * DT, "deadline": DT, "horizon": "shrinking", "when": when}
             with ls.Planner(stated, solution, clock=lambda: 0.0, **options) as planner:
                 for i in range(STEPS):
@@ -365,7 +354,11 @@ class TestPlanner:
         before, after = solution.trajectory.states[3:5]
         along = np.append((after - before)[:2], [0.0, 0.0])
         level = 0.2 * float(np.linalg.norm(along))
-        options: dict[str, Any] = {"every": DT, "horizon": "shrinking", "when": disc(solution, level)}
+        options: dict[str, Any] = {
+            "every": DT,
+            "horizon": "shrinking",
+            "when": funnel_by_hand(solution, np.eye(2), levels=[level]),
+        }
         with ls.Planner(stated, solution, clock=lambda: 0.0, **options) as planner:
             planner.step(before + 0.4 * (after - before) + off * 0.2 * along, 3.4 * DT)
             ready(planner)
@@ -384,7 +377,7 @@ class TestPlanner:
             for wrong, line in refused:
                 with pytest.raises(ls.InputError, match=line):
                     planner.step(*wrong)
-        when = disc(solution, 0.1)
+        when = funnel_by_hand(solution, np.eye(2))
         moved = replace(when, plan=replace(when.plan, states=when.plan.states + 1))
         for wrong, line in (
             ({"deadline": 0.0}, "deadline: got 0"),

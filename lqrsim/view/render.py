@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from lqrsim.errors import InputError, check_function, check_name, check_number, check_path, excerpt
+from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import replacing
 from lqrsim.results.solution import Solution
@@ -34,6 +35,7 @@ def render(
     titles: Sequence[str] = (),
     overlays: Sequence[Overlay] = OVERLAYS,
     solution: Solution | Sequence[Solution | None] | None = None,
+    funnel: Funnel | Sequence[Funnel | None] | None = None,
     quality: Quality = "standard",
     size: tuple[int, int] | None = None,
     fps: float | None = None,
@@ -57,8 +59,11 @@ def render(
         now. trace: the path so far, coloured by tracking error. forces: arrows of forces and wind, means over the last
         fifth of a second. measured: the last measured states, where they differ from the true ones. tube: the states
         predicted under the disturbances, within 2 standard deviations, where there is a `rollout.tube` and it is not
-        too wide. cost_tube: ellipsoids of low total cost. caption: time, tracking error, clearance, disturbances.
+        too wide. cost_tube: ellipsoids of low total cost. funnel: its shadow on the position, from its
+        first knot to its last one, pale where the level is interpolated. caption: time, tracking error, clearance,
+        disturbances, whether the run is in the funnel that is drawn.
       solution: of which the run is, for cost_tube; one for all, or one each.
+      funnel: about the plan of the run, with the position among its states; one for all, or one each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and how much the video is compressed.
       size: width and height in pixels, both even; by default the quality's, or half for a GIF (at least 480 x 270).
       fps: frames a second, whatever the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
@@ -80,7 +85,7 @@ def render(
     size = size if size is not None or not animated else _gif_size(quality)
     options = PictureOptions(
         trial=trial, camera=camera, insets=insets, titles=titles, overlays=overlays, solution=solution,
-        quality=quality, size=size, speed=speed,
+        funnel=funnel, quality=quality, size=size, speed=speed,
     )  # fmt: skip
     with replacing(path) as unfinished, open_picture(runs, options) as drawn:
         count = int(drawn.end / speed * rate + 1e-9) + 1
@@ -117,6 +122,7 @@ def still(
     titles: Sequence[str] = (),
     overlays: Sequence[Overlay] = OVERLAYS,
     solution: Solution | Sequence[Solution | None] | None = None,
+    funnel: Funnel | Sequence[Funnel | None] | None = None,
     quality: Quality = "standard",
     size: tuple[int, int] | None = None,
 ) -> Path:
@@ -136,6 +142,7 @@ def still(
       titles: as in `render`.
       overlays: as in `render`.
       solution: as in `render`.
+      funnel: as in `render`.
       quality: as in `render`.
       size: as in `render`.
 
@@ -148,7 +155,7 @@ def still(
     path = _checked_path(path, ".png")
     options = PictureOptions(
         trial=trial, camera=camera, insets=insets, titles=titles, overlays=overlays, solution=solution,
-        quality=quality, size=size,
+        funnel=funnel, quality=quality, size=size,
     )  # fmt: skip
     with replacing(path) as unfinished, open_picture(runs, options) as drawn:
         time = drawn.end if time is None else check_number("time", time, at_least=0, at_most=drawn.end)
