@@ -11,6 +11,7 @@ from PIL import Image
 
 import lqrsim as ls
 from lqrsim.cli import main
+from lqrsim.verify.pixels import EMPTY
 from lqrsim.view import gl
 from lqrsim.view.options import OVERLAYS, Overlay
 from lqrsim.view.overlays import BETWEEN, FUNNEL, Overlays, Scale
@@ -139,6 +140,10 @@ def test_it_is_seen_where_it_is(flight: ls.Rollout, quadrotor_solution: ls.Solut
     both = picture(1.0, 1.0)
     assert min(at(60), at(110)) > at(85) > 4
     assert at(10) == at(130) == 0
+    # Nothing of it is as green as the mark that `lqrsim verify` reads.
+    green = [one[..., 1] - one[..., [0, 2]].max(axis=2) > 255 * EMPTY for one in (both, bare)]
+    assert green[1].any()
+    np.testing.assert_array_equal(*green)
     np.testing.assert_array_equal(picture(0.0, 0.0), bare)
 
 

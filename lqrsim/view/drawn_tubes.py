@@ -13,8 +13,8 @@ from lqrsim.view.ellipsoids import OF_COST, SIGMAS, Ellipsoids
 from lqrsim.view.recorded_trial import RecordedTrial
 
 OPACITY = {True: 0.43, False: 0.2}  # of all of a tube: flat on a floor, with the lines above; and around the lines
-BETWEEN = {True: 0.4, False: 0.14}  # the same where the level of a funnel is interpolated
-CERTIFIED = {True: 0.4, False: 0.25}  # of each ellipsoid of a funnel that is certified
+BETWEEN = {True: 0.4, False: 0.18}  # the same where the level of a funnel is interpolated
+CERTIFIED = {True: 0.4, False: 0.16}  # of each ellipsoid of a funnel that is certified
 MOST_ELLIPSOIDS = 80  # more take too long to draw
 LIFT = 0.006  # metres between the floor and the lines on it
 
