@@ -116,13 +116,15 @@ class Render:
         from lqrsim.results import save_load
         from lqrsim.view import rerun_file
 
-        own, paths, trials = ("rollouts", "out", "trial"), list(self.rollouts), list(self.trial)
+        own, paths, trials = ("rollouts", "out", "trial", "funnel"), list(self.rollouts), list(self.trial)
         given = [one.name for one in fields(self) if one.name not in own and getattr(self, one.name) != one.default]
-        if given or len(paths) > 1 or len(trials) != 1:
-            got = ", ".join(f"--{name}" for name in given) or "several runs or none"
-            raise InputError(f"--out: got {out.name} with {got}, want it with one run, one --trial and nothing else")
+        if given or len(paths) > 1 or len(trials) != 1 or len(self.funnel) > 1:
+            got = ", ".join(f"--{name}" for name in given) or "several runs, trials or funnels, or none"
+            want = "one run, one --trial, at most one --funnel, and nothing else"
+            raise InputError(f"--out: got {out.name} with {got}, want it with {want}")
         console.check_output("--out", out.parent, out.name)
-        for name in rerun_file.write(save_load.load_rollout(paths[0]), out, trial=trials[0]):
+        funnel = save_load.load_funnel(self.funnel[0]) if self.funnel else None
+        for name in rerun_file.write(save_load.load_rollout(paths[0]), out, trial=trials[0], funnel=funnel):
             console.say(f"left out: {name}, of a kind that Rerun has no shape for")
         console.wrote(out)
         return 0
