@@ -54,6 +54,13 @@ PICTURES = {
         RUN_QUADROTOR,
         f"lqrsim render {QUADROTOR}/rollout.npz --every 0.5 {STILL} --out videos/readme_quadrotor.png",
     ),
+    "videos/readme_funnel.png": (
+        SOLVE_QUADROTOR,
+        RUN_QUADROTOR,
+        "lqrsim funnel quadrotor --rate 0.9 --confidence 0.9",
+        f"lqrsim render {QUADROTOR}/rollout.npz --overlays plan ghost trace forces funnel caption"
+        f" --funnel runs/funnel/quadrotor/funnel.npz --time 3.2 {STILL} --out videos/readme_funnel.png",
+    ),
     "docs/figures/policy_differential_drive.png": (
         f"{SOLVE_DRIVE} --figure docs/figures/policy_differential_drive.png",
     ),
@@ -66,7 +73,7 @@ class Config:
     out: Path = Path()
     """Folder that the lines are run in."""
     quick: bool = False
-    """Small pictures of few frames."""
+    """Small pictures of few frames, and a funnel of few trials."""
 
 
 def main(config: Config) -> list[Path]:
@@ -81,6 +88,7 @@ def main(config: Config) -> list[Path]:
 
 
 def _small(line: str) -> str:
+    line = line.replace("--rate 0.9", "--rate 0.5")
     return re.sub(r"--fps \d+", "--fps 1", re.sub(r"--size \d+ \d+", "--size 320 240", line))
 
 

@@ -215,6 +215,10 @@ def test_funnels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert 0 < len(names["law"].records) < 9
     assert names["chosen"].reached.value > 0.5
     assert Path("funnel.png").stat().st_size > 0
+    (block,) = re.findall(r"^```py\n(.*?)^```$", (DOCS / "funnels.md").read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    if gl.available():
+        exec(compile(block, "funnels.md", "exec"), names)
+        assert Path("run.png").stat().st_size > 0
 
 
 @pytest.mark.long

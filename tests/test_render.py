@@ -10,6 +10,7 @@ import av
 import mujoco
 import numpy as np
 import pytest
+from funnels_by_hand import funnel_by_hand
 from PIL import Image, ImageSequence
 
 import lqrsim as ls
@@ -244,10 +245,11 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
     """Each changes the picture, and only where it is: a few percent of it."""
     tube = np.tile(np.diag([0.01, 0.02, 0.01]), (len(flight.times), 1, 1))
     noisy = dataclasses.replace(flight, measured=flight.states + 0.05 * np.sin(np.arange(12)), tube=tube)
+    funnel = funnel_by_hand(quadrotor_solution, 0.04 * np.eye(3), knots=(0, 100), levels=(1.0, 1.0))
 
     def shown(*overlays: Overlay) -> np.ndarray:
         options: dict = {"time": 2.1, "size": (640, 360), "overlays": overlays, "solution": quadrotor_solution}
-        return pixels(still(noisy, tmp_path / "still.png", **options))
+        return pixels(still(noisy, tmp_path / "still.png", funnel=funnel, **options))
 
     bare = shown()
     for overlay in ALL_OVERLAYS:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from funnels_by_hand import funnel_by_hand
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from point_mass import RADIUS, Oracle, balls, problem
@@ -326,6 +327,44 @@ class TestPlanner:
             with pytest.raises(ls.InputError, match="change: got gaol, want fields of a Problem: dynamics, dt"):
                 planner.change(gaol=1)
 
+    def test_when_the_funnel_is_left(self, stated: ls.Problem, solution: ls.Solution) -> None:
+        """A robot on its plan solves nothing; one that is moved solves where that is next due, and once.
+
+        Its new plan begins where it is, so that it is in the funnel about that. Without levels all is outside.
+        """
+        for level, begun in ((0.05, [8]), (0.0, [0, 4, 8, 12, 16])):
+            state, when = solution.trajectory.states[0], funnel_by_hand(solution, np.eye(2), levels=[level])
+            options: dict[str, Any] = {"every": 4 * DT, "deadline": DT, "horizon": "shrinking", "when": when}
+            with ls.Planner(stated, solution, clock=lambda: 0.0, **options) as planner:
+                for i in range(STEPS):
+                    control = planner.step(state, i * DT)
+                    ready(planner)
+                    x = state
+                    state = np.concatenate([x[:2] + DT * x[2:] + DT**2 / 2 * control, x[2:] + DT * control])
+                    if i == 5:
+                        state[:2] += 0.2
+            assert [one.step for one in planner.account.records] == begun
+            assert planner.account.solved == len(begun)
+
+    @pytest.mark.parametrize(("off", "solves"), [(0.9, 0), (1.1, 1)])
+    def test_the_funnel_is_about_where_the_plan_is_between_two_knots(
+        self, stated: ls.Problem, solution: ls.Solution, off: float, solves: int
+    ) -> None:
+        """The states are a part of a period after the knot, in which the plan goes further than the funnel is wide."""
+        before, after = solution.trajectory.states[3:5]
+        along = np.append((after - before)[:2], [0.0, 0.0])
+        level = 0.2 * float(np.linalg.norm(along))
+        options: dict[str, Any] = {
+            "every": DT,
+            "horizon": "shrinking",
+            "when": funnel_by_hand(solution, np.eye(2), levels=[level]),
+        }
+        with ls.Planner(stated, solution, clock=lambda: 0.0, **options) as planner:
+            planner.step(before + 0.4 * (after - before) + off * 0.2 * along, 3.4 * DT)
+            ready(planner)
+            planner.step(after, 4 * DT)
+            assert [one.step for one in planner.account.records] == [3] * solves
+
     def test_bad_input(self, stated: ls.Problem, solution: ls.Solution) -> None:
         planner: Any = ls.Planner(stated, solution, every=DT)
         with pytest.raises(ls.InputError, match="Planner: got a step without its thread"):
@@ -338,6 +377,14 @@ class TestPlanner:
             for wrong, line in refused:
                 with pytest.raises(ls.InputError, match=line):
                     planner.step(*wrong)
-        for wrong, line in (({"deadline": 0.0}, "deadline: got 0"), ({"interpolate": 1}, "interpolate: got 1")):
+        when = funnel_by_hand(solution, np.eye(2))
+        moved = replace(when, plan=replace(when.plan, states=when.plan.states + 1))
+        for wrong, line in (
+            ({"deadline": 0.0}, "deadline: got 0"),
+            ({"interpolate": 1}, "interpolate: got 1"),
+            ({"when": 1}, "when: got 1"),
+            ({"when": when}, "when: got a funnel with horizon='moving', want \"shrinking\""),
+            ({"when": moved, "horizon": "shrinking"}, "when: got a funnel of another plan"),
+        ):
             with pytest.raises(ls.InputError, match=f"Planner: {line}"):
                 anything(ls.Planner)(stated, solution, **{"every": DT} | wrong)

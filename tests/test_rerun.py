@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from funnels_by_hand import funnel_by_hand
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -98,6 +99,27 @@ def test_numbers_plan_and_tube_are_those_of_the_run(run: Path, tmp_path: Path) -
     np.testing.assert_allclose(axes, np.maximum(wanted, 1e-4), rtol=1e-5, atol=1e-9)
 
 
+def test_a_funnel(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Balls of a quarter of a metre about the plan, of half of it at the second knot, and what is in between."""
+    pytest.importorskip("rerun", reason="needs the `rerun` extra")
+    solution, path, kept = ls.load_solution(run.parent / "solution.npz"), tmp_path / "run.rrd", tmp_path / "funnel.npz"
+    ls.save(funnel_by_hand(solution, 0.25**2 * np.eye(3), knots=(0, 100), levels=(1.0, 0.5)), kept)
+    assert main(["render", str(run), "--out", str(path), "--funnel", str(kept)]) == 0
+    found, plan = read(path), solution.trajectory.states[:, :3]
+    certified, between = (found[f"/world/funnel/{name}"] for name in ("certified", "interpolated"))
+    np.testing.assert_allclose(np.array(certified["centers"][0].tolist()), plan[[0, 100]], atol=1e-6)
+    sizes = np.array(certified["half_sizes"][0].tolist())
+    np.testing.assert_allclose(sizes, np.repeat([[0.25], [0.125]], 3, axis=1), atol=1e-6)
+    middles = np.array(between["centers"][0].tolist())
+    nearest = np.linalg.norm(middles[:, None] - plan[1:100], axis=2).argmin(axis=1) + 1
+    np.testing.assert_allclose(middles, plan[nearest], atol=1e-6)
+    sizes = np.array(between["half_sizes"][0].tolist())
+    np.testing.assert_allclose(sizes, 0.25 * (1 - nearest[:, None] / 200) * np.ones(3), rtol=0.02)
+    capsys.readouterr()
+    assert main(["render", str(run), "--out", str(path), "--funnel", str(kept), str(kept)]) == 2
+    assert "at most one --funnel" in capsys.readouterr().err
+
+
 def test_every_shape_is_drawn_or_named(run: Path, tmp_path: Path) -> None:
     """A mesh by MuJoCo's own vertices, a capsule from its lower end; a height field, which Rerun has not, is named."""
     pytest.importorskip("rerun", reason="needs the `rerun` extra")
@@ -135,7 +157,10 @@ def test_without_the_package_it_says_what_to_install(
 
 @pytest.mark.parametrize(
     ("options", "named"),
-    [(["--camera", "top", "--fps", "5"], "--camera, --fps"), (["--trial", "0", "1"], "several runs or none")],
+    [
+        (["--camera", "top", "--fps", "5"], "--camera, --fps"),
+        (["--trial", "0", "1"], "several runs, trials or funnels, or none"),
+    ],
 )
 def test_what_the_viewer_decides_is_refused(
     options: list[str], named: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -143,6 +168,7 @@ def test_what_the_viewer_decides_is_refused(
     capsys.readouterr()
     assert main(["render", str(run), "--out", str(tmp_path / "run.rrd"), *options]) == 2
     assert capsys.readouterr().err == (
-        f"lqrsim: error: --out: got run.rrd with {named}, want it with one run, one --trial and nothing else\n"
+        f"lqrsim: error: --out: got run.rrd with {named}, want it with one run, one --trial,"
+        " at most one --funnel, and nothing else\n"
     )
     assert not list(tmp_path.iterdir())

@@ -240,7 +240,7 @@ def pictures(place: Place) -> dict[str, tuple[Any, ...]]:
     world, rollout, solution = place.scenario.scene.world, place.rollout, place.solution
     options = {
         "runs": rollout, "trial": 0, "camera": "top", "insets": (), "titles": ("a title",), "overlays": ("plan",),
-        "solution": solution, "quality": "draft", "size": (128, 96),
+        "solution": solution, "funnel": None, "quality": "draft", "size": (128, 96),
     }  # fmt: skip
     video = place.folder / "video.mp4"
     made: dict[str, tuple[Any, ...]] = {

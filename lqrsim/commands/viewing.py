@@ -50,9 +50,12 @@ class Render:
     """Title of each run. By default the robot and the scene."""
     overlays: tuple[Overlay, ...] = OVERLAYS
     """Drawn over the scene. tube: the predicted tube under the run's disturbances, 2 sigma, if there is one. cost_tube:
-    where the total cost is near its minimum; it needs --solution and is not drawn by default."""
+    where the total cost is near its minimum; it needs --solution. funnel: the funnel about the plan; it needs --funnel.
+    These two are not drawn by default."""
     solution: Annotated[tuple[Path, ...], optional("SOLUTION ...")] = ()
     """Solution of the runs, one for all or one each, for cost_tube."""
+    funnel: Annotated[tuple[Path, ...], optional("FUNNEL ...")] = ()
+    """Funnel about the plan of the runs, one for all or one each, from `lqrsim funnel`."""
     quality: Quality = "standard"
     """Size, antialiasing, shadows and video compression: 640 x 360, 1280 x 720 or 1920 x 1080."""
     size: Annotated[tuple[int, int] | None, optional("WIDTH HEIGHT")] = None
@@ -89,11 +92,13 @@ class Render:
             for path in (path for path, run in zip(self.rollouts, runs, strict=True) if run.tube is None):
                 console.say(f"no tube in {path}: none was predicted for it")
         solutions = [save_load.load_solution(path) for path in self.solution]
+        funnels = [save_load.load_funnel(path) for path in self.funnel]
         one_trial = len(self.trial) == 1
         options = {
             "trial": self.trial[0] if one_trial else self.trial, "camera": self.camera, "insets": self.inset,
             "titles": self.title, "overlays": self.overlays, "quality": self.quality, "size": self.size,
             "solution": solutions[0] if len(solutions) == 1 else solutions or None,
+            "funnel": funnels[0] if len(funnels) == 1 else funnels or None,
         }  # fmt: skip
         shown = runs[0] if len(runs) == 1 else runs
         if is_still:
@@ -111,13 +116,15 @@ class Render:
         from lqrsim.results import save_load
         from lqrsim.view import rerun_file
 
-        own, paths, trials = ("rollouts", "out", "trial"), list(self.rollouts), list(self.trial)
+        own, paths, trials = ("rollouts", "out", "trial", "funnel"), list(self.rollouts), list(self.trial)
         given = [one.name for one in fields(self) if one.name not in own and getattr(self, one.name) != one.default]
-        if given or len(paths) > 1 or len(trials) != 1:
-            got = ", ".join(f"--{name}" for name in given) or "several runs or none"
-            raise InputError(f"--out: got {out.name} with {got}, want it with one run, one --trial and nothing else")
+        if given or len(paths) > 1 or len(trials) != 1 or len(self.funnel) > 1:
+            got = ", ".join(f"--{name}" for name in given) or "several runs, trials or funnels, or none"
+            want = "one run, one --trial, at most one --funnel, and nothing else"
+            raise InputError(f"--out: got {out.name} with {got}, want it with {want}")
         console.check_output("--out", out.parent, out.name)
-        for name in rerun_file.write(save_load.load_rollout(paths[0]), out, trial=trials[0]):
+        funnel = save_load.load_funnel(self.funnel[0]) if self.funnel else None
+        for name in rerun_file.write(save_load.load_rollout(paths[0]), out, trial=trials[0], funnel=funnel):
             console.say(f"left out: {name}, of a kind that Rerun has no shape for")
         console.wrote(out)
         return 0

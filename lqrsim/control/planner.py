@@ -12,6 +12,7 @@ import numpy.typing as npt
 from lqrsim.control.replanner import Account, Law, Replanner, Task
 from lqrsim.errors import Array, InputError, check_flag, check_number, vectors_of
 from lqrsim.problem.problem import Problem
+from lqrsim.results.funnel import Funnel
 from lqrsim.results.replan import Replan
 from lqrsim.results.solution import Solution
 
@@ -48,6 +49,8 @@ class Planner:
       horizon: "moving", always as long as the first plan's, or "shrinking", to its end.
       interpolate: whether laws are blended between two knots, for loops that are faster than the plan; see
         `AffinePolicy`.
+      when: a funnel of the solution, for the horizon "shrinking": a solve that is due begins only if the measured state
+        is outside then, about the plan in force; see `Replanning`. That holds after `change`, too.
       clock: what time it is, in seconds, for deadlines; for tests.
 
     Attributes:
@@ -67,15 +70,16 @@ class Planner:
         deadline: float | None = None,
         horizon: str = "moving",
         interpolate: bool = False,
+        when: Funnel | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         if deadline is not None:
             check_number("Planner: deadline", deadline, above=0.0)
-        self._replanner = Replanner("Planner", problem, solution, every, deadline=deadline, horizon=horizon)
+        self._replanner = Replanner("Planner", problem, solution, every, deadline=deadline, horizon=horizon, when=when)
         self._interpolate, self._clock = check_flag("Planner: interpolate", interpolate), clock
         self.problem = problem
         self.law: Law = self._replanner.start()
-        self._asked = -1  # the step of the last solve
+        self._asked = -1  # the step at which a solve was last due
         self._solve: _Solve | None = None
         self._tasks: queue.SimpleQueue[_Solve | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
@@ -152,12 +156,14 @@ class Planner:
         return left and step // every > self._asked // every
 
     def _ask(self, state: Array, t: float, step: int) -> None:
-        """Begin a solve, of a state that is measured within a control period."""
+        """Begin a solve, of a state that is measured within a control period, unless that is in the funnel."""
         begun, dt = self._clock(), self.problem.dt
-        late = t - step * dt
+        late, self._asked = t - step * dt, step
+        if not self._replanner.left(self.law, step, state, late=max(late, 0.0)):
+            return
         task = self._replanner.task(self.law, step, state, self.problem, late=late)
         solve = _Solve(task, begun + self._replanner.delay * dt - late)
-        self._asked, self._solve = step, solve
+        self._solve = solve
         self._tasks.put(solve)
 
     def _take(self, step: int) -> None:

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_count, check_flag, check_kind, check_name, check_number
+from lqrsim.errors import Array, InputError, check_count, check_flag, check_kind, check_name, check_number, excerpt
 from lqrsim.problem.problem import Problem
+from lqrsim.results.funnel import Funnel
 from lqrsim.results.replan import Replan
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import HORIZONS
@@ -136,6 +137,7 @@ class Replanner:
         period. Both are rounded to control periods, the deadline up.
       horizon: "shrinking", to the end of the first plan, or "moving", as long as that.
       predict: whether to solve from where the law in force leads by the deadline, or from the state at the beginning.
+      when: a funnel of the solution, if solves are only for states outside it.
 
     Attributes:
       periods: control periods between two solves. delay: until the answer comes into force.
@@ -156,6 +158,7 @@ class Replanner:
         deadline: float | None = None,
         horizon: str = "shrinking",
         predict: bool = True,
+        when: Funnel | None = None,
     ) -> None:
         check_kind(f"{who}: problem", problem, Problem, "a Problem, such as scenario.problem")
         check_kind(f"{who}: solution", solution, Solution, "its Solution")
@@ -177,7 +180,7 @@ class Replanner:
             )
         self.horizon = check_name(f"{who}: horizon", horizon, HORIZONS)
         self.predict = check_flag(f"{who}: predict", predict)
-        self.problem, self.solution = problem, solution
+        self.problem, self.solution, self.when = problem, solution, _checked_funnel(who, when, solution, horizon)
         self.solver = prepare(problem)
         self.account = Account()
 
@@ -190,6 +193,19 @@ class Replanner:
         """Whether a solve begins at a step."""
         left = self.horizon == "moving" or step + self.delay < self.problem.steps
         return step > 0 and step % self.periods == 0 and left
+
+    def left(self, law: Law, step: int, state: Array, *, late: float = 0.0) -> bool:
+        """Whether a state (n,), measured `late` seconds after a control period began, is outside the funnel.
+
+        The funnel is about the plan in force, which is interpolated between two knots. Without a funnel all is outside.
+        """
+        if self.when is None:
+            return True
+        row, dt, states = law.row(step), self.problem.dt, law.plan.trajectory.states
+        about = states[row]
+        if late > 0:
+            about = about + late / dt * self.when.state_coordinates.difference(states[row + 1], about)
+        return not self.when.contains(state, step * dt + late, about=about)
 
     def task(self, law: Law, step: int, state: Array, problem: Problem | None = None, *, late: float = 0.0) -> Task:
         """What is to be solved in a control period, of a state (n,) that was measured `late` seconds after it began."""
@@ -220,3 +236,13 @@ class Replanner:
         if self.horizon == "moving":
             problem, after = problem.later(task.first * problem.dt), 0
         return self.solver.solve(task.state, task.start, problem=problem, after=after, time_limit=time_limit)
+
+
+def _checked_funnel(who: str, when: Funnel | None, solution: Solution, horizon: str) -> Funnel | None:
+    """Raises InputError unless it is None, or a funnel of the solution, whose end stays where it is."""
+    check_kind(f"{who}: when", when, (Funnel, type(None)), "a Funnel, such as funnel(...) returns")
+    if when is not None and not np.array_equal(when.plan.states, solution.trajectory.states):
+        raise InputError(f"{who}: when: got a funnel of another plan, want that of the solution")
+    if when is not None and horizon != "shrinking":
+        raise InputError(f'{who}: when: got a funnel with horizon={excerpt(horizon)}, want "shrinking": it has an end')
+    return when

@@ -9,7 +9,7 @@ from lqrsim.codegen.fingerprint import fingerprint
 from lqrsim.control.controllers import Control, Controller
 from lqrsim.control.law import evaluator
 from lqrsim.control.replanner import Law, Replanner, ReplanRecord, Task
-from lqrsim.errors import Array, InputError, check_count, check_function, check_kind, check_number, excerpt
+from lqrsim.errors import Array, InputError, check_count, check_function, check_number, excerpt
 from lqrsim.machine import processors
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
@@ -82,14 +82,9 @@ class Replanning(Controller):
         if deadline is None and isinstance(computing, float):
             deadline = computing
         check_function(f"{who}: changes", changes, "a function of the time and the problem", arguments=2)
-        self._replanner = Replanner(who, problem, solution, every, deadline=deadline, horizon=horizon, predict=predict)
-        check_kind(f"{who}: when", when, (Funnel, type(None)), "a Funnel, such as funnel(...) returns")
-        if when is not None and not np.array_equal(when.plan.states, solution.trajectory.states):
-            raise InputError(f"{who}: when: got a funnel of another plan, want that of the solution")
-        if when is not None and horizon != "shrinking":
-            raise InputError(
-                f'{who}: when: got a funnel with horizon={excerpt(horizon)}, want "shrinking": it has an end'
-            )
+        self._replanner = Replanner(
+            who, problem, solution, every, deadline=deadline, horizon=horizon, predict=predict, when=when
+        )
         self.problem, self.solution, self.when = problem, solution, when
         self.every, self.deadline, self.horizon = self._replanner.every, self._replanner.deadline, horizon
         self.computing, self.changes, self.seed = computing, changes, check_count(f"{who}: seed", seed, at_least=0)
@@ -117,7 +112,7 @@ class Replanning(Controller):
                     laws[trial], waiting[trial] = law, None
             if replanner.due(step):
                 problem = self._problem_at(step)
-                left = [trial for trial, law in enumerate(laws) if self._left(law, step, shown[trial])]
+                left = [trial for trial, law in enumerate(laws) if replanner.left(law, step, shown[trial])]
                 tasks = [replanner.task(laws[trial], step, shown[trial], problem) for trial in left]
                 for trial, task, replan in zip(left, tasks, self._solve(tasks), strict=True):
                     if replanner.account.enter(step, trial, replan, late=self._late(shown[trial], step, replan)):
@@ -132,13 +127,6 @@ class Replanning(Controller):
             return commands
 
         return control
-
-    def _left(self, law: Law, step: int, state: Array) -> bool:
-        """Whether to solve for a trial."""
-        if self.when is None:
-            return True
-        about = law.plan.trajectory.states[law.row(step)]
-        return not self.when.contains(state, step * self.problem.dt, about=about)
 
     def _problem_at(self, step: int) -> Problem:
         if self.changes is None:

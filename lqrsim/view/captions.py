@@ -74,8 +74,11 @@ class Caption:
 
     def _readings_width(self, lines: int) -> int:
         """The width in pixels that readings in so many lines take, with some room for numbers that are longer."""
-        ends = (self._in_lines(time, lines) for time in (0.0, self.recorded.end))
-        tiles = [text_tiles.text_tile(readings, self.letter_height, width=0, bold=False) for readings in ends]
+        run, times = self.recorded.rollout, [0.0, self.recorded.end]
+        if (funnel := self.overlays.funnel) is not None:
+            times.append(float(run.times[funnel.said.index(max(funnel.said, key=len))]))
+        all_lines = (self._in_lines(time, lines) for time in times)
+        tiles = [text_tiles.text_tile(readings, self.letter_height, width=0, bold=False) for readings in all_lines]
         return max(tile.shape[1] for tile in tiles) + 3 * self.letter_height
 
     def _in_lines(self, time: float, most: int) -> tuple[str, ...]:
@@ -96,6 +99,8 @@ class Caption:
         readings += [f"clearance {clearance:.2f} m"] if np.isfinite(clearance) else []
         if "forces" in self.overlays.show:
             readings += [f"force {np.linalg.norm(recorded.force_at(time)):.2f} N"]
+        if (funnel := self.overlays.funnel) is not None:
+            readings += [funnel.said[recorded.step(time)]]
         return readings + ([ending.replace("_", " ")] if (ending := recorded.ending(time)) else [])
 
 

@@ -8,11 +8,12 @@ import numpy as np
 import numpy.typing as npt
 from mujoco import mjtGeom as Geom
 
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import Array
+from lqrsim.results.funnel import Funnel
 from lqrsim.results.solution import Solution
-from lqrsim.view import text_tiles
+from lqrsim.view import drawn_tubes, text_tiles
 from lqrsim.view.decorative_geoms import PLAN_RGB, decorate
-from lqrsim.view.ellipsoids import OF_COST, Ellipsoids
+from lqrsim.view.drawn_tubes import LIFT
 from lqrsim.view.options import Overlay
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.text_tiles import Colour
@@ -22,13 +23,11 @@ FORCE = (0.0, 0.50, 0.36)
 MEASURED = (0.10, 0.10, 0.12)
 TUBE = (0.0, 0.70, 0.72)
 COST_TUBE = (0.47, 0.30, 0.78)
-OPACITY = {True: 0.43, False: 0.2}  # of all of a tube: flat on a floor, with the lines above; and around the lines
+FUNNEL, BETWEEN = (0.92, 0.55, 0.0), (0.98, 0.76, 0.38)  # certified, and interpolated; no green, which marks have
 SLIM = 0.65  # width of lines in a tube, in those of others: it is often hardly wider than they are
 SEGMENTS = 120  # a line is drawn with no more than this many
 DOTS = 30  # measured states that are shown, the last ones
-MOST_ELLIPSOIDS = 80  # more take too long to draw
 END_ON = 0.9  # cosine of the angle to the line of sight
-LIFT = 0.006  # metres between the floor and the lines on it
 
 
 @dataclass(frozen=True)
@@ -56,13 +55,20 @@ class Overlays:
     Args:
       solution: of which the run is, for the tube of its cost.
       show: which; those of which there is nothing to show are left out, as the tube where none was predicted.
+      funnel: about the plan of the run.
 
     Raises:
-      InputError: the solution is not that of the run, has no total cost, or is missing.
+      InputError: the solution or the funnel is not that of the run, or is missing; the solution has no total cost, or
+        the funnel not the position among its states.
     """
 
     def __init__(
-        self, recorded: RecordedTrial, solution: Solution | None, show: Sequence[Overlay], scale: Scale
+        self,
+        recorded: RecordedTrial,
+        solution: Solution | None,
+        show: Sequence[Overlay],
+        scale: Scale,
+        funnel: Funnel | None = None,
     ) -> None:
         self.recorded, self.show, self.scale = recorded, set(show), scale
         self.width = 0.0035 * recorded.model.stat.extent
@@ -76,8 +82,9 @@ class Overlays:
             self.show.discard("measured")
         if scale.force < 1e-6:
             self.show.discard("forces")
-        self.tube = _predicted(recorded) if "tube" in self.show else None
-        self.cost_tube = _of_cost(recorded, solution) if "cost_tube" in self.show else None
+        self.tube = drawn_tubes.predicted(recorded) if "tube" in self.show else None
+        self.cost_tube = drawn_tubes.of_cost(recorded, solution) if "cost_tube" in self.show else None
+        self.funnel = drawn_tubes.of_funnel(recorded, funnel) if "funnel" in self.show else None
         if self.tube is not None:
             self.width *= SLIM
 
@@ -89,19 +96,24 @@ class Overlays:
             "measured": ("measured", MEASURED),
         }
         found = [entry for overlay, entry in entries.items() if overlay in self.show]
-        if self.tube is not None:
-            found.append((self.tube.label, TUBE))
-        if self.cost_tube is not None:
-            found.append((OF_COST, COST_TUBE))
-        return found
+        return found + [(tube.label, colour) for tube, colour, _ in reversed(self._tubes())]
+
+    def _tubes(self) -> list[tuple[drawn_tubes.DrawnTube, Colour, float]]:
+        """Those that there are, with their colours and heights above a floor, in lifts of the lines."""
+        certified, between = (None, None) if self.funnel is None else (self.funnel.certified, self.funnel.between)
+        tubes = (
+            (between, BETWEEN, 0.1),
+            (certified, FUNNEL, 0.2),
+            (self.cost_tube, COST_TUBE, 0.3),
+            (self.tube, TUBE, 0.6),
+        )
+        return [(tube, colour, height) for tube, colour, height in tubes if tube is not None]
 
     def draw(self, scene: mujoco.MjvScene, data: mujoco.MjData, time: float) -> None:
         """Appends the geoms of a moment to the scene; `data` is posed as it was then."""
         pen, recorded = _Pen(scene, flat=self.recorded.planar), self.recorded
         lift = np.array([0.0, 0.0, LIFT if recorded.planar else 0.0])
-        for tube, colour, height in ((self.cost_tube, COST_TUBE, 0.3), (self.tube, TUBE, 0.6)):
-            if tube is None:
-                continue
+        for tube, colour, height in self._tubes():
             for centre, sizes, rotation in zip(*tube.in_world, strict=True):
                 pen.add(Geom.mjGEOM_ELLIPSOID, centre + height * lift, sizes, (*colour, tube.opacity), rotation)
         if "trace" in self.show:
@@ -172,58 +184,6 @@ class _Pen:
         for number in np.flatnonzero(length > 1e-6):
             size = [width, thickness, 0.5 * length[number, 0]]
             self.add(Geom.mjGEOM_BOX, centres[number], size, colours[number], rotations[number])
-
-
-@dataclass(frozen=True)
-class _Tube:
-    """Ellipsoids in the world.
-
-    Attributes:
-      knots: (k,) of the plan, where they are. label: what the legend says of it. opacity: of each.
-      in_world: centres (k, 3), half axes (k, 3) and rotations (k, 3, 3).
-    """
-
-    knots: npt.NDArray[np.int64]
-    in_world: tuple[Array, Array, Array]
-    label: str
-    opacity: float
-
-
-def _predicted(recorded: RecordedTrial) -> _Tube | None:
-    """The tube that was predicted for the run, if it was, and has any width."""
-    run = recorded.rollout
-    if run.tube is None or run.tube.max() < 1e-12:
-        return None
-    return _tube(recorded, Ellipsoids.predicted(run.plan.states[:, list(run.state_coordinates.position)], run.tube))
-
-
-def _of_cost(recorded: RecordedTrial, solution: Solution | None) -> _Tube:
-    """Where the solution's total cost is near its least."""
-    run = recorded.rollout
-    if solution is None:
-        raise InputError("solution: got None with the overlay cost_tube, want the Solution that was executed")
-    if not run.state_coordinates.position:
-        raise InputError("overlays: got cost_tube of a run of a robot without a position, want others")
-    if not np.array_equal(solution.trajectory.states, run.plan.states):
-        raise InputError("solution: got one with another plan than that of the run, want the one that was executed")
-    return _tube(recorded, Ellipsoids.of_cost(solution, run.state_coordinates.position))
-
-
-def _tube(recorded: RecordedTrial, ellipsoids: Ellipsoids) -> _Tube:
-    space, knots = recorded.rollout.state_coordinates, ellipsoids.spread(MOST_ELLIPSOIDS)
-    size, count = len(space.position), len(knots)
-    lengths, turns = (part[knots] for part in ellipsoids.axes())
-    half_axes, rotations = np.full((count, 3), 0.1 * LIFT), np.zeros((count, 3, 3))
-    half_axes[:, :size] = np.maximum(lengths, 0.1 * LIFT)  # one without width cannot be drawn
-    rotations[:, list(space.world_axes), :size] = turns
-    if size == 2:  # what is flat is thin across
-        rotations[:, :, 2] = np.cross(rotations[:, :, 0], rotations[:, :, 1])
-    places = space.in_world(ellipsoids.centres[knots], height=recorded.floor)
-    apart = np.linalg.norm(np.diff(places, axis=0), axis=1).sum() / max(count - 1, 1)
-    overlap = 2 * float(lengths.mean()) / apart if apart > 0 else 1.0
-    # With too few to overlap much, more of it would show as stripes on the lines within.
-    opacity = 1 - (1 - OPACITY[recorded.planar]) ** (1 / np.clip(overlap, 1.6, 10.0))
-    return _Tube(knots, (places, half_axes, rotations), ellipsoids.label, float(opacity))
 
 
 def _round_up(value: float) -> float:

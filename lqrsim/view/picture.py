@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import InputError, check_count, check_items, check_kind, check_name, check_text, excerpt
+from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.view import gl, marker
@@ -61,6 +62,7 @@ class PictureOptions:
     titles: Sequence[str] = ()
     overlays: Sequence[Overlay] = OVERLAYS
     solution: Solution | Sequence[Solution | None] | None = None
+    funnel: Funnel | Sequence[Funnel | None] | None = None
     quality: Quality = "standard"
     size: tuple[int, int] | None = None
     speed: float = 1.0
@@ -118,7 +120,13 @@ def open_picture(runs: Rollout | Sequence[Rollout], options: PictureOptions) -> 
     solutions = _one_each("solution", options.solution, recordings)
     for one in solutions:
         check_kind("solution", one, (Solution, type(None)), "the Solution of the run, or None")
-    overlays = [Overlays(*each, options.overlays, common) for each in zip(recordings, solutions, strict=True)]
+    funnels = _one_each("funnel", options.funnel, recordings)
+    for one in funnels:
+        check_kind("funnel", one, (Funnel, type(None)), "a Funnel about the plan of the run, or None")
+    overlays = [
+        Overlays(recorded, solution, options.overlays, common, funnel)
+        for recorded, solution, funnel in zip(recordings, solutions, funnels, strict=True)
+    ]
     titles = _one_each("titles", list(options.titles), recordings) if options.titles else [None] * len(recordings)
     gl.bind()
     over = len(recordings) == 1 and not insets and size[1] >= READABLE

@@ -94,7 +94,11 @@ class RecordedTrial:
 
     def force_at(self, time: float) -> Array:
         """The force (3,) in N that has disturbed the robot lately."""
-        return self.force[min(int(time / self.rollout.plan.dt + 1e-9), len(self.force) - 1)]
+        return self.force[min(self.step(time), len(self.force) - 1)]
+
+    def step(self, time: float) -> int:
+        """The control period in which a time is; at the end of the plan, how many there are."""
+        return min(int(time / self.rollout.plan.dt + 1e-9), self.rollout.plan.steps)
 
     def interpolate(self, values: Array, time: float) -> float:
         """One of `error` and `clearance` at a time."""

@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from lqrsim.errors import InputError, check_function, check_name, check_number, check_path, excerpt
+from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import replacing
 from lqrsim.results.solution import Solution
@@ -35,6 +36,7 @@ def render(
     titles: Sequence[str] = (),
     overlays: Sequence[Overlay] = OVERLAYS,
     solution: Solution | Sequence[Solution | None] | None = None,
+    funnel: Funnel | Sequence[Funnel | None] | None = None,
     quality: Quality = "standard",
     size: tuple[int, int] | None = None,
     fps: float | None = None,
@@ -58,8 +60,10 @@ def render(
         now. trace: the path so far, coloured by tracking error. forces: arrows of forces and wind, means over the last
         fifth of a second. measured: the last measured states, where they differ from the true ones. tube: the states
         predicted under the disturbances, within 2 standard deviations, where there is a `rollout.tube` and it is not
-        too wide. cost_tube: ellipsoids of low total cost. caption: time, tracking error, clearance, disturbances.
+        too wide. cost_tube: ellipsoids of low total cost. funnel: its shadow on the position, pale between
+        its knots. caption: time, tracking error, clearance, disturbances, whether the run is in the funnel.
       solution: of which the run is, for cost_tube; one for all, or one each.
+      funnel: about the plan of the run, for funnel; one for all, or one each.
       quality: `draft`, `standard` or `publication`: size, edges, shadows, and how much the video is compressed.
       size: width and height in pixels, both even; by default the quality's, or half for a GIF (at least 480 x 270).
       fps: frames a second, whatever the rate of `rollout.frame_times`; 30 by default, and 15 for a GIF.
@@ -81,13 +85,10 @@ def render(
     size = size if size is not None or not animated else _gif_size(quality)
     options = PictureOptions(
         trial=trial, camera=camera, insets=insets, titles=titles, overlays=overlays, solution=solution,
-        quality=quality, size=size, speed=speed,
+        funnel=funnel, quality=quality, size=size, speed=speed,
     )  # fmt: skip
     with replacing(path) as unfinished, open_picture(runs, options) as drawn:
-        count = int(drawn.end / speed * rate + 1e-9) + 1
-        if count > MOST_FRAMES:
-            frames = f"{count} frames, want at most {MOST_FRAMES}"
-            raise InputError(f"speed, fps: got {speed:g} and {fps:g}, which are {frames}")
+        count = _frame_count(drawn.end, speed, rate)
         if animated:
             samples = [drawn.draw(time) for time in np.linspace(0, drawn.end, min(PALETTE_SAMPLES, count))]
             writer = gif(unfinished, rate, samples)
@@ -118,6 +119,7 @@ def still(
     titles: Sequence[str] = (),
     overlays: Sequence[Overlay] = OVERLAYS,
     solution: Solution | Sequence[Solution | None] | None = None,
+    funnel: Funnel | Sequence[Funnel | None] | None = None,
     quality: Quality = "standard",
     size: tuple[int, int] | None = None,
 ) -> PictureFile:
@@ -137,6 +139,7 @@ def still(
       titles: as in `render`.
       overlays: as in `render`.
       solution: as in `render`.
+      funnel: as in `render`.
       quality: as in `render`.
       size: as in `render`.
 
@@ -149,7 +152,7 @@ def still(
     path = _checked_path(path, ".png")
     options = PictureOptions(
         trial=trial, camera=camera, insets=insets, titles=titles, overlays=overlays, solution=solution,
-        quality=quality, size=size,
+        funnel=funnel, quality=quality, size=size,
     )  # fmt: skip
     with replacing(path) as unfinished, open_picture(runs, options) as drawn:
         time = drawn.end if time is None else check_number("time", time, at_least=0, at_most=drawn.end)
@@ -160,6 +163,14 @@ def still(
 
 def _multiples(every: float, time: float, drawn: Picture) -> list[float]:
     return np.arange(0, time, check_number("every", every, at_least=drawn.end / MOST_ROBOTS)).tolist()
+
+
+def _frame_count(end: float, speed: float, rate: Fraction) -> int:
+    count = int(end / speed * rate + 1e-9) + 1
+    if count > MOST_FRAMES:
+        frames = f"{count} frames, want at most {MOST_FRAMES}"
+        raise InputError(f"speed, fps: got {speed:g} and {float(rate):g}, which are {frames}")
+    return count
 
 
 def _gif_size(quality: Quality) -> tuple[int, int]:

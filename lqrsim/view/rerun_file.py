@@ -13,12 +13,14 @@ import numpy as np
 from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError, check_path
+from lqrsim.results.funnel import Funnel
 from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.save_load import replacing
+from lqrsim.view import drawn_tubes
 from lqrsim.view.decorative_geoms import PLAN_RGB
 from lqrsim.view.ellipsoids import Ellipsoids
-from lqrsim.view.overlays import FORCE, TUBE
+from lqrsim.view.overlays import BETWEEN, FORCE, FUNNEL, TUBE
 from lqrsim.view.recorded_trial import RecordedTrial
 
 TIMELINE = "time"
@@ -28,22 +30,25 @@ FLAT = 1e-4  # m: half the depth of what has none
 ARROW = 0.2  # of the scene's extent: the longest force
 
 
-def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0) -> list[str]:
+def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0, funnel: Funnel | None = None) -> list[str]:
     """Write a trial as FILE.rrd.
 
     Args:
       rollout: what `simulate` returned, with frames.
       path: of the file.
       trial: row of the rollout.
+      funnel: about the plan of the run, as the overlay of this name has it.
 
     Returns:
       The names of the geoms that are left out, because Rerun has no such shape.
 
     Raises:
-      InputError: no such trial, nothing of it to draw, a file that cannot be written, or the package is missing.
+      InputError: no such trial, nothing of it to draw, a funnel that is not of its plan or has no position, a file that
+        cannot be written, or the package is missing.
     """
     path = check_path("path", path, "the path of a file")
     rerun, recorded = _package(path), RecordedTrial(rollout, trial)
+    drawn = None if funnel is None else drawn_tubes.of_funnel(recorded, funnel)
     with replacing(path) as unfinished:
         name = f"{rollout.robot} in {rollout.scene}, trial {rollout.first_trial + trial}"
         stream = rerun.RecordingStream("lqrsim", recording_id=sha256(rollout.states[trial].tobytes())[:32])
@@ -51,6 +56,8 @@ def write(rollout: Rollout, path: str | os.PathLike[str], *, trial: int = 0) -> 
         stream.send_recording_name(name)
         left_out = _draw_model(rerun, stream, recorded)
         _draw_plan(rerun, stream, recorded)
+        if drawn is not None:
+            _draw_funnel(rerun, stream, drawn)
         _draw_numbers(rerun, stream, recorded)
         stream.disconnect()
     return left_out
@@ -150,6 +157,18 @@ def _draw_plan(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
             colors=[_bytes(np.array(FORCE))] * len(times),
         )
         _send(rerun, stream, ["world", "force"], times, arrows)
+
+
+def _draw_funnel(rerun: Any, stream: Any, funnel: drawn_tubes.DrawnFunnel) -> None:
+    """Its ellipsoids, which are there at all times: those that are certified, and those in between."""
+    for name, tube, colour in (("certified", funnel.certified, FUNNEL), ("interpolated", funnel.between, BETWEEN)):
+        if tube is not None:
+            centres, half_axes, turns = tube.in_world
+            quaternions = [_quaternion(turn) for turn in turns]
+            shape = rerun.Ellipsoids3D(
+                half_sizes=half_axes, centers=centres, quaternions=quaternions, colors=[_bytes(np.array(colour))]
+            )
+            stream.log(["world", "funnel", name], shape, static=True)
 
 
 def _draw_numbers(rerun: Any, stream: Any, recorded: RecordedTrial) -> None:
