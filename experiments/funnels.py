@@ -30,7 +30,8 @@ SHELLS = ((0.0, 1.0), (1.0, 1.3), (1.3, 1.6))  # of the level, where fresh trial
 EVERY = 0.1  # s, between two plans
 EACH = "at every period"
 # Gusts in which it is planned again, m/s, standard deviation, and the rates of the funnels that are watched.
-WATCHED = {1.25: (0.85, 0.9), 1.6: (0.7, 0.8)}
+WATCHED = {1.25: (0.85, 0.9), 1.6: (0.7,)}
+SHARES = (1.0, 0.5)  # of the level at which it is planned again
 LOOSE = 0.9  # confidence of these funnels
 MARGIN = 2.0  # percentage points: a law that reaches the goal less often by no more than that does as well
 
@@ -164,7 +165,9 @@ def in_gusts(config: Config, gusts: float, rates: tuple[float, ...]) -> dict[str
         funnel = ls.funnel(
             plant, solution, disturbances=wrong, rate=rate, confidence=LOOSE, failures=config.failures, seed=config.seed
         )  # fmt: skip
-        laws[f"outside the funnel of rate {rate:g}"] = ls.Replanning(problem, solution, every=EVERY, when=funnel)
+        for share in SHARES:
+            name = f"beyond {share:g} of the level, rate {rate:g}"
+            laws[name] = ls.Replanning(problem, solution, every=EVERY, when=funnel, share=share)
         funnels.append(funnel.summary())
     found: dict[str, Any] = {}
     ended: dict[str, Any] = {}
@@ -194,8 +197,8 @@ def report_replanning(found: dict[str, Any]) -> list[str]:
     )
     said = [
         "The quadrotor in gusts, with room beside obstacles. All laws have the same trials, which are not those that"
-        f" made the funnels: {found['trials']}. A law plans again every {EVERY:g} s, or only where the trial is outside"
-        " a funnel. Intervals of differences are Tango's for pairs."
+        f" made the funnels: {found['trials']}. A law plans again every {EVERY:g} s, or only where the trial is then"
+        " beyond a share of a funnel's level. Intervals of differences are Tango's for pairs."
     ]
     for one in found["gusts"]:
         every = one["laws"][EACH]["solves"]

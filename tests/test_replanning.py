@@ -346,9 +346,9 @@ class TestPlanner:
             assert [one.step for one in planner.account.records] == begun
             assert planner.account.solved == len(begun)
 
-    @pytest.mark.parametrize(("off", "solves"), [(0.9, 0), (1.1, 1)])
+    @pytest.mark.parametrize(("share", "off", "solves"), [(1.0, 0.9, 0), (1.0, 1.1, 1), (0.5, 0.4, 0), (0.5, 0.6, 1)])
     def test_the_funnel_is_about_where_the_plan_is_between_two_knots(
-        self, stated: ls.Problem, solution: ls.Solution, off: float, solves: int
+        self, stated: ls.Problem, solution: ls.Solution, share: float, off: float, solves: int
     ) -> None:
         """The states are a part of a period after the knot, in which the plan goes further than the funnel is wide."""
         before, after = solution.trajectory.states[3:5]
@@ -358,6 +358,7 @@ class TestPlanner:
             "every": DT,
             "horizon": "shrinking",
             "when": funnel_by_hand(solution, np.eye(2), levels=[level]),
+            "share": share,
         }
         with ls.Planner(stated, solution, clock=lambda: 0.0, **options) as planner:
             planner.step(before + 0.4 * (after - before) + off * 0.2 * along, 3.4 * DT)
@@ -383,6 +384,8 @@ class TestPlanner:
             ({"deadline": 0.0}, "deadline: got 0"),
             ({"interpolate": 1}, "interpolate: got 1"),
             ({"when": 1}, "when: got 1"),
+            ({"share": 0.5}, "share: got 0.5 without a funnel"),
+            ({"when": when, "horizon": "shrinking", "share": 1.5}, "share: got 1.5"),
             ({"when": when}, "when: got a funnel with horizon='moving', want \"shrinking\""),
             ({"when": moved, "horizon": "shrinking"}, "when: got a funnel of another plan"),
         ):

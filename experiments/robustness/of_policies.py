@@ -113,7 +113,10 @@ def replanning(place: Place) -> dict[str, tuple[Any, ...]]:
         "Problem.later": ({"self": place.problem, "seconds": 0.5},),
         "Problem.from_state": ({"self": place.problem, "state": state, "after": 1},),
         "Dynamics.period_near": ({"self": place.problem.dynamics, "dt": 0.1},),
-        "Planner": (planner | {"deadline": 1 / 3, "horizon": "moving", "interpolate": True, "when": None}, 0.3),
+        "Planner": (
+            planner | {"deadline": 1 / 3, "horizon": "moving", "interpolate": True, "when": None, "share": 1.0},
+            0.3,
+        ),
         "Planner.step": ({"self": running, "state": state, "t": 0.2},),
         "Planner.change": ({"self": running, "initial": ls.FixedState(state)},),
     }

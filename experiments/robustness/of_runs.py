@@ -128,7 +128,7 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
         "Plant.clearance": ({"self": plant, "states": np.zeros((1, 5, 3)),
                              "displaced": np.zeros((1, len(plant.world), 3))},),
         "Feedback": ({"policy": solution.policy},),
-        "Replanning": ({"problem": place.problem, "solution": solution, "every": 1 / 3, "when": None},),
+        "Replanning": ({"problem": place.problem, "solution": solution, "every": 1 / 3, "when": None, "share": 1.0},),
         "simulate": ({
             "plant": plant, "solution": solution, "disturbances": [noise], "controller": ls.Feedback(solution.policy),
             "seed": 0, "trials": 1, "first_trial": 0, "goal_radius": 0.1, "frames": True, "contacts": True,

@@ -51,6 +51,7 @@ class Planner:
         `AffinePolicy`.
       when: a funnel of the solution, for the horizon "shrinking": a solve that is due begins only if the measured state
         is outside then, about the plan in force; see `Replanning`. That holds after `change`, too.
+      share: as in `Replanning`.
       clock: what time it is, in seconds, for deadlines; for tests.
 
     Attributes:
@@ -71,11 +72,14 @@ class Planner:
         horizon: str = "moving",
         interpolate: bool = False,
         when: Funnel | None = None,
+        share: float = 1.0,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         if deadline is not None:
             check_number("Planner: deadline", deadline, above=0.0)
-        self._replanner = Replanner("Planner", problem, solution, every, deadline=deadline, horizon=horizon, when=when)
+        self._replanner = Replanner(
+            "Planner", problem, solution, every, deadline=deadline, horizon=horizon, when=when, share=share
+        )
         self._interpolate, self._clock = check_flag("Planner: interpolate", interpolate), clock
         self.problem = problem
         self.law: Law = self._replanner.start()

@@ -138,6 +138,7 @@ class Replanner:
       horizon: "shrinking", to the end of the first plan, or "moving", as long as that.
       predict: whether to solve from where the law in force leads by the deadline, or from the state at the beginning.
       when: a funnel of the solution, if solves are only for states outside it.
+      share: of the funnel's level that counts as its boundary.
 
     Attributes:
       periods: control periods between two solves. delay: until the answer comes into force.
@@ -159,6 +160,7 @@ class Replanner:
         horizon: str = "shrinking",
         predict: bool = True,
         when: Funnel | None = None,
+        share: float = 1.0,
     ) -> None:
         check_kind(f"{who}: problem", problem, Problem, "a Problem, such as scenario.problem")
         check_kind(f"{who}: solution", solution, Solution, "its Solution")
@@ -181,6 +183,9 @@ class Replanner:
         self.horizon = check_name(f"{who}: horizon", horizon, HORIZONS)
         self.predict = check_flag(f"{who}: predict", predict)
         self.problem, self.solution, self.when = problem, solution, _checked_funnel(who, when, solution, horizon)
+        self.share = check_number(f"{who}: share", share, above=0.0, at_most=1.0)
+        if when is None and self.share != 1:
+            raise InputError(f"{who}: share: got {self.share:g} without a funnel, want when=... beside it")
         self.solver = prepare(problem)
         self.account = Account()
 
@@ -205,7 +210,9 @@ class Replanner:
         about = states[row]
         if late > 0:
             about = about + late / dt * self.when.state_coordinates.difference(states[row + 1], about)
-        return not self.when.contains(state, step * dt + late, about=about)
+        t = step * dt + late
+        level = self.share * self.when.level(t)
+        return not (level > 0 and self.when.deviation(state, t, about=about) <= level)
 
     def task(self, law: Law, step: int, state: Array, problem: Problem | None = None, *, late: float = 0.0) -> Task:
         """What is to be solved in a control period, of a state (n,) that was measured `late` seconds after it began."""

@@ -48,6 +48,8 @@ class Replanning(Controller):
       seed: of what `computing` draws.
       when: a funnel of the solution: solve only for trials that are outside at the time, about the plan in force. What
         is certified is the first plan's; about a later one the same ellipsoids are a rule of thumb.
+      share: of the funnel's level at which to solve: 1 is its boundary. Planning earlier takes more solves and loses
+        fewer trials, for a plan that begins at the boundary often comes too late.
 
     Attributes:
       records: a `ReplanRecord` of each solve of the last run.
@@ -71,6 +73,7 @@ class Replanning(Controller):
         changes: Callable[[float, Problem], Problem] | None = None,
         seed: int = 0,
         when: Funnel | None = None,
+        share: float = 1.0,
     ) -> None:
         who = "Replanning"
         if callable(computing):
@@ -83,7 +86,7 @@ class Replanning(Controller):
             deadline = computing
         check_function(f"{who}: changes", changes, "a function of the time and the problem", arguments=2)
         self._replanner = Replanner(
-            who, problem, solution, every, deadline=deadline, horizon=horizon, predict=predict, when=when
+            who, problem, solution, every, deadline=deadline, horizon=horizon, predict=predict, when=when, share=share
         )
         self.problem, self.solution, self.when = problem, solution, when
         self.every, self.deadline, self.horizon = self._replanner.every, self._replanner.deadline, horizon
@@ -164,7 +167,7 @@ class Replanning(Controller):
     def digest(self) -> str:
         computing = fingerprint(self.computing) if callable(self.computing) else repr(self.computing)
         changes = fingerprint(self.changes) if self.changes is not None else ""
-        when = "" if self.when is None else self.when.digest
+        when = "" if self.when is None else f"{self.when.digest}{self._replanner.share}"
         parts = self._replanner.periods, self._replanner.delay, self.horizon, self._replanner.predict, self.seed
         return sha256(f"{self.solution.policy.digest} {self.problem.digest} {parts} {computing} {changes}{when}")[:16]
 
