@@ -114,7 +114,7 @@ class TestInfeasible:
         ended = {one.start: one for one in solution.candidates if one.status is not None}
         assert Status.INFEASIBLE in {one.status for one in ended.values()}
         chosen = next(name for name, one in ended.items() if one.cost == solution.cost)
-        assert f"the plan is of {chosen}, one of 7" in solution.summary()
+        assert f"the plan is from the start {chosen!r}, one of 7" in solution.summary()
 
 
 class TestTolerance:

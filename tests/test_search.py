@@ -48,7 +48,7 @@ class TestCandidates:
         three = [one for one in candidates if one.status is None and one.iterations == 3]
         assert (len(three), len(four)) == (4, 2)
         assert drive_solution.iterations[3].cost < min(one.cost for one in four)
-        assert f"the plan is of {chosen.start}, one of 7" in drive_solution.summary()
+        assert f"the plan is from the start {chosen.start!r}, one of 7" in drive_solution.summary()
         # What goes on was better than what was dropped at that time; of the two that were dropped later, cost fell.
         assert max(one.cost for one in four) < min(one.cost for one in three)
 

@@ -1,5 +1,6 @@
 """Commands of the stress test."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -94,6 +95,8 @@ class Stress:
             results = run_campaign(campaign, folder, progress=progress, **options)
         console.say(results.summary())
         console.wrote(folder)
+        own = ["--scenario", self.scenario] if ":" in self.scenario else []  # files never choose code to run
+        console.say(f"\nnext:\n  {shlex.join(['lqrsim', 'report', str(folder), *own])}")
         if console.wants_result():
             console.result(campaign=as_json.of_campaign(results))
         return 1 if any(results.tally(cell)["error"] for cell in results.cells) else 0

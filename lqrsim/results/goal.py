@@ -131,5 +131,8 @@ class Target:
         away = float(self.distance(self.plan[-1]))
         lines = [f"the plan ends {self.describe(away)}"]
         if radius is not None and self.misses(radius):
-            lines.append(f"the plan MISSES the goal: it ends {away - radius:.3g} {self.unit} outside {radius:g}")
+            lines.append(
+                f"the plan MISSES the goal: it ends {away - radius:.3g} {self.unit} outside {radius:g}; where it should"
+                " not, raise the weights of the final cost, or give it more steps"
+            )
         return lines

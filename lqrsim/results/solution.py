@@ -236,10 +236,11 @@ class Solution:
         """The status with its remedy, and what came out, in a few lines."""
         lines = [f"{self.status.name} after {len(self.iterations)} iterations of {self.solver}: {self.status.meaning}"]
         if self.detail:
-            lines.append(f"  where:     {self.detail}")
+            lines.append(f"  detail:    {self.detail}")
         if self.status.remedy:
             lines.append(f"  remedy:    {self.status.remedy}")
-        lines.append(f"  cost:      {self.cost:.9g}   gap: {self.gap:.1e}   optimality: {self.optimality:.1e}")
+        gap = f"{self.gap:.1e}" if np.isfinite(self.gap) else "none (no cost-to-come)"
+        lines.append(f"  cost:      {self.cost:.9g}   gap: {gap}   optimality: {self.optimality:.1e}")
         if "noise" in self.options:
             meant = f"log E exp(risk cost) / risk, risk {self.options.get('risk')}"
             if self.cost_to_go is None:
@@ -283,7 +284,7 @@ class Solution:
         best = min(
             ended, key=lambda candidate: (candidate.status != self.status, abs(candidate.cost - self.cost))
         ).start
-        lines = [f"the plan is of {best}, one of {len(self.candidates)}"]
+        lines = [f"the plan is from the start {best!r}, one of {len(self.candidates)}"]
         if dropped:
             lines[0] += f"; {len(dropped)} were dropped at costs of {min(dropped):.6g} or more"
         others = [one for one in ended if one.start != best]

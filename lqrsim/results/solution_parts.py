@@ -94,7 +94,7 @@ class Status(enum.StrEnum):
 
 
 _STATUS_TEXT = {
-    Status.CONVERGED: ("cost change, gap and first-order optimality are all within tolerance", ""),
+    Status.CONVERGED: ("cost change, optimality and, with a cost-to-come, the gap are within tolerance", ""),
     Status.COST_CONVERGED: (
         "the change of cost is within tolerance; gap and optimality were not asked for",
         'look at the gap, or solve with stop="optimal"',

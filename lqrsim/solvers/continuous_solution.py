@@ -137,7 +137,7 @@ class ContinuousSolution:
         if not self.iterations and self.success:
             lines = [f"{self.status.name}: a linear-quadratic problem is solved by one pass each way"]
         if self.detail:
-            lines.append(f"  where:     {self.detail}")
+            lines.append(f"  detail:    {self.detail}")
         if self.status.remedy:
             lines.append(f"  remedy:    {self.status.remedy}")
         line = f"  cost:      {self.cost:.9g}"

@@ -82,9 +82,8 @@ def smooth(
       constraint_tolerance: how closely the problem's constraints are solved for, in their unit: for a clearance it is
         metres. So much to spare is aimed at; a plan that has converged keeps the constraints themselves, and equalities
         to 1e-6, or to this where it is smaller.
-      penalty: the initial penalty of all constraints, in units of the cost per square of a constraint's unit. They then
-        act from the first iteration, which takes fewer where the start is near and the penalty suits the problem. It
-        needs a start. By default the problem is first solved without its constraints, and penalties are computed.
+      penalty: the initial penalty of all constraints, in cost per square of their unit; they then act from the first
+        iteration. It needs a start. By default they come in after a solve without them, with penalties from curvature.
       noise: replaces the problem's own; see `Noise`. The cost is then an expectation, in the log, line searches and
         the choice among starts.
       risk: replaces the problem's own; see `Problem`.

@@ -44,7 +44,8 @@ def plot_funnel(funnel: Funnel, path: str | os.PathLike[str], *, world: World, r
     planes = [(0, 1)] if len(space.position) == 2 else [(0, 1), (0, 2)]
     columns = len(planes) + 1
     with style.figure(path, size=(4 * columns, 5.2 if columns == 2 else 4.6)) as figure:
-        grid = figure.add_gridspec(1, columns, left=0.06, right=0.98, bottom=0.2, top=0.92, wspace=0.24)
+        left = 0.09 if columns == 2 else 0.07
+        grid = figure.add_gridspec(1, columns, left=left, right=0.98, bottom=0.2, top=0.92, wspace=0.24)
         drawn = [figure.add_subplot(grid[i]) for i in range(len(planes))]
         for axes, plane in zip(drawn, planes, strict=True):
             _shadow(axes, funnel, covariances, world, radius, plane)

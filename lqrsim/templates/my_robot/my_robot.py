@@ -37,13 +37,15 @@ class MyRobot(ls.Robot):
 
         def rate(x: Any, u: Any, p: Any) -> list[Any]:
             _, _, vx, vy = x
-            return [vx, vy, (u[0] - p.damping * vx) / p.mass, (u[1] - p.damping * vy) / p.mass]
+            force = [u[0] + p.force_x - p.damping * vx, u[1] + p.force_y - p.damping * vy]
+            return [vx, vy, force[0] / p.mass, force[1] / p.mass]
 
         return ls.Dynamics(
             rate,
             states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"},
             controls={"push_x": "N", "push_y": "N"},
             parameters={"mass": self.mass, "damping": self.damping},
+            disturbances={"force_x": 0.0, "force_y": 0.0},  # what ForceNoise does, for predictions and estimates
             position=("x", "y"),
             control_limits=(-2.0, 2.0),
         )
@@ -67,7 +69,7 @@ def scenario(goal_x: float = 1.2, goal_y: float = 0.3) -> ls.Scenario:
         steps=80,
         initial=ls.FixedState((-1.0, 0.0, 0.0, 0.0)),
         stage_cost=ls.ControlCost((1.0, 1.0)) + ls.ObstacleCost(scene.world, radius=robot.radius),
-        final_cost=ls.QuadraticCost((500.0, 500.0, 500.0, 500.0), about=(goal_x, goal_y, 0.0, 0.0)),
+        final_cost=ls.QuadraticCost((5000.0,) * 4, about=(goal_x, goal_y, 0.0, 0.0)),  # larger ends nearer to the goal
         constraints=[ls.Clearance(scene.world, radius=robot.radius, margin=0.02)],
     )
     return ls.Scenario(
@@ -77,5 +79,9 @@ def scenario(goal_x: float = 1.2, goal_y: float = 0.3) -> ls.Scenario:
         scene=scene,
         problem=problem,
         tracking_bound=1e-3,
-        disturbances=(ls.ControlNoise(0.05), ls.ForceNoise(0.05), ls.MeasurementNoise((0.005, 0.005, 0.02, 0.02))),
+        disturbances=(
+            ls.ControlNoise(0.05),
+            ls.ForceNoise((0.05, 0.05, 0.0)),
+            ls.MeasurementNoise((0.005, 0.005, 0.02, 0.02)),
+        ),
     )
