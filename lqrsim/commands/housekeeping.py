@@ -45,7 +45,7 @@ class Demo:
 class Reproduce:
     """Reproduce the paper's results and check its statements.
 
-    Writes results.md with a summary, results.json with every number, and the figures as png and pdf. Takes under an
+    Writes results.md with a summary, results.json with every number, and the figures as png and pdf. Takes over an
     hour, most of it for robust_policies. Includes other solvers and controllers if the bench extra is installed.
 
     Exits with 1 if an experiment failed, whether or not the paper's statements hold.
