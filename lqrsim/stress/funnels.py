@@ -182,13 +182,6 @@ class FunnelCheck(NamedTuple):
     reached: Estimate
     successes: npt.NDArray[np.bool_]
 
-    def __str__(self) -> str:
-        rate, of = self.reached, len(self.successes)
-        return (
-            f"knot {self.knot}, level {self.level:.3g}: {int(self.successes.sum())} of {of} reached,"
-            f" {100 * rate.value:.1f} [{100 * rate.low:.1f}, {100 * rate.high:.1f}] %"
-        )
-
 
 def check_funnel(
     funnel: Funnel,
