@@ -1,11 +1,15 @@
-"""Whether two checkouts of this project compute the same, to the last bit: for a change that is not to change results.
+"""Whether two checkouts of this project compute the same: for a change that is not to change results.
 
-    python experiments/compare_checkouts.py ../before .        # some minutes, most of them for compiling
+    python experiments/compare_checkouts.py ../before .        # some minutes
     python experiments/compare_checkouts.py ../before . --quick
+    python experiments/compare_checkouts.py ../before . --tolerance 1e-10    # where rounding may differ
 
 Each checkout computes in a process of its own, with the packages of this one and a cache of its own. Compared are the
 solutions of the paper's 100 queries of the quadrotor and of the drive, in both forms, with and without the paper's
-start, by smooth and ilqr: status, iterations, cost, plan, policy and cost-to-go; and every column of a small campaign.
+start, by smooth and ilqr, with a clearance, limits, noise and a risk, and of a robot from an MJCF: status, iterations,
+cost, plan, policy and cost-to-go; and every column of a small campaign. To the last bit; with a tolerance, the same
+status and iterations, and costs that differ by less than that, relatively. Of the rest it then says the largest
+difference, relative to the largest number of its array.
 """
 
 import hashlib
@@ -38,6 +42,8 @@ class Config:
     """Of the quadrotor."""
     trials: int = 50
     """Of each cell of the campaign."""
+    tolerance: float = 0.0
+    """Of costs, relative; 0 for the same bits in everything."""
     quick: bool = False
     """2 queries, 2 trials."""
     json: bool = False
@@ -47,38 +53,70 @@ class Config:
 def main(config: Config) -> dict[str, Any]:
     if config.quick:
         config = replace(config, queries=2, trials=2)
-    found = [_computed_by(folder, config) for folder in (config.before, config.after)]
-    different = {
-        name: [number for number, (one, other) in enumerate(zip(*lines, strict=True)) if one != other]
-        for name, lines in ((name, (found[0][name], found[1][name])) for name in found[0])
-    }
-    counts = {name: len(lines) for name, lines in found[0].items()}
+    with tempfile.TemporaryDirectory() as kept:
+        places = [Path(kept) / name for name in ("before", "after")]
+        pairs = zip((config.before, config.after), places, strict=True)
+        found = [_computed_by(folder, place, config) for folder, place in pairs]
+        arrays = [dict(np.load(place / "arrays.npz")) for place in places]
+    result: dict[str, Any] = {"compared": {}, "different": {}, "cost": {}, "arrays": {}}
+    for name, before in found[0].items():
+        pairs = list(zip(before, found[1][name], strict=True))
+        result["compared"][name] = len(pairs)
+        result["cost"][name] = max((_apart(one["cost"], other["cost"]) for one, other in pairs), default=0.0)
+        own = [key for key in arrays[0] if key.startswith(f"{name}/")]
+        result["arrays"][name] = max((_apart(arrays[0][key], arrays[1][key]) for key in own), default=0.0)
+        result["different"][name] = [i for i, pair in enumerate(pairs) if not _same(*pair, config.tolerance)]
     settings = {name: str(value) for name, value in asdict(config).items()}
-    return {"config": settings, "versions": versions(), "compared": counts, "different": different}
+    return {"config": settings, "versions": versions(), **result}
 
 
-def _computed_by(folder: Path, config: Config) -> dict[str, list[Any]]:
-    """What a checkout computes, in a process that imports nothing of another."""
+def _same(one: dict[str, Any], other: dict[str, Any], tolerance: float) -> bool:
+    if tolerance == 0:
+        return one == other
+    return one["what"] == other["what"] and _apart(one["cost"], other["cost"]) <= tolerance
+
+
+def _apart(one: Any, other: Any) -> float:
+    """The largest difference relative to the largest number; infinite for other shapes, or where one is not finite."""
+    a, b = np.atleast_1d(np.asarray(one, dtype=np.float64)), np.atleast_1d(np.asarray(other, dtype=np.float64))
+    if a.shape != b.shape or not np.array_equal(np.isfinite(a), np.isfinite(b)):
+        return float("inf")
+    good = np.isfinite(a)
+    return float(np.abs(a[good] - b[good]).max(initial=0.0) / max(np.abs(a[good]).max(initial=0.0), 1e-300))
+
+
+def _computed_by(folder: Path, place: Path, config: Config) -> dict[str, list[Any]]:
+    """What a checkout computes, in a process that imports nothing of another; its arrays are kept in a place."""
+    place.mkdir()
     if not (folder / "lqrsim" / "__init__.py").is_file():
         raise SystemExit(f"checkout: got {folder}, want a folder with lqrsim/ in it")
     with tempfile.TemporaryDirectory() as cache:
-        code = f"import json, runpy; compute = runpy.run_path({__file__!r})['compute']"
-        code += f"; print(json.dumps(compute({config.queries}, {config.trials})))"
+        code = f"import json, lqrsim, runpy; compute = runpy.run_path({__file__!r})['compute']"
+        code += f"; print(json.dumps([lqrsim.__file__, compute({config.queries}, {config.trials}, {str(place)!r})]))"
         environment = {**os.environ, "LQRSIM_CACHE_DIR": cache, "PYTHONPATH": str(folder.resolve())}
-        done = subprocess.run([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, check=False)
+        # -P: or the folder that this runs in would come before the checkout.
+        done = subprocess.run([sys.executable, "-P", "-c", code], env=environment, stdout=subprocess.PIPE, check=False)
     if done.returncode:
         raise SystemExit(f"checkout: {folder} failed with exit code {done.returncode}")
-    return json.loads(done.stdout.splitlines()[-1])
+    used, found = json.loads(done.stdout.splitlines()[-1])
+    if not Path(used).resolve().is_relative_to(folder.resolve()):
+        raise SystemExit(f"checkout: {folder} was not used, but {used}")
+    return found
 
 
-def compute(queries: int, trials: int) -> dict[str, list[Any]]:
-    """Of each kind of result one line each; only names that `lqrsim` itself offers are used."""
+def compute(queries: int, trials: int, place: str) -> dict[str, list[Any]]:
+    """Of each kind of result one entry each; only names that `lqrsim` itself offers are used."""
     scenario, drive = ls.scenarios.quadrotor, ls.scenarios.differential_drive()
     soft = [scenario(query=query).problem for query in range(queries)]
     free = [replace(problem, control_limits=(-np.inf, np.inf)) for problem in soft]
     starts = [(problem, problem.start) for problem in soft]
     fixed = [replace(problem, initial=ls.FixedState(start)) for problem, start in starts if start is not None]
     paper = scenario().paper_start
+    some = fixed[: max(queries // 10, 1)]
+    world, radius = scenario().scene.world, scenario().robot.radius
+    clear = [replace(one, constraints=[ls.Clearance(world, radius=radius)]) for one in some]
+    tight = [replace(one, control_limits=(0.9, 1.6)) for one in some]
+    shaken = ls.Noise(np.vstack([np.zeros((3, 2)), 0.01 * np.eye(9)[:, :2]]))
     solved = {
         "paper": ls.smooth_many(free, start=paper, stop="cost"),
         "primal": ls.smooth_many(free, start=paper, form="primal"),
@@ -86,27 +124,70 @@ def compute(queries: int, trials: int) -> dict[str, list[Any]]:
         "search, fixed start": ls.smooth_many(fixed),
         "ilqr": ls.ilqr_many(fixed),
         "drive": [ls.smooth(drive.problem), ls.smooth(drive.problem, start=drive.paper_start), ls.ilqr(drive.problem)],
+        "clearance": ls.smooth_many(clear),
+        "limits": ls.smooth_many(tight),
+        "noise": ls.smooth_many(some, noise=shaken),
+        "risk": ls.smooth_many(some, noise=shaken, risk=1e-3),
+        "mjcf": [ls.smooth(_cart_pole(angle)) for angle in (0.5, 1.0, 2.0)],
     }
-    lines: dict[str, list[Any]] = {name: [_line(one) for one in solutions] for name, solutions in solved.items()}
+    arrays: dict[str, np.ndarray] = {}
+    lines: dict[str, list[Any]] = {name: [] for name in solved}
+    for name, solutions in solved.items():
+        for i, solution in enumerate(solutions):
+            lines[name].append(_line(solution, f"{name}/{i}", arrays))
     for name in ("differential_drive", "quadrotor"):
         sweeps = {kind: tuple(ls.preset(kind, ls.scenarios.get(name).plant())) for kind in ("light", "severe")}
         with tempfile.TemporaryDirectory() as folder:
             results = ls.run_campaign(
                 ls.Campaign(scenario=name, sweeps=sweeps, strengths=(0.5, 1.0), trials=trials), folder, workers=0
             )
-            lines[f"campaign {name}"] = [_table(vars(results.outcomes(cell))) for cell in results.campaign.cells]
+            cells = [vars(results.outcomes(cell)) for cell in results.campaign.cells]
+        lines[f"campaign {name}"] = [_table(cell, f"campaign {name}/{i}", arrays) for i, cell in enumerate(cells)]
+    np.savez(Path(place) / "arrays.npz", **arrays)  # pyright: ignore[reportArgumentType]
     return lines
 
 
-def _line(solution: ls.Solution) -> list[Any]:
-    arrays = [solution.trajectory.states, solution.trajectory.controls, solution.policy.gain, solution.policy.offset]
+_CART_POLE = """
+<mujoco>
+  <option timestep="0.01" integrator="RK4"/>
+  <worldbody><body>
+    <joint name="cart" type="slide" axis="1 0 0" damping="0.1"/><geom type="box" size=".1 .1 .05" mass="1"/>
+    <body><joint name="pole" axis="0 1 0" damping="0.01"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.6" mass=".2"/></body>
+  </body></worldbody>
+  <actuator><motor name="push" joint="cart" ctrlrange="-20 20"/></actuator>
+</mujoco>
+"""
+
+
+def _cart_pole(angle: float) -> ls.Problem:
+    """Its pole is to swing up by that angle."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cart_pole.xml"
+        path.write_text(_CART_POLE, encoding="utf-8")
+        robot = ls.MjcfRobot(ls.load_scene(path))
+    return ls.Problem(
+        dynamics=robot.dynamics, dt=0.02, steps=60, initial=ls.FixedState(np.zeros(4)),
+        stage_cost=ls.ControlCost([0.01]),
+        final_cost=ls.QuadraticCost([100.0, 100.0, 10.0, 10.0], about=[0.0, angle, 0.0, 0.0]),
+    )  # fmt: skip
+
+
+def _line(solution: ls.Solution, key: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    own = [solution.trajectory.states, solution.trajectory.controls, solution.policy.gain, solution.policy.offset]
     if solution.cost_to_go is not None:
-        arrays.append(solution.cost_to_go.hessian)
-    return [solution.status.name, len(solution.iterations), float(solution.cost).hex(), _hash(arrays)]
+        own.append(solution.cost_to_go.hessian)
+    arrays.update({f"{key}/{i}": array for i, array in enumerate(own)})
+    what = [solution.status.name, len(solution.iterations)]
+    return {"what": what, "cost": float(solution.cost), "bits": _hash(own)}
 
 
-def _table(columns: dict[str, np.ndarray]) -> list[Any]:
-    return [[name, _hash([column])] for name, column in columns.items()]
+def _table(columns: dict[str, np.ndarray], key: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """What is counted has to be the same; what is measured, nearly."""
+    measured = {name: column for name, column in columns.items() if column.dtype == np.float64}
+    arrays.update({f"{key}/{name}": column for name, column in measured.items()})
+    what = [[name, _hash([column])] for name, column in columns.items() if name not in measured]
+    return {"what": what, "cost": 0.0, "bits": _hash(list(measured.values()))}
 
 
 def _hash(arrays: Sequence[np.ndarray]) -> str:
@@ -117,11 +198,13 @@ def _hash(arrays: Sequence[np.ndarray]) -> str:
 
 
 def report(result: dict[str, Any]) -> str:
-    lines = ["same bits"]
+    exact = float(result["config"]["tolerance"]) == 0
+    lines = ["same bits" if exact else "same status, iterations and counts, and cost within the tolerance"]
     for name, count in result["compared"].items():
         different = result["different"][name]
         which = f"; different: {', '.join(map(str, different[:10]))}" if different else ""
-        lines.append(f"  {name:<28} {count - len(different)} of {count}{which}")
+        apart = f"cost {result['cost'][name]:.1e}, arrays {result['arrays'][name]:.1e}"
+        lines.append(f"  {name:<28} {count - len(different):>4} of {count:<4} {apart}{which}")
     return "\n".join(lines)
 
 

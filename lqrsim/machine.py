@@ -7,7 +7,6 @@ import os
 import platform
 import re
 from pathlib import Path
-from typing import Any
 
 
 def processors() -> int:
@@ -52,16 +51,34 @@ def _physical() -> int:
 
 
 @functools.cache
-def processor() -> str:
-    """What code is compiled for, and a hash of all that it can do; NUMBA_CPU_NAME and NUMBA_CPU_FEATURES change it.
+def instruction_set() -> tuple[str, str, str]:
+    """What code is compiled for: LLVM's triple, the name of the processor, and its features.
 
-    Where it differs, the same program gives other bits: instructions round differently, and sums are taken in another
-    order. Both the kind that is really there counts, for which NumPy and MuJoCo choose, and that which numba is told.
+    `LQRSIM_CPU_NAME` and `LQRSIM_CPU_FEATURES` replace the last two: with "generic" and "", machines of one
+    architecture run the same instructions. Of AVX-512 only vectors of 256 bits are used, which are faster here; see
+    `python experiments/benchmark_compiling.py --sections features`.
     """
     import llvmlite.binding as llvm
-    from numba.core import codegen, config, registry
 
-    target: Any = registry.cpu_target
-    triple, name, features = target.target_context.codegen().magic_tuple()
-    here = llvm.get_host_cpu_name(), codegen.get_host_cpu_features(), getattr(config, "USING_SVML", None)
+    llvm.initialize_native_target()
+    name = os.environ.get("LQRSIM_CPU_NAME", "")
+    features = os.environ.get("LQRSIM_CPU_FEATURES")
+    if features is None:
+        features = "" if name else llvm.get_host_cpu_features().flatten()
+        if "+avx512f" in features.split(","):
+            features += ",+prefer-256-bit"
+    return llvm.get_process_triple(), name or llvm.get_host_cpu_name(), features
+
+
+@functools.cache
+def processor() -> str:
+    """What code is compiled for, and a hash of all that it can do; see `instruction_set`.
+
+    Where it differs, the same program gives other bits: instructions round differently, and sums are taken in another
+    order. Both the kind that is really there counts, for which NumPy and MuJoCo choose, and that which LLVM is told.
+    """
+    import llvmlite.binding as llvm
+
+    here = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    triple, name, features = instruction_set()
     return f"{name} {hashlib.sha256(repr((triple, name, features, *here)).encode()).hexdigest()[:8]}"

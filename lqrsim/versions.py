@@ -14,7 +14,7 @@ def versions() -> dict[str, str]:
 
     Where all of them are equal, the same program gives the same bits.
     """
-    installed = versions_of("lqrsim", "numpy", "numba", "mujoco")
+    installed = versions_of("lqrsim", "numpy", "llvmlite", "mujoco")
     return {"python": platform.python_version()} | installed | {"processor": processor()}
 
 

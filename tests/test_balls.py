@@ -125,13 +125,13 @@ def test_clearance(margin: Any) -> None:
         [WORLD.distances(place) - radius - margins[t] for place, radius in zip(in_numpy(state), RADII, strict=True)]
         for t, state in enumerate(states)
     ]
-    core, model = compiled.core(problem), compiled.arguments(problem)
+    costs, constraints = compiled.costs_module(problem), compiled.arguments(problem).stage.constraints
     values = (np.empty(36),)
-    core.evaluate_constraints(3, states, controls, model.stage, values)
+    costs.evaluate_constraints(3, states, controls, constraints, values)
     np.testing.assert_allclose(values[0], np.ravel(wanted), rtol=0, atol=1e-12)
     for row in range(9):
         slope, ball, obstacle = np.zeros(9), row // 3, row % 3
-        core.slope_of_constraint(0, row, states[1], controls[0], 1, model.stage, slope)
+        costs.slope_of_constraint(0, row, states[1], controls[0], 1, constraints, slope)
         ahead, behind = (
             [WORLD.distances(in_numpy(states[1] + side * d)[ball])[obstacle] for d in 1e-6 * np.eye(6)]
             for side in (1, -1)

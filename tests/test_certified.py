@@ -10,7 +10,7 @@ from whole_problems import planar_quadrotor
 from whole_problems.claims import contradictions
 
 import lqrsim as ls
-from lqrsim.codegen import jit
+from lqrsim.codegen import compiled_module
 from lqrsim.results.solution_parts import Certificate, Iteration, Status
 from lqrsim.solvers import certify
 from lqrsim.solvers.certify import faults
@@ -216,8 +216,8 @@ def test_nothing_is_compiled_in_mid_solve() -> None:
     """The damped iterations once were, where the first solve came to need them."""
     easy = planar_quadrotor.problem((-1.2, 0.1), (1.6, 0.3), steps=150)
     ls.smooth(easy)
-    before = len(jit.compilations)
+    before = len(compiled_module.compilations)
     hard = planar_quadrotor.problem((-1.42, 0.16), (1.94, 0.04), steps=257, effort=10.0, weight=1000.0)
     solution = ls.smooth(hard)
     assert "damped" in {iteration.method for iteration in solution.iterations}
-    assert jit.compilations[before:] == []
+    assert compiled_module.compilations[before:] == []

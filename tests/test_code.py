@@ -1,4 +1,4 @@
-"""What one can take in at once: functions, what they are called with, files; and test files that stand alone."""
+"""What one can take in at once: functions, and what they are called with; and test files that stand alone."""
 
 import ast
 from collections.abc import Iterator
@@ -11,7 +11,6 @@ TESTS = Path(__file__).parent
 
 LINES_OF_A_FUNCTION = 80
 POSITIONAL_ARGUMENTS = 8
-LINES_OF_A_FILE = 399
 
 
 def files() -> Iterator[tuple[str, str]]:
@@ -56,10 +55,6 @@ def test_functions_are_short() -> None:
 
 def test_functions_take_few_arguments_by_place() -> None:
     assert {found for name, text in files() for found in many_arguments(name, text)} == set()
-
-
-def test_files_are_short() -> None:
-    assert {name for name, text in files() if len(text.splitlines()) > LINES_OF_A_FILE} == set()
 
 
 def test_what_is_over_a_limit_is_noticed() -> None:

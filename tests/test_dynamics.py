@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
 from lqrsim import rotations
-from lqrsim.codegen import jit
+from lqrsim.codegen import compiled_module
 from lqrsim.errors import Array
 from lqrsim.kernels import rotation_ratios
-from lqrsim.solvers import compiled
 
 ROBOTS = [ls.DifferentialDrive(), ls.Quadrotor()]
 
@@ -44,12 +43,12 @@ def test_jacobians_are_those_of_the_step(robot: ls.Robot, dt: float) -> None:
 @pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
 def test_the_compiled_step_is_the_plain_one(robot: ls.Robot, request: pytest.FixtureRequest) -> None:
     scenario = request.getfixturevalue(robot.name)
-    built, rng = compiled.core(scenario.problem), np.random.default_rng(1)
+    dynamics, rng = scenario.problem.dynamics, np.random.default_rng(1)
     for _ in range(20):
         x, u = random_point(robot, rng)
         n, m = len(x), len(u)
         out, jacobian = np.zeros(n), np.zeros((n, n + m))
-        built.step_jacobian(x, u, robot.dynamics.data, 0.1, np.zeros((n, n)), np.zeros((n, m)), out, jacobian)
+        dynamics.compiled.step_jacobian(x, u, dynamics.data, 0.1, out, jacobian)
         a, b, _ = robot.dynamics.linearize(x, u, 0.1)
         # The same formulas, in an order that the compiler chose: rounding.
         np.testing.assert_allclose(out, robot.dynamics.step(x, u, 0.1), rtol=0, atol=1e-13)
@@ -168,9 +167,9 @@ def test_other_parameters_compile_nothing_and_change_what_they_are_in(level: str
 def test_a_solve_with_other_parameters_uses_the_solver_there_is(differential_drive: ls.Scenario) -> None:
     problem = differential_drive.problem
     first = ls.smooth(problem, max_iterations=3)
-    before = len(jit.compilations)
+    before = len(compiled_module.compilations)
     wider = ls.smooth(replace(problem, dynamics=problem.dynamics.with_parameters(axle_length=0.3)), max_iterations=3)
-    assert len(jit.compilations) == before
+    assert len(compiled_module.compilations) == before
     fresh = ls.smooth(replace(problem, dynamics=ls.DifferentialDrive(0.3).dynamics), max_iterations=3)
     np.testing.assert_array_equal(wider.trajectory.states, fresh.trajectory.states)
     assert (wider.trajectory.states != first.trajectory.states).any()

@@ -13,7 +13,7 @@ import pytest
 from scipy.optimize import approx_fprime
 
 import lqrsim as ls
-from lqrsim.codegen import jit
+from lqrsim.codegen import compiled_module
 from lqrsim.problem.derivative_check import evaluate
 from lqrsim.results.solution_parts import Status
 
@@ -147,7 +147,7 @@ def test_derivatives_of_costs_of_every_level(name: str) -> None:
 def test_goals_masses_obstacles_and_horizons_are_data(quadrotor: ls.Scenario) -> None:
     given = quadrotor.problem
     ls.smooth(given, max_iterations=2, safeguard=False)
-    before = len(jit.compilations)
+    before = len(compiled_module.compilations)
     heavy, world = ls.Quadrotor(mass=0.7), quadrotor.scene.world
     fewer = ls.ObstacleCost(ls.World(world.obstacles[3:]), radius=0.25, sharpness=8.0, weight=2.0)
     control = ls.ControlCost([10.0] * 4, about=[heavy.hover_force] * 4)
@@ -163,7 +163,7 @@ def test_goals_masses_obstacles_and_horizons_are_data(quadrotor: ls.Scenario) ->
         )
     }
     assert len(costs) == 5
-    assert jit.compilations[before:] == []
+    assert compiled_module.compilations[before:] == []
 
 
 @numba.njit
@@ -192,7 +192,7 @@ def test_a_cost_must_name_all_that_it_depends_on() -> None:
 def test_numbers_and_plain_functions_are_data() -> None:
     """Other goals, weights, parameters, lengths, and plain functions compile nothing."""
     ls.ilqr(swing(DYNAMICS["plain"], COSTS["compiled"]))
-    before = len(jit.compilations)
+    before = len(compiled_module.compilations)
     heavy = ls.Dynamics(pendulum, level="plain", **{**FIELDS, "parameters": {**FIELDS["parameters"], "inertia": 0.03}})
     other = ls.Dynamics(lambda x, u, p: [x[1], u[0] - x[0]], level="plain", **{**FIELDS, "parameters": {}})
     goal = ls.QuadraticCost([20.0, 2.0], about=[1.0, 0.0])
@@ -205,7 +205,7 @@ def test_numbers_and_plain_functions_are_data() -> None:
         )
     }
     assert len(costs) == 3
-    assert jit.compilations[before:] == []
+    assert compiled_module.compilations[before:] == []
 
 
 @pytest.mark.parametrize("level", ["compiled here", "plain with Jacobian"])

@@ -222,11 +222,11 @@ def test_results_name_the_processor(finished: Path, drive_solution: ls.Solution)
 
 
 def test_the_processor_is_the_one_that_code_is_compiled_for() -> None:
-    """numba takes what NUMBA_CPU_NAME says, which every LLVM knows as generic."""
+    """LLVM is told what LQRSIM_CPU_NAME says; every LLVM knows "generic"."""
     program = "from lqrsim.machine import processor; print(processor())"
     told = {}
     for name in ("", "generic"):
-        environment = {**os.environ, "NUMBA_CPU_NAME": name} if name else dict(os.environ)
+        environment = {**os.environ, "LQRSIM_CPU_NAME": name} if name else dict(os.environ)
         done = subprocess.run(
             [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
         )

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from point_mass import DT, MARGIN, RADIUS, Oracle, balls, check, problem
 
 import lqrsim as ls
-from lqrsim.codegen import jit
+from lqrsim.codegen import compiled_module
 
 ACROSS = balls((0.0, -2.0, 0.5), velocity=(0.0, 2.0))  # in the middle of the way when the mass would be there
 
@@ -120,7 +120,7 @@ class TestReplanning:
         stated = problem(parked, weight=1.0)
         planner = ls.Planner(stated, ls.smooth(stated), every=DT, deadline=DT, horizon=horizon, clock=lambda: 0.0)
         seen = balls((0.0, -2.0, 0.5), velocity=(0.0, 2.0)).moved(-0.2)  # it sets off at 0.2 s
-        made, state, clearances = len(jit.compilations), np.array([-2.0, 0, 0, 0]), []
+        made, state, clearances = len(compiled_module.compilations), np.array([-2.0, 0, 0, 0]), []
         with planner:
             for step in range(20):
                 if step == 2:
@@ -134,7 +134,7 @@ class TestReplanning:
                 state = np.concatenate([state[:2] + DT * state[2:] + DT**2 / 2 * u, state[2:] + DT * u])
                 where = seen if step >= 1 else parked
                 clearances.append(float(Oracle.distances(state[None], where, (step + 1) * DT).min()) - RADIUS)
-        assert len(jit.compilations) == made
+        assert len(compiled_module.compilations) == made
         assert min(clearances) > 0
 
     def test_chances_of_collision_are_for_what_stands_still(self) -> None:

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from stochastic_lq import CONTROLS, SIZE, STATES, affine, draw, parameters_of_noise, problem_of, riccati
 
 import lqrsim as ls
-from lqrsim.codegen.jit import compilations
-from lqrsim.codegen.kernel_source import source_of
-from lqrsim.codegen.user_functions import plain_names
+from lqrsim.codegen.compiled_module import compilations
+from lqrsim.codegen.plain import plain_functions
+from lqrsim.codegen.sources import source_of
 from lqrsim.errors import InputError
 from lqrsim.kernels import noise as kernel
 from lqrsim.solvers.compiled import costs_of
@@ -124,20 +124,21 @@ def test_slopes_of_what_noise_costs(risk):
     problem = problem_of(draw(rng), noise=noise)
     term = problem.noise_term
     assert term is not None
-    names = plain_names(STATES, CONTROLS, (), {})
-    exec(f"{term.source}\n\n{source_of(kernel, **term.filled)}", names)
+    source = source_of(kernel, **term.filled).filled(noise_values=term.source, noise_slopes=term.source)
+    sizes = {"N": STATES, "M": CONTROLS, "W": STATES + CONTROLS}
+    names = plain_functions(source, sizes, ("noise_value", "noise_quadratic"))
     root, s, jacobian, c = rng.normal(size=(3, 3)), rng.normal(size=3), rng.normal(size=(3, 5)), rng.normal(size=3)
-    S, model = root @ root.T, SimpleNamespace(noise=(term.data, np.array([risk, 0.0])))
+    S, risky = root @ root.T, np.array([risk, 0.0])
 
     def ahead(z: Any) -> Any:
         return SimpleNamespace(hessian=S, gradient=s, arrived=jacobian @ z + c, jacobian=jacobian)
 
     def value(z: Any) -> float:
-        return names["noise_value"](z[:3], z[3:], model, ahead(z))
+        return names["noise_value"](z[:3], z[3:], term.data, risky, ahead(z))
 
     for z in rng.normal(size=(5, 5)):
         stage = SimpleNamespace(hessian=np.zeros((5, 5)), gradient=np.zeros(5))
-        found = names["noise_quadratic"](z[:3], z[3:], model, ahead(z), False, stage)
+        found = names["noise_quadratic"](z[:3], z[3:], term.data, risky, ahead(z), 0, stage)
         (M,) = noise.matrices(problem.dynamics, z[None, :3], z[None, 3:])
         X, slope = M.T @ S @ M, M.T @ (S @ (jacobian @ z + c) + s)
         wanted, inner = 0.5 * np.trace(X), np.eye(3) - risk * X

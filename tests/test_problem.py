@@ -17,16 +17,16 @@ def test_a_sum_of_costs_keeps_its_terms_in_order() -> None:
 def test_the_stage_model_is_the_cost_to_second_order(quadrotor: ls.Scenario) -> None:
     """Gradient by central differences of the value, step 1e-6: 1e-5 of gradients of order ten."""
     problem = quadrotor.problem
-    core, data = compiled.core(problem), compiled.arguments(problem)
+    costs, stage = compiled.costs_module(problem), compiled.arguments(problem).stage
     rng, h = np.random.default_rng(0), 1e-6
     for _ in range(20):
         z = rng.uniform(-1, 1, size=16)
         hessian, gradient = np.zeros((16, 16)), np.zeros(16)
-        value = core.stage_quadratic(z[:12], z[12:], 1, data.stage, hessian, gradient)
-        assert value == pytest.approx(core.stage_value(z[:12], z[12:], 1, data.stage), rel=1e-12)
+        value = costs.cost_quadratic(z[:12], z[12:], 1, stage, hessian, gradient)
+        assert value == pytest.approx(costs.cost_value(z[:12], z[12:], 1, stage), rel=1e-12)
         for i, unit in enumerate(np.eye(16)):
             ahead, behind = (
-                core.stage_value((z + s * h * unit)[:12], (z + s * h * unit)[12:], 1, data.stage) for s in (1, -1)
+                costs.cost_value((z + s * h * unit)[:12], (z + s * h * unit)[12:], 1, stage) for s in (1, -1)
             )
             assert gradient[i] == pytest.approx((ahead - behind) / (2 * h), abs=1e-5 * max(1, value))
         assert np.linalg.eigvalsh(hessian).min() > -1e-9 * np.abs(hessian).max()

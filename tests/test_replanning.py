@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from point_mass import RADIUS, Oracle, balls, problem
 
 import lqrsim as ls
-from lqrsim.codegen import jit
+from lqrsim.codegen import compiled_module
 from lqrsim.errors import Array
 
 STEPS, DT = 20, 0.1
@@ -108,7 +108,7 @@ class TestPreparedSolver:
 
     def test_nothing_is_compiled_after_it_is_made(self, stated: ls.Problem, solution: ls.Solution) -> None:
         """Other goals, obstacles, limits, parameters and horizons are numbers."""
-        solver, before = ls.prepare(stated), len(jit.compilations)
+        solver, before = ls.prepare(stated), len(compiled_module.compilations)
         changed = problem(balls((0.1, 0.2, 0.4), (1.0, -1.0, 0.3)), weight=2.0, goal=(1, 1, 0, 0), limit=10.0)
         found = solver.solve(solution.trajectory.states[4], solution.shifted(4), problem=changed)
         assert found.success
@@ -116,7 +116,7 @@ class TestPreparedSolver:
         left = solver.solve(solution.trajectory.states[4], shorter, after=4)
         assert left.trajectory.steps == STEPS - 4
         solver.solve(solution.trajectory.states[4], found.shifted(2), problem=changed)
-        assert len(jit.compilations) == before
+        assert len(compiled_module.compilations) == before
 
     def test_another_structure_is_refused(self, stated: ls.Problem, solver: ls.PreparedSolver, solution: Any) -> None:
         other = replace(stated, stage_cost=ls.ControlCost([0.1, 0.1]))

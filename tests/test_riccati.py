@@ -211,6 +211,6 @@ def _project(matrix: Array) -> Array:
         final_cost=ls.QuadraticCost(np.ones(3), about=np.zeros(3)),
     )
     hessian, gradient = np.zeros((4, 4)), np.zeros(4)
-    core, data = compiled.core(problem), compiled.arguments(problem)
-    core.stage_quadratic(np.zeros(3), np.zeros(1), 1, data.stage, hessian, gradient)
+    costs, stage = compiled.costs_module(problem), compiled.arguments(problem).stage
+    costs.cost_quadratic(np.zeros(3), np.zeros(1), 1, stage, hessian, gradient)
     return hessian - np.diag([0.0, 0.0, 0.0, 1.0])  # less the control cost, which is convex and added as it is

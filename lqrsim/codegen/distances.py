@@ -1,14 +1,11 @@
 """Distances to obstacles, compiled."""
 
-from functools import cache
-
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.jit import Core, compiling
-from lqrsim.codegen.kernel_source import source_of
+from lqrsim.codegen.compiled_module import CompiledModule, module_of
+from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
-from lqrsim.kernels import declarations
 from lqrsim.kernels import signed_distance as kernel
 from lqrsim.scenes.world import World
 
@@ -20,9 +17,7 @@ def signed_distance(world_seen: World, points: npt.ArrayLike) -> Array:
     flat[:, : points.shape[-1]] = points.reshape(-1, points.shape[-1])
     out = np.empty(len(flat))
     table = np.array(world_seen.table)
-    with compiling:
-        distances = _distance_core()
-    distances.nearest(len(table), len(flat), table.ravel(), flat, out)
+    _distances().nearest(len(table), len(flat), table.ravel(), flat, out)
     return out.reshape(points.shape[:-1])
 
 
@@ -33,9 +28,7 @@ def signed_distance_displaced(world_seen: World, points: Array, displaced: Array
     flat[:, :size] = points.reshape(-1, size)
     out, table = np.empty(len(flat)), np.array(world_seen.table)
     away = np.ascontiguousarray(displaced, dtype=np.float64).reshape(trials, -1)
-    with compiling:
-        distances = _distance_core()
-    distances.nearest_displaced(len(table), len(flat), count, table.ravel(), flat, away, out)
+    _distances().nearest_displaced(len(table), len(flat), count, table.ravel(), flat, away, out)
     return out.reshape(trials, count)
 
 
@@ -55,12 +48,9 @@ def distances_with_normals(world_seen: World, points: npt.ArrayLike) -> tuple[Ar
     flat, count = np.zeros((len(points), 3)), len(world_seen)
     flat[:, : points.shape[1]] = points
     out, normals = np.empty(len(flat) * count), np.empty((len(flat) * count, 3))
-    with compiling:
-        distances = _distance_core()
-    distances.each_with_normal(count, len(flat), np.array(world_seen.table).ravel(), flat, out, normals)
+    _distances().each_with_normal(count, len(flat), np.array(world_seen.table).ravel(), flat, out, normals)
     return out.reshape(-1, count), normals.reshape(len(flat), count, 3)[..., : points.shape[1]]
 
 
-@cache
-def _distance_core() -> Core:
-    return Core(source_of(kernel), {"ROW": declarations.ROW}, "distances to obstacles")
+def _distances() -> CompiledModule:
+    return module_of(source_of(kernel), "distances to obstacles")

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lqrsim.codegen.jit import in_c_order
+from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.collision_chance import Surroundings
 from lqrsim.control.controllers import Control, Controller
 from lqrsim.control.kalman import check_observable, kalman_filter
@@ -26,7 +26,7 @@ from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of,
 from lqrsim.control.uncertainty import PerEntry, Uncertainty, per_entry
 from lqrsim.errors import Array, InputError, check_flag, check_kind, check_number
 from lqrsim.kernels.estimation import FAR
-from lqrsim.kernels.records import Limits, Policy
+from lqrsim.kernels.records import Limits, Measured, Policy
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
@@ -220,7 +220,7 @@ class OffsetFree(Controller):
         parts = (self.gain, self.offset, self.nominal, self.filter.gain, model.output, model.transition, limits)
         numbers = np.array([model.plan.dt, self.uncertainty.lag, self.uncertainty.latency, self.uncertainty.delay])
         moved = model.dynamics.fixed or np.array(list(model.dynamics.parameters.values()), dtype=np.float64)
-        sources = model.dynamics.source, moved, model.sensor.source, model.sensor.data
+        sources = model.dynamics.step_source.digest, moved, model.sensor.source.digest, model.sensor.data
         again = (
             ()
             if self._again is None
@@ -274,23 +274,23 @@ class _Run:
         """What is shown at a step, after the period before."""
         if step < self.latency:  # there is nothing new
             return
-        law, core = self.law, self.model.core
+        law, model = self.law, self.model
         if step > self.latency:
             self._predict(self.estimates, self.commands.pop(0))
         # After the horizon the last gain stays in force.
         knot = min(step - self.first - self.latency, law.model.plan.steps)
         lost = (shown == self.last).all(axis=1).astype(np.float64)
         self.last[:] = shown
-        core.correct(
-            self.trials, in_c_order(shown), lost, in_c_order(law.model.plan.states[knot]), law.filter.gain[knot],
-            self.model.sensor.data, self.estimates, self.differences,
+        model.compiled.correct(
+            self.trials, Measured(in_c_order(shown), lost), in_c_order(model.plan.states[knot]), law.filter.gain[knot],
+            model.compiled_sensor, model.turning, self.estimates, self.differences,
         )  # fmt: skip
         at = step - self.latency
         if at < len(self.estimated):  # which is empty if nothing is recorded
             self.estimated[at], self.surprises[at] = self.estimates, self.differences
 
     def command(self, step: int) -> Array:
-        law, core = self.law, self.model.core
+        law, model = self.law, self.model
         ahead = self.estimates
         if self.commands:
             ahead = ahead.copy()
@@ -299,7 +299,8 @@ class _Run:
         t = min(step - self.first + self.delay, law.model.plan.steps - 1)
         out = np.empty((self.trials, self.model.m))
         near = in_c_order(law.model.plan.states[t])
-        core.command(self.trials, ahead, near, Policy(law.gain[t], law.offset[t]), self.limits, out)
+        gains = Policy(law.gain[t], law.offset[t])
+        model.compiled.command(self.trials, ahead, near, gains, self.limits, model.turning, out)
         self.commands.append(out.copy())
         self._look_for_lost(ahead)
         return out
@@ -307,7 +308,7 @@ class _Run:
     def _look_for_lost(self, estimates: Array) -> None:
         """Notes whose estimates are not finite, or beyond all that a robot can be."""
         places = np.empty(self.trials)
-        self.model.core.diverged(self.trials, estimates, places)
+        self.model.compiled.diverged(self.trials, estimates, places)
         for k in np.flatnonzero(places < self.model.size):
             i = int(places[k])
             what = f"is beyond {FAR:g}" if np.isfinite(estimates[k, i]) else "is not finite"
@@ -315,7 +316,7 @@ class _Run:
 
     def _predict(self, estimates: Array, commands: Array) -> None:
         """A control period on."""
-        self.model.core.predict(self.trials, in_c_order(commands), self.model.predictor, estimates)
+        self.model.compiled.predict(self.trials, in_c_order(commands), self.model.predictor, estimates)
 
 
 def for_filter(uncertainty: Uncertainty, memory: float, effort: Array, problem: Problem) -> Uncertainty:

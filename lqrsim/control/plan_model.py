@@ -10,21 +10,22 @@ the planned controls.
 """
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 
-from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order
-from lqrsim.codegen.kernel_source import source_of
-from lqrsim.control.law import turn_source
+from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
+from lqrsim.codegen.sources import source_of
+from lqrsim.control.law import turning_of
 from lqrsim.control.sensors import Sensor, sensor_of
 from lqrsim.control.uncertainty import GAIN, OFFSET, Uncertainty, Unknown, per_entry, shaping_filter
 from lqrsim.errors import Array
-from lqrsim.kernels import estimation, linear_algebra, rotation_ratios, runge_kutta
-from lqrsim.kernels.records import Predictor
+from lqrsim.kernels import estimation
+from lqrsim.kernels.records import DynamicsModel, Predictor, SensorModel, Turning
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.solution_parts import Trajectory
+from lqrsim.solvers.compiled import dynamics_model
 
 STEP = 1e-5  # of a parameter for differences, relative to its value where that is larger than 1
 
@@ -155,29 +156,37 @@ class PlanModel:
     def predictor(self) -> Predictor:
         """What takes estimates on."""
         lag = np.array([self.lag.left, self.lag.mean])
-        return Predictor(self.numbers, self.plan.dt, self.places, lag, self.transition, self.output)
+        return Predictor(self.compiled_dynamics, self.plan.dt, self.places, lag, self.transition, self.output)
 
     # Along the plan.
 
     @cached_property
-    def core(self) -> Core:
-        """Its kernels, compiled."""
-        with compiling:
-            space = self.dynamics.state_coordinates
-            sizes = {
-                "N": self.n, "M": self.m, "W": self.n + self.m, "LAG": self.lagging, "D": len(self.transition),
-                "Y": self.sensor.size, "P": len(self.parameters), "Z": self.size,
-                "V": len(self.parameters) + 2 * self.m, "NUMBERS": len(self.numbers),
-                "HELD": max(len(self.transition), 1),
-            }  # fmt: skip
-            sources = self.dynamics.source, self.sensor.source, turn_source(space.angles, space.rotation_vectors)
-            return _core(sources, tuple(sizes.items()), f"{self.dynamics.name} ({self.n} states, {self.m} controls)")
+    def compiled(self) -> CompiledModule:
+        """`kernels/estimation.py`, for these sizes."""
+        unknown = len(self.parameters)
+        source = source_of(
+            estimation, LAG=self.lagging, D=len(self.transition), Y=self.sensor.size, P=unknown, Z=self.size,
+            V=unknown + 2 * self.m, NUMBERS=len(self.compiled_dynamics.parameters), HELD=max(len(self.transition), 1),
+        )  # fmt: skip
+        what = f"a filter of {self.size} numbers ({self.n} states, {self.m} controls)"
+        return module_of(source, what, N=self.n, M=self.m, W=self.n + self.m)
 
     @cached_property
-    def numbers(self) -> Array:
-        """What the compiled dynamics take: addresses of functions, then parameters."""
-        addresses = [address_of(function) for function in self.dynamics.functions]
-        return np.array([*addresses, *self.dynamics.data], dtype=np.float64)
+    def compiled_dynamics(self) -> DynamicsModel:
+        """The dynamics as compiled code takes them."""
+        return dynamics_model(self.dynamics)
+
+    @cached_property
+    def compiled_sensor(self) -> SensorModel:
+        """The sensor likewise."""
+        module = module_of(self.sensor.source, "sensors", N=self.n, M=self.m, W=self.n + self.m)
+        measure, slope = module.addresses("measure", "measure_slope")
+        return SensorModel(measure, slope, self.sensor.data)
+
+    @cached_property
+    def turning(self) -> Turning:
+        """Which states are angles."""
+        return turning_of(self.dynamics.state_coordinates)
 
     @cached_property
     def places(self) -> Array:
@@ -191,7 +200,8 @@ class PlanModel:
         plan = self.plan
         ahead, jacobian = np.empty((plan.steps, self.n)), np.empty((plan.steps, self.n, self.n + self.m))
         states, controls = in_c_order(plan.states), in_c_order(plan.controls)
-        self.core.slopes_along(plan.steps, states, controls, self.numbers, plan.dt, ahead, jacobian)
+        dynamics = self.compiled_dynamics
+        self.compiled.slopes_along(plan.steps, states, controls, dynamics, plan.dt, ahead, jacobian)
         return jacobian
 
     @cached_property
@@ -204,8 +214,8 @@ class PlanModel:
             values = np.array([self.dynamics.parameters[name] for name in self.parameters])
             changes = STEP * np.maximum(np.abs(values), 1.0)
             states, controls = in_c_order(plan.states), in_c_order(plan.controls)
-            self.core.parameter_slopes(
-                plan.steps, states, controls, self.numbers, plan.dt, self.places, changes, slopes
+            self.compiled.parameter_slopes(
+                plan.steps, states, controls, self.compiled_dynamics, plan.dt, self.places, changes, slopes
             )
         return np.concatenate([slopes, B * plan.controls[:, None, :], B], axis=2)
 
@@ -216,7 +226,7 @@ class PlanModel:
 
     @cached_property
     def F(self) -> Array:
-        """(T, Z, Z)."""
+        """State matrices F_t, (T, Z, Z)."""
         n, a, lag = self.n, self.lagging, self.lag
         F = np.zeros((self.plan.steps, self.size, self.size))
         F[:, :n, :n] = self.jacobian[:, :, :n]
@@ -228,7 +238,7 @@ class PlanModel:
 
     @cached_property
     def G(self) -> Array:
-        """(T, Z, m)."""
+        """Input matrices G_t, (T, Z, m)."""
         n, a, lag = self.n, self.lagging, self.lag
         G = np.zeros((self.plan.steps, self.size, self.m))
         G[:, :n] = (1 - lag.mean) * self.jacobian[:, :, n:]
@@ -247,7 +257,7 @@ class PlanModel:
 
     @cached_property
     def c(self) -> Array:
-        """(T, Z)."""
+        """Drift c_t, (T, Z)."""
         n, a = self.n, self.lagging
         c = np.zeros((self.plan.steps, self.size))
         if a:
@@ -257,9 +267,9 @@ class PlanModel:
 
     @cached_property
     def H(self) -> Array:
-        """(T+1, Y, n)."""
+        """Output matrices H_t, (T+1, Y, n)."""
         H = np.empty((self.plan.steps + 1, self.sensor.size, self.n))
-        self.core.sensor_slopes(len(H), in_c_order(self.plan.states), self.sensor.data, H)
+        self.compiled.sensor_slopes(len(H), in_c_order(self.plan.states), self.compiled_sensor, H)
         return H
 
     # Noise.
@@ -305,10 +315,3 @@ def _diagonal(blocks: list[Array]) -> Array:
         whole[at : at + len(block), at : at + len(block)] = block
         at += len(block)
     return whole
-
-
-@cache
-def _core(sources: tuple[str, ...], sizes: tuple[tuple[str, int], ...], what: str) -> Core:
-    """The kernels with the sources of dynamics, sensors and `turn`."""
-    parts = [source_of(module) for module in (rotation_ratios, linear_algebra, runge_kutta)]
-    return Core("\n\n".join([*parts, *sources, source_of(estimation, FAR=estimation.FAR)]), dict(sizes), what)

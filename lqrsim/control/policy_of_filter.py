@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lqrsim.codegen.jit import in_c_order
+from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
@@ -78,8 +78,7 @@ def _expected(law: "OffsetFree") -> Array:
     """h of y = H x + h about the plan, (T+1, Y)."""
     model, plan = law.model, law.solution.trajectory
     values = np.empty((plan.steps + 1, model.sensor.size))
-    for value, state in zip(values, in_c_order(plan.states), strict=True):
-        model.core.measure(state, model.sensor.data, value)
+    model.compiled.measurements(len(values), in_c_order(plan.states), model.compiled_sensor, values)
     return values - np.einsum("tij,tj->ti", model.H, plan.states)
 
 

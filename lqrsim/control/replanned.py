@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lqrsim.codegen.jit import in_c_order
+from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.replanner import Replanner, Task
 from lqrsim.errors import Array, InputError

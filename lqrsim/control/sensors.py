@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
+from lqrsim.codegen.sources import Source, text_source
 from lqrsim.codegen.user_functions import check_signature, name_of
 from lqrsim.errors import Array, InputError, check_array, check_items, check_name, excerpt
 from lqrsim.results.coordinates import Coordinates
@@ -19,11 +20,11 @@ class Sensor(NamedTuple):
     """What is measured of a state.
 
     Attributes:
-      source: `measure(x, data, out)` and `measure_slope(x, data, out)`; see `kernels/estimation.py`.
+      source: `measure(x, data, out)` and `measure_slope(x, data, out)`; see `kernels/declarations.py`.
       data: what these take. size: Y, how many numbers there are. names: what messages call them.
     """
 
-    source: str
+    source: Source
     data: Array
     size: int
     names: tuple[str, ...]
@@ -50,7 +51,7 @@ def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
         source = "def measure(x, data, out):\n" + "".join(f"    out[{i}] = x[{j}]\n" for i, j in enumerate(chosen))
         source += "def measure_slope(x, data, out):\n"
         source += "".join(f"    out[{i}, {j}] = 1.0\n" for i, j in enumerate(chosen))
-        return Sensor(source, np.zeros(1), len(names), names)
+        return Sensor(text_source(source, "sensors"), np.zeros(1), len(names), names)
     matrix = check_array("sensors", listed, (None, len(space)))
     if not len(matrix):
         raise InputError("sensors: got no rows, want a matrix with one for each number that is measured")
@@ -59,7 +60,9 @@ def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
     source += "        for j in range(N):\n            out[i] += data[N * i + j] * x[j]\n"
     source += f"def measure_slope(x, data, out):\n    for i in range({rows}):\n        for j in range(N):\n"
     source += "            out[i, j] = data[N * i + j]\n"
-    return Sensor(source, matrix.ravel().copy(), rows, tuple(f"row {i} of sensors" for i in range(rows)))
+    return Sensor(
+        text_source(source, "sensors"), matrix.ravel().copy(), rows, tuple(f"row {i} of sensors" for i in range(rows))
+    )
 
 
 def _symbolic(function: Callable[[Any, Any, Any], Any], states: int) -> Sensor:
@@ -78,4 +81,4 @@ def _symbolic(function: Callable[[Any, Any, Any], Any], states: int) -> Sensor:
 
     made = symbolic.kept(function, ("sensor", states), make)
     size = int(made["size"])
-    return Sensor(str(made["source"]), np.zeros(1), size, tuple(f"{of}[{i}]" for i in range(size)))
+    return Sensor(text_source(str(made["source"]), of), np.zeros(1), size, tuple(f"{of}[{i}]" for i in range(size)))

@@ -1,1 +1,1 @@
-"""All that is compiled, in the numba subset of Python; read `declarations.py` first."""
+"""All that is compiled, in a subset of Python that `codegen/language.py` writes down; read `declarations.py` first."""

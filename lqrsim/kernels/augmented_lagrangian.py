@@ -1,4 +1,4 @@
-"""The augmented Lagrangian: what is added to the cost for constraints. The numba subset; see `declarations.py`.
+"""The augmented Lagrangian: what is added to the cost for constraints. The kernels' subset.
 
 For inequalities d >= 0, with multipliers lambda >= 0 and a penalty mu, it is
 
@@ -11,7 +11,7 @@ and for equalities d = 0, with multipliers of either sign, the same without the 
 At the optimum the multipliers are the forces `max(0, lambda - mu d)` and `lambda - mu d`. For inequalities d is what a
 constraint has to spare beyond the tolerance to which it is solved, so that what is within the tolerance keeps the
 constraint itself. Of the curvature only `mu n n'` is taken, n the slope of d: the rest can be negative.
-`solvers/compiled.py` makes these functions for each constraint.
+These functions are compiled with each constraint.
 
 `multipliers` is one array a constraint: mu, how many numbers there are at a step, the first step at which they act, the
 tolerance that is to be left to spare, and from HEADER on lambda, step by step. With mu of zero there is nothing.
@@ -19,9 +19,7 @@ tolerance that is to be left to spare, and from HEADER on lambda, step by step. 
 
 from math import inf
 
-from lqrsim.kernels.declarations import HEADER, W, constraint_slope, constraint_value, stack
-
-EQUALITY = False  # whether the constraint's numbers are to be zero
+from lqrsim.kernels.declarations import EQUALITY, HEADER, W, constraint_slope, constraint_value, stack
 
 
 def augment(x, u, t, data, multipliers, hessian, gradient):
@@ -60,6 +58,11 @@ def augmentation(x, u, t, data, multipliers):
                 total += force * force
         total /= 2 * penalty
     return total
+
+
+def add_slope(x, u, t, row, data, gradient):
+    """Add the gradient (W,) of one of a constraint's numbers."""
+    constraint_slope(x, u, t, row, data, gradient)
 
 
 def constraint_values(x, u, t, acts, data, multipliers, values):

@@ -1,4 +1,4 @@
-"""The distance of each ball of a robot to each obstacle, less what there must be of it. The numba subset.
+"""The distance of each ball of a robot to each obstacle, less what there must be of it. The kernels' subset.
 
 `data` has what `places` reads, and from AT on for how many steps there are margins, of which the last hold from there
 on, how many at a step, of which row r has number r modulo that, how many obstacles there are, and at how many steps

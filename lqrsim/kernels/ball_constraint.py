@@ -1,7 +1,6 @@
-"""A constraint whose numbers share the places of balls: these are worked out once a step. The numba subset.
+"""A constraint whose numbers share the places of balls: these are worked out once a step. The kernels' subset.
 
-What a constraint is evaluated by, as `augmented_lagrangian.py` has it, is made of the same for the places: its
-functions get these and their derivatives in place of the state and the control. `solvers/compiled.py` puts in names.
+The constraint's own functions get these and their derivatives in place of the state and the control.
 """
 
 from lqrsim.kernels.augmented_lagrangian import augment as augment_places
@@ -42,7 +41,7 @@ def constraint_values(x, u, t, acts, data, multipliers, values):
     values_of_places(at, u, t, acts, data, multipliers, values)
 
 
-def constraint_slope(x, u, t, row, data, gradient):
+def add_slope(x, u, t, row, data, gradient):
     """Add the gradient (W,) of one of them."""
     at, moves = stack(PLACES), stack(PLACES, N)
     clear(moves, PLACES, N)

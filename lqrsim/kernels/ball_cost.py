@@ -1,4 +1,4 @@
-"""The cost of obstacles for a robot of several balls: that of `obstacle_cost.py`, of each ball. The numba subset.
+"""The cost of obstacles for a robot of several balls: that of `obstacle_cost.py`, of each ball. The kernels' subset.
 
 `data` has what `places` reads, and from AT on the sharpness, the weight, how many obstacles there are and at how many
 steps they are told, of which the last holds from there on; the radius of each ball, and for each step the ROW numbers

@@ -1,4 +1,4 @@
-"""What a plan really is, worked out from the problem by a short path of its own. The numba subset.
+"""What a plan really is, worked out from the problem by a short path of its own. The kernels' subset.
 
 Nothing of the passes, rollouts and line searches that found the plan is used: only the problem's own functions, their
 derivatives, and a Cholesky factor. `certify.py` compares with what a solver claims.
@@ -11,18 +11,11 @@ from lqrsim.kernels.declarations import (
     M,
     N,
     W,
-    final_quadratic,
-    final_value,
-    initial_quadratic,
-    initial_value,
-    noise_quadratic,
     stack,
-    stage_quadratic,
-    stage_value,
 )
-from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, clear
-from lqrsim.kernels.records import Ahead, Limits, Slopes, Stage, Step
-from lqrsim.kernels.runge_kutta import step_jacobian
+from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve
+from lqrsim.kernels.model_functions import cost_quadratic, cost_value, noise_quadratic, step_jacobian
+from lqrsim.kernels.records import Ahead, Limits, Stage, Step
 
 
 def certify(settings, own, plan, policy, to_go, model, found):
@@ -41,11 +34,9 @@ def certify(settings, own, plan, policy, to_go, model, found):
     that cannot. The cost includes no augmented Lagrangian, the decrease does.
     """
     stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
-    slopes, room = Slopes(stack(N, N), stack(N, M), stack(N)), Limits(stack(M), stack(M))
+    arrived, room = stack(N), Limits(stack(M), stack(M))
     none, costate, size, beyond = stack(M), stack(N), stack(N), stack(N)
     states, steps, hessians, nowhere = plan.states, settings.steps, to_go.hessian, stack(N)
-    clear(slopes.state, N, N)
-    clear(slopes.control, N, M)
     law, limits, decrease = 0.0, 0.0, 0.0
     for i in range(M):
         none[i] = 0.0
@@ -53,8 +44,8 @@ def certify(settings, own, plan, policy, to_go, model, found):
         size[i], beyond[i], nowhere[i] = 1.0, 0.0, 0.0
         for t in range(steps + 1):
             size[i] = max(size[i], abs(states[t, i]))
-    cost = final_value(states[steps], none, steps, model.final)
-    final_quadratic(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
+    cost = cost_value(states[steps], none, steps, model.final)
+    cost_quadratic(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
     scale = scale_of(states[steps], none, stage)
     for i in range(N):
         costate[i] = stage.gradient[i]
@@ -63,20 +54,20 @@ def certify(settings, own, plan, policy, to_go, model, found):
                 hessians[steps, i, j] = stage.hessian[i, j]
     for t in range(steps - 1, -1, -1):
         x, u = states[t], plan.controls[t]
-        cost += stage_value(x, u, t, model.stage)
-        step_jacobian(x, u, model.parameters, model.dt, slopes.state, slopes.control, slopes.arrived, step.jacobian)
-        stage_quadratic(x, u, t, model.stage, stage.hessian, stage.gradient)
+        cost += cost_value(x, u, t, model.stage)
+        step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
+        cost_quadratic(x, u, t, model.stage, stage.hessian, stage.gradient)
         if NOISY:  # of the policy as it is, the slope ahead is the costate
             slope = Ahead(
                 step.jacobian,
-                nowhere if own else slopes.arrived,
+                nowhere if own else arrived,
                 hessians[t + 1],
                 costate if own else to_go.gradient[t + 1],
             )
-            cost += noise_quadratic(x, u, model, slope, False, stage)
+            cost += noise_quadratic(x, u, model.noise, slope, False, stage)
         scale += scale_of(x, u, stage)
         for i in range(N):
-            difference = abs(states[t + 1, i] - slopes.arrived[i])
+            difference = abs(states[t + 1, i] - arrived[i])
             if not difference <= beyond[i]:  # a NaN stays
                 beyond[i] = difference
         for i in range(M):
@@ -87,8 +78,8 @@ def certify(settings, own, plan, policy, to_go, model, found):
         if own:
             closed_loop_hessian(step.jacobian, stage.hessian, policy.gain[t], room, hessians[t + 1], hessians[t])
     if not settings.fixed:
-        cost += initial_value(states[0], none, 0, model.initial)
-        initial_quadratic(states[0], none, 0, model.initial, stage.hessian, stage.gradient)
+        cost += cost_value(states[0], none, 0, model.initial)
+        cost_quadratic(states[0], none, 0, model.initial, stage.hessian, stage.gradient)
         scale += scale_of(states[0], none, stage)
         decrease += promised_of_start(stage, hessians[0], costate)
     motion = 0.0

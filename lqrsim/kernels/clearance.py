@@ -1,4 +1,4 @@
-"""The distance to each obstacle, less what there must be of it. The numba subset; see `declarations.py`.
+"""The distance to each obstacle, less what there must be of it. The kernels' subset.
 
 `data` has for how many steps there are least distances, of which the last hold from there on, and for how many
 obstacles, of which one holds for all; how many obstacles there are, and at how many steps they are told, of which the

@@ -1,4 +1,4 @@
-"""Limits of the controls. The numba subset; see `declarations.py`.
+"""Limits of the controls. The kernels' subset.
 
 A control that stands at a limit and would go beyond it is *fixed*: a constant in step and cost, with no gain.
 The backward pass finds out which controls are, by minimising within the limits where the state is expected to be; the

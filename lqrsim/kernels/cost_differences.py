@@ -1,4 +1,4 @@
-"""Derivatives of a cost by central differences, where there are none. The numba subset; see `declarations.py`.
+"""Derivatives of a cost by central differences, where there are none. The kernels' subset.
 
 The step is the fourth root of the machine's precision, as a second derivative wants it.
 """

@@ -1,4 +1,4 @@
-"""The dual form: the cost-to-come by its moments, as a Kalman filter whose noise is the control. The numba subset.
+"""The dual form: the cost-to-come by its moments, as a Kalman filter whose noise is the control. The kernels' subset.
 
 `1/2 (x - mean)' covariance^-1 (x - mean) + constant` is the cost-to-come. The covariance may be singular, and is
 zero at a fixed start; neither the inverse dynamics nor an invertible A is needed. In the backward pass the costate, the
@@ -11,10 +11,10 @@ h.
 
 from math import sqrt
 
-from lqrsim.kernels.declarations import M, N, stack
+from lqrsim.kernels.declarations import M, N, inline, stack
 from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, offset, within
+from lqrsim.kernels.model_functions import step_jacobian
 from lqrsim.kernels.records import Reduced
-from lqrsim.kernels.runge_kutta import step_jacobian
 
 
 def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
@@ -69,13 +69,13 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
     return constant, True
 
 
-def linearize(x, u, model, slopes, step):
+def linearize(x, u, model, arrived, step):
     """Write where (x, u) leads, and the step linearised there: x_next = jacobian (x, u) + offset."""
-    step_jacobian(x, u, model.parameters, model.dt, slopes.state, slopes.control, slopes.arrived, step.jacobian)
-    offset(step.jacobian, x, u, slopes.arrived, step.offset)
+    step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
+    offset(step.jacobian, x, u, arrived, step.offset)
 
 
-def forward_jacobian(x, u, model, slopes, step, spare):
+def forward_jacobian(x, u, model, arrived, step, spare):
     """The Jacobian (N, W) of the step forwards, which this form has anyway."""
     return step.jacobian
 
@@ -148,6 +148,7 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
     return True
 
 
+@inline
 def eliminate_control(step, stage, reduced):
     """Write a step and its stage without the control; see `Reduced`.
 
@@ -184,6 +185,7 @@ def eliminate_control(step, stage, reduced):
     return True, crossed
 
 
+@inline
 def control_response(reduced, G, updated, crossed, gain, feedforward):
     """Write the control at t as a function of the costate at t + 1."""
     F, h, BT = reduced.F, reduced.h, reduced.BT

@@ -1,4 +1,4 @@
-"""The primal form, the paper's: the cost-to-come as a quadratic, along the dynamics run backwards. The numba subset.
+"""The primal form, the paper's: the cost-to-come as a quadratic, along the dynamics run backwards. The kernels' subset.
 
 `cost_to_come_dual.py` has functions of the same names; `passes.py` is written against either. Paper: Eqs. (14)-(21).
 """
@@ -15,7 +15,7 @@ from lqrsim.kernels.linear_algebra import (
     quadratic_at,
     within,
 )
-from lqrsim.kernels.runge_kutta import advance, step_jacobian
+from lqrsim.kernels.model_functions import advance, step_jacobian
 
 
 def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
@@ -27,20 +27,18 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
     return constant, True
 
 
-def linearize(x, u, model, slopes, step):
+def linearize(x, u, model, arrived, step):
     """Write where (x, u) leads, and the inverse step linearised there: x = jacobian (x_next, u) + offset."""
     x_back = stack(N)
-    advance(x, u, model.parameters, model.dt, slopes.arrived)
-    step_jacobian(
-        slopes.arrived, u, model.parameters, -model.dt, slopes.state, slopes.control, x_back, step.jacobian
-    )  # fmt: skip
-    offset(step.jacobian, slopes.arrived, u, x_back, step.offset)
+    advance(x, u, model, model.dt, arrived)
+    step_jacobian(arrived, u, model, -model.dt, x_back, step.jacobian)
+    offset(step.jacobian, arrived, u, x_back, step.offset)
 
 
-def forward_jacobian(x, u, model, slopes, step, spare):
+def forward_jacobian(x, u, model, arrived, step, spare):
     """The Jacobian (N, W) of the step forwards, which is worked out where there is a risk."""
-    if NOISY and model.noise[1][0] != 0:
-        step_jacobian(x, u, model.parameters, model.dt, slopes.state, slopes.control, slopes.arrived, spare)
+    if NOISY and model.noise.risk[0] != 0:
+        step_jacobian(x, u, model, model.dt, arrived, spare)
     return spare
 
 
@@ -110,4 +108,4 @@ def backtrack(t, x_hat, costate, smoothing, model, x, u):
     """Write the state and control (x, u) that lead to x_hat = x_{t+1}: the inverse policy, then the inverse step."""
     affine(smoothing.control_gain[t], smoothing.control[t], x_hat, u)
     within(u, model.limits)
-    advance(x_hat, u, model.parameters, -model.dt, x)
+    advance(x_hat, u, model, -model.dt, x)

@@ -1,4 +1,4 @@
-"""The cost-to-go: a step of the Riccati recursion, from t + 1 to t. The numba subset; see `declarations.py`.
+"""The cost-to-go: a step of the Riccati recursion, from t + 1 to t. The kernels' subset.
 
 Paper: Eqs. (9)-(13), in discrete time.
 """

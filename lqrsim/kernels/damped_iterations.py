@@ -1,4 +1,4 @@
-"""The safeguard: LQR smoothing held near the best plan so far, for when it fails on its own. The numba subset.
+"""The safeguard: LQR smoothing held near the best plan so far, for when it fails on its own. The kernels' subset.
 
 Rollouts on the way to an optimum can be worse than the first one by any factor, so a rising cost does not tell that the
 method will fail. It is left alone until a pass fails or the least cost so far no longer falls; see `no_progress`. What

@@ -1,18 +1,19 @@
-"""What a compiled core knows about its problem: the names that the kernels are written against.
+"""The names that kernels are written against, and that mean something only when they are compiled.
 
-The modules of the numba subset, with one of `cost_to_come_dual.py` and `cost_to_come_primal.py`, and the sources that
-dynamics and costs write are joined into one text for each structure (see `solvers/compiled.py`), with these sizes as
-constants and these functions filled in. This module only declares them, so that each of those files can be read, linted
-and type-checked on its own.
+Sizes become constants; words of the language are what `codegen/language.py` says; functions are filled in, by what the
+form of the cost-to-come, dynamics, constraints and noise bring (see `codegen/sources.py`). This module only declares
+them, so that each kernel can be read, linted and type-checked on its own.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 
 N = 0  # states
 M = 0  # controls
 W = N + M  # a state and a control, joined
-K = 0  # of these, how many entries a cost is not convex in
-NOISY = 0  # 1 for a problem with noise: what `if NOISY` guards is not in the cores of others
+NOISY = 0  # 1 for a problem with noise: what `if NOISY` guards is not compiled for others
+EQUALITY = 0  # 1 for a constraint whose numbers are to be zero
 
 # How iterations end; see `Status`. Of those without a status of their own, NO_START is a first trajectory that is not
 # finite, STALLED a line search that found no lower cost, CYCLING that the same costs come again and again, and
@@ -39,20 +40,36 @@ SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
 PATIENCE = 50
 
 
+# Words of the language; see `codegen/language.py`.
+
+
 def stack(*shape: int) -> np.ndarray:
     """An uninitialised float64 array of constant shape, on the stack of the compiled function."""
     return np.empty(shape)
 
 
-def invoke(address, x, u, data, out) -> None:
-    """Call the user's function at an address: it writes what it returns."""
+def inline(function: Callable) -> Callable:
+    """Decorates a kernel that becomes part of its callers. LLVM finds most of what is worth it by itself."""
+    return function
 
 
-def invoke_writing(address, x, u, data, first, second) -> None:
-    """Call the user's function at an address that writes to two arrays, which it gets as they are."""
+def outline(function: Callable) -> Callable:
+    """Decorates a kernel that stays a function of its own, called for one thing after the other.
+
+    In a loop LLVM might work on several at once, and for the last few round otherwise: then the bits of a trial would
+    depend on how many there are.
+    """
+    return function
 
 
-# Memory and functions of a C library; see `codegen/foreign.py`.
+def call(function, *arguments) -> None:
+    """Call the C function at an address with arrays, by their addresses, floats, ints of 64 bits, and `int32`; records
+    are taken apart."""
+
+
+def call_for_value(function, *arguments) -> float:
+    """The same for one that returns a float."""
+    return 0.0
 
 
 def at(address):
@@ -65,16 +82,9 @@ def rows_at(address, width: int):
     return np.empty((0, width))
 
 
-def call(function, first, second) -> None:
-    """Call the C function at an address with two pointers."""
-
-
-def call_with_two(function, first, second, third: int, fourth: int) -> None:
-    """Call the C function at an address with two pointers and two ints."""
-
-
-def call_alone(function) -> None:
-    """Call the C function at an address that takes nothing."""
+def int32(number: int) -> int:
+    """An int of 32 bits, to call a C function with."""
+    return number
 
 
 def claim(flags, index) -> int:
@@ -96,32 +106,15 @@ def fetch_add(words, index, value: int) -> int:
     return 0
 
 
+# What dynamics, constraints, balls, noise and sensors bring.
+
+
 def rate(x, u, p, out) -> None:
     """Write xdot = f(x, u), (N,)."""
 
 
 def rate_jacobian(x, u, p, out, fx, fu) -> None:
     """Write f (N,), and the entries of df/dx (N, N) and df/du (N, M) that are not zero everywhere."""
-
-
-def stage_value(x, u, t, data) -> float:
-    """The stage cost c(x, u, t)."""
-    return 0.0
-
-
-def stage_quadratic(x, u, t, data, hessian, gradient) -> float:
-    """Write the projected Hessian (W, W) and the gradient (W,) of the stage cost at (x, u); return its value."""
-    return 0.0
-
-
-def stage_added(x, u, t, data) -> float:
-    """What the augmented Lagrangian adds to the stage cost for constraints."""
-    return 0.0
-
-
-def final_added(x, u, t, data) -> float:
-    """What it adds to the final cost."""
-    return 0.0
 
 
 def constraint_value(x, u, t, row, data) -> float:
@@ -141,26 +134,6 @@ def places_jacobian(x, data, out, slopes) -> None:
     """Write these, and those of their derivatives in the states (..., N) that are not zero everywhere."""
 
 
-def initial_value(x, u, t, data) -> float:
-    """The initial cost c_0(x)."""
-    return 0.0
-
-
-def initial_quadratic(x, u, t, data, hessian, gradient) -> float:
-    """As `stage_quadratic`, of the initial cost."""
-    return 0.0
-
-
-def final_value(x, u, t, data) -> float:
-    """The final cost c_l(x)."""
-    return 0.0
-
-
-def final_quadratic(x, u, t, data, hessian, gradient) -> float:
-    """As `stage_quadratic`, of the final cost."""
-    return 0.0
-
-
 def noise_values(x, u, data, out) -> None:
     """Write M(x, u), the rows of it that `noise.py` takes."""
 
@@ -169,14 +142,12 @@ def noise_slopes(x, u, data, out, slopes) -> None:
     """Write these, and their derivatives, column by column, in the entries of (x, u) that `noise.py` takes."""
 
 
-def noise_value(x, u, model, ahead) -> float:
-    """What noise is expected to cost at (x, u); see `noise.py`."""
-    return 0.0
+def measure(x, data, out) -> None:
+    """Write what the sensors say of a state, (Y,)."""
 
 
-def noise_quadratic(x, u, model, ahead, convex, stage) -> float:
-    """The same, and its quadratic model added to the stage."""
-    return 0.0
+def measure_slope(x, data, out) -> None:
+    """Write those entries of its Jacobian (Y, N) that are not zero everywhere, to zeros."""
 
 
 # What the form of the cost-to-come brings; see `cost_to_come_dual.py`, `cost_to_come_primal.py` and `records.py`.
@@ -187,11 +158,11 @@ def initial_cost_to_come(Q, q, constant, x, to_go, to_come) -> tuple[float, bool
     return 0.0, True
 
 
-def linearize(x, u, model, slopes, step) -> None:
+def linearize(x, u, model, arrived, step) -> None:
     """Write where (x, u) leads, and the linearised step that `riccati_forward` takes."""
 
 
-def forward_jacobian(x, u, model, slopes, step, spare):
+def forward_jacobian(x, u, model, arrived, step, spare):
     """The Jacobian (N, W) of the step forwards, after `linearize`; `spare` may be written to."""
     return step.jacobian
 

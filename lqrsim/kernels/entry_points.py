@@ -1,4 +1,4 @@
-"""What Python calls: one function a solver. The numba subset; see `declarations.py`.
+"""What Python calls: one function a solver, and what is wanted on its own. The kernels' subset.
 
 All that a solve can need is compiled at once, before it begins, and what its parts share is compiled once.
 """
@@ -7,6 +7,8 @@ from lqrsim.kernels.certificate import certify
 from lqrsim.kernels.damped_iterations import damped_iterations
 from lqrsim.kernels.declarations import CERTIFY, DAMP, EVALUATE
 from lqrsim.kernels.iterations import ilqr_iterations, smoother_iterations
+from lqrsim.kernels.passes import opening_pass as opening_pass
+from lqrsim.kernels.rollouts import rollout as rollout
 
 
 def smoother(task, first, last, settings, model, work, memory, log):

@@ -1,4 +1,4 @@
-"""A Kalman filter's steps for many trials at once, and slopes along a plan. The numba subset; see `declarations.py`.
+"""A Kalman filter's steps for many trials at once, and slopes along a plan. The kernels' subset.
 
 An estimate is one row: the state x (N), what the actuators have reached (LAG: M numbers, or none), and the states of
 the unknowns (D). The unknowns' values, `output` times these, are of so many parameters of the dynamics (P), and the
@@ -7,138 +7,141 @@ gain and the offset of each control.
 
 from math import nan
 
-from lqrsim.kernels.declarations import M, N, stack
+from lqrsim.kernels.declarations import M, N, call, outline, stack
 from lqrsim.kernels.policy_evaluation import turn
-from lqrsim.kernels.runge_kutta import advance, step_jacobian
 
-LAG, D, Y = 0, 1, 1  # lagging actuators, states of unknowns, measured numbers; each core has its own
+LAG, D, Y = 0, 1, 1  # lagging actuators, states of unknowns, measured numbers
 P, Z, V = 1, 1, 1  # unknown parameters; N + LAG + D; P + 2 M
 NUMBERS, HELD = 1, 1  # that the dynamics have; D, and at least 1
 FAR = 1e9  # of an estimate, in its unit: nothing of a robot is
 
 
-def measure(x, data, out) -> None:
-    """Write what the sensors say of a state, (Y,); each system's is written for it."""
-
-
-def measure_slope(x, data, out) -> None:
-    """Write its Jacobian, (Y, N)."""
-
-
-# The numba subset.
-
-
-def sensor_slopes(count, states, data, out) -> None:
+def sensor_slopes(count, states, sensor, out) -> None:
     """Write the Jacobians of the sensors at states (count, N): (count, Y, N)."""
     for t in range(count):
         for i in range(Y):
             for j in range(N):
                 out[t, i, j] = 0.0
-        measure_slope(states[t], data, out[t])
+        call(sensor.slope, states[t], sensor.data, out[t])
 
 
-def slopes_along(steps, states, controls, p, dt, ahead, jacobian) -> None:
+def measurements(count, states, sensor, out) -> None:
+    """Write what the sensors say at states (count, N): (count, Y)."""
+    for t in range(count):
+        call(sensor.measure, states[t], sensor.data, out[t])
+
+
+def slopes_along(steps, states, controls, dynamics, dt, ahead, jacobian) -> None:
     """Write where each step of a plan leads, (steps, N), and its Jacobian [A B], (steps, N, W)."""
-    fx, fu = stack(N, N), stack(N, M)
-    for i in range(N):
-        for j in range(N):
-            fx[i, j] = 0.0
-        for j in range(M):
-            fu[i, j] = 0.0
     for t in range(steps):
-        step_jacobian(states[t], controls[t], p, dt, fx, fu, ahead[t], jacobian[t])
+        call(dynamics.step_jacobian, states[t], controls[t], dynamics.parameters, dt, ahead[t], jacobian[t])
 
 
-def parameter_slopes(steps, states, controls, p, dt, which, changes, slopes) -> None:
+def parameter_slopes(steps, states, controls, dynamics, dt, which, changes, slopes) -> None:
     """Write how the steps of a plan depend on parameters, (steps, N, P), by central differences."""
-    q, more, less = stack(NUMBERS), stack(N), stack(N)
+    p, q, more, less = dynamics.parameters, stack(NUMBERS), stack(N), stack(N)
     for i in range(NUMBERS):
         q[i] = p[i]
     for j in range(P):
         k, h = int(which[j]), changes[j]
         for t in range(steps):
             q[k] = p[k] + h
-            advance(states[t], controls[t], q, dt, more)
+            call(dynamics.advance, states[t], controls[t], q, dt, more)
             q[k] = p[k] - h
-            advance(states[t], controls[t], q, dt, less)
+            call(dynamics.advance, states[t], controls[t], q, dt, less)
             for i in range(N):
                 slopes[t, i, j] = (more[i] - less[i]) / (2.0 * h)
         q[k] = p[k]
 
 
-def correct(count, shown, lost, near, gain, data, estimates, innovations) -> None:
-    """Take a measurement into the estimates (count, Z), but where it was lost: lost (count,) is 1 there.
+def correct(count, measured, near, gain, sensor, turning, estimates, innovations) -> None:
+    """Take a measurement into the estimates (count, Z), but where it was lost.
 
     The states that are shown (count, N) are taken to the representatives nearest to the estimates, and these nearest to
     `near` (N,). Writes what measurements differ by from what was expected, (count, Y); NaN where they were lost.
     """
-    x, seen, expected = stack(N), stack(Y), stack(Y)
     for k in range(count):
-        z = estimates[k]
-        turn(z, near)
-        if lost[k] != 0.0:
-            for j in range(Y):
-                innovations[k, j] = nan
-            continue
-        for i in range(N):
-            x[i] = shown[k, i]
-        turn(x, z)
-        measure(x, data, seen)
-        measure(z, data, expected)
+        correct_one(measured.shown[k], measured.lost[k], near, gain, sensor, turning, estimates[k], innovations[k])
+
+
+@outline
+def correct_one(shown, lost, near, gain, sensor, turning, z, innovation) -> None:
+    """That of one trial: z (Z,)."""
+    x, seen, expected = stack(N), stack(Y), stack(Y)
+    turn(z, near, turning)
+    if lost != 0.0:
         for j in range(Y):
-            seen[j] -= expected[j]
-            innovations[k, j] = seen[j]
-        for i in range(Z):
-            total = z[i]
-            for j in range(Y):
-                total += gain[i, j] * seen[j]
-            z[i] = total
+            innovation[j] = nan
+        return
+    for i in range(N):
+        x[i] = shown[i]
+    turn(x, z, turning)
+    call(sensor.measure, x, sensor.data, seen)
+    call(sensor.measure, z, sensor.data, expected)
+    for j in range(Y):
+        seen[j] -= expected[j]
+        innovation[j] = seen[j]
+    for i in range(Z):
+        total = z[i]
+        for j in range(Y):
+            total += gain[i, j] * seen[j]
+        z[i] = total
 
 
 def predict(count, controls, predictor, estimates) -> None:
     """Take the estimates (count, Z) one control period on, in which the controls (count, M) are commanded."""
-    p, places, lag = predictor.parameters, predictor.places, predictor.lag
-    q, v, after, value, fresh = stack(NUMBERS), stack(M), stack(N), stack(V), stack(HELD)
     for k in range(count):
-        z = estimates[k]
-        for i in range(V):
-            total = 0.0
-            for j in range(D):
-                total += predictor.output[i, j] * z[N + LAG + j]
-            value[i] = total
-        for i in range(NUMBERS):
-            q[i] = p[i]
-        for i in range(P):
-            q[int(places[i])] += value[i]
-        for i in range(M):
-            u = controls[k, i]
-            if LAG > 0:
-                behind = z[N + i] - u
-                z[N + i] = u + lag[0] * behind
-                u += lag[1] * behind
-            v[i] = u * (1.0 + value[P + i]) + value[P + M + i]
-        advance(z, v, q, predictor.dt, after)
-        for i in range(N):
-            z[i] = after[i]
-        for i in range(D):
-            total = 0.0
-            for j in range(D):
-                total += predictor.transition[i, j] * z[N + LAG + j]
-            fresh[i] = total
-        for i in range(D):
-            z[N + LAG + i] = fresh[i]
+        predict_one(controls[k], predictor, estimates[k])
 
 
-def command(count, estimates, near, law, limits, out) -> None:
+@outline
+def predict_one(control, predictor, z) -> None:
+    """That of one trial: z (Z,)."""
+    p, places, lag = predictor.dynamics.parameters, predictor.places, predictor.lag
+    q, v, after, value, fresh = stack(NUMBERS), stack(M), stack(N), stack(V), stack(HELD)
+    for i in range(V):
+        total = 0.0
+        for j in range(D):
+            total += predictor.output[i, j] * z[N + LAG + j]
+        value[i] = total
+    for i in range(NUMBERS):
+        q[i] = p[i]
+    for i in range(P):
+        q[int(places[i])] += value[i]
+    for i in range(M):
+        u = control[i]
+        if LAG > 0:
+            behind = z[N + i] - u
+            z[N + i] = u + lag[0] * behind
+            u += lag[1] * behind
+        v[i] = u * (1.0 + value[P + i]) + value[P + M + i]
+    call(predictor.dynamics.advance, z, v, q, predictor.dt, after)
+    for i in range(N):
+        z[i] = after[i]
+    for i in range(D):
+        total = 0.0
+        for j in range(D):
+            total += predictor.transition[i, j] * z[N + LAG + j]
+        fresh[i] = total
+    for i in range(D):
+        z[N + LAG + i] = fresh[i]
+
+
+def command(count, estimates, near, law, limits, turning, out) -> None:
     """Controls (count, M) within the limits, of the estimates, whose angles are taken nearest to `near`."""
     for k in range(count):
-        z = estimates[k]
-        turn(z, near)
-        for j in range(M):
-            total = law.offset[j]
-            for i in range(Z):
-                total += law.gain[j, i] * z[i]
-            out[k, j] = min(max(total, limits.low[j]), limits.high[j])
+        command_one(estimates[k], near, law, limits, turning, out[k])
+
+
+@outline
+def command_one(z, near, law, limits, turning, u) -> None:
+    """Those of one trial: z (Z,) and u (M,)."""
+    turn(z, near, turning)
+    for j in range(M):
+        total = law.offset[j]
+        for i in range(Z):
+            total += law.gain[j, i] * z[i]
+        u[j] = min(max(total, limits.low[j]), limits.high[j])
 
 
 def diverged(count, estimates, out) -> None:

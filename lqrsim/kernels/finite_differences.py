@@ -1,4 +1,4 @@
-"""Derivatives by central differences, for functions that come without. The numba subset; see `kernels/declarations.py`.
+"""Derivatives by central differences, for functions that come without. The kernels' subset.
 
 The step is the cube root of the machine's precision: the error of the formula and that of rounding are both some 1e-10
 of the function's size then.

@@ -1,4 +1,4 @@
-"""A cost that is a user's own function, called at its address. The numba subset; see `declarations.py`.
+"""A cost that is a user's own function, called at its address. The kernels' subset.
 
 `data` has the addresses of the function and of its derivatives, then the parameters. Where no derivatives are given,
 `cost_differences.py` has them.
@@ -6,7 +6,7 @@
 
 from math import nan
 
-from lqrsim.kernels.declarations import W, invoke, invoke_writing, stack
+from lqrsim.kernels.declarations import W, call, stack
 from lqrsim.kernels.linear_algebra import clear
 
 
@@ -14,7 +14,7 @@ def value(x, u, t, data):
     """The cost; NaN where the function does not write one."""
     out = stack(1)
     out[0] = nan
-    invoke(data[0], x, u, data, out)
+    call(data[0], x, u, data, out)
     return out[0]
 
 
@@ -24,7 +24,7 @@ def derivatives(x, u, t, data, hessian, gradient):
     clear(curve, W, W)
     for i in range(W):
         slope[i] = 0.0
-    invoke_writing(data[1], x, u, data, slope, curve)
+    call(data[1], x, u, data, slope, curve)
     for i in range(W):
         gradient[i] += slope[i]
         for j in range(W):

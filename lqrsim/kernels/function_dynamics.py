@@ -1,4 +1,4 @@
-"""Dynamics that are a user's own functions, called at their addresses. The numba subset; see `declarations.py`.
+"""Dynamics that are a user's own functions, called at their addresses. The kernels' subset.
 
 `p` has the addresses of f and of its Jacobian, then the parameters. Where no Jacobian is given,
 `finite_differences.py` has it.
@@ -6,7 +6,7 @@
 
 from math import nan
 
-from lqrsim.kernels.declarations import M, N, invoke, invoke_writing
+from lqrsim.kernels.declarations import M, N, call
 from lqrsim.kernels.linear_algebra import clear
 
 
@@ -14,7 +14,7 @@ def rate(x, u, p, out):
     """Write f (N,); NaN where the function does not."""
     for i in range(N):
         out[i] = nan
-    invoke(p[0], x, u, p, out)
+    call(p[0], x, u, p, out)
 
 
 def rate_jacobian(x, u, p, out, fx, fu):
@@ -22,4 +22,4 @@ def rate_jacobian(x, u, p, out, fx, fu):
     rate(x, u, p, out)
     clear(fx, N, N)
     clear(fu, N, M)
-    invoke_writing(p[1], x, u, p, fx, fu)
+    call(p[1], x, u, p, fx, fu)

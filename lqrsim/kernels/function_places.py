@@ -1,4 +1,4 @@
-"""Places of balls that are a user's own function, called at its address. The numba subset; see `declarations.py`.
+"""Places of balls that are a user's own function, called at its address. The kernels' subset.
 
 `data` has the addresses of the function and of its Jacobian, then the parameters. Where no Jacobian is given,
 `place_differences.py` has it.
@@ -6,7 +6,7 @@
 
 from math import nan
 
-from lqrsim.kernels.declarations import N, invoke, stack
+from lqrsim.kernels.declarations import N, call, stack
 from lqrsim.kernels.linear_algebra import clear
 
 BALLS = 1  # how many there are
@@ -19,7 +19,7 @@ def places(x, data, out):
     given = stack(GIVEN)
     for i in range(GIVEN):
         given[i] = nan
-    invoke(data[0], x, x, data, given)
+    call(data[0], x, x, data, given)
     for k in range(BALLS):
         out[3 * k + 2] = 0.0
         for i in range(SIZE):
@@ -31,7 +31,7 @@ def places_jacobian(x, data, out, slopes):
     given = stack(GIVEN, N)
     clear(given, GIVEN, N)
     places(x, data, out)
-    invoke(data[1], x, x, data, given)
+    call(data[1], x, x, data, given)
     for k in range(BALLS):
         for i in range(SIZE):
             for j in range(N):

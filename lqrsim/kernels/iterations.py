@@ -1,4 +1,4 @@
-"""The iterations of the solvers, with nothing but compiled code between them. The numba subset; see `declarations.py`.
+"""The iterations of the solvers, with nothing but compiled code between them. The kernels' subset.
 
 Each function runs the iterations `first` to `last` - 1 and can be called again to go on: what it needs to remember is
 in its arrays. The log gets a row an iteration. All return how many iterations there are now, the outcome (a name in
@@ -67,7 +67,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
     no_weight, steps, fixed, x_hat = stack(N), settings.steps, settings.fixed, work.x_hat
     for i in range(N):
         no_weight[i] = 0.0
-    eased = Model(model.parameters, model.dt, model.initial, work.eased, model.final, model.limits, model.noise)
+    eased = Model(model.dynamics, model.dt, model.initial, work.eased, model.final, model.limits, model.noise)
     if memory.started == 0:
         memory.started, memory.plan_cost = 1.0, inf
         keep_rollout(steps, work.start, model, work, memory)
@@ -123,7 +123,7 @@ def keep_rollout(steps, start, model, work, memory):
 
 def failure(good, model):
     """The outcome of a pass that failed, given whether all numbers there were finite."""
-    if NOISY and model.noise[1][1] > 0:
+    if NOISY and model.noise.risk[1] > 0:
         return RISK_TOO_HIGH
     return NOT_POSITIVE_DEFINITE if good else NOT_FINITE
 

@@ -1,4 +1,4 @@
-"""Small dense algebra. The numba subset; see `declarations.py`.
+"""Small dense algebra. The kernels' subset.
 
 The innermost loops are sums of constant length, which LLVM unrolls and turns into vector instructions. Matrices are
 (N, N) or, with states and controls joined, (W, W); their upper triangle is what is read where they are symmetric.

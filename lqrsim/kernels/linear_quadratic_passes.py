@@ -1,4 +1,4 @@
-"""Both passes of a linear-quadratic problem, whose stages are given. The numba subset; see `declarations.py`."""
+"""Both passes of a linear-quadratic problem, whose stages are given. The kernels' subset."""
 
 from lqrsim.kernels.cost_to_go import riccati_backward
 from lqrsim.kernels.declarations import N, W, minimizer, riccati_forward, stack

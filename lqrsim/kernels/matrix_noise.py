@@ -1,4 +1,4 @@
-"""Noise whose matrix is always the same. The numba subset; see `noise.py`.
+"""Noise whose matrix is always the same. The kernels' subset; see `noise.py`.
 
 `data` has the matrix, row by row, then the strength.
 """

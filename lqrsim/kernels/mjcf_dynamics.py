@@ -14,10 +14,9 @@ from lqrsim.kernels.declarations import (
     W,
     at,
     call,
-    call_alone,
-    call_with_two,
     claim,
     fetch_add,
+    int32,
     load,
     rows_at,
     stack,
@@ -62,11 +61,11 @@ def advance(x, u, p, h, out):
     store(p[FLAGS], slot, 0)
 
 
-def step_jacobian(x, u, p, h, fx, fu, out, jacobian):
+def step_jacobian(x, u, p, h, out, jacobian):
     """Write the step as above and its Jacobian `[A B]` (N, W), by central differences over the whole of it.
 
-    `fx` and `fu` are not used. If there are helpers and nobody has them, they do columns, too; which thread did one
-    makes no difference to the last bit.
+    If there are helpers and nobody has them, they do columns, too; which thread did one makes no difference to the
+    last bit.
     """
     z = stack(W)
     substeps = steps_in(x, u, p, h, z)
@@ -105,7 +104,7 @@ def step_jacobian(x, u, p, h, fx, fu, out, jacobian):
     while load(team, DONE) < W:  # a helper has still something to do, if it gets to run
         patience += 1
         if patience > PATIENT and p[YIELD] != 0:
-            call_alone(p[YIELD])
+            call(p[YIELD])
     for i in range(N):
         for j in range(W):
             jacobian[i, j] = columns[i, j]
@@ -125,7 +124,7 @@ def help_out(p):
         if load(team, TICKET) % JOBS >= W:
             patience += 1
             if patience > PATIENT and p[YIELD] != 0:
-                call_alone(p[YIELD])
+                call(p[YIELD])
             continue
         patience, ticket = 0, fetch_add(team, TICKET, 1)
         if ticket % JOBS >= W:
@@ -152,7 +151,7 @@ def run(z, p, wrench, substeps, two, out):
     write_to(z, p, two)
     begin(p, wrench, two)
     for _ in range(substeps):
-        call(p[STEP], p[MODEL], two[DATA])
+        call(p[STEP], at(p[MODEL]), at(two[DATA]))
     read_from(z, p, two, out)
 
 
@@ -161,7 +160,7 @@ def linearize_here(z, p, wrench, address, warm):
     one = at(address)
     write_to(z, p, one)
     begin(p, wrench, one)
-    call_with_two(p[FORWARD], p[MODEL], one[DATA], 0, 1)
+    call(p[FORWARD], at(p[MODEL]), at(one[DATA]), int32(0), int32(1))
     accelerations = at(one[QACC])
     for i in range(int(p[NV])):
         warm[i] = accelerations[i]
@@ -190,7 +189,7 @@ def column(k, z, p, wrench, substeps, address, warm, jacobian):
             write_to(moved, p, two)
             start_from(p, two, warm)
         for _ in range(substeps - 1 if kept > 0 else substeps):
-            call(p[STEP], p[MODEL], two[DATA])
+            call(p[STEP], at(p[MODEL]), at(two[DATA]))
         read_from(z, p, two, ahead if side == 0 else behind)
     for i in range(N):
         jacobian[i, j] = (ahead[i] - behind[i]) / (2 * difference)
@@ -264,8 +263,8 @@ def step_from(z, p, one, two, guess, kept):
     """A step of the physics with the stages kept that `one` has, and that the state and control share; to `two`."""
     write_to(z, p, one)
     start_from(p, one, guess)
-    call_with_two(p[FORWARD], p[MODEL], one[DATA], kept, 1)
-    call(p[INTEGRATE], p[MODEL], one[DATA])
+    call(p[FORWARD], at(p[MODEL]), at(one[DATA]), int32(kept), int32(1))
+    call(p[INTEGRATE], at(p[MODEL]), at(one[DATA]))
     nv = int(p[NV])
     write_to(z, p, two)
     for k in range(int(p[JOINTS])):
@@ -305,7 +304,7 @@ def read_from(near, p, one, out):
     for i in range(N):
         good = good and abs(out[i]) < LARGEST
     if not good:
-        call(p[RESET], p[MODEL], one[DATA])  # so that nothing of it is left
+        call(p[RESET], at(p[MODEL]), at(one[DATA]))  # so that nothing of it is left
         for i in range(N):
             out[i] = nan
 

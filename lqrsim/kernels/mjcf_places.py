@@ -1,4 +1,4 @@
-"""Where MuJoCo has the balls of a robot: points fixed to bodies of an MJCF. The numba subset; see `declarations.py`.
+"""Where MuJoCo has the balls of a robot: points fixed to bodies of an MJCF. The kernels' subset.
 
 `data` has the address of what `mjcf_dynamics.py` calls p, how many balls there are, on how many of the states they
 depend, and of each the number of its body and its place in the axes of that. It goes with functions of that module.
@@ -26,7 +26,7 @@ def places(x, data, out):
     slot = take_slot(p)
     one = at(p[SLOTS] + 8 * SLOT * slot)
     write_positions(x, p, at(one[QPOS]))
-    call(p[KINEMATICS], p[MODEL], one[DATA])
+    call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
     origins, axes = at(one[XPOS]), at(one[XMAT])
     for k in range(int(data[1])):
         body = int(data[3 + 4 * k])

@@ -1,4 +1,4 @@
-"""What noise is expected to cost, as part of each stage. The numba subset; see `declarations.py`.
+"""What noise is expected to cost, as part of each stage. The kernels' subset.
 
 With x' = g(x, u) + M(x, u) w and w ~ N(0, I), a quadratic cost-to-go v with Hessian S at t + 1 has the expectation
 
@@ -20,19 +20,9 @@ left out. The matrices here are compact: the rows of M that are not zero everywh
 
 from math import inf, log1p, sqrt
 
-from lqrsim.kernels.declarations import (
-    M,
-    N,
-    W,
-    final_value,
-    initial_value,
-    noise_slopes,
-    noise_values,
-    stack,
-    stage_value,
-)
+from lqrsim.kernels.declarations import M, N, W, noise_slopes, noise_values, stack
 from lqrsim.kernels.linear_algebra import affine, within
-from lqrsim.kernels.runge_kutta import advance
+from lqrsim.kernels.model_functions import advance, cost_value
 
 ROWS = (0,)  # the states that noise acts on at once
 COUNT = 1  # how many these are
@@ -42,18 +32,16 @@ ACTIVE = (0,)  # entries of (x, u) that M depends on
 SOME = 1  # how many these are
 WIDE = 4  # the same, rounded up to vectors of four
 
-# The numba subset
 
-
-def noise_value(x, u, model, ahead):
-    """What it is expected to cost; infinite where the risk is too high."""
+def noise_value(x, u, data, risk, ahead):
+    """What it is expected to cost, given what lies ahead; infinite where the risk is too high."""
     values, mixed, slope = stack(COUNT, SIZE), stack(COUNT, SIZE), stack(COUNT)
     factor, root, weighed = stack(SIZE, SIZE), stack(SIZE), stack(COUNT, SIZE)
     S = stack(COUNT, COUNT)
-    noise_values(x, u, model.noise[0], values)
+    noise_values(x, u, data, values)
     gather(ahead.hessian, S)
     weigh(S, values, weighed)
-    theta = model.noise[1][0]
+    theta = risk[0]
     if theta == 0:
         return half_trace(values, weighed)
     total, good = factor_of_risk(theta, values, weighed, factor, root)
@@ -64,11 +52,11 @@ def noise_value(x, u, model, ahead):
     return total + 0.5 * theta * square_along(mixed, slope)
 
 
-def noise_quadratic(x, u, model, ahead, convex, stage):
+def noise_quadratic(x, u, data, risk, ahead, convex, stage):
     """Add the quadratic model to a stage, Hessian (W, W) and gradient (W,), and return the value.
 
     With `convex` what is added is positive semidefinite, with a negative risk, too. Where the risk is too high the
-    Hessian is spoilt, so that the pass fails, and `model.noise[1][1]` is 1.
+    Hessian is spoilt, so that the pass fails, and `risk[1]` is 1.
     """
     values, slopes = stack(COUNT, SIZE), stack(SIZE, COUNT, WIDE)
     weighed, factor, root = stack(COUNT, SIZE), stack(SIZE, SIZE), stack(SIZE)
@@ -77,16 +65,16 @@ def noise_quadratic(x, u, model, ahead, convex, stage):
         for i in range(COUNT):
             for a in range(SOME, WIDE):
                 slopes[k, i, a] = 0.0
-    noise_slopes(x, u, model.noise[0], values, slopes)
+    noise_slopes(x, u, data, values, slopes)
     gather(ahead.hessian, S)
     weigh(S, values, weighed)
-    theta = model.noise[1][0]
+    theta = risk[0]
     if theta == 0:
         if SOME:
             add_weighed(S, weighed, slopes, stage)
         return half_trace(values, weighed)
     total, good = factor_of_risk(theta, values, weighed, factor, root)
-    model.noise[1][1] = 0.0 if good else 1.0
+    risk[1] = 0.0 if good else 1.0
     if not good:
         stage.hessian[W - 1, W - 1] = -inf
         return inf
@@ -107,19 +95,19 @@ def noisy_costs(count, steps, start, policy, model, draws, costs):
     for run in range(count):
         for i in range(N):
             x[i] = start[i]
-        total = initial_value(x, u, 0, model.initial)
+        total = cost_value(x, u, 0, model.initial)
         for t in range(steps):
             affine(policy.gain[t], policy.offset[t], x, u)
             within(u, model.limits)
-            total += stage_value(x, u, t, model.stage)
-            advance(x, u, model.parameters, model.dt, ahead)
-            noise_values(x, u, model.noise[0], values)
+            total += cost_value(x, u, t, model.stage)
+            advance(x, u, model, model.dt, ahead)
+            noise_values(x, u, model.noise.data, values)
             for i in range(COUNT):
                 for k in range(SIZE):
                     ahead[i if FIRST else ROWS[i]] += values[i, k] * draws[run * steps + t, k]
             for i in range(N):
                 x[i] = ahead[i]
-        costs[run] = total + final_value(x, u, steps, model.final)
+        costs[run] = total + cost_value(x, u, steps, model.final)
 
 
 def gather(S, compact):
@@ -291,7 +279,7 @@ def add_risk(theta, ahead, mixed, slopes, slope, convex, stage):
                 stage.gradient[entry] += theta * along[k] * pull
                 if theta > 0:
                     slopes_along[k, entry] += pull
-    if theta > 0 or not convex:
+    if theta > 0 or convex == 0:
         for a in range(W):  # line by line, which stays in registers
             for b in range(W):
                 line[b] = 0.0

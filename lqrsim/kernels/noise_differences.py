@@ -1,4 +1,7 @@
-"""Derivatives of noise by central differences, where there are none. The numba subset; see `finite_differences.py`."""
+"""Derivatives of noise by central differences, where there are none.
+
+The kernels' subset; see `finite_differences.py`.
+"""
 
 from lqrsim.kernels.declarations import M, N, noise_values, stack
 

@@ -1,4 +1,4 @@
-"""`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. The numba subset; see `declarations.py`.
+"""`weight * sum over obstacles of exp(-sharpness * (distance - radius))`. The kernels' subset.
 
 `data` has the radius, the sharpness, the weight, how many obstacles there are and at how many steps they are told, of
 which the last holds from there on; and for each of these the ROW numbers of each obstacle.

@@ -1,4 +1,4 @@
-"""The passes of LQR smoothing. The numba subset; see `declarations.py`, and `records.py` for what they are given.
+"""The passes of LQR smoothing. The kernels' subset; see `records.py` for what they are given.
 
 A pass returns the step at which it failed, or -1, and whether all numbers there were finite.
 """
@@ -12,20 +12,16 @@ from lqrsim.kernels.declarations import (
     N,
     W,
     backtrack,
-    final_quadratic,
     forward_jacobian,
     initial_cost_to_come,
-    initial_quadratic,
     linearize,
     minimizer,
-    noise_quadratic,
     riccati_forward,
     stack,
-    stage_quadratic,
 )
 from lqrsim.kernels.linear_algebra import about_origin, affine, cholesky, cholesky_solve, clear, finite, offset, within
-from lqrsim.kernels.records import Ahead, Linearization, Slopes, Stage, Step
-from lqrsim.kernels.runge_kutta import advance, step_jacobian
+from lqrsim.kernels.model_functions import advance, cost_quadratic, noise_quadratic, step_jacobian
+from lqrsim.kernels.records import Ahead, Linearization, Stage, Step
 
 
 def forward_pass(settings, model, about, work):
@@ -35,8 +31,7 @@ def forward_pass(settings, model, about, work):
     set. Where the linearisation is guided, it is about the plan, and not about the minimisers.
     """
     stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
-    slopes = Slopes(stack(N, N), stack(N, M), stack(N))
-    clear_slopes(slopes)
+    arrived = stack(N)
     costate, u, x_hat, to_go, to_come = stack(N), stack(M), work.x_hat, work.to_go, work.to_come
     spare = stack(N, W)
     good, _ = initial_model(x_hat, settings.fixed, model, about, to_go, to_come)
@@ -49,9 +44,9 @@ def forward_pass(settings, model, about, work):
         else:
             affine(work.policy.gain[t], work.policy.offset[t], x_hat, u)
             within(u, model.limits)
-        linearize(x_hat, u, model, slopes, step)
-        jacobian = forward_jacobian(x_hat, u, model, slopes, step, spare)
-        ahead = Ahead(jacobian, slopes.arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
+        linearize(x_hat, u, model, arrived, step)
+        jacobian = forward_jacobian(x_hat, u, model, arrived, step, spare)
+        ahead = Ahead(jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
         constant = stage_model(x_hat, u, t, model, about, ahead, True, stage)
         constant += fix_controls_at_limits(u, work.policy.gain[t], model.limits, stage, step)
         if not riccati_forward(t, step, stage, constant, to_come, work.smoothing):
@@ -63,7 +58,7 @@ def forward_pass(settings, model, about, work):
         copy(about.plan.states[steps], N, x_hat)
     elif not minimizer(steps, to_go, to_come, costate, x_hat):
         # In the first iteration there may be no minimum without c_l, and the state of arrival is what we have.
-        copy(slopes.arrived, N, x_hat)
+        copy(arrived, N, x_hat)
     final_model(x_hat, steps, model, to_go)
     if not minimizer(steps, to_go, to_come, costate, x_hat):
         return steps, finite(to_go.hessian[steps], N, N) and finite(to_come.matrix[steps], N, N)
@@ -81,8 +76,7 @@ def backward_pass(settings, model, about, work):
     some 1e-13 of the numbers that cancel: those are in what the quadratic models are at the origin.
     """
     stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
-    slopes = Slopes(stack(N, N), stack(N, M), stack(N))
-    clear_slopes(slopes)
+    arrived = stack(N)
     x, u, costate, x_hat, to_go, to_come = stack(N), stack(M), stack(N), work.x_hat, work.to_go, work.to_come
     steps = settings.steps
     if not minimizer(steps, to_go, to_come, costate, x_hat):
@@ -94,8 +88,8 @@ def backward_pass(settings, model, about, work):
         if about.reach < 1:
             towards(x, about.reach, about.plan.states[t], N)
             towards(u, about.reach, about.plan.controls[t], M)
-        linearize_forward(x, u, model, slopes, step)
-        ahead = Ahead(step.jacobian, slopes.arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
+        linearize_forward(x, u, model, arrived, step)
+        ahead = Ahead(step.jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
         constant = stage_model(x, u, t, model, about, ahead, False, stage)
         size += abs(constant)
         good = riccati_backward_within(t, step, stage, constant, x, model.limits, work.policy, to_go)
@@ -122,8 +116,7 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
     guess; c_l is first quadratised at its last state.
     """
     stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
-    slopes = Slopes(stack(N, N), stack(N, M), stack(N))
-    clear_slopes(slopes)
+    arrived = stack(N)
     x, x_hat, u = stack(N), stack(N), stack(M)
     about = Linearization(guess, guided, 1.0, 0.0, prior)
     copy(guess.states[steps], N, x_hat)
@@ -136,9 +129,9 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
         if guided:
             copy(guess.states[t], N, x)
         else:
-            advance(x_hat, u, model.parameters, -model.dt, x)
-        linearize_forward(x, u, model, slopes, step)
-        ahead = Ahead(step.jacobian, slopes.arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
+            advance(x_hat, u, model, -model.dt, x)
+        linearize_forward(x, u, model, arrived, step)
+        ahead = Ahead(step.jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
         constant = stage_model(x, u, t, model, about, ahead, False, stage)
         if not riccati_backward_within(t, step, stage, constant, x, model.limits, policy, to_go):
             return t, finite(stage.hessian, W, W) and finite(step.jacobian, N, W)
@@ -147,10 +140,10 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
     return -1, True
 
 
-def linearize_forward(x, u, model, slopes, step):
+def linearize_forward(x, u, model, arrived, step):
     """Write where (x, u) leads, and the step linearised there, Eq. (25): x_next = jacobian (x, u) + offset."""
-    step_jacobian(x, u, model.parameters, model.dt, slopes.state, slopes.control, slopes.arrived, step.jacobian)
-    offset(step.jacobian, x, u, slopes.arrived, step.offset)
+    step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
+    offset(step.jacobian, x, u, arrived, step.offset)
 
 
 def stage_model(x, u, t, model, about, ahead, convex, stage):
@@ -161,9 +154,9 @@ def stage_model(x, u, t, model, about, ahead, convex, stage):
     linearisations sensible. Damping weighs how far the control moves from the plan's.
     """
     hessian, gradient, prior = stage.hessian, stage.gradient, about.prior
-    value = stage_quadratic(x, u, t, model.stage, hessian, gradient)
+    value = cost_quadratic(x, u, t, model.stage, hessian, gradient)
     if NOISY:
-        value += noise_quadratic(x, u, model, ahead, convex, stage)
+        value += noise_quadratic(x, u, model.noise, ahead, convex, stage)
     if t > 0:
         for i in range(N):
             weight, error = prior.weight[i], x[i] - prior.about[t, i]
@@ -182,7 +175,7 @@ def stage_model(x, u, t, model, about, ahead, convex, stage):
 def final_model(x, steps, model, to_go):
     """Write the cost-to-go at T: c_l quadratised at x. Paper: Eq. (31)."""
     hessian, gradient, none = stack(W, W), stack(W), stack(M)
-    value = final_quadratic(x, none, steps, model.final, hessian, gradient)
+    value = cost_quadratic(x, none, steps, model.final, hessian, gradient)
     to_go.constant[steps] = end_model(hessian, gradient, value, x, to_go.hessian[steps], to_go.gradient[steps])
 
 
@@ -197,7 +190,7 @@ def initial_model(x, fixed, model, about, to_go, to_come):
         copy(x, N, to_come.vector[0])
         to_come.constant[0] = 0.0
         return True, 0.0
-    value = initial_quadratic(x, none, 0, model.initial, hessian, gradient)
+    value = cost_quadratic(x, none, 0, model.initial, hessian, gradient)
     if about.damping > 0:
         for i in range(N):
             weight, error = about.damping * hessian[i, i], x[i] - about.plan.states[0, i]
@@ -220,12 +213,6 @@ def end_model(hessian, gradient, value, x, S, s):
         for j in range(N):
             S[i, j] = hessian[i, j]
     return constant
-
-
-def clear_slopes(slopes):
-    """Set to zero what dynamics leave alone because it is zero everywhere."""
-    clear(slopes.state, N, N)
-    clear(slopes.control, N, M)
 
 
 def towards(z, fraction, origin, size):

@@ -1,4 +1,7 @@
-"""Derivatives of places by central differences, where there are none. The numba subset; see `finite_differences.py`."""
+"""Derivatives of places by central differences, where there are none.
+
+The kernels' subset; see `finite_differences.py`.
+"""
 
 from lqrsim.kernels.declarations import N, places, stack
 

@@ -1,43 +1,39 @@
-"""Feedback laws of many measured states at once, in the numba subset. `AffinePolicy` has the same in NumPy.
-
-A system's `turn(x, nominal)`, which takes its angles and rotation vectors to the nearest representative, is written by
-`solvers/compiled.py` from the two functions here.
-"""
+"""Feedback laws of many measured states at once. The kernels' subset. `AffinePolicy` has the same in NumPy."""
 
 from math import floor, pi, sqrt
 
-N, M = 3, 2  # states and controls; each compiled core has its own
+from lqrsim.kernels.declarations import outline
+from lqrsim.kernels.linear_algebra import affine, within
 
 
-def turn(x, nominal) -> None:
-    """Takes a state to its representative nearest to the nominal; each system's is written for it."""
-    raise NotImplementedError
-
-
-# The numba subset.
-
-
-def apply_law(count, near, gain, offset, nominal, low, high, out) -> None:
+def apply_law(count, near, law, nominal, turning, limits, out) -> None:
     """Controls (count, M) within the limits, of states (count, N), which become those nearest to the nominal (N,)."""
     for k in range(count):
-        x = near[k]
-        turn(x, nominal)
-        for j in range(M):
-            total = offset[j]
-            for i in range(N):
-                total += gain[j, i] * x[i]
-            if total < low[j]:
-                total = low[j]
-            elif total > high[j]:
-                total = high[j]
-            out[k, j] = total
+        apply_one(near[k], law, nominal, turning, limits, out[k])
 
 
-def turn_all(steps, count, states, nominal) -> None:
+@outline
+def apply_one(x, law, nominal, turning, limits, u) -> None:
+    """One of these."""
+    turn(x, nominal, turning)
+    affine(law.gain, law.offset, x, u)
+    within(u, limits)
+
+
+def turn_all(steps, count, states, nominal, turning) -> None:
     """Takes each of the states (steps count, N) to its representative nearest to its step's nominal (steps, N)."""
     for t in range(steps):
         for k in range(count):
-            turn(states[t * count + k], nominal[t])
+            turn(states[t * count + k], nominal[t], turning)
+
+
+@outline
+def turn(x, nominal, turning) -> None:
+    """Takes a state to its representative nearest to the nominal: its angles and its rotation vectors."""
+    for k in range(turning.angle_count):
+        nearest_angle(x, nominal, int(turning.angles[k]))
+    for k in range(turning.rotation_count):
+        nearest_rotation(x, nominal, int(turning.rotations[k]))
 
 
 def nearest_angle(x, nominal, i: int) -> None:

@@ -1,19 +1,22 @@
-"""The nearest positive-semidefinite matrix. The numba subset; see `declarations.py`."""
+"""The nearest positive-semidefinite matrix. The kernels' subset."""
 
 from math import sqrt
 
-from lqrsim.kernels.declarations import K, stack
+from lqrsim.kernels.declarations import stack
+
+SUPPORT = (0,)  # the entries of (x, u) in which a cost may not be convex
+K = 1  # how many these are
 
 
-def project(hessian, support):
-    """Set the negative eigenvalues of the symmetric block of `hessian` on the K indices `support` to zero.
+def project(hessian):
+    """Set the negative eigenvalues of the symmetric block of `hessian` (W, W) on the SUPPORT to zero.
 
     Cyclic Jacobi rotations: for the 3 x 3 blocks of obstacle costs far faster than a call to LAPACK.
     """
     a, v = stack(K, K), stack(K, K)
     for i in range(K):
         for j in range(K):
-            a[i, j] = hessian[support[i], support[j]]
+            a[i, j] = hessian[SUPPORT[i], SUPPORT[j]]
             v[i, j] = 1.0 if i == j else 0.0
     for _ in range(30):
         off, diagonal = 0.0, 0.0
@@ -49,4 +52,4 @@ def project(hessian, support):
                 for k in range(K):
                     if a[k, k] > 0:
                         total += v[i, k] * a[k, k] * v[j, k]
-                hessian[support[i], support[j]] = total
+                hessian[SUPPORT[i], SUPPORT[j]] = total

@@ -1,4 +1,4 @@
-"""`1/2 (z - about)' weight (z - about)`, z the state or the control. The numba subset; see `declarations.py`.
+"""`1/2 (z - about)' weight (z - about)`, z the state or the control. The kernels' subset.
 
 `data` has about (size,), then weight (size, size), row by row.
 """

@@ -1,6 +1,7 @@
 """What kernels are given: named tuples of arrays and numbers, and rows with fields for what is remembered or logged.
 
-T is the number of steps. Kernels see an array as a pointer to blocks of constant shape; see `codegen/jit.py`.
+T is the number of steps. Kernels see an array as a pointer to blocks of constant shape, and a tuple of vectors as one
+of addresses; see `codegen/language.py`. An address is a float64, which has all integers up to 2^53.
 """
 
 from typing import Any, NamedTuple
@@ -19,17 +20,67 @@ class Limits(NamedTuple):
     high: Arrays
 
 
-class Model(NamedTuple):
-    """A problem as numbers: of the dynamics (any,), the time step in s, of each cost one array (any,) a term.
+class DynamicsModel(NamedTuple):
+    """The addresses of what dynamics bring, and their parameters (any,).
 
-    `noise` is empty, or has what the noise's function reads (any,), and (2,) the risk, and whether it was too high.
+    `step_curvature` is the place of the second derivatives of a step against a costate; 0 where there are none.
     """
 
+    advance: float
+    step_jacobian: float
+    step_curvature: float
     parameters: Arrays
+
+
+class Constraints(NamedTuple):
+    """The constraints that act on a cost.
+
+    Attributes:
+      functions: (C, 6) of each the addresses of its functions, and whether it uses the control; see
+        `model_functions.py`. data, multipliers: what these take, a vector each; see `augmented_lagrangian.py`.
+      size: C.
+    """
+
+    functions: Arrays
+    data: Any
+    multipliers: Any
+    size: int
+
+
+class CostModel(NamedTuple):
+    """A cost, as the sum of its terms, and the constraints that act where it does.
+
+    Attributes:
+      functions: (K, 2) of each term the addresses of its value and its derivatives; those that may be indefinite come
+        first. data: what these take, a vector each. size: K. indefinite: how many may be.
+      project: the address of the projection of their sum; 0 where none may be indefinite.
+    """
+
+    functions: Arrays
+    data: Any
+    size: int
+    indefinite: int
+    project: float
+    constraints: Constraints
+
+
+class NoiseModel(NamedTuple):
+    """The addresses of what noise brings; what its function reads (any,); the risk, and if it was too high, (2,)."""
+
+    value: float
+    quadratic: float
+    data: Arrays
+    risk: Arrays
+
+
+class Model(NamedTuple):
+    """A problem as numbers and addresses; the time step is in s, and `noise` is empty where there is none."""
+
+    dynamics: DynamicsModel
     dt: float
-    initial: Any
-    stage: Any
-    final: Any
+    initial: CostModel
+    stage: CostModel
+    final: CostModel
     limits: Limits
     noise: Any = ()
 
@@ -114,14 +165,6 @@ class Ahead(NamedTuple):
     arrived: Arrays
     hessian: Arrays
     gradient: Arrays
-
-
-class Slopes(NamedTuple):
-    """What a linearisation works with: df/dx (N, N), df/du (N, M), where a step leads (N,)."""
-
-    state: Arrays
-    control: Arrays
-    arrived: Arrays
 
 
 class Stage(NamedTuple):
@@ -221,17 +264,41 @@ class Predictor(NamedTuple):
     """What takes estimates a control period on: see `estimation.py`.
 
     Attributes:
-      parameters, dt: of the dynamics, as in `Model`. places: which of them are unknown, (P,).
+      dynamics, dt: as in `Model`. places: which of the parameters are unknown, (P,).
       lag: how much is left of the distance to a command at the end of a period, and in the mean over it, (2,).
       transition: of the unknowns' states, (D, D). output: from these to the unknowns' values, (V, D).
     """
 
-    parameters: Arrays
+    dynamics: DynamicsModel
     dt: float
     places: Arrays
     lag: Arrays
     transition: Arrays
     output: Arrays
+
+
+class SensorModel(NamedTuple):
+    """The addresses of what is measured of a state and of its slope, and what these read (any,)."""
+
+    measure: float
+    slope: float
+    data: Arrays
+
+
+class Measured(NamedTuple):
+    """What is shown of the states (count, N), and 1 where that was lost, else 0, (count,)."""
+
+    shown: Arrays
+    lost: Arrays
+
+
+class Turning(NamedTuple):
+    """Which states are angles, and where rotation vectors begin: their places, (any,), and how many there are."""
+
+    angles: Arrays
+    angle_count: int
+    rotations: Arrays
+    rotation_count: int
 
 
 def _row(*names: str) -> np.dtype[np.void]:

@@ -1,6 +1,6 @@
-"""Sweeps along a trajectory: running a policy, and what a linear-quadratic model about the plan says. The numba subset.
+"""Sweeps along a trajectory: running a policy, and what a linear-quadratic model about the plan says.
 
-Shapes and names are those of `passes.py`.
+The kernels' subset. Shapes and names are those of `passes.py`.
 """
 
 from math import isnan, nan
@@ -11,22 +11,20 @@ from lqrsim.kernels.declarations import (
     M,
     N,
     W,
-    final_added,
-    final_quadratic,
-    final_value,
-    initial_quadratic,
-    initial_value,
-    noise_quadratic,
-    noise_value,
     stack,
-    stage_added,
-    stage_quadratic,
-    stage_value,
 )
 from lqrsim.kernels.linear_algebra import affine, cholesky, cholesky_solve, congruence, finite, within
-from lqrsim.kernels.passes import clear_slopes, copy, end_model
-from lqrsim.kernels.records import Ahead, Limits, Slopes, Stage
-from lqrsim.kernels.runge_kutta import advance, step_jacobian
+from lqrsim.kernels.model_functions import (
+    advance,
+    cost_added,
+    cost_quadratic,
+    cost_value,
+    noise_quadratic,
+    noise_value,
+    step_jacobian,
+)
+from lqrsim.kernels.passes import copy, end_model
+from lqrsim.kernels.records import Ahead, Limits, Stage
 
 
 def rollout(steps, x0, policy, model, plan):
@@ -34,37 +32,14 @@ def rollout(steps, x0, policy, model, plan):
     x, u = plan.states[0], stack(M)
     for i in range(N):
         x[i] = x0[i]
-    cost = initial_value(x, u, 0, model.initial)
+    cost = cost_value(x, u, 0, model.initial)
     for t in range(steps):
         x, u = plan.states[t], plan.controls[t]
         affine(policy.gain[t], policy.offset[t], x, u)
         within(u, model.limits)
-        cost += stage_value(x, u, t, model.stage)
-        advance(x, u, model.parameters, model.dt, plan.states[t + 1])
-    return cost + final_value(plan.states[steps], u, steps, model.final)
-
-
-def costs_of(count, steps, plans, model, costs):
-    """Stage and final cost of trajectories, one after the other: states (count (steps + 1), N), controls alike."""
-    for k in range(count):
-        costs[k] = 0.0
-        for t in range(steps):
-            x, u = plans.states[k * (steps + 1) + t], plans.controls[k * steps + t]
-            costs[k] += stage_value(x, u, t, model.stage)
-        last = plans.controls[(k + 1) * steps - 1]
-        costs[k] += final_value(plans.states[(k + 1) * (steps + 1) - 1], last, steps, model.final)
-
-
-def stage_costs_of(count, t, plans, model, costs):
-    """Stage costs of step t: states (count, N), controls (count, M)."""
-    for k in range(count):
-        costs[k] = stage_value(plans.states[k], plans.controls[k], t, model.stage)
-
-
-def final_costs_of(count, steps, plans, model, costs):
-    """Final costs of trajectories of so many steps that end with these states (count, N) and controls (count, M)."""
-    for k in range(count):
-        costs[k] = final_value(plans.states[k], plans.controls[k], steps, model.final)
+        cost += cost_value(x, u, t, model.stage)
+        advance(x, u, model, model.dt, plan.states[t + 1])
+    return cost + cost_value(plan.states[steps], u, steps, model.final)
 
 
 def noise_cost(steps, plan, model, to_go):
@@ -72,19 +47,19 @@ def noise_cost(steps, plan, model, to_go):
     total, none = 0.0, stack(N, W)
     for t in range(steps):
         ahead = Ahead(none, plan.states[t + 1], to_go.hessian[t + 1], to_go.gradient[t + 1])
-        total += noise_value(plan.states[t], plan.controls[t], model, ahead)
+        total += noise_value(plan.states[t], plan.controls[t], model.noise, ahead)
     return total
 
 
 def plan_cost(steps, plan, model, to_go):
     """Cost of a trajectory, with what noise is expected to cost, and what the augmented Lagrangian adds to it."""
     states, controls = plan.states, plan.controls
-    cost, added = initial_value(states[0], controls[0], 0, model.initial), 0.0
+    cost, added = cost_value(states[0], controls[0], 0, model.initial), 0.0
     for t in range(steps):
-        cost += stage_value(states[t], controls[t], t, model.stage)
-        added += stage_added(states[t], controls[t], t, model.stage)
-    cost += final_value(states[steps], controls[steps - 1], steps, model.final)
-    added += final_added(states[steps], controls[steps - 1], steps, model.final)
+        cost += cost_value(states[t], controls[t], t, model.stage)
+        added += cost_added(states[t], controls[t], t, model.stage)
+    cost += cost_value(states[steps], controls[steps - 1], steps, model.final)
+    added += cost_added(states[steps], controls[steps - 1], steps, model.final)
     return cost + noise_cost(steps, plan, model, to_go), added
 
 
@@ -97,17 +72,16 @@ def differential_pass(steps, plan, model, damping, keep, policy, to_go):
 
     Returns as every pass does, and the decrease of cost that the linear-quadratic model predicts.
     """
-    stage, slopes = Stage(stack(W, W), stack(W)), Slopes(stack(N, N), stack(N, M), stack(N))
+    stage, arrived = Stage(stack(W, W), stack(W)), stack(N)
     jacobian, none, no_change = stack(N, W), stack(M), stack(N)
     slope, curve = stack(N), stack(N, N)
     hessian, gradient, room = stage.hessian, stage.gradient, Limits(stack(M), stack(M))
     states, controls, S, s, k = plan.states, plan.controls, to_go.hessian, to_go.gradient, to_go.constant
     for i in range(N):
         no_change[i] = 0.0
-    clear_slopes(slopes)
     for i in range(M):
         none[i] = 0.0
-    value = final_quadratic(states[steps], none, steps, model.final, hessian, gradient)
+    value = cost_quadratic(states[steps], none, steps, model.final, hessian, gradient)
     predicted, ahead = 0.0, value
     for i in range(N):
         slope[i] = gradient[i]
@@ -117,11 +91,11 @@ def differential_pass(steps, plan, model, damping, keep, policy, to_go):
     k[last] = end_model(hessian, gradient, value, states[steps], S[last], s[last])
     for t in range(steps - 1, -1, -1):
         at, x, u = t * keep, states[t], controls[t]
-        step_jacobian(x, u, model.parameters, model.dt, slopes.state, slopes.control, slopes.arrived, jacobian)
-        ahead += stage_quadratic(x, u, t, model.stage, hessian, gradient)
+        step_jacobian(x, u, model, model.dt, arrived, jacobian)
+        ahead += cost_quadratic(x, u, t, model.stage, hessian, gradient)
         if NOISY:
-            beyond = Ahead(jacobian, slopes.arrived, curve, s[(t + 1) * keep])
-            ahead += noise_quadratic(x, u, model, beyond, False, stage)
+            beyond = Ahead(jacobian, arrived, curve, s[(t + 1) * keep])
+            ahead += noise_quadratic(x, u, model.noise, beyond, False, stage)
         congruence(jacobian, curve, slope, hessian, gradient)
         for i in range(M):
             hessian[N + i, N + i] += damping
@@ -149,7 +123,7 @@ def initial_step(x0, model, to_go, direction):
     total, slope = stack(N, N), stack(N)
     for i in range(M):
         none[i] = 0.0
-    initial_quadratic(x0, none, 0, model.initial, hessian, gradient)
+    cost_quadratic(x0, none, 0, model.initial, hessian, gradient)
     for i in range(N):
         slope[i] = gradient[i] + s[i]
         for j in range(N):
@@ -191,7 +165,7 @@ def dynamics_residual(steps, x_hats, policy, model, states):
     for t in range(steps):
         affine(policy.gain[t], policy.offset[t], x_hats[t], u)
         within(u, model.limits)
-        advance(x_hats[t], u, model.parameters, model.dt, ahead)
+        advance(x_hats[t], u, model, model.dt, ahead)
         for i in range(N):
             difference = abs(x_hats[t + 1, i] - ahead[i])
             if difference > worst[i] or isnan(difference):
@@ -216,7 +190,7 @@ def line_search(steps, shift, work, model, bound, smallest, trial):
     while fraction >= smallest:
         for i in range(N):
             trial.states[0, i] = plan.states[0, i] + fraction * shift[i]
-        cost, added = initial_value(trial.states[0], trial.controls[0], 0, model.initial), 0.0
+        cost, added = cost_value(trial.states[0], trial.controls[0], 0, model.initial), 0.0
         for t in range(steps):
             x, u = trial.states[t], trial.controls[t]
             for i in range(M):
@@ -225,13 +199,13 @@ def line_search(steps, shift, work, model, bound, smallest, trial):
                     total += policy.gain[t, i, j] * (x[j] - plan.states[t, j])
                 u[i] = total
             within(u, model.limits)
-            cost += stage_value(x, u, t, model.stage)
-            added += stage_added(x, u, t, model.stage)
-            advance(x, u, model.parameters, model.dt, trial.states[t + 1])
-        cost += final_value(trial.states[steps], trial.controls[steps - 1], steps, model.final)
+            cost += cost_value(x, u, t, model.stage)
+            added += cost_added(x, u, t, model.stage)
+            advance(x, u, model, model.dt, trial.states[t + 1])
+        cost += cost_value(trial.states[steps], trial.controls[steps - 1], steps, model.final)
         if NOISY:
             cost += noise_cost(steps, trial, model, work.to_go)
-        added += final_added(trial.states[steps], trial.controls[steps - 1], steps, model.final)
+        added += cost_added(trial.states[steps], trial.controls[steps - 1], steps, model.final)
         if cost + added < bound:
             return cost + added, cost, fraction
         fraction *= 0.5

@@ -1,9 +1,10 @@
-"""One Runge-Kutta step with the control held, and its Jacobian. The numba subset; see `kernels/declarations.py`.
+"""One Runge-Kutta step with the control held, and its Jacobian. The kernels' subset.
 
 A negative `h` steps backwards in time: the approximate inverse `gbar` of the step, exact to O(h^5).
 """
 
 from lqrsim.kernels.declarations import M, N, W, rate, rate_jacobian, stack
+from lqrsim.kernels.linear_algebra import clear
 
 
 def advance(x, u, p, h, out):
@@ -40,13 +41,15 @@ def chain(fx, fu, previous, a, out):
             out[i, j] = row[j]
 
 
-def step_jacobian(x, u, p, h, fx, fu, out, jacobian):
-    """Write the step as above and its Jacobian `[A B]` (N, W); `fx`, `fu` are work arrays whose zeros are set.
+def step_jacobian(x, u, p, h, out, jacobian):
+    """Write the step as above and its Jacobian `[A B]` (N, W).
 
     The four stages are written out: a loop over them takes longer.
     """
     k, z = stack(N), stack(N)
-    first, second = stack(N, W), stack(N, W)
+    fx, fu, first, second = stack(N, N), stack(N, M), stack(N, W), stack(N, W)
+    clear(fx, N, N)
+    clear(fu, N, M)
     rate_jacobian(x, u, p, k, fx, fu)
     for i in range(N):
         out[i] = k[i]

@@ -1,13 +1,14 @@
-"""The distance to each primitive, and the one place where it is written down. The numba subset; see `declarations.py`.
+"""The distance to each primitive, and the one place where it is written down. The kernels' subset.
 
 Scalars, flat arrays, no allocation. `row` is where an obstacle's numbers start in a table flattened.
 """
 
 from math import inf, sqrt
 
-from lqrsim.kernels.declarations import ROW, stack
+from lqrsim.kernels.declarations import ROW, inline, outline, stack
 
 
+@inline
 def signed_distance(data, row: int, x: float, y: float, z: float) -> float:
     """Signed distance of (x, y, z) to the obstacle whose `ROW` numbers start at `data[row]`; negative inside."""
     kind = data[row]
@@ -32,6 +33,7 @@ def signed_distance(data, row: int, x: float, y: float, z: float) -> float:
     return sqrt(a * a + b * b + c * c) if inside > 0 else inside
 
 
+@inline
 def signed_distance_derivatives(data, row: int, x: float, y: float, z: float, gradient, hessian) -> float:
     """Signed distance as above; writes its gradient (3,) and Hessian (3, 3).
 
@@ -137,33 +139,41 @@ def box_derivatives(data, row: int, dx: float, dy: float, dz: float, gradient, h
 
 def nearest(obstacles, count, data, points, out):
     """Write the distance to the nearest of the obstacles, of `count` points (any, 3)."""
+    nowhere = stack(3)
     for i in range(count):
-        out[i] = inf
-        for row in range(0, ROW * obstacles, ROW):
-            distance = signed_distance(data, row, points[i, 0], points[i, 1], points[i, 2])
-            if not distance >= out[i]:  # NaN, too: nowhere is not far away
-                out[i] = distance
+        out[i] = nearest_to(obstacles, data, points[i], nowhere, 0)
 
 
 def nearest_displaced(obstacles, count, each, data, points, displaced, out):
     """The same with obstacles that are elsewhere, by displaced[trial], where each trial has `each` of the points."""
     for i in range(count):
-        out[i] = inf
-        trial = i // each
-        for k in range(obstacles):
-            x = points[i, 0] - displaced[trial, 3 * k]
-            y = points[i, 1] - displaced[trial, 3 * k + 1]
-            z = points[i, 2] - displaced[trial, 3 * k + 2]
-            distance = signed_distance(data, ROW * k, x, y, z)
-            if not distance >= out[i]:
-                out[i] = distance
+        out[i] = nearest_to(obstacles, data, points[i], displaced[i // each], 1)
+
+
+@outline
+def nearest_to(obstacles, data, point, displaced, moved):
+    """The distance of one point (3,) to the nearest; where they have moved, by displaced (3 obstacles,)."""
+    least = inf
+    for k in range(obstacles):
+        x, y, z = point[0], point[1], point[2]
+        if moved == 1:
+            x, y, z = x - displaced[3 * k], y - displaced[3 * k + 1], z - displaced[3 * k + 2]
+        distance = signed_distance(data, ROW * k, x, y, z)
+        if not distance >= least:  # NaN, too: nowhere is not far away
+            least = distance
+    return least
 
 
 def each_with_normal(obstacles, count, data, points, distances, normals):
     """Write the distance to each obstacle of `count` points (any, 3), and which way it grows: (any,), (any, 3)."""
-    curve = stack(3, 3)
     for i in range(count):
         for k in range(obstacles):
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
             at = i * obstacles + k
-            distances[at] = signed_distance_derivatives(data, ROW * k, x, y, z, normals[at], curve)
+            distances[at] = distance_with_normal(data, ROW * k, points[i], normals[at])
+
+
+@outline
+def distance_with_normal(data, row, point, normal):
+    """That of one point (3,) to one obstacle."""
+    curve = stack(3, 3)
+    return signed_distance_derivatives(data, row, point[0], point[1], point[2], normal, curve)

@@ -1,4 +1,4 @@
-"""How far a state is from a number, to the side where it may be. The numba subset; see `declarations.py`.
+"""How far a state is from a number, to the side where it may be. The kernels' subset.
 
 `data` has of each row which state it is, 1 where the number is its least and -1 where it is its most, the number, and
 the last step at which that holds.

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import distances, symbolic
-from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order
-from lqrsim.codegen.kernel_source import check_source, source_of
-from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
+from lqrsim.codegen.compiled_module import in_c_order, module_of
+from lqrsim.codegen.sources import Source, check_source, source_of
+from lqrsim.codegen.user_functions import UserFunction, address_of, check_signature, level_of, name_of
 from lqrsim.errors import (
     Array,
     InputError,
@@ -26,7 +26,7 @@ from lqrsim.errors import (
     excerpt,
     vectors_of,
 )
-from lqrsim.kernels import ball_places, function_places, linear_algebra, place_differences, rotation_ratios
+from lqrsim.kernels import ball_places, function_places, place_differences
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.world import SPACE, World
@@ -39,21 +39,26 @@ class Places:
     Attributes:
       source: defines `places(x, data, out)`, which writes three coordinates a ball, ball by ball, and
         `places_jacobian(x, data, out, slopes)`, which writes them and the derivatives in the states (3 K, N) that are
-        not zero, to zeros. The numba subset; see `costs.Term`.
+        not zero, to zeros. As the source of a `costs.Term`.
       data: (any,) float64, which the source reads from the first on, after the addresses of its functions.
       depends_on: the states that the places depend on, by their indices.
       in_plane: whether they are places in the plane of the robot's position, the third coordinate 0; or in space.
-      functions: what the source calls with `invoke`; their addresses come first in what it is given.
+      functions: what the source calls with `call`; their addresses come first in what it is given.
     """
 
-    source: str
+    source: str | Source
     data: Array
     depends_on: tuple[int, ...]
     in_plane: bool = False
     functions: tuple[UserFunction, ...] = ()
 
+    @functools.cached_property
+    def code(self) -> Source:
+        """The source, checked. Raises InputError."""
+        return check_source("Places", self.source, {"places": 3, "places_jacobian": 4})
+
     def __post_init__(self) -> None:
-        check_source("Places", self.source, {"places": 3, "places_jacobian": 4})
+        _ = self.code
         object.__setattr__(self, "data", check_array("Places: data", self.data, (None,), infinite=True))
         given = check_items("Places: depends_on", self.depends_on, (int, np.integer), "a tuple of indices of states")
         indices = tuple(check_count("Places: depends_on", i, at_least=0) for i in given)
@@ -246,8 +251,8 @@ class Balls:
             shape = len(self), size, len(names)
             functions += (UserFunction(function=self.jacobian, writes=(shape,), **rest),)
             return Places(source_of(function_places, **filled), dynamics.data, axes, size == 2, functions)
-        differences = source_of(place_differences, PLACES=coordinates, AXES=axes)
-        source = f"{source_of(function_places, 'places', **filled)}\n\n{differences}"
+        given = source_of(function_places, **filled)
+        source = source_of(place_differences, PLACES=coordinates, AXES=axes).filled(places=given)
         return Places(source, dynamics.data, axes, size == 2, functions)
 
     def _size_of(self, dynamics: Dynamics) -> int:
@@ -344,10 +349,10 @@ def evaluate_slopes(places: Places, count: int, states: Array) -> tuple[Array, A
 
 def _call(places: Places, name: str, states: Array, *outputs: Array) -> None:
     """Call a function of `kernels/ball_places.py`; what a user's function raises comes through."""
-    with compiling:
-        core = _core(places.source, states.shape[1])
-        data = np.array([*(address_of(function) for function in places.functions), *places.data], dtype=np.float64)
-    getattr(core, name)(len(states), states, data, *outputs)
+    filled = source_of(ball_places).filled(places=places.code, places_jacobian=places.code)
+    module = module_of(filled, f"places of balls ({states.shape[1]} states)", N=states.shape[1])
+    data = np.array([*(address_of(function) for function in places.functions), *places.data], dtype=np.float64)
+    getattr(module, name)(len(states), states, data, *outputs)
     for function in places.functions:
         if function.raised is not None:
             error = function.raised
@@ -363,12 +368,6 @@ def clearances(balls: Balls, dynamics: Dynamics, world: World, states: npt.Array
     places = balls.bind(dynamics)
     seen = places.world_seen(world, dynamics.state_coordinates)
     return distances.signed_distance_at(seen, evaluate(places, len(balls), states), times) - balls.radii
-
-
-@functools.cache
-def _core(source: str, n: int) -> Core:
-    parts = [source_of(rotation_ratios), source_of(linear_algebra, "clear"), source, source_of(ball_places)]
-    return Core("\n\n".join(parts), {"N": n}, f"places of balls ({n} states)")
 
 
 def _points(returned: Any, count: int) -> list[list[Any]]:

@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.kernel_source import source_of
+from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt, real
 from lqrsim.kernels import ball_clearance, clearance
 from lqrsim.problem.balls import Balls, bind_outline, check_outline
@@ -86,7 +86,9 @@ class Clearance(Constraint):
             return ConstraintTerm(source, data, len(world), describe)
         own = [*margins.shape, len(world), len(tables), *balls.radii, *margins.ravel(), *tables.ravel()]
         return ConstraintTerm(
-            source=f"{places.source}\n\n{source_of(ball_clearance, AT=places.numbers, BALLS=len(balls))}",
+            source=source_of(ball_clearance, AT=places.numbers, BALLS=len(balls)).filled(
+                places=places.code, places_jacobian=places.code
+            ),
             data=np.concatenate([places.data, own]),
             rows=len(balls) * len(world),
             describe=describe,

@@ -4,6 +4,7 @@ To add a kind, state it as a formula with `SymbolicConstraint`, or subclass `Con
 """
 
 import abc
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
-from lqrsim.codegen.kernel_source import check_source, source_of
+from lqrsim.codegen.sources import Source, check_source, source_of
 from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
 from lqrsim.errors import (
     Array,
@@ -51,10 +52,10 @@ class ConstraintTerm:
       balls: of how many balls the numbers are, whose places all of them share; mostly none. With it the source defines
         `places` and `places_jacobian`, too, as `Places` has them, and `value` and `slope` get the places (3 balls,) and
         their derivatives (3 balls, n) in place of x and u.
-      functions: what the source calls with `invoke`; their addresses come first in the data that it is given.
+      functions: what the source calls with `call`; their addresses come first in the data that it is given.
     """
 
-    source: str
+    source: str | Source
     data: Array
     rows: int
     describe: Callable[[int], str]
@@ -63,6 +64,12 @@ class ConstraintTerm:
     final_only: bool = False
     balls: int = 0
     functions: tuple[UserFunction, ...] = ()
+
+    @functools.cached_property
+    def code(self) -> Source:
+        """The source, checked. Raises InputError."""
+        of_balls = {"places": 3, "places_jacobian": 4} if self.balls else {}
+        return check_source("ConstraintTerm", self.source, {"value": 5, "slope": 6, **of_balls})
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", check_array("ConstraintTerm: data", self.data, (None,), infinite=True))
@@ -73,8 +80,7 @@ class ConstraintTerm:
         if self.uses_control and self.final_only:
             raise InputError("ConstraintTerm: final_only: got True with uses_control, want one: the end has no control")
         object.__setattr__(self, "balls", check_count("ConstraintTerm: balls", self.balls, at_least=0))
-        of_balls = {"places": 3, "places_jacobian": 4} if self.balls else {}
-        check_source("ConstraintTerm", self.source, {"value": 5, "slope": 6, **of_balls})
+        _ = self.code
         functions = check_items("ConstraintTerm: functions", self.functions, UserFunction, "a tuple of UserFunction")
         object.__setattr__(self, "functions", functions)
 

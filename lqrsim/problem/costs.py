@@ -4,6 +4,7 @@ To add a kind of cost, subclass `Cost` and write `bind`; or state it as a formul
 """
 
 import abc
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
-from lqrsim.codegen.kernel_source import check_source, source_of
+from lqrsim.codegen.sources import Source, check_source, source_of
 from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
 from lqrsim.errors import (
     Array,
@@ -38,22 +39,23 @@ class Term:
     """A cost term, made for one system: what gets compiled, and the numbers it reads.
 
     Attributes:
-      source: defines `value(x, u, t, data)` and `derivatives(x, u, t, data, hessian, gradient)`, both returning the
-        cost; the latter *adds* the Hessian (n+m, n+m) and gradient (n+m,) at the point, states before controls. The
-        numba subset; the names of `kernels/signed_distance.py` and `kernels/rotation_ratios.py`, and N, M, W, sqrt, exp
-        and the like are at hand, by their bare names: `cos`, not `math.cos` or `np.cos`, which are refused.
+      source: text that defines `value(x, u, t, data)` and `derivatives(x, u, t, data, hessian, gradient)`, both
+        returning the cost; the latter *adds* the Hessian (n+m, n+m) and gradient (n+m,) at the point, states before
+        controls. `codegen/language.py` says what it may contain. N, M, W, sqrt, exp and the like are at hand, by their
+        bare names: `cos`, not `math.cos` or `np.cos`, which are refused; and the functions of
+        `kernels/signed_distance.py` and `kernels/rotation_ratios.py`. Or a Source, of a module of the package's.
       data: (any,) float64; the source can index it, but not ask for its length.
       nonconvex_in: indices of the entries of (x, u) in which the Hessian may be indefinite: None for a convex term. The
         sum of all such terms is projected to the nearest positive-semidefinite matrix.
       uses_control: whether it depends on u (only stage costs may).
       factor: index in `data` of a number that the whole term is proportional to, for what may be eased in the first
         iterations; see `InitialPrior`. None where there is none.
-      functions: what the source calls with `invoke`; their addresses come first in the data that it is given.
+      functions: what the source calls with `call`; their addresses come first in the data that it is given.
       exact_hessian: whether the Hessian is all of it. Where a part is left out on purpose, `check_derivatives` does not
         compare it with differences.
     """
 
-    source: str
+    source: str | Source
     data: Array
     nonconvex_in: tuple[int, ...] | None = None
     uses_control: bool = False
@@ -61,9 +63,14 @@ class Term:
     functions: tuple[UserFunction, ...] = ()
     exact_hessian: bool = True
 
+    @functools.cached_property
+    def code(self) -> Source:
+        """The source, checked. Raises InputError."""
+        return check_source("Term", self.source, {"value": 4, "derivatives": 6})
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", check_array("Term: data", self.data, (None,), infinite=True))
-        check_source("Term", self.source, {"value": 4, "derivatives": 6})
+        _ = self.code
         if self.nonconvex_in is not None:
             wanted = "a tuple of indices, or None"
             given = check_items("Term: nonconvex_in", self.nonconvex_in, (int, np.integer), wanted)
@@ -146,7 +153,7 @@ class QuadraticCost(Cost):
 
     def bind(self, dynamics: Dynamics) -> Term:
         _check_size("QuadraticCost: weight", self.weight, len(dynamics.state_coordinates), "states")
-        return Term(source_of(quadratic_cost, CONTROL=False), np.concatenate([self.about, self.weight.ravel()]))
+        return Term(source_of(quadratic_cost, CONTROL=0), np.concatenate([self.about, self.weight.ravel()]))
 
 
 class ControlCost(Cost):
@@ -166,7 +173,7 @@ class ControlCost(Cost):
     def bind(self, dynamics: Dynamics) -> Term:
         _check_size("ControlCost: weight", self.weight, len(dynamics.control_coordinates), "controls")
         numbers = np.concatenate([self.about, self.weight.ravel()])
-        return Term(source_of(quadratic_cost, CONTROL=True), numbers, uses_control=True)
+        return Term(source_of(quadratic_cost, CONTROL=1), numbers, uses_control=True)
 
 
 class ObstacleCost(Cost):
@@ -237,7 +244,7 @@ class ObstacleCost(Cost):
         count, axes = len(balls), places.depends_on
         kernel = source_of(ball_cost, AT=places.numbers, BALLS=count, PLACES=3 * count, AXES=axes)
         return Term(
-            f"{places.source}\n\n{kernel}",
+            kernel.filled(places=places.code, places_jacobian=places.code),
             np.concatenate([places.data, own]),
             nonconvex_in=axes or None,
             factor=len(places.data) + 1,
@@ -372,7 +379,7 @@ class FunctionCost(Cost):
             functions += (UserFunction(function=self.derivatives, writes=((n + m,), (n + m, n + m)), **rest),)
         source = source_of(function_cost)
         if self.derivatives is None:
-            source = f"{source_of(function_cost, 'value')}\n\n{source_of(cost_differences, AXES=axes)}"
+            source = source_of(cost_differences, AXES=axes)
         return Term(
             source,
             np.array(list(self.parameters.values()), dtype=np.float64),

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lqrsim.codegen.user_functions import UserFunction, brief, plain_names
+from lqrsim.codegen.plain import plain_functions
+from lqrsim.codegen.user_functions import UserFunction, brief, plain_calls
 from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, check_text, excerpt, real, shaped
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import Term, terms_of
@@ -88,8 +89,9 @@ def _run_plainly(term: Term | ConstraintTerm, n: int, m: int) -> tuple[dict[str,
     """What a term's source defines, as plain Python, and the data that it is given."""
     first = term.functions[:1]
     parameters = dict(zip(first[0].parameters, term.data.tolist(), strict=False)) if first else {}
-    names = plain_names(n, m, term.functions, parameters)
-    exec(compile(term.source, "<term>", "exec"), names)
+    wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]
+    calls = plain_calls(term.functions, parameters)
+    names = plain_functions(term.code, {"N": n, "M": m, "W": n + m}, wanted, calls)
     return names, np.concatenate([np.arange(len(term.functions), dtype=np.float64), term.data])
 
 

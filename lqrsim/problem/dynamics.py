@@ -10,8 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
-from lqrsim.codegen.kernel_source import source_of
-from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of, plain_names
+from lqrsim.codegen.compiled_module import CompiledModule, module_of
+from lqrsim.codegen.plain import plain_functions
+from lqrsim.codegen.sources import Source, source_of, text_source
+from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of, plain_calls
 from lqrsim.errors import (
     Array,
     InputError,
@@ -165,7 +167,7 @@ class Dynamics:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is derived and cannot be pickled."""
-        return {name: value for name, value in vars(self).items() if name not in ("_plain", "disturbed")}
+        return {name: value for name, value in vars(self).items() if name not in ("_plain", "disturbed", "compiled")}
 
     @property
     def name(self) -> str:
@@ -197,7 +199,8 @@ class Dynamics:
         if self.disturbances.keys() <= self.parameters.keys():
             return self
         other = copy.copy(self)
-        vars(other).pop("source", None)
+        for name in ("source", "step_source", "compiled"):
+            vars(other).pop(name, None)
         other.parameters = self.parameters | self.disturbances
         return other
 
@@ -219,15 +222,27 @@ class Dynamics:
         return rate, UserFunction(function=self.jacobian, writes=((n, n), (n, m)), **rest)
 
     @cached_property
-    def source(self) -> str:
+    def source(self) -> Source:
         """Source of `rate` and `rate_jacobian` of `kernels/declarations.py`; symbolic dynamics are traced, once."""
         if self.level != "symbolic":
-            if self.jacobian is not None:
-                return source_of(function_dynamics)
-            return f"{source_of(function_dynamics, 'rate')}\n\n{source_of(finite_differences)}"
+            given = source_of(function_dynamics)
+            return given if self.jacobian is not None else source_of(finite_differences).filled(rate=given)
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
         details = ("dynamics", *names, *self.constants.items())
-        return symbolic.kept(self.f, details, lambda: {"source": self._trace()})["source"]
+        made = symbolic.kept(self.f, details, lambda: {"source": self._trace()})
+        return text_source(made["source"], f"{self.name}(x, u, p)")
+
+    @cached_property
+    def step_source(self) -> Source:
+        """Source of `advance` and `step_jacobian`, as `kernels/runge_kutta.py` has them."""
+        names = [name for name in ("rate", "rate_jacobian", "chain") if self.source.has(name)]
+        return source_of(runge_kutta).filled(**dict.fromkeys(names, self.source))
+
+    @cached_property
+    def compiled(self) -> CompiledModule:
+        """These, compiled."""
+        n, m = len(self.state_coordinates), len(self.control_coordinates)
+        return module_of(self.step_source, f"{self.name} ({n} states, {m} controls)", N=n, M=m, W=n + m)
 
     @property
     def constants(self) -> dict[str, float]:
@@ -348,9 +363,7 @@ class Dynamics:
         x, u = self._check(state, control)
         n, m = len(x), len(u)
         out, jacobian = np.zeros(n), np.zeros((n, n + m))
-        self._plain["step_jacobian"](
-            x, u, self._numbers(), check_number("dt", dt), np.zeros((n, n)), np.zeros((n, m)), out, jacobian
-        )
+        self._plain["step_jacobian"](x, u, self._numbers(), check_number("dt", dt), out, jacobian)
         a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
         return a, b, out - a @ x - b @ u
 
@@ -364,13 +377,9 @@ class Dynamics:
     def _plain(self) -> dict[str, Any]:
         """The very source that gets compiled, run as plain Python."""
         n, m = len(self.state_coordinates), len(self.control_coordinates)
-        names = plain_names(n, m, self.functions, self.parameters)
-        exec(compile(self.source, f"<{self.name}>", "exec"), names)
-        for function in ("advance", "step_jacobian"):
-            exec(compile(source_of(runge_kutta, function), "<runge_kutta>", "exec"), names)
-        if "chain" not in names:
-            exec(compile(source_of(runge_kutta, "chain"), "<runge_kutta>", "exec"), names)
-        return names
+        names = ("rate", "rate_jacobian", "advance", "step_jacobian")
+        calls = plain_calls(self.functions, self.parameters)
+        return plain_functions(self.step_source, {"N": n, "M": m, "W": n + m}, names, calls)
 
     def _numbers(self) -> Array:
         """What `p` is in the compiled functions, with the places of the functions for their addresses."""

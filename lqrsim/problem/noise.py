@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen import symbolic
-from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order
-from lqrsim.codegen.kernel_source import source_of
-from lqrsim.codegen.user_functions import UserFunction, check_signature, level_of, name_of
+from lqrsim.codegen.compiled_module import in_c_order, module_of
+from lqrsim.codegen.sources import Source, source_of, text_source
+from lqrsim.codegen.user_functions import UserFunction, address_of, check_signature, level_of, name_of
 from lqrsim.errors import (
     Array,
     InputError,
@@ -28,14 +28,7 @@ from lqrsim.errors import (
     check_number,
     excerpt,
 )
-from lqrsim.kernels import (
-    function_noise,
-    linear_algebra,
-    matrix_noise,
-    noise_differences,
-    noise_matrices,
-    rotation_ratios,
-)
+from lqrsim.kernels import function_noise, matrix_noise, noise_differences, noise_matrices
 from lqrsim.problem.dynamics import Dynamics
 
 MOST = 100  # independent normal numbers
@@ -51,10 +44,10 @@ class NoiseTerm:
       data: (any,) the parameters or the matrix, then the strength.
       rows: the states that noise acts on at once. size: of w.
       active: the entries of (x, u), states before controls, that M depends on.
-      functions: what the source calls with `invoke`; their addresses come first in the data that it is given.
+      functions: what the source calls with `call`; their addresses come first in the data that it is given.
     """
 
-    source: str
+    source: Source
     data: Array
     rows: tuple[int, ...]
     size: int
@@ -200,7 +193,8 @@ class Noise:
             return self._bind_function(dynamics, numbers)
         details = ("noise", n, m, self.size, tuple(self.parameters))
         made = symbolic.kept(self.function, details, lambda: self._trace(n, m))
-        return NoiseTerm(made["source"], numbers, tuple(made["rows"]), self.size, tuple(made["active"]))
+        source = text_source(made["source"], self.name)
+        return NoiseTerm(source, numbers, tuple(made["rows"]), self.size, tuple(made["active"]))
 
     def _trace(self, n: int, m: int) -> dict[str, Any]:
         @functools.wraps(self.function)
@@ -258,8 +252,9 @@ class Noise:
             values=n * self.size, entries=states, columns=self.size,
             unused=tuple((i, name) for i, name in enumerate(names) if i not in active),
         )  # fmt: skip
-        source = source_of(function_noise, SIZE=self.size, STRENGTH=1 + len(self.parameters))
-        source += "\n\n" + source_of(noise_differences, SIZE=self.size, ACTIVE=active, SOME=len(active))
+        given = source_of(function_noise, SIZE=self.size, STRENGTH=1 + len(self.parameters))
+        differences = source_of(noise_differences, SIZE=self.size, ACTIVE=active, SOME=len(active))
+        source = differences.filled(noise_values=given)
         return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, (function,))
 
     def matrices(self, dynamics: Dynamics, states: npt.ArrayLike, controls: npt.ArrayLike) -> Array:
@@ -282,9 +277,9 @@ class Noise:
         u = check_array("controls", controls, (len(x), m), infinite=True)
         term = self.bind(dynamics)
         compact = np.zeros((len(x), len(term.rows), self.size))
-        with compiling:
-            core, data = _core(term.source, n, m), numbers_of(term)
-        core.matrices_of(len(x), in_c_order(x), in_c_order(u), data, compact)
+        filled = source_of(noise_matrices).filled(noise_values=term.source)
+        module = module_of(filled, f"noise ({n} states, {m} controls)", N=n, M=m, W=n + m)
+        module.matrices_of(len(x), in_c_order(x), in_c_order(u), numbers_of(term), compact)
         for function in term.functions:
             if function.raised is not None:
                 error = function.raised
@@ -298,9 +293,3 @@ class Noise:
 def numbers_of(term: NoiseTerm) -> Array:
     """What its source reads: the addresses of its functions, then its own numbers."""
     return np.array([*(address_of(function) for function in term.functions), *term.data], dtype=np.float64)
-
-
-@functools.cache
-def _core(source: str, n: int, m: int) -> Core:
-    parts = [source_of(rotation_ratios), source_of(linear_algebra, "clear"), source, source_of(noise_matrices)]
-    return Core("\n\n".join(parts), {"N": n, "M": m, "W": n + m}, f"noise ({n} states, {m} controls)")

@@ -90,6 +90,7 @@ class Problem:
     _terms: dict[str, tuple[Term, ...]] = field(init=False, repr=False, compare=False)
     _constraint_terms: tuple[ConstraintTerm, ...] = field(init=False, repr=False, compare=False)
     _noise_term: NoiseTerm | None = field(init=False, repr=False, compare=False)
+    _controls: tuple[Coordinates, Coordinates] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dt", check_number("dt", self.dt, above=0.0))
@@ -120,6 +121,7 @@ class Problem:
         object.__setattr__(self, "risk", check_number("risk", self.risk))
         if self.risk and self.noise is None:
             raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
+        controls = self.dynamics.control_coordinates
         if self.control_limits is not None:
             try:
                 low, high = self.control_limits
@@ -127,9 +129,12 @@ class Problem:
                 raise InputError(
                     f"control_limits: got {excerpt(self.control_limits)}, want (lowest, highest)"
                 ) from None
-            limited = self.dynamics.control_coordinates.limited(low, high)
-            _check_within_reach(limited, self.dynamics.control_coordinates)
+            limited = controls.limited(low, high)
+            _check_within_reach(limited, controls)
             object.__setattr__(self, "control_limits", (limited.low, limited.high))
+            object.__setattr__(self, "_controls", (limited, limited.within(controls)))
+        else:
+            object.__setattr__(self, "_controls", (controls, controls))
         self._check_start_clear()
 
     @property
@@ -250,8 +255,12 @@ class Problem:
     @property
     def control_coordinates(self) -> Coordinates:
         """Names, units and limits of the controls, as they are planned with."""
-        coordinates = self.dynamics.control_coordinates
-        return coordinates if self.control_limits is None else coordinates.limited(*self.control_limits)
+        return self._controls[0]
+
+    @property
+    def applied_coordinates(self) -> Coordinates:
+        """The same with limits that are also the actuators', as a policy keeps them."""
+        return self._controls[1]
 
     @property
     def nominal_control(self) -> Array:
@@ -301,7 +310,8 @@ class Problem:
     @property
     def digest(self) -> str:
         """Hash of everything that defines the problem: structure and numbers."""
-        parts: list[str | Array] = [f"{self.dynamics.source} {self.dt!r} {self.steps}", repr(self.dynamics.parameters)]
+        parts: list[str | Array] = [self.dynamics.step_source.digest, f" {self.dt!r} {self.steps}"]
+        parts.append(repr(self.dynamics.parameters))
         parts.append(repr((self.control_coordinates.low, self.control_coordinates.high)))
         if self.dynamics.fixed:
             parts.append(self.dynamics.fixed)
@@ -310,15 +320,15 @@ class Problem:
             parts.append(np.asarray(self.initial.state))
         for name in ("initial", "stage_cost", "final_cost"):
             for term in self.terms(name):
-                parts += [term.source, term.data]
+                parts += [term.code.digest, term.data]
                 functions += term.functions
         for term in self.constraint_terms:
-            parts += [term.source, term.data]
+            parts += [term.code.digest, term.data]
             functions += term.functions
             if term.equality or term.final_only:
                 parts.append(repr((term.equality, term.final_only)))
         if self._noise_term is not None:
-            parts += [self._noise_term.source, self._noise_term.data, repr((self._noise_term.filled, self.risk))]
+            parts += [self._noise_term.source.digest, self._noise_term.data, repr((self._noise_term.filled, self.risk))]
             functions += self._noise_term.functions
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
 

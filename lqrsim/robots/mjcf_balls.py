@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen.kernel_source import source_of
+from lqrsim.codegen.sources import source_of
 from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError
-from lqrsim.kernels import mjcf_dynamics, mjcf_places
+from lqrsim.kernels import mjcf_places
 from lqrsim.problem.balls import Balls, Places
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.robots.mjcf_dynamics import MjcfDynamics, named_places
+from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes.mjcf_outline import Outline
 
 
@@ -38,8 +38,7 @@ class MjcfBalls(Balls):
         memory = _Memory.of(dynamics, self)
         positions = dynamics.physics.model.nv
         data = np.concatenate([[len(self), positions], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
-        own = source_of(mjcf_dynamics, "take_slot", "write_positions", "write_quaternion", **named_places())
-        return Places(f"{own}\n\n{_places()}", data, tuple(range(positions)), functions=(memory,))
+        return Places(source_of(mjcf_places), data, tuple(range(positions)), functions=(memory,))
 
 
 class _Memory(UserFunction):
@@ -65,8 +64,3 @@ class _Memory(UserFunction):
 
 def _plainly(place: Callable[[Array], Array], x: Array, p: Any) -> Array:
     return place(x)
-
-
-def _places() -> str:
-    used = {name: value for name, value in named_places().items() if hasattr(mjcf_places, name)}
-    return source_of(mjcf_places, **used)

@@ -4,17 +4,16 @@ import contextlib
 import copy
 import threading
 from collections.abc import Iterator
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.jit import Core, in_c_order
-from lqrsim.codegen.kernel_source import source_of
+from lqrsim.codegen.compiled_module import in_c_order
+from lqrsim.codegen.sources import Source, source_of
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number
 from lqrsim.kernels import mjcf_dynamics as kernel
-from lqrsim.kernels import rotation_ratios
 from lqrsim.machine import processors
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
@@ -61,7 +60,7 @@ class MjcfDynamics(Dynamics):
 
     def __getstate__(self) -> dict[str, Any]:
         """Without MuJoCo's memory, which another process makes anew."""
-        return {name: value for name, value in vars(self).items() if name not in ("physics", "disturbed")}
+        return {name: value for name, value in vars(self).items() if name not in ("physics", "disturbed", "compiled")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -78,8 +77,12 @@ class MjcfDynamics(Dynamics):
         return self._name
 
     @cached_property
-    def source(self) -> str:
-        return _source()
+    def source(self) -> Source:
+        return self.step_source
+
+    @cached_property
+    def step_source(self) -> Source:
+        return source_of(kernel)
 
     @property
     def data(self) -> Array:
@@ -143,7 +146,7 @@ class MjcfDynamics(Dynamics):
         self.check_period(dt)
         out = np.empty(len(x))
         with unlogged():
-            self._core.advance(in_c_order(x), in_c_order(u), self.data, float(dt), out)
+            self.compiled.advance(in_c_order(x), in_c_order(u), self.data, float(dt), out)
         return out
 
     def linearize(self, state: npt.ArrayLike, control: npt.ArrayLike, dt: float) -> tuple[Array, Array, Array]:
@@ -151,11 +154,9 @@ class MjcfDynamics(Dynamics):
         x, u = self._check(state, control)
         self.check_period(dt)
         n, m = len(x), len(u)
-        out, jacobian, unused = np.empty(n), np.empty((n, n + m)), np.empty((n, n))
+        out, jacobian = np.empty(n), np.empty((n, n + m))
         with unlogged():
-            self._core.step_jacobian(
-                in_c_order(x), in_c_order(u), self.data, float(dt), unused, np.empty((n, m)), out, jacobian
-            )
+            self.compiled.step_jacobian(in_c_order(x), in_c_order(u), self.data, float(dt), out, jacobian)
         a, b = jacobian[:, :n].copy(), jacobian[:, n:].copy()
         return a, b, out - a @ x - b @ u
 
@@ -170,7 +171,7 @@ class MjcfDynamics(Dynamics):
         with unlogged():
             with _forming:
                 if team[kernel.HELPERS] == 0:
-                    numbers, help_out = self.data, self._core.help_out
+                    numbers, help_out = self.data, self.compiled.help_out
                     helpers += [threading.Thread(target=help_out, args=(numbers,)) for _ in range(threads - 1)]
                     team[kernel.HELPERS] = len(helpers)
             for helper in helpers:
@@ -183,23 +184,3 @@ class MjcfDynamics(Dynamics):
                     for helper in helpers:
                         helper.join()
                     team[kernel.STOP] = team[kernel.HELPERS] = 0
-
-    @property
-    def _core(self) -> Core:
-        return _core(len(self.state_coordinates), len(self.control_coordinates))
-
-
-def named_places() -> dict[str, int]:
-    """Where the kernel's numbers are what, as `source_of` takes it."""
-    return {name: value for name, value in vars(kernel).items() if name.isupper() and len(name) > 1}
-
-
-@cache
-def _source() -> str:
-    return source_of(kernel, **named_places())
-
-
-@cache
-def _core(n: int, m: int) -> Core:
-    sizes = {"N": n, "M": m, "W": n + m}
-    return Core(f"{source_of(rotation_ratios)}\n\n{_source()}", sizes, f"MuJoCo's steps ({n} states, {m} controls)")

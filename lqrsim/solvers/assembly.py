@@ -42,7 +42,7 @@ def assemble(
         return AffinePolicy(
             gain=gain, offset=offset, nominal=nominal, dt=problem.dt,
             state_coordinates=problem.dynamics.state_coordinates,
-            control_coordinates=problem.control_coordinates.within(problem.dynamics.control_coordinates),
+            control_coordinates=problem.applied_coordinates,
         )  # fmt: skip
 
     return Solution(

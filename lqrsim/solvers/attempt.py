@@ -68,7 +68,7 @@ class Attempt:
         self.termination = Termination((), declarations.RUNNING, False, -1, "")
         self._log = np.zeros(settings.max_iterations, LOG)
         self._shares = initial_guess.prior.obstacles if initial_guess.prior is not None else ()
-        self._loop = self.work.core.entry("smoother", *self._arguments(0, 0, self._log))
+        self._loop = self.work.core.lay_out("smoother", *self._arguments(0, 0, self._log))
 
     @property
     def cost(self) -> float:
@@ -87,7 +87,7 @@ class Attempt:
         self.termination = iterate(
             self.problem, lambda first, last: self._loop(*self._arguments(first, last, self._log)), self._log,
             min(last, self.settings.max_iterations), done=self.termination.iterations, look=self._violation,
-            each=self._returns_each(each), stop=self.stop, callback=callback,
+            each=each, stop=self.stop, callback=callback,
         )  # fmt: skip
         if self.termination.outcome == declarations.TIMED_OUT and not self.termination.iterations:
             self.roll_out()
@@ -99,7 +99,7 @@ class Attempt:
         self.work.memory["watched"] = 0.0  # with constraints the least cost is no measure
         return iterate(
             self.problem, lambda first, last: self._loop(*self._arguments(first, last, log, again=True)), log, last,
-            done=done, look=self._violation, each=self._returns_each(each), stop=self.stop, callback=callback,
+            done=done, look=self._violation, each=each, stop=self.stop, callback=callback,
         )  # fmt: skip
 
     def roll_out(self) -> None:
@@ -165,9 +165,9 @@ class Attempt:
         """
         work, log = self.work, np.full(1, np.nan, LOG)
         trial, own = Plan(np.zeros_like(work.states), np.zeros_like(work.controls)), self.problem.risk
-        work.model.noise[1][0] = risk
+        work.model.noise.risk[0] = risk
         *_, failed = self._loop(*self._damped_arguments(0, 0, log, 1, trial))
-        work.model.noise[1][0] = own
+        work.model.noise.risk[0] = own
         return failed
 
     def rescue(self, found: AttemptResult, *, each: bool, callback: Callback | None = None) -> AttemptResult:
@@ -209,7 +209,7 @@ class Attempt:
 
         return iterate(
             self.problem, run, log, last, before=before, look=lambda: self._violation_of(work.plan),
-            each=self._returns_each(each), stop=self.stop, callback=callback,
+            each=each, stop=self.stop, callback=callback,
         )  # fmt: skip
 
     def damped_result(self, damped: Termination, status: Status, detail: str) -> AttemptResult:
@@ -335,10 +335,6 @@ class Attempt:
     def _obstacle_share(self, iteration: int) -> float:
         """How much of the obstacle costs the passes of an iteration see."""
         return self._shares[iteration] if iteration < len(self._shares) else 1.0
-
-    def _returns_each(self, each: bool) -> bool:
-        """Whether to come back after each iteration: constraints are looked at from outside of the loops."""
-        return each or bool(self.problem.constraints)
 
     def _violation(self) -> float:
         return self._violation_of((self.work.states, self.work.controls))

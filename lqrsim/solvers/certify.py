@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lqrsim.codegen.jit import in_c_order
+from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import CERTIFICATE, CostToGo, Rows

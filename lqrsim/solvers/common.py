@@ -60,6 +60,7 @@ _METHODS = {
     declarations.ILQR: "ilqr",
 }
 MOST_STARTS, MOST_THREADS = 10_000, 1024
+ATTENTION = 0.1  # s, after which compiled code comes back to heed Ctrl-C
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,12 +231,13 @@ def iterate(
       done: those that there are already.
       before: the iterations of what ran before, which come first in the termination's.
       look: how far the constraints are missed by what `run` found last.
-      each: come back after each iteration, to time it, to tell `callback` and to heed Ctrl-C; otherwise nothing but
-        compiled code runs, and the seconds of an iteration are the average.
+      each: come back from compiled code to heed Ctrl-C: after each iteration where there is a callback, a deadline, or
+        something to look at, else after `ATTENTION`. The seconds of an iteration are the average of those between.
       stop: looked at before each iteration, where there is a deadline or a callback.
     """
-    each = each or stop.deadline < np.inf
     functions = functions_of(problem)
+    single = (each and (callback is not None or bool(functions))) or bool(problem.constraints) or stop.deadline < np.inf
+    bite = 1 if each or single else last
     for function in functions:
         function.forget()
     iterations = list(done)
@@ -247,8 +249,10 @@ def iterate(
                 break
             first = len(iterations)
             clock = time.perf_counter()
-            count, outcome, backward, failed = run(first, first + 1 if each else last)
+            count, outcome, backward, failed = run(first, min(first + bite, last))
             seconds = (time.perf_counter() - clock) / max(count - first, 1)
+            if each and not single:
+                bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
             for i, row in enumerate(log[first:count].tolist(), first):
                 cost, improvement, gap, optimality, residual, method = row
                 missed = look() if i == count - 1 or not problem.constraints else float("nan")

@@ -1,142 +1,183 @@
-"""From a problem to its compiled core and back: which text, which numbers.
+"""From a problem to its compiled passes and back: addresses of what the problem brings, and its numbers.
 
-The text is the structure: the sources that the dynamics and the cost terms wrote, and those of the package's own
-numba-subset modules, joined, with the sizes as constants. Everything that is a number (goal, weights, masses,
-obstacles, horizon) is an argument.
+The passes and iterations are compiled once for a size. Dynamics, each term of a cost, each constraint and the noise are
+compiled on their own, behind the C signatures of `codegen/compiled_module.py`, and the passes call them by their
+addresses. Everything that is a number (goal, weights, masses, obstacles, horizon) is an argument.
 """
 
-import hashlib
-import re
+import functools
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen.jit import Core, address_of, compiling, in_c_order
-from lqrsim.codegen.kernel_source import source_of
+from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
+from lqrsim.codegen.sources import Source, source_of
+from lqrsim.codegen.user_functions import address_of
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     augmented_lagrangian,
     ball_constraint,
-    certificate,
-    control_limits,
     cost_to_come_dual,
     cost_to_come_primal,
-    cost_to_go,
-    damped_iterations,
-    declarations,
     entry_points,
-    iterations,
-    linear_algebra,
     linear_quadratic_passes,
-    passes,
+    model_functions,
     projection,
-    rollouts,
-    rotation_ratios,
-    runge_kutta,
-    signed_distance,
 )
 from lqrsim.kernels import noise as noise_kernel
-from lqrsim.kernels.records import Limits, Model, Plan, Policy
+from lqrsim.kernels.records import Constraints, CostModel, DynamicsModel, Limits, Model, NoiseModel, Plan, Policy
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import Term
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.problem.noise import numbers_of
+from lqrsim.problem.noise import NoiseTerm, numbers_of
 from lqrsim.problem.problem import FixedState, Problem
-
-# The terms of a cost as far as they are structure: the source of each, and what it is not convex in (see `Term`).
-Structure = tuple[tuple[str, tuple[int, ...] | None], ...]
-# The constraints: the source of each, whether it uses the control, whether it is an equality, and of how many balls.
-Constraints = tuple[tuple[str, bool, bool, int], ...]
-# The noise: its source, and the constants that `kernels/noise.py` leaves open; none without noise.
-Noise = tuple[str, tuple[tuple[str, Any], ...]] | None
-
-_FIELDS = {"initial": "initial", "stage": "stage_cost", "final": "final_cost"}
-
 
 # The forms of the cost-to-come, and what brings each.
 FORMS = {"dual": cost_to_come_dual, "primal": cost_to_come_primal}
+_OF_FORM = (
+    "initial_cost_to_come", "linearize", "forward_jacobian", "riccati_forward", "minimizer", "backtrack",
+)  # fmt: skip
 
 
-def core(problem: Problem, form: str = "dual") -> Core:
-    """The compiled passes for problems of this structure; `kernels/` has what it offers."""
-    with compiling:  # not only against doing it twice: Python 3.11 cannot parse in two threads at once
-        return _core(form, *_structure(problem))
+def core(problem: Problem, form: str = "dual") -> CompiledModule:
+    """The compiled passes and iterations for problems of this size; `kernels/entry_points.py` has what they offer."""
+    noisy = problem.noise_term is not None
+    sizes = _sizes(problem.dynamics)
+    what = f"{sizes['N']} states and {sizes['M']} controls{' with noise' if noisy else ''}"
+    what += "" if form == "dual" else f", {form} form"
+    return module_of(_with_form(form, "entry_points"), what, **sizes, NOISY=int(noisy))
 
 
-def _structure(problem: Problem) -> tuple[Any, ...]:
-    dynamics = problem.dynamics
+def linear_quadratic(n: int, m: int, form: str) -> CompiledModule:
+    """Those for linear-quadratic problems of that size; see `kernels/linear_quadratic_passes.py`."""
+    what = f"linear-quadratic problems, {n} states and {m} controls"
+    return module_of(_with_form(form, "linear_quadratic_passes"), what, N=n, M=m, W=n + m, NOISY=0)
+
+
+@functools.cache
+def _with_form(form: str, which: str) -> Source:
+    module = {"entry_points": entry_points, "linear_quadratic_passes": linear_quadratic_passes}[which]
+    return source_of(module).filled(**dict.fromkeys(_OF_FORM, source_of(FORMS[form])))
+
+
+def _sizes(dynamics: Dynamics) -> dict[str, int]:
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
-    costs = [(name, tuple((t.source, t.nonconvex_in) for t in problem.terms(field))) for name, field in _FIELDS.items()]
-    constraints = tuple((one.source, one.uses_control, one.equality, one.balls) for one in problem.constraint_terms)
+    return {"N": n, "M": m, "W": n + m}
+
+
+def structure(problem: Problem) -> tuple[Any, ...]:
+    """What problems have in common that are solved without compiling anything between them."""
+    costs = tuple(tuple((term.code, term.nonconvex_in) for term in problem.terms(field)) for field in _FIELDS)
+    constraints = tuple((one.code, one.uses_control, one.equality, one.balls) for one in problem.constraint_terms)
     term = problem.noise_term
     noise = None if term is None else (term.source, tuple(term.filled.items()))
-    return n, m, dynamics.source, tuple(costs), constraints, noise, f"{dynamics.name} ({n} states, {m} controls)"
+    return problem.dynamics.step_source, tuple(_sizes(problem.dynamics).items()), costs, constraints, noise
 
 
-@cache
-def _core(
-    form: str,
-    n: int,
-    m: int,
-    dynamics: str,
-    costs: tuple[tuple[str, Structure], ...],
-    constraints: Constraints,
-    noise: Noise,
-    what: str,
-) -> Core:
-    parts = [source_of(module) for module in (*_BASE, FORMS[form], *_SHARED)]
-    parts += [dynamics, _constraint_source(constraints, len(dict(costs)["stage"]))]
-    parts += [_cost_source(name, terms, () if name == "initial" else constraints) for name, terms in costs]
-    if noise is not None:
-        parts += [noise[0], source_of(noise_kernel, **dict(noise[1]))]
-    sizes = {"N": n, "M": m, "W": n + m, "NOISY": int(noise is not None)}
-    return Core("\n\n".join(parts), {**_NAMES, **sizes}, what)
-
-
-_BASE = rotation_ratios, signed_distance, linear_algebra, cost_to_go, runge_kutta
-_SHARED = control_limits, passes, rollouts, iterations, damped_iterations, certificate, entry_points
-
-
-@cache
-def linear_quadratic(n: int, m: int, form: str) -> Core:
-    """Those for linear-quadratic problems of that size; see `kernels/linear_quadratic_passes.py`."""
-    with compiling:
-        parts = [source_of(module) for module in (linear_algebra, cost_to_go, FORMS[form], linear_quadratic_passes)]
-        return Core("\n\n".join(parts), {"N": n, "M": m, "W": n + m}, f"linear-quadratic, {n} states, {m} controls")
-
-
-# The numbers that have names: outcomes, methods, and the places of what is remembered.
-_NAMES = {name: value for name, value in vars(declarations).items() if name.isupper() and len(name) > 1}
+_FIELDS = ("initial", "stage_cost", "final_cost")
 
 
 def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> Model:
-    """The problem's numbers, as the passes take them: before its own, each part has the addresses of its functions.
+    """The problem as the passes take it; compiles what it brings, if that is new.
 
     Args:
       multipliers: of each constraint, as `augmented_lagrangian.py` has them; by default none act.
     """
-
-    def numbers(part: Dynamics | Term | ConstraintTerm) -> Array:
-        return np.array([*(address_of(function) for function in part.functions), *part.data], dtype=np.float64)
-
-    data = {name: tuple(numbers(term) for term in problem.terms(field)) for name, field in _FIELDS.items()}
     multipliers = multipliers or [no_multipliers(problem, term) for term in problem.constraint_terms]
-    pairs = [(numbers(part), own) for part, own in zip(problem.constraint_terms, multipliers, strict=True)]
-    data["stage"] += tuple(array for pair in pairs for array in pair)
-    data["final"] += tuple(array for pair in pairs for array in pair)
-    space = problem.control_coordinates
-    limits = Limits(np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64))
-    noise = () if problem.noise_term is None else (numbers_of(problem.noise_term), np.array([problem.risk, 0.0]))
-    return Model(numbers(problem.dynamics), float(problem.dt), limits=limits, noise=noise, **data)
+    pairs = list(zip(problem.constraint_terms, multipliers, strict=True))
+    space, term = problem.control_coordinates, problem.noise_term
+    return Model(
+        dynamics_model(problem.dynamics), float(problem.dt),
+        initial=_cost(problem, "initial", []), stage=_cost(problem, "stage_cost", pairs),
+        final=_cost(problem, "final_cost", [pair for pair in pairs if not pair[0].uses_control]),
+        limits=Limits(np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64)),
+        noise=() if term is None else _noise(problem, term),
+    )  # fmt: skip
+
+
+def dynamics_model(dynamics: Dynamics) -> DynamicsModel:
+    """Dynamics as compiled code takes them."""
+    advance, step_jacobian = dynamics.compiled.addresses("advance", "step_jacobian")
+    return DynamicsModel(advance, step_jacobian, 0.0, numbers(dynamics))
+
+
+def numbers(part: Dynamics | Term | ConstraintTerm) -> Array:
+    """The numbers that a part reads: the addresses of its functions, then its own."""
+    return np.array([*(address_of(function) for function in part.functions), *part.data], dtype=np.float64)
+
+
+def cost_terms(problem: Problem, field: str) -> list[Term]:
+    """The terms of a cost in the order of `CostModel`: those that may be indefinite come first."""
+    return sorted(problem.terms(field), key=lambda term: term.nonconvex_in is None)
+
+
+def _cost(problem: Problem, field: str, constraints: list[tuple[ConstraintTerm, Array]]) -> CostModel:
+    sizes = _sizes(problem.dynamics)
+    terms = cost_terms(problem, field)
+    functions = np.array([_term_functions(term, sizes) for term in terms], dtype=np.float64).reshape(-1, 2)
+    support = tuple(sorted({i for term in terms for i in term.nonconvex_in or ()}))
+    project = 0.0
+    if support:
+        source = source_of(projection, SUPPORT=support, K=len(support))
+        (project,) = module_of(source, "projection", **sizes).addresses("project")
+    indefinite = sum(term.nonconvex_in is not None for term in terms)
+    return CostModel(
+        functions, tuple(map(numbers, terms)), len(terms), indefinite, project,
+        Constraints(
+            np.array([_constraint_functions(one, sizes) for one, _ in constraints], dtype=np.float64).reshape(-1, 6),
+            tuple(numbers(one) for one, _ in constraints), tuple(own for _, own in constraints), len(constraints),
+        ),
+    )  # fmt: skip
+
+
+def _term_functions(term: Term, sizes: dict[str, int]) -> tuple[float, ...]:
+    return module_of(term.code, f"a cost: {term.code.what}", **sizes).addresses("value", "derivatives")
+
+
+def _constraint_functions(term: ConstraintTerm, sizes: dict[str, int]) -> tuple[float, ...]:
+    """A row of `Constraints.functions`."""
+    pairs = {"constraint_value": (term.code, "value"), "constraint_slope": (term.code, "slope")}
+    source = source_of(augmented_lagrangian)
+    if term.balls:
+        source = source_of(ball_constraint, PLACES=3 * term.balls)
+        pairs |= {name: (term.code, name) for name in ("places", "places_jacobian")}
+    module = module_of(source.filled(**pairs), f"a constraint: {term.code.what}", **sizes, EQUALITY=int(term.equality))
+    found = module.addresses("augment", "augmentation", "constraint_values", "add_slope")
+    return *found, 0.0, float(term.uses_control)
+
+
+def _noise_module(problem: Problem, term: NoiseTerm) -> CompiledModule:
+    source = source_of(noise_kernel, **term.filled).filled(noise_values=term.source, noise_slopes=term.source)
+    return module_of(source, "noise", **_sizes(problem.dynamics))
+
+
+def _noise(problem: Problem, term: NoiseTerm) -> NoiseModel:
+    value, quadratic = _noise_module(problem, term).addresses("noise_value", "noise_quadratic")
+    return NoiseModel(value, quadratic, numbers_of(term), np.array([problem.risk, 0.0]))
+
+
+def noisy_costs(problem: Problem, start: Array, policy: Policy, draws: Array) -> Array:
+    """What runs of a policy from a state (n,) cost, (K,), the noise drawn: (K, T, size)."""
+    assert problem.noise_term is not None
+    costs, steps = np.empty(len(draws)), problem.steps
+    flat = draws.reshape(-1, draws.shape[2])
+    module = _noise_module(problem, problem.noise_term)
+    module.noisy_costs(len(draws), steps, start, policy, arguments(problem), flat, costs)
+    return costs
+
+
+def costs_module(problem: Problem) -> CompiledModule:
+    """`kernels/model_functions.py` for Python to call."""
+    sizes = _sizes(problem.dynamics)
+    return module_of(source_of(model_functions), f"costs of {sizes['N']} states and {sizes['M']} controls", **sizes)
 
 
 def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
     """Stage and final cost (K,) of each of K trajectories, states (K, T+1, n) and controls (K, T, m)."""
     costs = np.empty(len(states))
     flat = (in_c_order(array).reshape(-1, array.shape[2]) for array in (states, controls))
-    core(problem).costs_of(len(states), problem.steps, Plan(*flat), arguments(problem), costs)
+    costs_module(problem).costs_of(len(states), problem.steps, Plan(*flat), arguments(problem), costs)
     return costs
 
 
@@ -144,20 +185,19 @@ class CostsByStep:
     """The parts of `costs_of` of a problem, one step at a time."""
 
     def __init__(self, problem: Problem) -> None:
-        self._core, self._steps, self._model = core(problem), problem.steps, arguments(problem)
+        self._module, self._steps, self._model = costs_module(problem), problem.steps, arguments(problem)
 
     def stage(self, t: int, states: Array, controls: Array) -> Array:
         """Stage costs (K,) of step t in states (K, n) under controls (K, m)."""
-        costs = np.empty(len(states))
-        plans = Plan(in_c_order(states), in_c_order(controls))
-        self._core.stage_costs_of(len(states), t, plans, self._model, costs)
-        return costs
+        return self._each(t, states, controls, self._model.stage)
 
     def final(self, states: Array, controls: Array) -> Array:
         """Final costs (K,) of states (K, n) that controls (K, m) led to."""
+        return self._each(self._steps, states, controls, self._model.final)
+
+    def _each(self, t: int, states: Array, controls: Array, cost: CostModel) -> Array:
         costs = np.empty(len(states))
-        plans = Plan(in_c_order(states), in_c_order(controls))
-        self._core.final_costs_of(len(states), self._steps, plans, self._model, costs)
+        self._module.cost_of_each(len(states), t, Plan(in_c_order(states), in_c_order(controls)), cost, costs)
         return costs
 
 
@@ -180,98 +220,7 @@ def rollout(
 
 def no_multipliers(problem: Problem, term: ConstraintTerm, tolerance: float = 0.0) -> Array:
     """Those of a constraint that does not act yet; see `kernels/augmented_lagrangian.py`."""
-    # Nothing can be done about a start that is given; but about its control.
+    # A fixed start cannot change; its control can.
     first = 1 if isinstance(problem.initial, FixedState) and not term.uses_control else 0
     first, spare = problem.steps if term.final_only else first, 0.0 if term.equality else tolerance
     return np.concatenate([[0.0, term.rows, first, spare], np.zeros((problem.steps + 1) * term.rows)])
-
-
-def _constraint_source(constraints: Constraints, terms: int) -> str:
-    """Source of what the augmented Lagrangian needs of each constraint, and to evaluate them from outside."""
-    parts = []
-    values = "def evaluate_constraints(steps, states, controls, data, values):\n    for t in range(steps + 1):\n"
-    values += "        u = controls[min(t, steps - 1)]\n"
-    slope = "def slope_of_constraint(which, row, x, u, t, data, gradient):\n"
-    for k, (source, uses_control, equality, balls) in enumerate(constraints):
-        prefix, own = _prefix(source), _constraint_prefix(source, equality)
-        names = {"constraint_value": f"{prefix}_value", "constraint_slope": f"{prefix}_slope"}
-        names |= {name: f"{own}_{name}" for name in ("augment", "augmentation", "constraint_values")}
-        slope_name = names["constraint_slope"]
-        parts.append(_own(source))
-        if balls:
-            parts.append(_of_state(prefix, own, balls))
-            names |= {name: f"{own}_{inner}" for name, inner in _OF_PLACES.items()}
-            slope_name = f"{own}_constraint_slope"
-        parts.append(_rename(source_of(augmented_lagrangian, EQUALITY=equality), names))
-        at = terms + 2 * k
-        slope += f"    if which == {k}:\n        {slope_name}(x, u, t, row, data[{at}], gradient)\n"
-        acts = "t < steps" if uses_control else "True"  # there is no last control
-        pair = f"data[{at}], data[{at + 1}]"
-        values += f"        {own}_constraint_values(states[t], u, t, {acts}, {pair}, values[{k}])\n"
-    return "\n\n".join([*parts, values, slope] if constraints else [])
-
-
-# What `ball_constraint.py` calls the functions of a constraint that get the places of balls in place of the state.
-_OF_PLACES = {
-    "augment": "augment_places", "augmentation": "augmentation_places", "constraint_values": "values_of_places",
-}  # fmt: skip
-
-
-def _of_state(prefix: str, own: str, balls: int) -> str:
-    """Source of what evaluates a constraint of balls at a state, by its functions of their places."""
-    names = {name: f"{prefix}_{name}" for name in ("places", "places_jacobian")}
-    names["slope_of_places"] = f"{prefix}_slope"
-    names |= {name: f"{own}_{name}" for name in (*_OF_PLACES, *_OF_PLACES.values(), "constraint_slope")}
-    return _rename(source_of(ball_constraint, PLACES=3 * balls), names)
-
-
-def _constraint_prefix(source: str, equality: bool) -> str:
-    return f"{_prefix(source)}_{'equality' if equality else 'inequality'}"
-
-
-def _prefix(source: str) -> str:
-    # Terms of the same source are the same functions: those of an initial and a final cost, say.
-    return f"term_{hashlib.sha256(source.encode()).hexdigest()[:8]}"
-
-
-def _own(source: str) -> str:
-    """A source with its functions renamed, so that several can stand side by side."""
-    own = re.findall(r"^def (\w+)\(", source, flags=re.MULTILINE)
-    return _rename(source, {name: f"{_prefix(source)}_{name}" for name in own})
-
-
-def _cost_source(name: str, terms: Structure, constraints: Constraints) -> str:
-    """Source of `<name>_value`, the sum of the terms, of `<name>_added`, what the augmented Lagrangian adds, and of
-    `<name>_quadratic`, which models both.
-    """
-    parts, values, convex, nonconvex = [], [], [], []
-    for i, (source, nonconvex_in) in enumerate(terms):
-        prefix = _prefix(source)
-        parts.append(_own(source))
-        values.append(f"    total += {prefix}_value(x, u, t, data[{i}])")
-        call = f"    total += {prefix}_derivatives(x, u, t, data[{i}], hessian, gradient)"
-        (convex if nonconvex_in is None else nonconvex).append(call)
-    support = tuple(sorted({i for _, entries in terms for i in entries or ()}))
-    if support:
-        # The sum of what may be indefinite is projected once; what is convex is added after.
-        parts.append(_rename(source_of(projection, K=len(support)), {"project": f"{name}_project"}))
-        nonconvex.append(f"    {name}_project(hessian, {support})")
-    added = []
-    for k, (source, uses_control, equality, _) in enumerate(constraints):
-        if not (uses_control and name == "final"):
-            own = _constraint_prefix(source, equality)
-            pair = f"data[{len(terms) + 2 * k}], data[{len(terms) + 2 * k + 1}]"
-            convex.append(f"    total += {own}_augment(x, u, t, {pair}, hessian, gradient)")
-            added.append(f"    total += {own}_augmentation(x, u, t, {pair})")
-    if name != "initial":
-        parts.append("\n".join([f"def {name}_added(x, u, t, data):\n    total = 0.0", *added, "    return total"]))
-    summed = f"def {name}_value(x, u, t, data):\n    total = 0.0\n" + "\n".join(values)
-    parts.append(f"{summed}\n    return total")
-    modelled = f"def {name}_quadratic(x, u, t, data, hessian, gradient):\n    clear(hessian, W, W)\n"
-    modelled += "    for i in range(W):\n        gradient[i] = 0.0\n    total = 0.0\n"
-    parts.append("\n".join([modelled.rstrip(), *nonconvex, *convex, "    return total"]))
-    return "\n\n".join(parts)
-
-
-def _rename(source: str, names: dict[str, str]) -> str:
-    return re.sub(r"\b(" + "|".join(names) + r")\b", lambda match: names[match.group(1)], source)

@@ -159,7 +159,7 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     )  # fmt: skip
     model = compiled.arguments(problem)
     stop = settings.stop_early()
-    loop = compiled.core(problem).entry("ilqr", declarations.ITERATE, 0, 0, options, model, work, log)
+    loop = compiled.core(problem).lay_out("ilqr", declarations.ITERATE, 0, 0, options, model, work, log)
     termination = iterate(
         problem,
         lambda first, last: loop(declarations.ITERATE, first, last, options, model, work, log),
@@ -192,7 +192,7 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     if status is Status.RISK_TOO_HIGH:
 
         def fails(risk: float) -> int:
-            model.noise[1][0] = risk
+            model.noise.risk[0] = risk
             return loop(declarations.ITERATE, 1, 1, options, model, work, log)[3]
 
         detail = "; ".join(part for part in (named(fails, problem.risk, steps), detail) if part)

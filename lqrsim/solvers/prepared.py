@@ -5,7 +5,7 @@ import time
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.codegen.jit import in_c_order
+from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array, InputError, check_array, check_kind, check_number
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
@@ -66,8 +66,8 @@ class PreparedSolver:
         check_kind("PreparedSolver: settings", settings, SmootherSettings, "what prepare(problem) makes of its options")
         self.problem, self.settings = problem, settings
         self._states = problem.dynamics.state_coordinates
-        self._controls = problem.control_coordinates.within(problem.dynamics.control_coordinates)
-        self._core = compiled.core(problem)
+        self._controls = problem.applied_coordinates
+        self._structure = compiled.structure(problem)
         self._pace = 0.0  # s, of a slow iteration
         self._compile()
 
@@ -96,7 +96,7 @@ class PreparedSolver:
           InputError: it would have to be compiled.
         """
         check_problem(problem)
-        if compiled.core(problem) is not self._core:
+        if compiled.structure(problem) != self._structure:
             raise InputError(
                 "problem: got one of another structure, want the prepared one with other numbers: goal, weights,"
                 " obstacles, parameters, limits, steps"

@@ -221,34 +221,34 @@ class System:
     """A problem in continuous time: its functions, compiled, and its stage cost a second."""
 
     def __init__(self, problem: Problem) -> None:
-        core, data, dynamics = compiled.core(problem), compiled.arguments(problem), problem.dynamics
+        costs, data, dynamics = compiled.costs_module(problem), compiled.arguments(problem), problem.dynamics
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         self.n, self.m, self.dt, self.horizon = n, m, problem.dt, problem.steps * problem.dt
         self.knots = np.linspace(0.0, self.horizon, problem.steps + 1)
         self._last, self._data = max(problem.steps - 1, 1), data
         self._none = np.zeros(m)
-        # The core writes to these, and to the same entries of the Jacobians each time.
+        # Compiled code writes to these, and to the same entries of the Jacobians each time.
         self._f, self._fx, self._fu = np.zeros(n), np.zeros((n, n)), np.zeros((n, m))
         self._hessian, self._gradient = np.zeros((n + m, n + m)), np.zeros(n + m)
         joint = self._hessian, self._gradient
-        self._linearize = core.entry("rate_jacobian", self._f, self._none, data.parameters, self._f, self._fx, self._fu)
-        self._quadratize = {
-            name: core.entry(f"{name}_quadratic", self._f, self._none, 1, getattr(data, name), *joint)
-            for name in ("initial", "stage", "final")
-        }
+        self._parameters = data.dynamics.parameters
+        self._linearize = dynamics.compiled.lay_out(
+            "rate_jacobian", self._f, self._none, self._parameters, self._f, self._fx, self._fu
+        )
+        self._quadratize = costs.lay_out("cost_quadratic", self._f, self._none, 1, data.stage, *joint)
 
     def _expand(self, t: float, x: Array, u: Array) -> float:
         """Expand dynamics and stage cost about (x, u), in place; returns the cost a second. All are per second."""
-        self._linearize(x, u, self._data.parameters, self._f, self._fx, self._fu)
+        self._linearize(x, u, self._parameters, self._f, self._fx, self._fu)
         step = min(max(int(t / self.dt), 1), self._last)
-        value = self._quadratize["stage"](x, u, step, self._data.stage, self._hessian, self._gradient)
+        value = self._quadratize(x, u, step, self._data.stage, self._hessian, self._gradient)
         self._hessian /= self.dt
         self._gradient /= self.dt
         return value / self.dt
 
     def end_value(self, which: str, x: Array) -> float:
         """The `initial` or `final` cost; leaves its derivatives in place."""
-        return self._quadratize[which](x, self._none, 0, getattr(self._data, which), self._hessian, self._gradient)
+        return self._quadratize(x, self._none, 0, getattr(self._data, which), self._hessian, self._gradient)
 
     def end_model(self, which: str, x: Array) -> Array:
         """The `initial` or `final` cost, quadratised at x, as V. Paper: Eqs. (23), (31)."""

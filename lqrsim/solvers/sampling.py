@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lqrsim.codegen.jit import in_c_order
+from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_memory, check_seed
 from lqrsim.kernels.records import Policy
 from lqrsim.problem.problem import Problem
@@ -46,9 +46,6 @@ def sample_costs(problem: Problem, solution: Solution, *, trials: int = 1000, se
     for trial in range(trials):
         stream = np.random.SeedSequence(seed, spawn_key=(trial,))
         draws[trial] = np.random.Generator(np.random.SFC64(stream)).standard_normal((problem.steps, size))
-    costs, policy = np.empty(trials), Policy(in_c_order(solution.policy.gain), in_c_order(solution.policy.offset))
+    policy = Policy(in_c_order(solution.policy.gain), in_c_order(solution.policy.offset))
     start = solution.trajectory.states[0].copy()
-    compiled.core(problem).noisy_costs(
-        trials, problem.steps, start, policy, compiled.arguments(problem), draws.reshape(-1, size), costs
-    )
-    return costs
+    return compiled.noisy_costs(problem, start, policy, draws)

@@ -7,7 +7,17 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations, records
-from lqrsim.kernels.records import CERTIFICATE, MEMORY, CostToCome, CostToGo, Plan, Policy, Prior, Smoothing
+from lqrsim.kernels.records import (
+    CERTIFICATE,
+    MEMORY,
+    CostModel,
+    CostToCome,
+    CostToGo,
+    Plan,
+    Policy,
+    Prior,
+    Smoothing,
+)
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.value_functions import Moments, Quadratic
@@ -57,7 +67,7 @@ class Workspace:
         self.multipliers = [compiled.no_multipliers(problem, one, spare) for one in problem.constraint_terms]
         for array, known in zip(self.multipliers, initial_guess.multipliers, strict=False):
             array[0], array[declarations.HEADER :] = known.penalty, known.values.ravel()
-        self.core = compiled.core(problem, settings.form)
+        self.core, self._costs = compiled.core(problem, settings.form), compiled.costs_module(problem)
         self.model = compiled.arguments(problem, multipliers=self.multipliers)
         self._problem, self._tolerance = problem, settings.constraint_tolerance
         self.arrays = records.Workspace(
@@ -101,26 +111,29 @@ class Workspace:
                 law = gain, inverse[1] - np.einsum("tij,tj->ti", gain, mean[1:])
         return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_law": law}
 
-    def eased(self, share: float) -> Any:
+    def eased(self, share: float) -> CostModel:
         """The stage cost with that share of what may be eased; see `Term.factor`."""
-        stage = list(self.model.stage)
-        for i, term in enumerate(self._problem.terms("stage_cost")):
-            if share != 1 and term.factor is not None:
-                stage[i] = stage[i].copy()
-                stage[i][len(term.functions) + term.factor] *= share
-        return tuple(stage)
+        if share == 1:
+            return self.model.stage
+        data = list(self.model.stage.data)
+        for i, term in enumerate(compiled.cost_terms(self._problem, "stage_cost")):
+            if term.factor is not None:
+                data[i] = data[i].copy()
+                data[i][len(term.functions) + term.factor] *= share
+        return self.model.stage._replace(data=tuple(data))
 
     def constraint_values(self, states: Array, controls: Array) -> list[Array]:
         """Of each constraint (T+1, rows): not to be negative, or zero; where it does not act, infinite or zero."""
         values = [np.empty(len(multipliers) - declarations.HEADER) for multipliers in self.multipliers]
         if values:
-            self.core.evaluate_constraints(self._problem.steps, states, controls, self.model.stage, tuple(values))
+            constraints = self.model.stage.constraints
+            self._costs.evaluate_constraints(self._problem.steps, states, controls, constraints, tuple(values))
         return [one.reshape(self._problem.steps + 1, -1) for one in values]
 
     def constraint_slope(self, which: int, row: int, x: Array, u: Array, step: int) -> Array:
         """Gradient (n+m,) of one of a constraint's numbers."""
         slope = np.zeros(len(x) + len(u))
-        self.core.slope_of_constraint(which, row, x, u, step, self.model.stage, slope)
+        self._costs.slope_of_constraint(which, row, x, u, step, self.model.stage.constraints, slope)
         return slope
 
     def violation(self, values: list[Array]) -> float:

@@ -1,0 +1,188 @@
+"""The kernels' subset of Python, written down in one place. `printer.py` prints it to LLVM IR.
+
+A kernel is a function of positional arguments. It runs as plain Python on NumPy arrays, too, with the same results to
+rounding. What is not listed here is refused with file and line.
+
+Types
+    float           float64. Arithmetic may be fused and reordered, but NaN and infinity keep their meaning.
+    int             64 bits. An overflow is undefined.
+    bool            What comparisons give.
+    pointer         A C-ordered float64 array; the shape of its blocks a[0], a[1], ... is constant. With fewer indices
+                    than dimensions it is a pointer to a block.
+    pointers        A tuple of vectors; its length is not part of the type.
+    rows, row       A structured array whose fields are float64, and one of its entries, as in `log[i].cost`.
+    tuple, record   Of any of these; records are the named tuples of `kernels/records.py`.
+
+Statements
+    assignments     To names, entries and fields, also several at once, chained and augmented. A name has one type; one
+                    that is an int here and a float there is a float.
+    control flow    if, for over range, while, break, continue, return, pass. A condition that is constant is decided
+                    when compiling, and the branch that is not taken is not looked at.
+    calls           Of other kernels, for what they write. No recursion, no keywords.
+
+Expressions
+    + - * / // %    As in Python, signs too. A division by zero gives infinity or NaN.
+    **              Of any float; a whole exponent is best constant.
+    < <= == ...     Chained, too; and, or, not, conditional expressions.
+    a[i, j]         Indices are ints, not negative; of a tuple, any int if its entries have one type.
+    min, max        Of two or more. abs, int, float, len of a tuple.
+    math            The functions in `UNARY`, `BINARY` and `TESTS`, of which floor, ceil and trunc return floats; and
+                    inf, nan, pi, e.
+
+Beside these there are the functions of `kernels/declarations.py`: `stack` for work arrays of constant shape, `call` and
+`call_for_value` for C functions at an address, `at` and `rows_at` for memory at an address, and words that threads
+share. An address is an int or a float64, which has all integers up to 2^53, beyond any address of a process.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lqrsim.errors import InputError
+
+# Functions of one float: those that LLVM knows, and those of the C library; by their names in `math`.
+UNARY = {
+    name: f"llvm.{name}.f64" for name in ("sqrt", "sin", "cos", "exp", "log", "log10", "log2", "floor", "ceil", "trunc")
+} | {name: name for name in (
+    "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "expm1", "log1p", "exp2", "cbrt",
+    "erf", "erfc", "lgamma",
+)} | {"fabs": "llvm.fabs.f64", "gamma": "tgamma"}  # fmt: skip
+BINARY = {
+    "copysign": "llvm.copysign.f64", "pow": "llvm.pow.f64", "atan2": "atan2", "hypot": "hypot", "fmod": "fmod",
+}  # fmt: skip
+SCALES = {"degrees": 180 / np.pi, "radians": np.pi / 180}
+TESTS = ("isnan", "isinf", "isfinite")
+CONSTANTS = ("inf", "nan", "pi", "e", "tau")
+MATH = (*UNARY, *BINARY, *SCALES, *TESTS, *CONSTANTS)
+
+
+class SubsetError(InputError):
+    """What is outside of the subset, with the place where it stands."""
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """A number."""
+
+    name: str
+    llvm: str
+
+
+FLOAT, INT, BOOL = Scalar("float", "double"), Scalar("int", "i64"), Scalar("bool", "i1")
+INT32 = Scalar("32-bit int", "i32")  # only to call C functions with
+
+
+@dataclass(frozen=True)
+class Pointer:
+    """To float64 blocks of the shape `block`: `()` for a vector, `(W,)` for a matrix with rows of W."""
+
+    block: tuple[int, ...] = ()
+
+    def strides(self) -> list[int]:
+        """In entries, an index at a time."""
+        return [int(np.prod(self.block[i:], dtype=int)) for i in range(len(self.block) + 1)]
+
+
+@dataclass(frozen=True)
+class Pointers:
+    """To the addresses of vectors."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Of a structured array."""
+
+    fields: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One of these."""
+
+    fields: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Group:
+    """A tuple, or with names a record."""
+
+    members: tuple["Type", ...]
+    record: str = ""
+    fields: tuple[str, ...] = ()
+
+
+Type = Scalar | Pointer | Pointers | Rows | Row | Group
+
+VECTOR = Pointer()
+
+
+def describe(kind: Type | None) -> str:
+    """As messages call a type."""
+    match kind:
+        case None:
+            return "nothing"
+        case Scalar(name=name):
+            return f"a {name}" if name != "int" else "an int"
+        case Pointer(block=block):
+            return f"an array of {len(block) + 1} dimensions"
+        case Pointers():
+            return "a tuple of vectors"
+        case Rows():
+            return "rows"
+        case Row():
+            return "a row"
+        case Group(record=record):
+            return f"a {record}" if record else "a tuple"
+
+
+def scalars(kind: Type) -> list[Scalar | Pointer | Pointers | Rows | Row]:
+    """A type with its tuples and records taken apart."""
+    if isinstance(kind, Group):
+        return [one for member in kind.members for one in scalars(member)]
+    return [kind]
+
+
+def llvm_type(kind: Type) -> str:
+    """What LLVM calls it."""
+    if isinstance(kind, Group):
+        return "{" + ", ".join(llvm_type(member) for member in kind.members) + "}"
+    return kind.llvm if isinstance(kind, Scalar) else "ptr"
+
+
+def join(one: Type, other: Type) -> Type | None:
+    """The type that both fit; None if there is none."""
+    if one == other:
+        return one
+    if isinstance(one, Scalar) and isinstance(other, Scalar) and INT32 not in (one, other):
+        return min((one, other), key=(FLOAT, INT, BOOL).index)
+    if isinstance(one, Group) and isinstance(other, Group):
+        if (one.record, len(one.members)) != (other.record, len(other.members)):
+            return None
+        members = tuple(join(a, b) for a, b in zip(one.members, other.members, strict=True))
+        return None if None in members else Group(members, one.record, one.fields)  # pyright: ignore[reportArgumentType]
+    return None
+
+
+def type_of(argument: Any) -> Type:
+    """The type of what Python calls a kernel with.
+
+    Raises:
+      TypeError: it has none.
+    """
+    if isinstance(argument, np.ndarray):
+        if argument.dtype.names:
+            return Rows(argument.dtype.names)
+        return Pointer(argument.shape[1:])
+    if isinstance(argument, (bool, np.bool_)):
+        return BOOL
+    if isinstance(argument, (int, np.integer)):
+        return INT
+    if isinstance(argument, (float, np.floating)):
+        return FLOAT
+    if isinstance(argument, tuple):
+        members = tuple(map(type_of, argument))
+        if hasattr(argument, "_fields"):
+            return Group(members, type(argument).__name__, argument._fields)  # pyright: ignore[reportAttributeAccessIssue]
+        return Pointers()
+    raise TypeError(f"{type(argument).__name__} is no argument of a kernel")

@@ -1,0 +1,102 @@
+"""LLVM: from IR to machine code of this processor, and machine code into memory."""
+
+import ctypes
+import ctypes.util
+import os
+import threading
+from functools import cache
+from typing import Any
+
+from lqrsim.machine import instruction_set
+
+# What LLVM may make of loops over arrays and of its own functions, beside what kernels call.
+_IMPLIED = (
+    "sin", "cos", "sincos", "exp", "exp2", "log", "log2", "log10", "pow", "fmod", "floor", "ceil", "trunc", "rint",
+    "memcpy", "memset", "memmove",
+)  # fmt: skip
+
+_loading = threading.Lock()
+
+
+@cache
+def _binding() -> Any:
+    import llvmlite.binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm
+
+
+def _machine() -> Any:
+    llvm = _binding()
+    _, name, features = instruction_set()
+    target = llvm.Target.from_default_triple()
+    return target.create_target_machine(
+        cpu=name, features=features, opt=3, jit=True, reloc="default", codemodel="jitdefault"
+    )
+
+
+def object_code(text: str) -> bytes:
+    """Machine code, as an object file, of IR."""
+    llvm, machine = _binding(), _machine()
+    module = llvm.parse_assembly(text)
+    module.triple, module.data_layout = llvm.get_process_triple(), str(machine.target_data)
+    module.verify()
+    options = llvm.create_pipeline_tuning_options(speed_level=3)
+    options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = True
+    passes = llvm.create_pass_builder(machine, options)
+    passes.getModulePassManager().run(module, passes)
+    return machine.emit_object(module)
+
+
+class Loaded:
+    """An object file in memory; it must be kept alive as long as its functions are called.
+
+    Args:
+      contents: the object file. libraries: the functions of C libraries that it calls.
+
+    Raises:
+      RuntimeError: it is no object file of this processor, or a function is nowhere.
+    """
+
+    def __init__(self, contents: bytes, libraries: tuple[str, ...]) -> None:
+        llvm = _binding()
+        with _loading:
+            for name in (*libraries, *_IMPLIED):
+                _provide(name)
+            self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+            self._engine.add_object_file(llvm.ObjectFileRef.from_data(contents))
+            self._engine.finalize_object()
+
+    def address(self, symbol: str) -> int:
+        """Where a function is. Raises RuntimeError if there is none of that name."""
+        found = self._engine.get_function_address(symbol)
+        if not found:
+            raise RuntimeError(f"{symbol} is not in the object file")
+        return found
+
+
+@cache
+def _provide(name: str) -> None:
+    """Have LLVM find a function of a C library, where it does not by itself."""
+    llvm = _binding()
+    if llvm.address_of_symbol(name):
+        return
+    for library in _libraries():
+        function = getattr(library, name, None)
+        address = ctypes.cast(function, ctypes.c_void_p).value if function is not None else None
+        if address:
+            llvm.add_symbol(name, address)
+            return
+
+
+@cache
+def _libraries() -> list[ctypes.CDLL]:
+    names = ["ucrtbase", "msvcrt"] if os.name == "nt" else [ctypes.util.find_library("m"), None]
+    found = []
+    for name in names:
+        try:
+            found.append(ctypes.CDLL(name))
+        except OSError:
+            continue
+    return found

@@ -1,0 +1,164 @@
+"""Kernels as plain Python on NumPy arrays: for single evaluations, and to hold compiled code against."""
+
+import ast
+import ctypes
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lqrsim.codegen.sources import PYTHON, Function, Record, Scope, Source, Word
+from lqrsim.errors import Array
+from lqrsim.kernels import records
+
+_LONG = 1 << 24  # entries that memory at an address is taken to have
+
+# Called with the name of each kernel, the kernel, and what it is given.
+Caller = Callable[[Function, Callable[..., Any], tuple[Any, ...]], Any]
+
+
+def plain_functions(
+    source: Source,
+    sizes: Mapping[str, int],
+    names: Sequence[str],
+    functions: Sequence[Callable[..., None]] = (),
+    caller: Caller | None = None,
+) -> dict[str, Callable[..., Any]]:
+    """Functions of a source, run as plain Python, by name.
+
+    Args:
+      source: the kernels. sizes: as for a `Scope`. names: the functions.
+      functions: Python's own, which a kernel calls by their place here in place of an address.
+      caller: calls each kernel, if given: `caller(kernel, run, arguments)`.
+    """
+    scope, made = Scope(source, sizes), {}
+    return {name: _run(scope.function(name), _words(functions), made, caller) for name in names}
+
+
+def _run(
+    function: Function, words: Mapping[str, Any], made: dict[Any, Any], caller: Caller | None
+) -> Callable[..., Any]:
+    """The function of Python; `made` has those that there are already."""
+    key = id(function.scope), function.node.name
+    if key in made:
+        return made[key]
+    code = ast.Module([_Plain().visit(ast.parse(ast.unparse(function.node)).body[0])], [])
+    given: dict[str, Any] = {}
+    exec(compile(ast.fix_missing_locations(code), f"<{function.scope.source.what}>", "exec"), given)
+    run = given[function.node.name]
+    called = run if caller is None else lambda *arguments: caller(function, run, arguments)
+    made[key] = called
+    for name in {node.id for node in ast.walk(code) if isinstance(node, ast.Name)}:
+        match function.scope.find(name):
+            case None:
+                continue
+            case Function() as other:
+                given[name] = _run(other, words, made, caller)
+            case Record():
+                given[name] = getattr(records, name)
+            case Word(name=word):
+                if word not in PYTHON:
+                    given[name] = words[word]
+            case constant:
+                given[name] = constant
+    return called
+
+
+class _Plain(ast.NodeTransformer):
+    """Drops decorators and annotations, whose names are not at hand."""
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef:
+        node.decorator_list, node.returns = [], None
+        for argument in node.args.args:
+            argument.annotation = None
+        return node
+
+
+def _words(functions: Sequence[Callable[..., None]]) -> dict[str, Any]:
+    """What the language has beside Python's own: NumPy's functions, and not those of math, which raise where compiled
+    code goes on with NaN or infinity.
+    """
+
+    def call(address: float, *arguments: Any) -> None:
+        if address < len(functions):
+            functions[int(address)](*arguments)
+        else:
+            given = _taken_apart(arguments)
+            _c_function(None, given)(int(address))(*map(_c_argument, given))
+
+    def call_for_value(address: float, *arguments: Any) -> float:
+        given = _taken_apart(arguments)
+        return _c_function(ctypes.c_double, given)(int(address))(*map(_c_argument, given))
+
+    words = {name: getattr(np, name, getattr(math, name)) for name in vars(math) if not name.startswith("_")}
+    words |= {f"{side}{name}": getattr(np, f"arc{name}") for name in ("sin", "cos", "tan") for side in "a"}
+    words |= {f"a{name}h": getattr(np, f"arc{name}h") for name in ("sin", "cos", "tan")}
+    words |= {"atan2": np.arctan2, "pow": np.power}
+    words |= {name: _quietly(getattr(math, name)) for name in ("erf", "erfc", "gamma", "lgamma")}
+    return words | {
+        "stack": lambda *shape: np.empty(shape), "call": call, "call_for_value": call_for_value,
+        "at": lambda address: _memory(address, ctypes.c_double),
+        "rows_at": lambda at, width: _memory(at, ctypes.c_double)[: _LONG // width * width].reshape(-1, width),
+        "int32": ctypes.c_int32, "claim": _claim, "load": lambda words, index: int(_integers(words)[index]),
+        "store": _store, "fetch_add": _fetch_add,
+    }  # fmt: skip
+
+
+def _quietly(function: Callable[[float], float]) -> Callable[[float], float]:
+    def run(number: float) -> float:
+        try:
+            return function(number)
+        except (ValueError, OverflowError):
+            return math.nan
+
+    return run
+
+
+def _taken_apart(arguments: Sequence[Any]) -> list[Any]:
+    return [part for one in arguments for part in (_taken_apart(one) if isinstance(one, tuple) else [one])]
+
+
+def _c_argument(argument: Any) -> Any:
+    if isinstance(argument, np.ndarray):
+        return argument.ctypes.data
+    return (
+        argument if isinstance(argument, ctypes.c_int32) else argument.item() if hasattr(argument, "item") else argument
+    )
+
+
+def _c_function(returns: Any, arguments: Sequence[Any]) -> Any:
+    def kind(argument: Any) -> Any:
+        if isinstance(argument, np.ndarray):
+            return ctypes.c_void_p
+        if isinstance(argument, ctypes.c_int32):
+            return ctypes.c_int32
+        return ctypes.c_double if isinstance(argument, float | np.floating) else ctypes.c_int64
+
+    return ctypes.CFUNCTYPE(returns, *map(kind, arguments))
+
+
+def _memory(address: float, kind: Any) -> Array:
+    return np.frombuffer((kind * _LONG).from_address(int(address)), dtype=kind)
+
+
+def _integers(words: float) -> Array:
+    return _memory(words, ctypes.c_int64)
+
+
+def _claim(words: float, index: int) -> int:
+    flags = _integers(words)
+    free = flags[index] == 0
+    flags[index] = 1
+    return int(free)
+
+
+def _store(words: float, index: int, value: int) -> None:
+    _integers(words)[index] = value
+
+
+def _fetch_add(words: float, index: int, value: int) -> int:
+    numbers = _integers(words)
+    before = int(numbers[index])
+    numbers[index] += value
+    return before

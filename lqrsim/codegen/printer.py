@@ -1,0 +1,965 @@
+"""Kernels to LLVM IR: the subset that `language.py` writes down, printed function by function.
+
+A function is printed once for each combination of types that it is called with. Records and tuples are taken apart, so
+that LLVM sees numbers and addresses; variables are slots on the stack, which it turns into registers.
+"""
+
+import ast
+import operator
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from lqrsim.codegen.language import (
+    BINARY,
+    BOOL,
+    FLOAT,
+    INT,
+    INT32,
+    SCALES,
+    TESTS,
+    UNARY,
+    VECTOR,
+    Group,
+    Pointer,
+    Pointers,
+    Row,
+    Rows,
+    SubsetError,
+    Type,
+    describe,
+    join,
+    llvm_type,
+    scalars,
+)
+from lqrsim.codegen.sources import Constant, Function, Record, Scope, Word
+
+FAST = "reassoc nsz arcp contract"  # lets LLVM fuse and reorder sums, but keeps NaN and infinity meaningful
+MOST_FACTORS = 64  # of a power with a constant exponent, which becomes a product
+
+_COMPARISONS = {
+    ast.Lt: ("lt", operator.lt), ast.LtE: ("le", operator.le), ast.Gt: ("gt", operator.gt),
+    ast.GtE: ("ge", operator.ge), ast.Eq: ("eq", operator.eq), ast.NotEq: ("ne", operator.ne),
+}  # fmt: skip
+_OPERATORS: dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]] = {
+    ast.Add: ("add", operator.add), ast.Sub: ("sub", operator.sub), ast.Mult: ("mul", operator.mul),
+    ast.Div: ("div", operator.truediv), ast.FloorDiv: ("floordiv", operator.floordiv),
+    ast.Mod: ("mod", operator.mod), ast.Pow: ("pow", operator.pow),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Value:
+    """What an expression gives: its type, and LLVM's name of it, or its parts; and what it is if that is constant."""
+
+    type: Type
+    name: str = ""
+    parts: tuple["Value", ...] = ()
+    constant: Constant | None = None
+
+
+@dataclass
+class Block:
+    """A basic block."""
+
+    label: str
+    lines: list[str]
+    ended: bool = False
+
+
+class _Retyped(Exception):
+    """A name, or what is returned, has turned out to be a float: the function is printed anew."""
+
+
+class Program:
+    """LLVM IR of kernels with all that they call.
+
+    `export` and `entry` add functions; `text` is the IR of all.
+    """
+
+    def __init__(self) -> None:
+        self._instances: dict[tuple[Any, ...], tuple[str, Type | None]] = {}
+        self._running: list[tuple[Any, ...]] = []
+        self._texts: list[str] = []
+        self._declared: dict[str, str] = {}
+
+    @property
+    def text(self) -> str:
+        """The IR."""
+        kinds = "attributes #0 = { nounwind }\nattributes #1 = { nounwind alwaysinline }\n"
+        kinds += "attributes #2 = { nounwind noinline }\n"
+        return "\n".join([*self._declared.values(), *self._texts, kinds])
+
+    @property
+    def libraries(self) -> list[str]:
+        """The functions of C libraries that are called."""
+        return [name for name in self._declared if not name.startswith("llvm.")]
+
+    def instance(self, function: Function, types: tuple[Type, ...]) -> tuple[str, Type | None]:
+        """LLVM's name of a function for arguments of these types, and the type of what it returns."""
+        key = id(function.scope), function.node.name, types
+        if key not in self._instances:
+            if key in self._running:
+                raise SubsetError(f"{where(function, function.node)}: got a function that calls itself, want a loop")
+            self._running.append(key)
+            plain = function.node.name if function.node.name.isascii() else "function"
+            name = f"@{plain}.{len(self._instances) + len(self._running)}"  # as many as were begun
+            text, result = _print(self, function, types, name)
+            self._running.pop()
+            self._texts.append(text)
+            self._instances[key] = name, result
+        return self._instances[key]
+
+    def library(self, name: str, count: int) -> str:
+        """LLVM's name of a function of so many floats, of LLVM's own or of a C library."""
+        self._declared.setdefault(name, f"declare double @{name}({', '.join(['double'] * count)}) #0")
+        return f"@{name}"
+
+    def export(self, function: Function, types: tuple[Type, ...], symbol: str) -> None:
+        """A C function of numbers and addresses under that name; records are taken apart."""
+        name, result = self.instance(function, types)
+        leaves = [one for kind in types for one in scalars(kind)]
+        given = [f"{llvm_type(one)} %a{i}" for i, one in enumerate(leaves)]
+        kind = "void" if result is None else llvm_type(result)
+        call = f"call {kind} {name}({', '.join(given)})"
+        body = [f"  {call}", "  ret void"] if result is None else [f"  %r = {call}", f"  ret {kind} %r"]
+        self._texts.append("\n".join([f"define {kind} @{symbol}({', '.join(given)}) #0 {{", *body, "}"]))
+
+    def entry(self, function: Function, types: tuple[Type, ...], symbol: str) -> Type | None:
+        """A C function of one address, at which are 8 bytes for each number and address among the arguments.
+
+        What it returns is written after these. Returns the type of that.
+        """
+        name, result = self.instance(function, types)
+        lines, given, place = [], [], 0
+        for one in (one for kind in types for one in scalars(kind)):
+            loaded = "i64" if one is BOOL else llvm_type(one)
+            lines += [
+                f"  %p{place} = getelementptr inbounds i64, ptr %words, i64 {place}",
+                f"  %{'w' if one is BOOL else 'a'}{place} = load {loaded}, ptr %p{place}",
+            ]
+            if one is BOOL:
+                lines.append(f"  %a{place} = trunc i64 %w{place} to i1")
+            given.append(f"{llvm_type(one)} %a{place}")
+            place += 1
+        kind = "void" if result is None else llvm_type(result)
+        call = f"call {kind} {name}({', '.join(given)})"
+        lines.append(f"  {call}" if result is None else f"  %r = {call}")
+        for i, one in enumerate(scalars(result) if result is not None else ()):
+            part = "%r"
+            if isinstance(result, Group):
+                lines.append(f"  %o{i} = extractvalue {kind} %r, {i}")
+                part = f"%o{i}"
+            if one is BOOL:
+                lines.append(f"  %z{i} = zext i1 {part} to i64")
+                part = f"%z{i}"
+            stored = "i64" if one is BOOL else llvm_type(one)
+            lines += [
+                f"  %q{i} = getelementptr inbounds i64, ptr %words, i64 {place + i}",
+                f"  store {stored} {part}, ptr %q{i}",
+            ]
+        self._texts.append("\n".join([f"define void @{symbol}(ptr %words) #0 {{", *lines, "  ret void", "}"]))
+        return result
+
+
+def where(function: Function, node: ast.AST) -> str:
+    """The place of a node, for messages."""
+    return f"{function.scope.source.what}: {function.node.name}, line {getattr(node, 'lineno', 0)}"
+
+
+def _print(program: Program, function: Function, types: tuple[Type, ...], name: str) -> tuple[str, Type | None]:
+    widened: dict[str, Type] = {}
+    result: Type | None = None
+    while True:
+        body = _Body(program, function, types, widened, result)
+        try:
+            body.run()
+        except _Retyped:
+            result = body.result
+            continue
+        return body.text(name), body.result
+
+
+class _Body:
+    """One function, printed for arguments of certain types.
+
+    `widened` has the types that names turned out to have; `result` the type that is returned, as far as it is known.
+    """
+
+    def __init__(
+        self, program: Program, function: Function, types: tuple[Type, ...], widened: dict[str, Type],
+        result: Type | None,
+    ) -> None:  # fmt: skip
+        self.program, self.function, self.widened, self.result = program, function, widened, result
+        self.scope: Scope = function.scope
+        self.types = types
+        self._count = 0
+        self._slots: list[str] = []
+        self._names: dict[str, tuple[Type, Any]] = {}
+        self._loops: list[tuple[str, str]] = []
+        self._blocks: list[Block] = [Block("body", [])]
+        self._empty = False  # whether it returns nothing somewhere
+
+    # Lines and blocks.
+
+    def run(self) -> None:
+        """Print the function."""
+        arguments = self.function.node.args
+        if arguments.vararg or arguments.kwarg or arguments.kwonlyargs or arguments.defaults or arguments.posonlyargs:
+            self._refuse(self.function.node, "arguments with defaults, * or **", "positional ones")
+        if len(arguments.args) != len(self.types):
+            self._refuse(self.function.node, f"{len(self.types)} arguments", str(len(arguments.args)))
+        place = 0
+        for one, kind in zip(arguments.args, self.types, strict=True):
+            parts = scalars(kind)
+            self._store(one.arg, _assemble(kind, iter([f"%a{place + i}" for i in range(len(parts))])), one)
+            place += len(parts)
+        self._block(self.function.node.body)
+        if not self._now.ended:
+            if self.result is not None:
+                self._refuse(self.function.node, "a path that returns nothing", "a value on all")
+            self._end("ret void")
+        elif self._empty and self.result is not None:
+            self._refuse(self.function.node, "a path that returns nothing", "a value on all")
+
+    def text(self, name: str) -> str:
+        """The IR."""
+        leaves = [one for kind in self.types for one in scalars(kind)]
+        given = ", ".join(f"{llvm_type(one)} %a{i}" for i, one in enumerate(leaves))
+        kind = "void" if self.result is None else llvm_type(self.result)
+        decorators = self.function.decorators
+        attributes = "#1" if "inline" in decorators else "#2" if "outline" in decorators else "#0"
+        lines = [f"define internal {kind} {name}({given}) {attributes} {{", "entry:", *self._slots, "  br label %body"]
+        for block in self._blocks:
+            lines += [f"{block.label}:", *block.lines]
+        return "\n".join([*lines, "}"])
+
+    @property
+    def _now(self) -> Block:
+        return self._blocks[-1]
+
+    def _fresh(self) -> str:
+        self._count += 1
+        return f"%v{self._count}"
+
+    def _label(self) -> str:
+        self._count += 1
+        return f"b{self._count}"
+
+    def _emit(self, text: str) -> str:
+        name = self._fresh()
+        self._now.lines.append(f"  {name} = {text}")
+        return name
+
+    def _do(self, text: str) -> None:
+        self._now.lines.append(f"  {text}")
+
+    def _end(self, text: str) -> None:
+        if not self._now.ended:
+            self._do(text)
+            self._now.ended = True
+
+    def _begin(self, label: str) -> None:
+        self._blocks.append(Block(label, []))
+
+    def _branch(self, condition: Value, yes: str, no: str) -> None:
+        self._end(f"br i1 {condition.name}, label %{yes}, label %{no}")
+
+    def _slot(self, kind: str, align: int = 0) -> str:
+        name = self._fresh()
+        self._slots.append(f"  {name} = alloca {kind}" + (f", align {align}" if align else ""))
+        return name
+
+    def _refuse(self, node: ast.AST, got: str, want: str) -> NoReturn:
+        raise SubsetError(f"{where(self.function, node)}: got {got}, want {want}")
+
+    # Variables.
+
+    def _store(self, name: str, value: Value, node: ast.AST) -> None:
+        if name not in self._names:
+            kind = self.widened.get(name, value.type)
+            self._names[name] = kind, self._slots_of(kind)
+        kind, slots = self._names[name]
+        both = join(kind, value.type)
+        if both is None:
+            self._refuse(node, f"{describe(value.type)} for {name}, which is {describe(kind)}", "one type a name")
+        if both != kind:
+            self.widened[name] = both
+            raise _Retyped
+        self._put(slots, self._cast(value, kind, node))
+
+    def _slots_of(self, kind: Type) -> Any:
+        if isinstance(kind, Group):
+            return [self._slots_of(member) for member in kind.members]
+        return self._slot(llvm_type(kind))
+
+    def _put(self, slots: Any, value: Value) -> None:
+        if isinstance(slots, list):
+            for slot, part in zip(slots, value.parts, strict=True):
+                self._put(slot, part)
+        else:
+            self._do(f"store {llvm_type(value.type)} {value.name}, ptr {slots}")
+
+    def _get(self, kind: Type, slots: Any) -> Value:
+        if isinstance(kind, Group):
+            return Value(
+                kind, parts=tuple(self._get(member, slot) for member, slot in zip(kind.members, slots, strict=True))
+            )
+        return Value(kind, self._emit(f"load {llvm_type(kind)}, ptr {slots}"))
+
+    # Types.
+
+    def _cast(self, value: Value, kind: Type, node: ast.AST) -> Value:
+        if value.type == kind:
+            return value
+        if isinstance(value.constant, bool | int | float) and kind in (FLOAT, INT):
+            return _constant(float(value.constant) if kind is FLOAT else int(value.constant))
+        if kind is FLOAT and value.type in (INT, BOOL):
+            convert = "sitofp" if value.type is INT else "uitofp"
+            return Value(FLOAT, self._emit(f"{convert} {llvm_type(value.type)} {value.name} to double"))
+        if kind is INT and value.type is BOOL:
+            return Value(INT, self._emit(f"zext i1 {value.name} to i64"))
+        if isinstance(kind, Group) and value.parts:
+            parts = zip(value.parts, kind.members, strict=True)
+            return Value(kind, parts=tuple(self._cast(part, member, node) for part, member in parts))
+        self._refuse(node, describe(value.type), describe(kind))
+
+    def _float(self, value: Value, node: ast.AST) -> str:
+        if value.type not in (FLOAT, INT, BOOL):
+            self._refuse(node, describe(value.type), "a number")
+        return self._cast(value, FLOAT, node).name
+
+    def _int(self, value: Value, node: ast.AST) -> str:
+        if value.type not in (INT, BOOL):
+            self._refuse(node, describe(value.type), "an int")
+        return self._cast(value, INT, node).name
+
+    def _condition(self, node: ast.expr) -> Value:
+        value = self._expression(node)
+        if value.constant is not None:
+            return _constant(bool(value.constant))
+        if value.type is BOOL:
+            return value
+        if value.type is INT:
+            return Value(BOOL, self._emit(f"icmp ne i64 {value.name}, 0"))
+        self._refuse(node, f"{describe(value.type)} as a condition", "a comparison")
+
+    # Statements.
+
+    def _block(self, body: list[ast.stmt]) -> None:
+        for statement in body:
+            if self._now.ended:
+                return
+            method = getattr(self, f"_statement_{type(statement).__name__}", None)
+            if method is None:
+                self._refuse(statement, f"`{ast.unparse(statement).splitlines()[0]}`", "a statement of the subset")
+            method(statement)
+
+    def _statement_Pass(self, node: ast.Pass) -> None:
+        pass
+
+    def _statement_Expr(self, node: ast.Expr) -> None:
+        if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            return
+        if not isinstance(node.value, ast.Call):
+            self._refuse(node, "an expression that is not used", "a call")
+        self._call(node.value)
+
+    def _statement_Assign(self, node: ast.Assign) -> None:
+        value = self._expression(node.value)
+        for target in node.targets:
+            self._assign(target, value)
+
+    def _statement_AnnAssign(self, node: ast.AnnAssign) -> None:
+        if node.value is None:
+            self._refuse(node, "a name without a value", "an assignment")
+        self._assign(node.target, self._expression(node.value))
+
+    def _statement_AugAssign(self, node: ast.AugAssign) -> None:
+        if isinstance(node.target, ast.Name):
+            old = self._expression(ast.copy_location(ast.Name(node.target.id, ast.Load()), node.target))
+            self._assign(node.target, self._arithmetic(node.op, old, self._expression(node.value), node))
+            return
+        address = self._address(node.target)
+        old = Value(FLOAT, self._emit(f"load double, ptr {address}"))
+        new = self._arithmetic(node.op, old, self._expression(node.value), node)
+        self._do(f"store double {self._float(new, node)}, ptr {address}")
+
+    def _assign(self, target: ast.expr, value: Value) -> None:
+        match target:
+            case ast.Name(id=name):
+                self._store(name, value, target)
+            case ast.Tuple(elts=parts):
+                if len(parts) != len(value.parts):
+                    self._refuse(target, f"{describe(value.type)} for {len(parts)} names", "as many values")
+                for one, part in zip(parts, value.parts, strict=True):
+                    self._assign(one, part)
+            case ast.Subscript() | ast.Attribute():
+                address = self._address(target)
+                self._do(f"store double {self._float(value, target)}, ptr {address}")
+            case _:
+                self._refuse(target, f"`{ast.unparse(target)}` assigned to", "a name, an entry or a field of a row")
+
+    def _address(self, target: ast.expr) -> str:
+        """Where an entry of an array or a field of a row is."""
+        if isinstance(target, ast.Subscript):
+            found = self._entry(self._expression(target.value), target)
+            if isinstance(found, str):
+                return found
+        elif isinstance(target, ast.Attribute):
+            row = self._expression(target.value)
+            if isinstance(row.type, Row) and target.attr in row.type.fields:
+                place = row.type.fields.index(target.attr)
+                return self._emit(f"getelementptr inbounds double, ptr {row.name}, i64 {place}")
+        self._refuse(target, f"`{ast.unparse(target)}` assigned to", "a name, an entry or a field of a row")
+
+    def _statement_Return(self, node: ast.Return) -> None:
+        if node.value is None:
+            self._empty = True
+            self._end("ret void")
+            return
+        value = self._expression(node.value)
+        if self.result is None:
+            self.result = value.type
+        both = join(self.result, value.type)
+        if both is None:
+            self._refuse(node, describe(value.type), f"{describe(self.result)}, as it returns elsewhere")
+        if both != self.result:
+            self.result = both
+            raise _Retyped
+        value = self._cast(value, both, node)
+        if not value.parts:
+            self._end(f"ret {llvm_type(both)} {value.name}")
+            return
+        if any(isinstance(part.type, Group) for part in value.parts):
+            self._refuse(node, "a tuple of tuples", "numbers and arrays")
+        total = "undef"
+        for i, part in enumerate(value.parts):
+            total = self._emit(f"insertvalue {llvm_type(both)} {total}, {llvm_type(part.type)} {part.name}, {i}")
+        self._end(f"ret {llvm_type(both)} {total}")
+
+    def _statement_If(self, node: ast.If) -> None:
+        test = self._condition(node.test)
+        if test.constant is not None:
+            self._block(node.body if test.constant else node.orelse)
+            return
+        yes, no, end = self._label(), self._label(), self._label()
+        self._branch(test, yes, no if node.orelse else end)
+        reached = not node.orelse
+        for label, body in ((yes, node.body), (no, node.orelse)):
+            if body:
+                self._begin(label)
+                self._block(body)
+                reached = reached or not self._now.ended
+                self._end(f"br label %{end}")
+        if reached:
+            self._begin(end)
+
+    def _statement_While(self, node: ast.While) -> None:
+        if node.orelse:
+            self._refuse(node, "an else after a loop", "none")
+        head, body, end = self._label(), self._label(), self._label()
+        self._end(f"br label %{head}")
+        self._begin(head)
+        self._branch(self._condition(node.test), body, end)
+        self._begin(body)
+        self._loops.append((head, end))
+        self._block(node.body)
+        self._loops.pop()
+        self._end(f"br label %{head}")
+        self._begin(end)
+
+    def _statement_For(self, node: ast.For) -> None:
+        match node:
+            case ast.For(target=ast.Name(id=name), iter=ast.Call(func=ast.Name("range"), args=given), orelse=[]):
+                pass
+            case _:
+                self._refuse(node, f"`{ast.unparse(node).splitlines()[0]}`", "for NAME in range(...), without an else")
+        values = [self._expression(one) for one in given]
+        numbers = [self._int(value, node) for value in values]
+        start, stop, step = ("0", numbers[0], "1") if len(numbers) == 1 else (*numbers, "1")[:3]
+        size = values[2].constant if len(values) == 3 else 1
+        if not isinstance(size, int) or size == 0:
+            self._refuse(node, "a step that is not constant", "a constant one, not 0")
+        counter = self._slot("i64")
+        self._do(f"store i64 {start}, ptr {counter}")
+        head, body, more, end = (self._label() for _ in range(4))
+        self._end(f"br label %{head}")
+        self._begin(head)
+        now = self._emit(f"load i64, ptr {counter}")
+        going = self._emit(f"icmp {'slt' if size > 0 else 'sgt'} i64 {now}, {stop}")
+        self._branch(Value(BOOL, going), body, end)
+        self._begin(body)
+        self._store(name, Value(INT, now), node)
+        self._loops.append((more, end))
+        self._block(node.body)
+        self._loops.pop()
+        self._end(f"br label %{more}")
+        self._begin(more)
+        now = self._emit(f"load i64, ptr {counter}")
+        self._do(f"store i64 {self._emit(f'add nsw i64 {now}, {step}')}, ptr {counter}")
+        self._end(f"br label %{head}")
+        self._begin(end)
+
+    def _statement_Break(self, node: ast.Break) -> None:
+        self._end(f"br label %{self._loops[-1][1]}")
+
+    def _statement_Continue(self, node: ast.Continue) -> None:
+        self._end(f"br label %{self._loops[-1][0]}")
+
+    # Expressions.
+
+    def _expression(self, node: ast.expr) -> Value:
+        method = getattr(self, f"_expression_{type(node).__name__}", None)
+        if method is None:
+            self._refuse(node, f"`{ast.unparse(node)}`", "an expression of the subset")
+        return method(node)
+
+    def _expression_Constant(self, node: ast.Constant) -> Value:
+        if not isinstance(node.value, bool | int | float):
+            self._refuse(node, f"`{ast.unparse(node)}`", "a number")
+        return _constant(node.value)
+
+    def _expression_Name(self, node: ast.Name) -> Value:
+        if node.id in self._names:
+            return self._get(*self._names[node.id])
+        found = self.scope.find(node.id)
+        if found is None:
+            self._refuse(node, f"the name {node.id}, which nothing has", "one that is defined")
+        if isinstance(found, Function | Word | Record):
+            self._refuse(node, f"the function {node.id} as a value", "a call of it")
+        return _constant(found)
+
+    def _expression_Tuple(self, node: ast.Tuple) -> Value:
+        return _group([self._expression(one) for one in node.elts])
+
+    def _expression_Attribute(self, node: ast.Attribute) -> Value:
+        value = self._expression(node.value)
+        fields = value.type.fields if isinstance(value.type, Group | Row) else ()
+        if node.attr not in fields:
+            self._refuse(node, f".{node.attr} of {describe(value.type)}", f"one of: {', '.join(fields) or '(none)'}")
+        if isinstance(value.type, Row):
+            return Value(FLOAT, self._emit(f"load double, ptr {self._address(node)}"))
+        return value.parts[fields.index(node.attr)]
+
+    def _expression_Subscript(self, node: ast.Subscript) -> Value:
+        found = self._entry(self._expression(node.value), node)
+        return Value(FLOAT, self._emit(f"load double, ptr {found}")) if isinstance(found, str) else found
+
+    def _entry(self, base: Value, node: ast.Subscript) -> Value | str:
+        """The part of a value at an index; of an array's entry, where it is."""
+        indices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        values = [self._expression(one) for one in indices]
+        if any(isinstance(one.constant, int) and one.constant < 0 for one in values):
+            self._refuse(node, "a negative index", "one from 0 on")
+        match base.type:
+            case Pointer(block=block) if len(values) <= len(block) + 1:
+                total = None
+                for value, stride in zip(values, base.type.strides(), strict=False):
+                    number = self._int(value, node)
+                    number = self._emit(f"mul nsw i64 {number}, {stride}") if stride != 1 else number
+                    total = number if total is None else self._emit(f"add nsw i64 {total}, {number}")
+                address = self._emit(f"getelementptr inbounds double, ptr {base.name}, i64 {total}")
+                return address if len(values) == len(block) + 1 else Value(Pointer(block[len(values) :]), address)
+            case Pointers() if len(values) == 1:
+                address = self._emit(f"getelementptr inbounds ptr, ptr {base.name}, i64 {self._int(values[0], node)}")
+                return Value(VECTOR, self._emit(f"load ptr, ptr {address}"))
+            case Rows(fields=fields) if len(values) == 1:
+                place = self._emit(f"mul nsw i64 {self._int(values[0], node)}, {len(fields)}")
+                return Value(Row(fields), self._emit(f"getelementptr inbounds double, ptr {base.name}, i64 {place}"))
+            case Group() if len(values) == 1:
+                return self._member(base, values[0], node)
+        self._refuse(node, f"{len(values)} indices of {describe(base.type)}", "as many as it has")
+
+    def _member(self, group: Value, index: Value, node: ast.AST) -> Value:
+        """The entry of a tuple."""
+        if isinstance(index.constant, int):
+            if index.constant >= len(group.parts):
+                self._refuse(node, f"entry {index.constant} of {len(group.parts)}", "one that there is")
+            return group.parts[index.constant]
+        kinds = {part.type for part in group.parts}
+        if len(kinds) != 1 or isinstance((kind := kinds.pop()), Group):
+            self._refuse(node, "an index that is not constant, of a tuple of several types", "a constant one")
+        table = self._slot(f"[{len(group.parts)} x {llvm_type(kind)}]")
+        for i, part in enumerate(group.parts):
+            address = self._emit(f"getelementptr inbounds {llvm_type(kind)}, ptr {table}, i64 {i}")
+            self._do(f"store {llvm_type(kind)} {part.name}, ptr {address}")
+        number = self._int(index, node)
+        address = self._emit(f"getelementptr inbounds {llvm_type(kind)}, ptr {table}, i64 {number}")
+        return Value(kind, self._emit(f"load {llvm_type(kind)}, ptr {address}"))
+
+    def _expression_UnaryOp(self, node: ast.UnaryOp) -> Value:
+        if isinstance(node.op, ast.Not):
+            value = self._condition(node.operand)
+            return (
+                _constant(not value.constant)
+                if value.constant is not None
+                else Value(BOOL, self._emit(f"xor i1 {value.name}, true"))
+            )
+        value = self._expression(node.operand)
+        if isinstance(node.op, ast.UAdd):
+            return value
+        if not isinstance(node.op, ast.USub):
+            self._refuse(node, f"`{ast.unparse(node)}`", "-, + or not")
+        if isinstance(value.constant, bool | int | float):
+            return _constant(-value.constant)
+        if value.type is FLOAT:
+            return Value(FLOAT, self._emit(f"fneg {FAST} double {value.name}"))
+        return Value(INT, self._emit(f"sub nsw i64 0, {self._int(value, node)}"))
+
+    def _expression_BinOp(self, node: ast.BinOp) -> Value:
+        return self._arithmetic(node.op, self._expression(node.left), self._expression(node.right), node)
+
+    def _arithmetic(self, op: ast.operator, left: Value, right: Value, node: ast.AST) -> Value:
+        if type(op) not in _OPERATORS:
+            self._refuse(node, f"`{ast.unparse(node)}`", "+, -, *, /, //, % or **")
+        name, plainly = _OPERATORS[type(op)]
+        if left.constant is not None and right.constant is not None:
+            try:
+                return _constant(plainly(left.constant, right.constant))
+            except (ArithmeticError, TypeError, ValueError):  # as the processor does it, or refused below
+                pass
+        if name == "pow":
+            return self._power(left, right, node)
+        if name != "div" and left.type in (INT, BOOL) and right.type in (INT, BOOL):
+            return self._whole(name, self._int(left, node), self._int(right, node))
+        a, b = self._float(left, node), self._float(right, node)
+        if name in ("floordiv", "mod"):
+            rest = self._emit(f"frem double {a}, {b}")
+            signs = [self._emit(f"fcmp olt double {one}, {_hex(0.0)}") for one in (rest, b)]
+            other = self._emit(f"xor i1 {signs[0]}, {signs[1]}")
+            there = self._emit(f"fcmp one double {rest}, {_hex(0.0)}")
+            shift = self._emit(f"select i1 {self._emit(f'and i1 {other}, {there}')}, double {b}, double {_hex(0.0)}")
+            rest = self._emit(f"fadd double {rest}, {shift}")
+            if name == "mod":
+                return Value(FLOAT, rest)
+            whole = self._emit(f"fdiv double {self._emit(f'fsub double {a}, {rest}')}, {b}")
+            return Value(FLOAT, self._emit(f"call double {self.program.library('llvm.rint.f64', 1)}(double {whole})"))
+        return Value(FLOAT, self._emit(f"f{name} {FAST} double {a}, {b}"))
+
+    def _whole(self, name: str, a: str, b: str) -> Value:
+        """Arithmetic of ints."""
+        if name in ("add", "sub", "mul"):
+            return Value(INT, self._emit(f"{name} nsw i64 {a}, {b}"))
+        quotient, rest = self._emit(f"sdiv i64 {a}, {b}"), self._emit(f"srem i64 {a}, {b}")
+        # Python rounds down, the processor towards zero.
+        signs = self._emit(f"icmp slt i64 {self._emit(f'xor i64 {rest}, {b}')}, 0")
+        down = self._emit(f"and i1 {signs}, {self._emit(f'icmp ne i64 {rest}, 0')}")
+        if name == "floordiv":
+            return Value(INT, self._emit(f"sub nsw i64 {quotient}, {self._emit(f'zext i1 {down} to i64')}"))
+        return Value(INT, self._emit(f"add nsw i64 {rest}, {self._emit(f'select i1 {down}, i64 {b}, i64 0')}"))
+
+    def _power(self, base: Value, exponent: Value, node: ast.AST) -> Value:
+        number = exponent.constant
+        if isinstance(number, int) and abs(number) <= MOST_FACTORS:
+            total, square, left = None, base, abs(number)
+            while left:  # by squaring
+                if left & 1:
+                    total = square if total is None else self._arithmetic(ast.Mult(), total, square, node)
+                left >>= 1
+                square = self._arithmetic(ast.Mult(), square, square, node) if left else square
+            total = _constant(1 if base.type is INT else 1.0) if total is None else total
+            return self._arithmetic(ast.Div(), _constant(1.0), total, node) if number < 0 else total
+        if exponent.type is not FLOAT and base.type is not FLOAT:
+            self._refuse(node, "a whole exponent of an int that is not constant", "a float")
+        function = self.program.library("llvm.pow.f64", 2)
+        a, b = self._float(base, node), self._float(exponent, node)
+        return Value(FLOAT, self._emit(f"call double {function}(double {a}, double {b})"))
+
+    def _expression_Compare(self, node: ast.Compare) -> Value:
+        left, total = self._expression(node.left), None
+        for op, comparator in zip(node.ops, node.comparators, strict=True):
+            right = self._expression(comparator)
+            one = self._compare(op, left, right, node)
+            if total is None:
+                total = one
+            elif total.constant is not None and one.constant is not None:
+                total = _constant(bool(total.constant) and bool(one.constant))
+            else:
+                total = Value(BOOL, self._emit(f"and i1 {total.name}, {one.name}"))
+            left = right
+        assert total is not None
+        return total
+
+    def _compare(self, op: ast.cmpop, left: Value, right: Value, node: ast.AST) -> Value:
+        if type(op) not in _COMPARISONS:
+            self._refuse(node, f"`{ast.unparse(node)}`", "<, <=, >, >=, == or !=")
+        name, plainly = _COMPARISONS[type(op)]
+        if left.constant is not None and right.constant is not None:
+            return _constant(bool(plainly(left.constant, right.constant)))
+        if left.type in (INT, BOOL) and right.type in (INT, BOOL):
+            signed = name if name in ("eq", "ne") else f"s{name}"
+            a, b = self._int(left, node), self._int(right, node)
+            return Value(BOOL, self._emit(f"icmp {signed} i64 {a}, {b}"))
+        a, b = self._float(left, node), self._float(right, node)
+        ordered = f"u{name}" if name == "ne" else f"o{name}"  # a NaN is only unequal
+        return Value(BOOL, self._emit(f"fcmp {ordered} double {a}, {b}"))
+
+    def _expression_BoolOp(self, node: ast.BoolOp) -> Value:
+        """One after the other, until one decides."""
+        decides = isinstance(node.op, ast.Or)
+        end, slot, pending = self._label(), "", False
+        for i, one in enumerate(node.values):
+            value = self._condition(one)
+            last = i + 1 == len(node.values)
+            if value.constant is not None:
+                if bool(value.constant) != decides and not last:
+                    continue
+                if not pending:
+                    return _constant(bool(value.constant))
+            slot = slot or self._slot("i1")
+            self._do(f"store i1 {value.name}, ptr {slot}")
+            if last or value.constant is not None:
+                break
+            more, pending = self._label(), True
+            self._branch(value, *((end, more) if decides else (more, end)))
+            self._begin(more)
+        self._end(f"br label %{end}")
+        self._begin(end)
+        return Value(BOOL, self._emit(f"load i1, ptr {slot}"))
+
+    def _expression_IfExp(self, node: ast.IfExp) -> Value:
+        test = self._condition(node.test)
+        if test.constant is not None:
+            return self._expression(node.body if test.constant else node.orelse)
+        yes, no, end = self._label(), self._label(), self._label()
+        self._branch(test, yes, no)
+        found = []
+        for label, branch in ((yes, node.body), (no, node.orelse)):
+            self._begin(label)
+            found.append((self._expression(branch), len(self._blocks) - 1))
+        kind = join(found[0][0].type, found[1][0].type)
+        if kind is None:
+            self._refuse(node, f"{describe(found[0][0].type)} or {describe(found[1][0].type)}", "one type")
+        slots = self._slots_of(kind)
+        last = self._blocks[found[0][1] + 1 :]  # the second branch waits, for its blocks come after the first one's end
+        del self._blocks[found[0][1] + 1 :]
+        self._put(slots, self._cast(found[0][0], kind, node))
+        self._end(f"br label %{end}")
+        self._blocks += last
+        self._put(slots, self._cast(found[1][0], kind, node))
+        self._end(f"br label %{end}")
+        self._begin(end)
+        return self._get(kind, slots)
+
+    # Calls.
+
+    def _expression_Call(self, node: ast.Call) -> Value:
+        value = self._call(node)
+        if value is None:
+            self._refuse(node, f"`{ast.unparse(node)}`, which returns nothing", "a value")
+        return value
+
+    def _call(self, node: ast.Call) -> Value | None:
+        if not isinstance(node.func, ast.Name) or node.keywords:
+            self._refuse(node, f"`{ast.unparse(node)}`", "a call by a bare name, of positional arguments")
+        name = node.func.id
+        found = self.scope.find(name)
+        given = [self._expression(one) for one in node.args]
+        match found:
+            case Function():
+                return self._call_kernel(found, given, node)
+            case Record(name=record, fields=fields):
+                if len(given) != len(fields):
+                    self._refuse(node, f"{len(given)} fields of {record}", str(len(fields)))
+                return Value(Group(tuple(one.type for one in given), record, fields), parts=tuple(given))
+            case Word():
+                return self._call_word(found.name, given, node)
+        self._refuse(node, f"a call of {name}", "a kernel, a record, or what `codegen/language.py` lists")
+
+    def _call_kernel(self, function: Function, given: list[Value], node: ast.Call) -> Value | None:
+        count = len(function.node.args.args)
+        if len(given) != count:
+            self._refuse(node, f"{len(given)} arguments for {function.node.name}", str(count))
+        symbol, result = self.program.instance(function, tuple(one.type for one in given))
+        arguments = ", ".join(f"{llvm_type(part.type)} {part.name}" for one in given for part in _leaves(one))
+        if result is None:
+            self._do(f"call void {symbol}({arguments})")
+            return None
+        returned = self._emit(f"call {llvm_type(result)} {symbol}({arguments})")
+        if not isinstance(result, Group):
+            return Value(result, returned)
+        kind = llvm_type(result)
+        parts = [self._emit(f"extractvalue {kind} {returned}, {i}") for i in range(len(result.members))]
+        return _assemble(result, iter(parts))
+
+    def _call_word(self, name: str, given: list[Value], node: ast.Call) -> Value | None:
+        method = getattr(self, f"_word_{name}", None)
+        if method is not None:
+            return method(given, node)
+        if name in UNARY or name in BINARY:
+            count = 1 if name in UNARY else 2
+            self._expect(given, count, count, node)
+            library = UNARY.get(name) or BINARY[name]
+            function = self.program.library(library, count)
+            numbers = ", ".join(f"double {self._float(one, node)}" for one in given)
+            fast = f" {FAST}" if library.startswith("llvm.") and name not in ("copysign", "pow") else ""
+            return Value(FLOAT, self._emit(f"call{fast} double {function}({numbers})"))
+        if name in SCALES:
+            self._expect(given, 1, 1, node)
+            return self._arithmetic(ast.Mult(), given[0], _constant(float(SCALES[name])), node)
+        if name in TESTS:
+            self._expect(given, 1, 1, node)
+            number = self._float(given[0], node)
+            if name == "isnan":
+                return Value(BOOL, self._emit(f"fcmp uno double {number}, {number}"))
+            size = self._emit(f"call double {self.program.library('llvm.fabs.f64', 1)}(double {number})")
+            test = "oeq" if name == "isinf" else "olt"
+            return Value(BOOL, self._emit(f"fcmp {test} double {size}, {_hex(float('inf'))}"))
+        self._refuse(node, f"a call of {name}", "what `codegen/language.py` lists")
+
+    def _expect(self, given: list[Value], least: int, most: int, node: ast.AST) -> None:
+        if not least <= len(given) <= most:
+            wanted = str(least) if least == most else f"{least} or more"
+            self._refuse(node, f"{len(given)} arguments in `{ast.unparse(node)}`", wanted)
+
+    def _extreme(self, given: list[Value], node: ast.AST, op: ast.cmpop, plainly: Callable[..., Any]) -> Value:
+        self._expect(given, 2, 1000, node)
+        total = given[0]
+        for other in given[1:]:
+            if total.constant is not None and other.constant is not None:
+                total = _constant(plainly(total.constant, other.constant))
+                continue
+            kind = join(total.type, other.type)
+            if kind not in (FLOAT, INT):
+                self._refuse(node, f"{describe(total.type)} and {describe(other.type)}", "numbers")
+            a, b = self._cast(total, kind, node), self._cast(other, kind, node)
+            better = self._compare(op, b, a, node)
+            of = llvm_type(kind)
+            total = Value(kind, self._emit(f"select i1 {better.name}, {of} {b.name}, {of} {a.name}"))
+        return total
+
+    def _word_min(self, given: list[Value], node: ast.AST) -> Value:
+        return self._extreme(given, node, ast.Lt(), min)
+
+    def _word_max(self, given: list[Value], node: ast.AST) -> Value:
+        return self._extreme(given, node, ast.Gt(), max)
+
+    def _word_abs(self, given: list[Value], node: ast.AST) -> Value:
+        self._expect(given, 1, 1, node)
+        if given[0].type in (INT, BOOL):
+            number = self._int(given[0], node)
+            negative = self._emit(f"icmp slt i64 {number}, 0")
+            minus = self._emit(f"sub nsw i64 0, {number}")
+            return Value(INT, self._emit(f"select i1 {negative}, i64 {minus}, i64 {number}"))
+        function = self.program.library("llvm.fabs.f64", 1)
+        return Value(FLOAT, self._emit(f"call double {function}(double {self._float(given[0], node)})"))
+
+    def _word_int(self, given: list[Value], node: ast.AST) -> Value:
+        self._expect(given, 1, 1, node)
+        if given[0].type is FLOAT:
+            return Value(INT, self._emit(f"fptosi double {given[0].name} to i64"))
+        return Value(INT, self._int(given[0], node))
+
+    def _word_float(self, given: list[Value], node: ast.AST) -> Value:
+        self._expect(given, 1, 1, node)
+        return Value(FLOAT, self._float(given[0], node))
+
+    def _word_len(self, given: list[Value], node: ast.AST) -> Value:
+        self._expect(given, 1, 1, node)
+        if not isinstance(given[0].type, Group):
+            self._refuse(node, f"the length of {describe(given[0].type)}", "that of a tuple")
+        return _constant(len(given[0].parts))
+
+    def _word_stack(self, given: list[Value], node: ast.AST) -> Value:
+        shape = [one.constant for one in given]
+        if not shape or not all(isinstance(size, int) and size >= 0 for size in shape):
+            self._refuse(node, f"`{ast.unparse(node)}`", "constant sizes")
+        kind = Pointer(tuple(int(size) for size in shape[1:]))  # pyright: ignore[reportArgumentType]
+        total = int(shape[0]) * kind.strides()[0]  # pyright: ignore[reportArgumentType]
+        return Value(kind, self._slot(f"[{max(total, 1)} x double]", 64))
+
+    def _pointer(self, address: Value, node: ast.AST) -> str:
+        if address.type not in (FLOAT, INT):
+            self._refuse(node, describe(address.type), "an address")
+        number = address.name
+        if address.type is FLOAT:
+            number = self._emit(f"fptosi double {number} to i64")
+        return self._emit(f"inttoptr i64 {number} to ptr")
+
+    def _word_at(self, given: list[Value], node: ast.AST) -> Value:
+        self._expect(given, 1, 1, node)
+        return Value(VECTOR, self._pointer(given[0], node))
+
+    def _word_rows_at(self, given: list[Value], node: ast.AST) -> Value:
+        self._expect(given, 2, 2, node)
+        if not isinstance(given[1].constant, int):
+            self._refuse(node, "a width that is not constant", "a constant one")
+        return Value(Pointer((given[1].constant,)), self._pointer(given[0], node))
+
+    def _word_int32(self, given: list[Value], node: ast.AST) -> Value:
+        self._expect(given, 1, 1, node)
+        return Value(INT32, self._emit(f"trunc i64 {self._int(given[0], node)} to i32"))
+
+    def _c_call(self, kind: str, given: list[Value], node: ast.AST) -> str:
+        self._expect(given, 1, 1000, node)
+        function = self._pointer(given[0], node)
+        parts = [part for one in given[1:] for part in _leaves(one)]
+        parts = [self._cast(part, INT, node) if part.type is BOOL else part for part in parts]
+        return f"call {kind} {function}({', '.join(f'{llvm_type(one.type)} {one.name}' for one in parts)})"
+
+    def _word_call(self, given: list[Value], node: ast.AST) -> None:
+        self._do(self._c_call("void", given, node))
+
+    def _word_call_for_value(self, given: list[Value], node: ast.AST) -> Value:
+        return Value(FLOAT, self._emit(self._c_call("double", given, node)))
+
+    def _shared(self, given: list[Value], node: ast.AST) -> str:
+        """The address of one of the int64 that threads share."""
+        words, index = self._pointer(given[0], node), self._int(given[1], node)
+        return self._emit(f"getelementptr inbounds i64, ptr {words}, i64 {index}")
+
+    def _word_claim(self, given: list[Value], node: ast.AST) -> Value:
+        self._expect(given, 2, 2, node)
+        outcome = self._emit(f"cmpxchg ptr {self._shared(given, node)}, i64 0, i64 1 acq_rel acquire")
+        won = self._emit(f"extractvalue {{i64, i1}} {outcome}, 1")
+        return Value(INT, self._emit(f"zext i1 {won} to i64"))
+
+    def _word_load(self, given: list[Value], node: ast.AST) -> Value:
+        self._expect(given, 2, 2, node)
+        return Value(INT, self._emit(f"load atomic i64, ptr {self._shared(given, node)} acquire, align 8"))
+
+    def _word_store(self, given: list[Value], node: ast.AST) -> None:
+        self._expect(given, 3, 3, node)
+        number = self._int(given[2], node)
+        self._do(f"store atomic i64 {number}, ptr {self._shared(given, node)} release, align 8")
+
+    def _word_fetch_add(self, given: list[Value], node: ast.AST) -> Value:
+        self._expect(given, 3, 3, node)
+        number = self._int(given[2], node)
+        return Value(INT, self._emit(f"atomicrmw add ptr {self._shared(given, node)}, i64 {number} acq_rel"))
+
+
+def _hex(number: float) -> str:
+    """A float64 as LLVM reads it, to the last bit."""
+    return f"0x{struct.unpack('<Q', struct.pack('<d', number))[0]:016X}"
+
+
+def _constant(number: Constant) -> Value:
+    if isinstance(number, bool):
+        return Value(BOOL, "true" if number else "false", constant=number)
+    if isinstance(number, int):
+        return Value(INT, str(number), constant=number)
+    if isinstance(number, float):
+        return Value(FLOAT, _hex(number), constant=number)
+    return _group([_constant(one) for one in number])
+
+
+def _group(parts: list[Value]) -> Value:
+    constants = tuple(part.constant for part in parts)
+    constant: Any = None if None in constants else constants
+    return Value(Group(tuple(part.type for part in parts)), parts=tuple(parts), constant=constant)
+
+
+def _leaves(value: Value) -> list[Value]:
+    if isinstance(value.type, Group):
+        return [leaf for part in value.parts for leaf in _leaves(part)]
+    return [value]
+
+
+def _assemble(kind: Type, names: Any) -> Value:
+    """A value of that type, of LLVM's names of its scalars."""
+    if isinstance(kind, Group):
+        return Value(kind, parts=tuple(_assemble(member, names) for member in kind.members))
+    return Value(kind, next(names))

@@ -1,0 +1,304 @@
+"""Functions in the kernels' subset, and what the names in them mean.
+
+A `Source` is a module of `lqrsim/kernels` or a text. What it leaves open is filled in by name: constants, such as which
+states are the position, and functions, such as the places of balls. Nothing is joined or renamed: a `Scope` tells of
+each name in a source what it is, to who prints it (`printer.py`) and to who runs it as plain Python (`plain.py`).
+"""
+
+import ast
+import functools
+import importlib
+import inspect
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Any
+
+from lqrsim.codegen.language import CONSTANTS, MATH, SubsetError
+from lqrsim.errors import InputError, check_kind, excerpt
+from lqrsim.kernels import declarations, linear_algebra, records, rotation_ratios, signed_distance
+from lqrsim.results.hashing import sha256
+
+# What kernels declare and the language has.
+WORDS = (
+    "stack", "call", "call_for_value", "at", "rows_at", "int32", "claim", "load", "store", "fetch_add",
+    "inline", "outline",
+)  # fmt: skip
+PYTHON = ("range", "len", "abs", "min", "max", "int", "float")
+
+Constant = bool | int | float | tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Functions in the kernels' subset; `source_of` and `text_source` make it.
+
+    Attributes:
+      module: the name of a module in `lqrsim/kernels`; empty for a text. text: what is defined beside that.
+      constants: name -> number or tuple of numbers, for what the module declares.
+      fills: (name, source, name there) of functions that are only declared.
+      what: as messages call it.
+    """
+
+    module: str = ""
+    text: str = ""
+    constants: tuple[tuple[str, Constant], ...] = ()
+    fills: tuple[tuple[str, "Source", str], ...] = ()
+    what: str = field(default="source", compare=False)
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """A hash of all that it is made of."""
+        filled = (f"{name}={source.digest}.{there}" for name, source, there in self.fills)
+        own = _module_text(self.module) if self.module else ""
+        return sha256(self.module, own, self.text, repr(self.constants), *filled)
+
+    def filled(self, **fills: "Source | tuple[Source, str]") -> "Source":
+        """The same with functions for what it leaves open, from sources that have them by that or another name."""
+        pairs = {name: one if isinstance(one, tuple) else (one, name) for name, one in fills.items()}
+        kept = tuple(fill for fill in self.fills if fill[0] not in pairs)
+        return Source(
+            self.module, self.text, self.constants, (*kept, *((name, *pair) for name, pair in pairs.items())), self.what
+        )
+
+    def has(self, name: str) -> bool:
+        """Whether it has a function of that name, of its own or filled in."""
+        return isinstance(Scope(self, {}).find(name), Function)
+
+
+def source_of(module: ModuleType, **constants: Constant) -> Source:
+    """The functions of a module of `lqrsim/kernels`.
+
+    Args:
+      module: of the kernels.
+      **constants: numbers and tuples of numbers for names that the module declares.
+
+    Raises:
+      AttributeError: the module declares no such constant.
+    """
+    for name in constants:
+        getattr(module, name)
+    return Source(module.__name__, constants=tuple(sorted(constants.items())), what=module.__name__)
+
+
+def text_source(text: str, what: str = "source") -> Source:
+    """A text that defines functions: a formula's, or a user's own."""
+    return Source(text=text, what=what)
+
+
+def check_source(field: str, source: object, functions: Mapping[str, int]) -> Source:
+    """The Source, of a text or as it is. Raises InputError unless it defines these functions, of so many arguments.
+
+    What there is besides Python's own arithmetic is named without its module: cos, not math.cos or np.cos.
+    """
+    if isinstance(source, Source):
+        return source
+    wanted = " and ".join(f"{name}(...)" for name in functions)
+    check_kind(f"{field}: source", source, str, f"text that defines {wanted}")
+    wrong = _wrong(str(source), tuple(functions.items()))
+    if wrong:
+        raise InputError(f"{field}: source: {wrong}")
+    return text_source(str(source), f"{field}: source")
+
+
+@functools.lru_cache(maxsize=256)  # a problem that is stated again and again has the same sources
+def _wrong(source: str, functions: tuple[tuple[str, int], ...]) -> str:
+    """What is wrong with a source; see `check_source`."""
+    try:
+        tree = ast.parse(source)
+    except Exception as error:  # SyntaxError, or what nesting, null characters and the like lead to
+        return f"got {excerpt(source)}, which is no Python ({error}), want functions"
+    defined = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    for name, count in functions:
+        found = defined.get(name)
+        if found is None:
+            return f"got {excerpt(source)}, want it to define {name}(...)"
+        if len(found.args.args) != count:
+            return f"got {name} of {len(found.args.args)} arguments, want {count}"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            return f"got an import in line {node.lineno}, want none: sqrt, exp, cos and the like are at hand"
+        if isinstance(node, ast.Attribute):
+            return f"got {ast.unparse(node)} in line {node.lineno}, want {node.attr}: modules are not at hand"
+    return ""
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function, and the scope in which its names mean something."""
+
+    scope: "Scope"
+    node: ast.FunctionDef
+
+    @property
+    def decorators(self) -> set[str]:
+        """Among them `inline`, for what is to become part of its callers, or `outline`, for what is not to."""
+        return {one.id for one in self.node.decorator_list if isinstance(one, ast.Name)}
+
+
+@dataclass(frozen=True)
+class Word:
+    """What the language itself has by that name: of `declarations.py`, of `math`, or of Python."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Record:
+    """A named tuple of `kernels/records.py`."""
+
+    name: str
+    fields: tuple[str, ...]
+
+
+Meaning = Function | Word | Record | Constant
+
+
+@dataclass(frozen=True)
+class _Parsed:
+    """A module or a text, read."""
+
+    functions: dict[str, ast.FunctionDef]
+    imports: dict[str, tuple[str, str]]  # name here -> module, name there
+
+
+class Scope:
+    """What the names in one source mean, for one set of sizes.
+
+    Args:
+      source: the functions. sizes: name -> number, of what `declarations.py` declares: N, M, W and so on.
+    """
+
+    def __init__(self, source: Source, sizes: Mapping[str, int]) -> None:
+        self.source, self.sizes = source, sizes
+        parsed = _parsed_module(source.module) if source.module else _parsed_text(source.text)
+        self._functions, self._imports = parsed.functions, parsed.imports
+        self._constants = dict(source.constants)
+        self._fills = {name: (filled, there) for name, filled, there in source.fills}
+        self._scopes: dict[Source, Scope] = {}
+        self._found: dict[str, Meaning] = {}
+
+    def find(self, name: str) -> Meaning | None:
+        """What a name means; None if nothing."""
+        if name not in self._found:
+            found = self._find(name)
+            if found is None:
+                return None
+            self._found[name] = found
+        return self._found[name]
+
+    def function(self, name: str) -> Function:
+        """The function of that name. Raises SubsetError if there is none."""
+        found = self.find(name)
+        if not isinstance(found, Function):
+            raise SubsetError(f"{self.source.what}: got no function {name}, want one")
+        return found
+
+    def _find(self, name: str) -> Meaning | None:
+        if name in self._constants:
+            return self._constants[name]
+        if name in self._fills:
+            source, there = self._fills[name]
+            return self._scope_of(source).function(there)
+        if name in self._functions:
+            return Function(self, self._functions[name])
+        if name in self._imports:
+            return self._imported(*self._imports[name])
+        if self.source.module:
+            value = getattr(importlib.import_module(self.source.module), name, None)
+            if _is_constant(value):
+                return value
+        elif (found := self._at_hand(name)) is not None:
+            return found
+        return Word(name) if name in PYTHON else None
+
+    def _imported(self, module: str, name: str) -> Meaning | None:
+        if module == "math":
+            return getattr(math, name) if name in CONSTANTS else Word(name) if name in MATH else None
+        if module == declarations.__name__:
+            return self._declared(name)
+        if module == records.__name__:
+            return _record(name)
+        return self._module(module).find(name)
+
+    def _declared(self, name: str) -> Meaning | None:
+        """What `declarations.py` declares: a size, a number with a name, a word of the language, or what is filled."""
+        if name in self.sizes:
+            return self.sizes[name]
+        if name in WORDS:
+            return Word(name)
+        if name in self._fills:
+            source, there = self._fills[name]
+            return self._scope_of(source).function(there)
+        value = getattr(declarations, name, None)
+        return value if _is_constant(value) else None
+
+    def _at_hand(self, name: str) -> Meaning | None:
+        """What a text can use without importing it."""
+        if name in MATH:
+            return self._imported("math", name)
+        for module in (rotation_ratios, signed_distance, linear_algebra):
+            if name in _parsed_module(module.__name__).functions:
+                return self._module(module.__name__).find(name)
+        return self._declared(name)
+
+    def _module(self, module: str) -> "Scope":
+        """Another module of the kernels; what is filled in here is filled in there, as far as it is asked for."""
+        fills = tuple(fill for fill in self.source.fills if fill[0] in _left_open(module))
+        return self._scope_of(Source(module, fills=fills, what=module))
+
+    def _scope_of(self, source: Source) -> "Scope":
+        if source not in self._scopes:
+            made = Scope(source, self.sizes)
+            made._scopes = self._scopes  # one scope a source in all of a program
+            self._scopes[source] = made
+        return self._scopes[source]
+
+
+def _is_constant(value: object) -> bool:
+    if isinstance(value, tuple):
+        return all(_is_constant(one) for one in value)
+    return isinstance(value, bool | int | float)
+
+
+def _record(name: str) -> Record | None:
+    kind = getattr(records, name, None)
+    return Record(name, kind._fields) if isinstance(kind, type) and hasattr(kind, "_fields") else None
+
+
+@functools.cache
+def _module_text(module: str) -> str:
+    return inspect.getsource(importlib.import_module(module))
+
+
+@functools.cache
+def _parsed_module(module: str) -> _Parsed:
+    return _parse(_module_text(module))
+
+
+@functools.lru_cache(maxsize=256)
+def _parsed_text(text: str) -> _Parsed:
+    return _parse(text)
+
+
+@functools.cache
+def _left_open(module: str) -> frozenset[str]:
+    """The names that may be filled in for a module: what it and those that it imports declare, and its functions."""
+    parsed = _parsed_module(module)
+    declared = {name for home, name in parsed.imports.values() if home == declarations.__name__}
+    others = {home for home, _ in parsed.imports.values() if home not in _WITHOUT_FUNCTIONS}
+    return frozenset(declared | parsed.functions.keys()).union(*(_left_open(home) for home in others))
+
+
+_WITHOUT_FUNCTIONS = (declarations.__name__, records.__name__, "math")
+
+
+def _parse(text: str) -> _Parsed:
+    functions, imports = {}, {}
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.FunctionDef):
+            functions[node.name] = node
+        elif isinstance(node, ast.ImportFrom):
+            imports |= {one.asname or one.name: (str(node.module), one.name) for one in node.names}
+    return _Parsed(functions, imports)
