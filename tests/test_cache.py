@@ -117,9 +117,16 @@ def test_another_problem_of_the_same_size_compiles_only_its_own_and_has_the_same
     assert as_many == all_of_it
 
 
+NESTED = b"[" * 100_000 + b"]" * 100_000
+
+
 @pytest.mark.parametrize(
-    "damage", [lambda item: item[: len(item) // 2], lambda item: b"", lambda item: item[:-1] + b"x"]
-)
+    "damage",
+    [
+        lambda item: item[: len(item) // 2], lambda item: b"", lambda item: item[:-1] + b"x",
+        lambda item: NESTED + b"\n" + item, lambda item: b"[]\n" + item, lambda item: b'{"sha256": 1}\n' + item,
+    ],
+)  # fmt: skip
 def test_a_damaged_item_is_made_again(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, damage: Callable[[bytes], bytes]
 ) -> None:
@@ -136,14 +143,29 @@ def test_a_damaged_item_is_made_again(
             item.write_bytes(damage(item.read_bytes()))
 
 
-def test_what_was_well_kept_and_can_not_be_used_is_made_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def foreign(contents: bytes) -> list[bytes]:
+    """What may stand in place of an object file and what is said of it."""
+    header, _, code = contents.partition(b"\n")
+    return [
+        b"what nobody writes", b"", NESTED + b"\n" + code, b"null\n" + code, b"{}\n" + code, header, header + b"\n",
+        b'{"libraries": [], "returns": [["complex"], false]}\n' + code, b'{"libraries": 3, "returns": null}\n' + code,
+        header + b"\n" + code[: len(code) // 2], header + b"\n\x7fELF" + bytes(1000), header + b"\n" + bytes(200),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("number", range(12))
+def test_what_was_well_kept_and_can_not_be_used_is_made_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, number: int
+) -> None:
     """A checksum does not tell whether another version of the compiler wrote it."""
     monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
     source = "def triple(x, out):\n    out[0] = 3 * x[0]\n"
     x, out = np.array([2.0]), np.zeros(1)
     CompiledModule(text_source(source), {}, "a test").triple(x, out)
     (item,) = tmp_path.iterdir()
-    disk_cache.save(item.stem, b"not what numba writes", "a test")
+    contents = disk_cache.load(item.stem)
+    assert contents is not None
+    disk_cache.save(item.stem, foreign(contents)[number], "a test")
     CompiledModule(text_source(source), {}, "a test").triple(x, out)
     assert out[0] == 6
 
@@ -188,6 +210,33 @@ def test_the_cache_is_bounded_and_forgets_what_was_used_longest_ago(
     assert {item.path.stem for item in disk_cache.items()} == {"item0", "item2", "item3"}
     assert disk_cache.clear() == 3
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_killed_processes_left_goes_when_it_is_old(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+    left = [tmp_path / f".unfinished-{i:016x}{suffix}" for i, suffix in enumerate((".item", ".json", ".item"))]
+    for path in left:
+        path.write_bytes(b"half of ")
+    for path in left[:2]:
+        os.utime(path, (0, 0))
+    disk_cache.save("kept", b"contents", "a test")
+    assert [path.exists() for path in left] == [False, False, True]  # the last may be another process's
+    assert disk_cache.clear() == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_derivatives_that_were_kept_by_something_else_are_derived_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def falling(x, u, p):
+        return [u[0] - x[0]]
+
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+    wanted = ls.Dynamics(falling, states={"a": ""}, controls={"b": ""}).source
+    (item,) = tmp_path.iterdir()
+    for contents in (NESTED, b"[]", b"{}", b'{"source": 3}', b"\xff", b""):
+        disk_cache.save(item.stem, contents, "a test")
+        assert ls.Dynamics(falling, states={"a": ""}, controls={"b": ""}).source == wanted
 
 
 def scale(x, u, p):
@@ -254,6 +303,10 @@ def test_what_may_change_unseen_has_no_fingerprint() -> None:
     assert fingerprint(imports) is None
     assert fingerprint(counts) is None
     assert fingerprint(lambda x, u, p: [eval("MASS") * x[0]]) is None
+    assert fingerprint(lambda x, u, p: [getattr(p, "mass") * x[0]]) is not None  # noqa: B009
+    assert fingerprint(lambda x, u, p: [getattr(Mass, "value") * x[0]]) is None  # noqa: B009
+    assert fingerprint(lambda x, u, p: [getattr(scale, "__globals__")["FACTOR"] * x[0]]) is None  # noqa: B009
+    assert fingerprint(lambda x, u, p: [scale.__globals__["FACTOR"] * x[0]]) is None
     assert fingerprint(lambda x, u, p: [x[0] * np.random.default_rng().normal()]) is None
     assert fingerprint(lambda x, u, p: [pytest.approx(x[0])]) is None
 

@@ -3,6 +3,8 @@
 import copy
 import dataclasses
 import pickle
+import subprocess
+import sys
 import threading
 import time
 from typing import Any
@@ -429,3 +431,38 @@ def test_check_derivatives_names_the_worst_entry() -> None:
     assert [(check.what, check.row, check.column) for check in bad] == [("df/dx of pendulum", "speed", "speed")]
     assert bad[0].stated == 0.25
     assert "DISAGREES; worst at row speed, column speed: 0.25 stated" in str(bad[0])
+
+
+WITHOUT_NUMBA = """
+import sys
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == "numba":
+            raise ModuleNotFoundError("No module named 'numba'")
+
+sys.meta_path.insert(0, Refuse())
+import lqrsim as ls
+
+drive = ls.scenarios.differential_drive()
+print(ls.smooth(drive.problem).status.name)
+ls.simulate(drive.plant(), ls.ilqr(drive.problem), disturbances=[ls.ControlNoise(0.05)], seed=0)
+dynamics = ls.Dynamics(lambda x, u, p: (u[0] - x[0],), states={"x": ""}, controls={"u": ""}, level="compiled")
+problem = ls.Problem(
+    dynamics=dynamics, dt=0.1, steps=5, initial=ls.FixedState([1.0]), stage_cost=ls.ControlCost([1.0]),
+    final_cost=ls.QuadraticCost([1.0], about=[0.0]),
+)
+try:
+    ls.ilqr(problem)
+except ls.InputError as error:
+    print(error)
+print("numba" in sys.modules)
+"""
+
+
+def test_only_functions_for_numba_need_it() -> None:
+    command = [sys.executable, "-c", WITHOUT_NUMBA]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=200)
+    status, refused, imported = done.stdout.splitlines()
+    assert (status, imported) == ("CONVERGED", "False")
+    assert "level: got 'compiled', which needs numba, want pip install 'lqrsim[numba]'" in refused

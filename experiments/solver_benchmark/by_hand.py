@@ -9,9 +9,10 @@ import numba
 import numpy as np
 
 import lqrsim as ls
+from lqrsim.codegen.sources import text_source
 from lqrsim.codegen.symbolic import write_chain
 
-# numba is told what lqrsim tells it.
+# numba is told what lqrsim tells LLVM.
 compiled: Any = numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
 
 
@@ -33,7 +34,9 @@ def inlined(symbolic: ls.Dynamics) -> ls.Dynamics:
     jacobian += rate.split("\n", 3)[3]
     source = f"def _ratios(s):\n{ratios}\ndef rate(x, u, p, out):\n{rate}\n"
     source += f"def rate_jacobian(x, u, p, out, fx, fu):\n{jacobian}\n"
-    vars(dynamics)["source"] = source + write_chain(12, filled)  # what cached_property would trace otherwise
+    vars(dynamics)["source"] = text_source(
+        source + write_chain(12, filled)
+    )  # what cached_property would trace otherwise
     return dynamics
 
 

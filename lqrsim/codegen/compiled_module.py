@@ -42,6 +42,7 @@ from lqrsim.codegen.sources import Scope, Source
 from lqrsim.errors import Array
 from lqrsim.kernels import records
 from lqrsim.machine import instruction_set
+from lqrsim.results.hashing import sha256
 
 logger = logging.getLogger("lqrsim")
 
@@ -178,7 +179,7 @@ class CompiledModule:
         loaded = Loaded(code, libraries)
         if long:
             disk.note(timed, time.perf_counter() - clock)
-        header = {"libraries": libraries, "returns": _encoded(returns)}
+        header = {"libraries": libraries, "returns": _encoded(returns), "code": sha256(code)}
         disk.save(key, json.dumps(header).encode() + b"\n" + code, what)
         return loaded, returns
 
@@ -230,7 +231,11 @@ class Call:
 
     def __call__(self, *arguments: Any) -> Any:
         if arguments:
-            self._lay_changes(self._layout, arguments, self._arguments, 0)
+            try:
+                self._lay_changes(self._layout, arguments, self._arguments, 0)
+            except Exception:  # so that nothing is left of what is not kept alive
+                self._lay(self._layout, self._arguments, 0)
+                raise
             self._arguments = arguments
         self._run(self._address)
         returns, place = self._returns, self._layout.size
@@ -259,51 +264,56 @@ class Call:
     def _lay(self, layout: "_Layout", argument: Any, place: int) -> None:
         """Write the words of an argument from a place on."""
         kind = layout.kind
-        if isinstance(kind, Pointer):
-            if not isinstance(argument, np.ndarray):
-                raise TypeError(f"got {type(argument).__name__}, want an array")
-            if argument.shape[1:] != kind.block or not argument.flags.c_contiguous or argument.dtype != np.float64:
-                raise TypeError(f"got an array {argument.shape} of {argument.dtype}, want {kind.block} in C's order")
-            self._words[place] = _address_of(argument)
-        elif isinstance(kind, Group):
+        if layout.block is not None:
+            self._words[place] = _address_of(argument, layout.block)
+        elif layout.parts or isinstance(kind, Group):
             if not isinstance(argument, tuple) or len(argument) != len(layout.parts):
-                raise TypeError(f"got {type(argument).__name__}, want {kind.record or 'a tuple'}")
+                raise TypeError(f"got {type(argument).__name__}, want {layout.what}")
             for part, one in zip(layout.parts, argument, strict=True):
                 self._lay(part, one, place)
                 place += part.size
         elif kind is FLOAT:
             self._floats[place] = argument
-        elif kind is INT or kind is BOOL:
+        elif kind is INT:
             self._words[place] = operator.index(argument)
+        elif kind is BOOL:
+            if not isinstance(argument, bool | np.bool_):
+                raise TypeError(f"got {type(argument).__name__}, want a bool")
+            self._words[place] = bool(argument)
         elif isinstance(kind, Pointers):
-            table = (ctypes.c_int64 * max(len(argument), 1))()
-            for i, array in enumerate(argument):
-                if array.ndim != 1 or not array.flags.c_contiguous or array.dtype != np.float64:
-                    raise TypeError(f"got an array {array.shape} of {array.dtype}, want vectors of float64")
-                table[i] = _address_of(array)
+            table = (ctypes.c_int64 * max(len(argument), 1))(*(_address_of(array, ()) for array in argument))
             self._tables[place] = table
             self._words[place] = ctypes.addressof(table)
         else:
             assert isinstance(kind, Rows)
-            if (
-                not isinstance(argument, np.ndarray)
-                or argument.dtype.names != kind.fields
-                or not argument.flags.c_contiguous
-            ):
-                raise TypeError(f"got rows of {argument.dtype}, want {', '.join(kind.fields)}")
+            if not isinstance(argument, np.ndarray) or argument.dtype != layout.row or not argument.ndim:
+                raise TypeError(f"got {type(argument).__name__}, want rows of float64: {', '.join(kind.fields)}")
+            if not argument.flags.c_contiguous:
+                raise TypeError("got rows that are not one after the other")
             self._words[place] = argument.ctypes.data
 
 
 class _Layout:
-    """How many words a type takes, and its parts."""
+    """How many words a type takes, and its parts; of an array, the shape of its blocks; of rows, what one is."""
 
     def __init__(self, kind: Type) -> None:
         self.kind = kind
         self.parts = tuple(_Layout(member) for member in kind.members) if isinstance(kind, Group) else ()
         self.size = len(scalars(kind))
+        self.block = kind.block if isinstance(kind, Pointer) else None
+        self.row = np.dtype([(name, np.float64) for name in kind.fields]) if isinstance(kind, Rows) else None
+        self.what = (kind.record or "a tuple") if isinstance(kind, Group) else ""
 
 
-def _address_of(array: Array) -> int:
+_FLOAT64 = np.dtype(np.float64)
+
+
+def _address_of(array: Array, block: tuple[int, ...]) -> int:
+    """Where the numbers of an array of such blocks are. Raises TypeError for what is none."""
+    if not isinstance(array, np.ndarray):
+        raise TypeError(f"got {type(array).__name__}, want an array")
+    if array.dtype != _FLOAT64 or not array.ndim or array.shape[1:] != block or not array.flags.c_contiguous:
+        raise TypeError(f"got an array {array.shape} of {array.dtype}, want blocks {block} of float64 in C's order")
     try:  # in a quarter of the time that array.ctypes.data takes
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError):  # nothing in it, or read-only
@@ -334,7 +344,9 @@ def _unpacked(kept: bytes) -> tuple[Loaded, Type | None] | None:
             names, several = known["returns"]
             kinds = tuple({one.name: one for one in (FLOAT, INT, BOOL)}[name] for name in names)
             returns = Group(kinds) if several else kinds[0]
-        return Loaded(code, tuple(known["libraries"])), returns
+        if known["code"] != sha256(code):  # LLVM ends the process over what is no object file
+            raise ValueError("it has another code")
+        return Loaded(code, tuple(map(str, known["libraries"]))), returns
     except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
         logger.debug(f"a compiled function in the cache could not be used ({error})")
         return None

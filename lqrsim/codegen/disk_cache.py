@@ -4,8 +4,8 @@ An item's name is a hash of all that it depends on, so an item cannot be stale; 
 damaged one is as good as none. A cache that cannot be read or written costs time, never an error. When the items
 outgrow `LIMIT`, those that were used longest ago go.
 
-Items are programs: compiled functions are unpickled and run, and sources are executed. The checksum keeps off damage,
-not people. Who can write the folder can have code run by whoever reads it: share it with nobody whom you do not trust.
+Items are programs: compiled functions are run, and sources are executed. The checksum keeps off damage, not people.
+Who can write the folder can have code run by whoever reads it: share it with nobody whom you do not trust.
 """
 
 import contextlib
@@ -18,12 +18,14 @@ from pathlib import Path
 import platformdirs
 
 from lqrsim.errors import InputError
+from lqrsim.results.archive import replacing
 from lqrsim.results.hashing import sha256
-from lqrsim.results.save_load import replacing
 
-LIMIT = 512 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about one megabyte, and four with its parts
+LIMIT = 512 * 1024 * 1024  # bytes; a solver for a system of 12 states takes about 100 kB
 _SUFFIX = ".item"
 _DURATIONS = "durations.json"
+_LONGEST_HEADER = 10_000  # bytes
+_ABANDONED = 3600.0  # s, after which a file that is not finished never will be
 
 
 @dataclass(frozen=True)
@@ -53,28 +55,22 @@ def load(name: str) -> bytes | None:
     path = folder() / f"{name}{_SUFFIX}"
     try:
         header, _, contents = path.read_bytes().partition(b"\n")
-        good = json.loads(header)["sha256"] == sha256(contents)
-    except (OSError, ValueError, KeyError, TypeError):
+    except OSError:
         return None
-    if not good:
+    if _described(header).get("sha256") != sha256(contents):
         return None
     with contextlib.suppress(OSError):
         os.utime(path)  # it was used now
     return contents
 
 
-def save(name: str, contents: bytes, what: str, *, shrink: bool = True) -> None:
-    """Keep an item if that is possible; two processes that keep the same one do not disturb each other.
-
-    Args:
-      shrink: whether to look if there is too much by now, which takes longer than keeping a small item.
-    """
+def save(name: str, contents: bytes, what: str) -> None:
+    """Keep an item if that is possible; two processes that keep the same one do not disturb each other."""
     header = json.dumps({"what": what, "sha256": sha256(contents)}).encode()
     with contextlib.suppress(OSError, InputError):
         with replacing(folder() / f"{name}{_SUFFIX}") as unfinished:
             unfinished.write_bytes(header + b"\n" + contents)
-        if shrink:
-            _shrink()
+        _shrink()
 
 
 def note(name: str, seconds: float) -> None:
@@ -97,6 +93,15 @@ def _durations() -> dict[str, object]:
     return found if isinstance(found, dict) else {}
 
 
+def _described(header: bytes) -> dict[str, object]:
+    """What the first line of an item says; nothing if it is damaged."""
+    try:
+        found = json.loads(header[:_LONGEST_HEADER])
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def items() -> list[Item]:
     """What there is, the last used first."""
     found = []
@@ -104,12 +109,8 @@ def items() -> list[Item]:
         with contextlib.suppress(OSError):  # another process may remove it meanwhile
             status = path.stat()
             with path.open("rb") as file:
-                header = file.readline(10_000)
-            try:
-                what = str(json.loads(header)["what"])
-            except (ValueError, KeyError, TypeError):
-                what = "damaged; it will be made again"
-            found.append(Item(what, path, status.st_size, status.st_mtime))
+                what = _described(file.readline(_LONGEST_HEADER)).get("what", "damaged; it will be made again")
+            found.append(Item(str(what), path, status.st_size, status.st_mtime))
     return sorted(found, key=lambda item: -item.used)
 
 
@@ -124,12 +125,18 @@ def clear() -> int:
 
 
 def _shrink() -> None:
+    """Remove what was used longest ago, as far as there is too much, and what killed processes left."""
+    found = []
+    for path in _files(f"[!.]*{_SUFFIX}"):
+        with contextlib.suppress(OSError):  # another process may remove it meanwhile
+            status = path.stat()
+            found.append((status.st_mtime, status.st_size, path))
     total = 0
-    for item in items():
-        total += item.size
+    for _, size, path in sorted(found, reverse=True):
+        total += size
         if total > LIMIT:
-            item.path.unlink(missing_ok=True)
-    for path in _unfinished(3600.0):
+            path.unlink(missing_ok=True)
+    for path in _unfinished(_ABANDONED):
         path.unlink(missing_ok=True)
 
 
@@ -143,7 +150,7 @@ def _files(pattern: str) -> list[Path]:
 def _unfinished(age: float) -> list[Path]:
     """What a process that was killed did not finish, at least `age` seconds ago."""
     found = []
-    for path in _files(f".*{_SUFFIX}"):
+    for path in _files(".unfinished-*"):
         with contextlib.suppress(OSError):
             if time.time() - path.stat().st_mtime >= age:
                 found.append(path)

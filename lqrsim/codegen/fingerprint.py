@@ -24,11 +24,13 @@ from lqrsim.kernels import rotation_ratios
 # What formulas may use without being read: by version, which the hash includes.
 _PACKAGES = ("math", "numba", "numpy", "sympy")
 _MODULES = ("lqrsim", "lqrsim.rotations")
-# What reads files, other names or chance: a function that mentions these does more than can be covered.
+# What reads files, other names or chance: a function that mentions these does more than can be covered. `getattr` may,
+# for what it can reach is covered, but for names like `__globals__`.
 _REFUSED = {
-    "open", "input", "eval", "exec", "compile", "globals", "locals", "vars", "getattr", "setattr", "__import__",
+    "open", "input", "eval", "exec", "compile", "globals", "locals", "vars", "setattr", "__import__",
     "random", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "frompyfunc", "vectorize",
 }  # fmt: skip
+_UNCOVERED = {"__globals__", "__dict__", "__builtins__", "__closure__", "__code__", "__subclasses__", "__class__"}
 _PLAIN = (int, float, complex, str, bytes, bool, type(None), type(Ellipsis))
 
 
@@ -98,7 +100,8 @@ def _code(code: types.CodeType) -> Iterator[str]:
 
 def _names(code: types.CodeType) -> set[str]:
     """The global names that code reads, and that of functions inside it; refuses imports of what has no version."""
-    if _REFUSED & set(code.co_names):
+    texts = {constant for constant in code.co_consts if isinstance(constant, str)}
+    if _REFUSED & set(code.co_names) or _UNCOVERED & (texts | set(code.co_names)):
         raise _NoFingerprint
     found = set()
     instructions = list(dis.get_instructions(code))

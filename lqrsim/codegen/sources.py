@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any
 
+from lqrsim import kernels
 from lqrsim.codegen.language import CONSTANTS, MATH, SubsetError
 from lqrsim.errors import InputError, check_kind, excerpt
 from lqrsim.kernels import declarations, linear_algebra, records, rotation_ratios, signed_distance
@@ -46,6 +47,13 @@ class Source:
     constants: tuple[tuple[str, Constant], ...] = ()
     fills: tuple[tuple[str, "Source", str], ...] = ()
     what: str = field(default="source", compare=False)
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @functools.cached_property
+    def _hash(self) -> int:
+        return hash((self.module, self.text, self.constants, self.fills))
 
     @functools.cached_property
     def digest(self) -> str:
@@ -220,7 +228,7 @@ class Scope:
             return self._declared(name)
         if module == records.__name__:
             return _record(name)
-        return self._module(module).find(name)
+        return self._module(module).find(name) if module.startswith(f"{kernels.__name__}.") else None
 
     def _declared(self, name: str) -> Meaning | None:
         """What `declarations.py` declares: a size, a number with a name, a word of the language, or what is filled."""
@@ -296,7 +304,11 @@ _WITHOUT_FUNCTIONS = (declarations.__name__, records.__name__, "math")
 
 def _parse(text: str) -> _Parsed:
     functions, imports = {}, {}
-    for node in ast.parse(text).body:
+    try:
+        tree = ast.parse(text)
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:  # of nesting, null characters and the like
+        raise SubsetError(f"got {excerpt(text)}, which is no Python ({error}), want functions") from None
+    for node in tree.body:
         if isinstance(node, ast.FunctionDef):
             functions[node.name] = node
         elif isinstance(node, ast.ImportFrom):

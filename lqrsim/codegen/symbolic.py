@@ -44,10 +44,16 @@ def check_parameters(parameters: Mapping[str, float] | None) -> dict[str, float]
     return {name: check_number(f"parameters: {name}", value) for name, value in normal.items()}
 
 
-def kept(function: Callable[..., Any], details: object, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def kept(
+    function: Callable[..., Any], details: object, make: Callable[[], dict[str, Any]], **kinds: type
+) -> dict[str, Any]:
     """What `make` derives from a user's function, from the cache if it is there: then SymPy need not be imported.
 
     What cannot be told from other functions by its fingerprint is derived anew, and errors are not kept.
+
+    Args:
+      function: the user's. details: what else it depends on. make: returns names and values, as JSON has them.
+      **kinds: the types of these.
     """
     print_of_it = fingerprint(function)
     if print_of_it is None:
@@ -55,8 +61,10 @@ def kept(function: Callable[..., Any], details: object, make: Callable[[], dict[
     key = disk_cache.key("derivatives", _writers(), print_of_it, repr(details))
     stored = disk_cache.load(key)
     if stored is not None:
-        with contextlib.suppress(ValueError):
-            return json.loads(stored)
+        with contextlib.suppress(ValueError, RecursionError):
+            found = json.loads(stored)
+            if isinstance(found, dict) and all(isinstance(found.get(name), kind) for name, kind in kinds.items()):
+                return found
     made = make()
     name = getattr(function, "__qualname__", repr(function))
     disk_cache.save(key, json.dumps(made).encode(), f"derivatives of {name}(x, u, p)")

@@ -72,8 +72,8 @@ class Reproduce:
 class Cache:
     """Show or clear the cache of compiled solvers.
 
-    The cache holds compiled code and derived formulas. Without it, each kind of problem is compiled again, in about 10
-    seconds.
+    The cache holds compiled code and derived formulas. Without it, the solver is compiled again for each number of
+    states and controls, in two to five seconds.
 
     It holds programs, which are loaded and run: do not share the folder with people you do not trust.
     """

@@ -79,6 +79,6 @@ def _symbolic(function: Callable[[Any, Any, Any], Any], states: int) -> Sensor:
         source += symbolic.write_function("measure_slope", "x, data, out", "data", slopes, of=of)
         return {"source": source, "size": len(values)}
 
-    made = symbolic.kept(function, ("sensor", states), make)
+    made = symbolic.kept(function, ("sensor", states), make, source=str, size=int)
     size = int(made["size"])
     return Sensor(text_source(str(made["source"]), of), np.zeros(1), size, tuple(f"{of}[{i}]" for i in range(size)))

@@ -197,7 +197,10 @@ class Balls:
             return self._bind_functions(dynamics)
         n, constants = len(dynamics.state_coordinates), dynamics.constants
         details = ("balls", n, len(self), tuple(dynamics.parameters), *constants.items())
-        made = symbolic.kept(self.function, details, lambda: self._trace(n, dynamics.parameters, constants))
+        made = symbolic.kept(
+            self.function, details, lambda: self._trace(n, dynamics.parameters, constants),
+            source=str, size=int, depends_on=list,
+        )  # fmt: skip
         self._check_plane(made["size"], dynamics.state_coordinates)
         return Places(made["source"], dynamics.data, tuple(made["depends_on"]), made["size"] == 2)
 

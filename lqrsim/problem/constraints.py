@@ -41,7 +41,7 @@ class ConstraintTerm:
 
     Attributes:
       source: defines `value(x, u, t, row, data)`, which returns one of the numbers, and `slope(x, u, t, row, data,
-        gradient)`, which *adds* its gradient (n+m,), states before controls. The numba subset; see `costs.Term`.
+        gradient)`, which *adds* its gradient (n+m,), states before controls. As the source of a `costs.Term`.
         Functions go by their bare names: `cos`, not `math.cos` or `np.cos`, which are refused.
       data: (any,) float64.
       rows: how many numbers there are at a step.
@@ -165,7 +165,7 @@ class SymbolicConstraint(Constraint):
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         details = ("constraint", n, m, tuple(self.parameters))
-        made = symbolic.kept(self.function, details, lambda: self._trace(n, m))
+        made = symbolic.kept(self.function, details, lambda: self._trace(n, m), source=str, rows=int, with_control=list)
         with_control, rows = made["with_control"], made["rows"]
         if self.at == "final" and with_control:
             raise InputError(

@@ -285,7 +285,9 @@ class SymbolicCost(Cost):
     def bind(self, dynamics: Dynamics) -> Term:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         details = ("cost", n, m, tuple(self.parameters))
-        made = symbolic.kept(self.function, details, lambda: self._trace(n, m))
+        made = symbolic.kept(
+            self.function, details, lambda: self._trace(n, m), source=str, nonconvex_in=list, uses_control=bool
+        )
         return Term(
             made["source"],
             np.array(list(self.parameters.values()), dtype=np.float64),

@@ -229,7 +229,7 @@ class Dynamics:
             return given if self.jacobian is not None else source_of(finite_differences).filled(rate=given)
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
         details = ("dynamics", *names, *self.constants.items())
-        made = symbolic.kept(self.f, details, lambda: {"source": self._trace()})
+        made = symbolic.kept(self.f, details, lambda: {"source": self._trace()}, source=str)
         return text_source(made["source"], f"{self.name}(x, u, p)")
 
     @cached_property

@@ -192,7 +192,7 @@ class Noise:
         if self.level != "symbolic":
             return self._bind_function(dynamics, numbers)
         details = ("noise", n, m, self.size, tuple(self.parameters))
-        made = symbolic.kept(self.function, details, lambda: self._trace(n, m))
+        made = symbolic.kept(self.function, details, lambda: self._trace(n, m), source=str, rows=list, active=list)
         source = text_source(made["source"], self.name)
         return NoiseTerm(source, numbers, tuple(made["rows"]), self.size, tuple(made["active"]))
 

@@ -4,8 +4,9 @@
 functions. `save_load.py` writes a `Solution` to disk and reads it back; `rollout.py` has what comes out of running it.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -90,6 +91,31 @@ class Solution:
     multipliers: tuple[Multipliers, ...] = ()
     goal: Array | None = None
     goal_radius: float | None = None
+
+    @classmethod
+    def assembled(cls, later: Mapping[str, Callable[[], Any]], **parts: Any) -> "Solution":
+        """A solver's own, whose parts fit each other: without a check, and with parts that are made when they are read.
+
+        Args:
+          later: name -> what makes it, for parts that have no default.
+          **parts: all others.
+
+        Returns:
+          A Solution.
+        """
+        solution = object.__new__(cls)
+        vars(solution).update(parts, _later=later)
+        return solution
+
+    def __getattr__(self, name: str) -> Any:
+        later = vars(self).get("_later", {})
+        if name not in later:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return vars(self).setdefault(name, later[name]())  # of two threads that read it both get the same
+
+    def __getstate__(self) -> dict[str, Any]:
+        """With all parts made."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @property
     def target(self) -> Target:

@@ -45,23 +45,26 @@ def assemble(
             control_coordinates=problem.applied_coordinates,
         )  # fmt: skip
 
-    return Solution(
+    later = {
+        "inverse_policy": lambda: policy(*inverse_law, states[1:]) if inverse_law is not None else None,
+        "clearance": lambda: clearance_of(problem, states),
+        "problem_digest": lambda: problem.digest,
+    }
+    return Solution.assembled(
+        later,
         status=status,
         detail=detail,
         policy=policy(*law, states[:-1]),
-        inverse_policy=policy(*inverse_law, states[1:]) if inverse_law is not None else None,
         cost_to_go=cost_to_go,
         cost_to_come=cost_to_come,
         trajectory=Trajectory(states, controls, problem.dt),
         iterations=iterations,
-        clearance=clearance_of(problem, states),
         certificate=certificate,
         gap=gap,
         solver=solver,
         options=options,
         multipliers=multipliers,
         candidates=candidates,
-        problem_digest=problem.digest,
         versions=versions(),
         goal=problem.weighed_goal,
         goal_radius=_radius(problem),

@@ -62,13 +62,25 @@ class Attempt:
         self.problem, self.settings, self.stop = problem, settings, stop
         if settings.first_pass == "backward" and (initial_guess.gain.any() or problem.dynamics.discrete):
             initial_guess = initial_guess.rolled_out(problem, start)
-        self.initial_guess = initial_guess
         self.work = Workspace(problem, settings, initial_guess, start)
-        self.work.memory["watched"] = float(settings.safeguard)
-        self.termination = Termination((), declarations.RUNNING, False, -1, "")
         self._log = np.zeros(settings.max_iterations, LOG)
-        self._shares = initial_guess.prior.obstacles if initial_guess.prior is not None else ()
+        self._begin(initial_guess)
         self._loop = self.work.core.lay_out("smoother", *self._arguments(0, 0, self._log))
+
+    def restart(self, problem: Problem, initial_guess: InitialGuess, start: Array, stop: Stop) -> None:
+        """Begin anew in the same memory, with a problem of the same structure and as many steps.
+
+        What the last run returned is written over. Not for a backward pass that comes first.
+        """
+        self.problem, self.stop = problem, stop
+        self.work.begin(problem, initial_guess, start)
+        self._begin(initial_guess)
+
+    def _begin(self, initial_guess: InitialGuess) -> None:
+        self.initial_guess = initial_guess
+        self.work.memory["watched"] = float(self.settings.safeguard)
+        self.termination = Termination((), declarations.RUNNING, False, -1, "")
+        self._shares = initial_guess.prior.obstacles if initial_guess.prior is not None else ()
 
     @property
     def cost(self) -> float:

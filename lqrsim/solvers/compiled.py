@@ -104,7 +104,9 @@ def dynamics_model(dynamics: Dynamics) -> DynamicsModel:
 
 def numbers(part: Dynamics | Term | ConstraintTerm) -> Array:
     """The numbers that a part reads: the addresses of its functions, then its own."""
-    return np.array([*(address_of(function) for function in part.functions), *part.data], dtype=np.float64)
+    if not part.functions:
+        return part.data
+    return np.concatenate([[address_of(function) for function in part.functions], part.data])
 
 
 def cost_terms(problem: Problem, field: str) -> list[Term]:
@@ -113,38 +115,48 @@ def cost_terms(problem: Problem, field: str) -> list[Term]:
 
 
 def _cost(problem: Problem, field: str, constraints: list[tuple[ConstraintTerm, Array]]) -> CostModel:
-    sizes = _sizes(problem.dynamics)
-    terms = cost_terms(problem, field)
-    functions = np.array([_term_functions(term, sizes) for term in terms], dtype=np.float64).reshape(-1, 2)
-    support = tuple(sorted({i for term in terms for i in term.nonconvex_in or ()}))
+    terms, sizes = cost_terms(problem, field), tuple(_sizes(problem.dynamics).items())
+    functions, project = _term_functions(tuple((term.code, term.nonconvex_in) for term in terms), sizes)
+    stated = tuple((one.code, one.balls, one.equality, one.uses_control) for one, _ in constraints)
+    acting = Constraints(
+        _constraint_functions(stated, sizes), tuple(numbers(one) for one, _ in constraints),
+        tuple(own for _, own in constraints), len(constraints),
+    )  # fmt: skip
+    indefinite = sum(term.nonconvex_in is not None for term in terms)
+    return CostModel(functions, tuple(map(numbers, terms)), len(terms), indefinite, project, acting)
+
+
+_Sizes = tuple[tuple[str, int], ...]
+
+
+@functools.lru_cache(maxsize=1024)
+def _term_functions(terms: tuple[tuple[Source, tuple[int, ...] | None], ...], sizes: _Sizes) -> tuple[Array, float]:
+    """`CostModel.functions` and `project` of the terms of a cost."""
+    rows = []
+    for code, _ in terms:
+        rows.append(module_of(code, f"a cost: {code.what}", **dict(sizes)).addresses("value", "derivatives"))
+    support = tuple(sorted({i for _, entries in terms for i in entries or ()}))
     project = 0.0
     if support:
         source = source_of(projection, SUPPORT=support, K=len(support))
-        (project,) = module_of(source, "projection", **sizes).addresses("project")
-    indefinite = sum(term.nonconvex_in is not None for term in terms)
-    return CostModel(
-        functions, tuple(map(numbers, terms)), len(terms), indefinite, project,
-        Constraints(
-            np.array([_constraint_functions(one, sizes) for one, _ in constraints], dtype=np.float64).reshape(-1, 6),
-            tuple(numbers(one) for one, _ in constraints), tuple(own for _, own in constraints), len(constraints),
-        ),
-    )  # fmt: skip
+        (project,) = module_of(source, "the projection of a cost", **dict(sizes)).addresses("project")
+    return np.array(rows, dtype=np.float64).reshape(-1, 2), project
 
 
-def _term_functions(term: Term, sizes: dict[str, int]) -> tuple[float, ...]:
-    return module_of(term.code, f"a cost: {term.code.what}", **sizes).addresses("value", "derivatives")
-
-
-def _constraint_functions(term: ConstraintTerm, sizes: dict[str, int]) -> tuple[float, ...]:
-    """A row of `Constraints.functions`."""
-    pairs = {"constraint_value": (term.code, "value"), "constraint_slope": (term.code, "slope")}
-    source = source_of(augmented_lagrangian)
-    if term.balls:
-        source = source_of(ball_constraint, PLACES=3 * term.balls)
-        pairs |= {name: (term.code, name) for name in ("places", "places_jacobian")}
-    module = module_of(source.filled(**pairs), f"a constraint: {term.code.what}", **sizes, EQUALITY=int(term.equality))
-    found = module.addresses("augment", "augmentation", "constraint_values", "add_slope")
-    return *found, 0.0, float(term.uses_control)
+@functools.lru_cache(maxsize=1024)
+def _constraint_functions(constraints: tuple[tuple[Source, int, bool, bool], ...], sizes: _Sizes) -> Array:
+    """`Constraints.functions`."""
+    rows = []
+    for code, balls, equality, uses_control in constraints:
+        pairs = {"constraint_value": (code, "value"), "constraint_slope": (code, "slope")}
+        source = source_of(augmented_lagrangian)
+        if balls:
+            source = source_of(ball_constraint, PLACES=3 * balls)
+            pairs |= {name: (code, name) for name in ("places", "places_jacobian")}
+        module = module_of(source.filled(**pairs), f"a constraint: {code.what}", **dict(sizes), EQUALITY=int(equality))
+        found = module.addresses("augment", "augmentation", "constraint_values", "add_slope")
+        rows.append([*found, 0.0, float(uses_control)])
+    return np.array(rows, dtype=np.float64).reshape(-1, 6)
 
 
 def _noise_module(problem: Problem, term: NoiseTerm) -> CompiledModule:

@@ -69,6 +69,7 @@ class PreparedSolver:
         self._controls = problem.applied_coordinates
         self._structure = compiled.structure(problem)
         self._pace = 0.0  # s, of a slow iteration
+        self._idle: dict[int, list[Attempt]] = {}  # with memory for so many steps, which no solve is using
         self._compile()
 
     def _compile(self) -> None:
@@ -133,25 +134,40 @@ class PreparedSolver:
         stop = Stop() if time_limit is None else Stop(clock + check_number("time_limit", time_limit, above=0.0))
         stop.reserve = self._pace
         guess = start if isinstance(start, InitialGuess) else _initial_guess(start, problem)
-        attempt = Attempt(problem, self.settings, guess, np.array(state, dtype=np.float64), stop)
+        attempt = self._attempt(problem, guess, np.asarray(state, dtype=np.float64), stop)
         best = _Best(attempt)
         with problem.dynamics.solving(1):
             found = _run(attempt, best)
         iterating = best.rolling_out + sum(one.seconds for one in found.iterations)
         self._pace = max(0.5 * self._pace, max((one.seconds for one in found.iterations), default=0.0))
         best.consider(found)
-        return self._answer(problem, best, found, clock, iterating)
+        answer = self._answer(problem, best, found, clock, iterating)
+        self._idle.setdefault(problem.steps, []).append(attempt)  # not where something was raised
+        return answer
+
+    def _attempt(self, problem: Problem, guess: InitialGuess, state: Array, stop: Stop) -> Attempt:
+        """A solve that begins, in memory that there is already where there is some."""
+        try:
+            attempt = self._idle.get(problem.steps, []).pop()
+        except IndexError:  # the first solve, or another thread is in one
+            return Attempt(problem, self.settings, guess, state, stop)
+        attempt.restart(problem, guess, state, stop)
+        return attempt
 
     def _answer(self, problem: Problem, best: "_Best", found: AttemptResult, clock: float, iterating: float) -> Replan:
-        states, controls = best.plan
+        # The next solve writes over the memory that this one has worked in.
+        states, controls, gain, offset = (array.copy() for array in (*best.plan, *best.law))
+        value = best.cost_to_go
+        if value is not None:
+            value = Quadratic(value.hessian.copy(), value.gradient.copy(), np.array(value.constant))
         policy = AffinePolicy(
-            gain=best.law[0], offset=best.law[1], nominal=states[:-1], dt=problem.dt, state_coordinates=self._states,
+            gain=gain, offset=offset, nominal=states[:-1], dt=problem.dt, state_coordinates=self._states,
             control_coordinates=self._controls,
         )  # fmt: skip
         return Replan(
             status=found.status, detail=found.detail, improved=best.improved, policy=policy,
             trajectory=Trajectory(states, controls, problem.dt), cost=best.cost, before=best.before,
-            violation=best.violation, cost_to_go=best.cost_to_go, multipliers=best.multipliers,
+            violation=best.violation, cost_to_go=value, multipliers=best.multipliers,
             iterations=len(found.iterations), seconds=time.perf_counter() - clock, iterating=iterating,
         )  # fmt: skip
 

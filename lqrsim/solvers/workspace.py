@@ -40,45 +40,68 @@ class Workspace:
         n, steps, zeros = len(start), problem.steps, np.zeros
         m = initial_guess.offset.shape[1]
         self.dual = settings.form == "dual"
-        self.fixed = isinstance(problem.initial, FixedState)
-        self.start = start
-        go = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
-        if initial_guess.cost_to_go is not None:
-            value = initial_guess.cost_to_go
-            go = value.hessian.copy(), value.gradient.copy(), np.array(value.constant)
-        come = zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)
-        kept = steps if self.dual else 1  # the primal form finds its way back without
-        back = zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))
+        self._tolerance = settings.constraint_tolerance
+        self.core, self._costs = compiled.core(problem, settings.form), compiled.costs_module(problem)
         self.no_prior = Prior(zeros(n), zeros((steps + 1, n)))
-        self.prior, self.prior_iterations = self.no_prior, 0
-        if initial_guess.prior is not None:
-            about = np.broadcast_to(initial_guess.prior.about, (steps + 1, n)).copy()
-            self.prior, self.prior_iterations = (
-                Prior(initial_guess.prior.weight.copy(), about),
-                initial_guess.prior.iterations,
-            )
-        # Without a trajectory to begin with: the start, and the controls with which the dynamics can run backwards.
-        guess = Plan(np.tile(start, (steps + 1, 1)), initial_guess.offset.copy())
-        if initial_guess.trajectory is not None:
-            guess = Plan(initial_guess.trajectory.states.copy(), initial_guess.trajectory.controls.copy())
         self.memory_rows = zeros(1, MEMORY)
         self.memory = self.memory_rows[0]
-        spare = settings.constraint_tolerance
-        self.multipliers = [compiled.no_multipliers(problem, one, spare) for one in problem.constraint_terms]
-        for array, known in zip(self.multipliers, initial_guess.multipliers, strict=False):
-            array[0], array[declarations.HEADER :] = known.penalty, known.values.ravel()
-        self.core, self._costs = compiled.core(problem, settings.form), compiled.costs_module(problem)
-        self.model = compiled.arguments(problem, multipliers=self.multipliers)
-        self._problem, self._tolerance = problem, settings.constraint_tolerance
+        kept = steps if self.dual else 1  # the primal form finds its way back without
+
+        def plan() -> Plan:
+            return Plan(zeros((steps + 1, n)), zeros((steps, m)))
+
+        def policy() -> Policy:
+            return Policy(zeros((steps, m, n)), zeros((steps, m)))
+
+        self.multipliers: list[Array] = []
         self.arrays = records.Workspace(
-            start=start, x_hat=start.copy(), x_hats=zeros((steps + 1, n)),
-            policy=Policy(initial_guess.gain.copy(), initial_guess.offset.copy()), to_go=CostToGo(*go),
-            to_come=CostToCome(*come), smoothing=Smoothing(*back), eased=self.model.stage, prior=self.prior,
-            guess=guess,
-            plan=Plan(guess.states.copy(), guess.controls.copy()),
-            rollout=Plan(zeros((steps + 1, n)), zeros((steps, m))),
-            kept=Policy(zeros((steps, m, n)), zeros((steps, m))), certificate=zeros(1, CERTIFICATE),
+            start=zeros(n), x_hat=zeros(n), x_hats=zeros((steps + 1, n)), policy=policy(),
+            to_go=CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
+            to_come=CostToCome(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
+            smoothing=Smoothing(zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))),
+            eased=None, prior=self.no_prior, guess=plan(), plan=plan(), rollout=plan(), kept=policy(),
+            certificate=zeros(1, CERTIFICATE),
         )  # fmt: skip
+        self.begin(problem, initial_guess, start)
+
+    def begin(self, problem: Problem, initial_guess: InitialGuess, start: Array) -> None:
+        """Begin a solve; after another one, of a problem of the same structure with as many steps."""
+        self._problem, steps = problem, problem.steps
+        self.fixed = isinstance(problem.initial, FixedState)
+        self.prior, self.prior_iterations = self.no_prior, 0
+        if initial_guess.prior is not None:
+            about = np.broadcast_to(initial_guess.prior.about, (steps + 1, len(start))).copy()
+            self.prior = Prior(initial_guess.prior.weight.copy(), about)
+            self.prior_iterations = initial_guess.prior.iterations
+        spare = self._tolerance
+        multipliers = [compiled.no_multipliers(problem, one, spare) for one in problem.constraint_terms]
+        for array, known in zip(multipliers, initial_guess.multipliers, strict=False):
+            array[0], array[declarations.HEADER :] = known.penalty, known.values.ravel()
+        self.multipliers = multipliers
+        self.model = compiled.arguments(problem, multipliers=multipliers)
+        arrays = self.arrays = self.arrays._replace(eased=self.model.stage, prior=self.prior)
+        # What ran before leaves nothing.
+        for record in (arrays.to_go, arrays.to_come, arrays.smoothing, arrays.rollout, arrays.kept):
+            for array in record:
+                array[...] = 0.0
+        arrays.x_hats[...] = 0.0
+        self.memory_rows[...], arrays.certificate[...] = 0.0, 0.0
+        arrays.start[...] = arrays.x_hat[...] = start
+        arrays.policy.gain[...], arrays.policy.offset[...] = initial_guess.gain, initial_guess.offset
+        if initial_guess.cost_to_go is not None:
+            value = initial_guess.cost_to_go
+            for array, given in zip(arrays.to_go, (value.hessian, value.gradient, value.constant), strict=True):
+                array[...] = given
+        # Without a trajectory to begin with: the start, and the controls with which the dynamics can run backwards.
+        known = initial_guess.trajectory
+        for plan in (arrays.guess, arrays.plan):
+            plan.states[...] = start if known is None else known.states
+            plan.controls[...] = initial_guess.offset if known is None else known.controls
+
+    @property
+    def start(self) -> Array:
+        """Where it begins, (n,)."""
+        return self.arrays.start
 
     @property
     def plan(self) -> Plan:

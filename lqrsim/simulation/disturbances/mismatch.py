@@ -6,6 +6,7 @@ well: of mean 1, and of a standard deviation that is its distance from 1.
 """
 
 import abc
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -14,7 +15,6 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 from mujoco import batch
-from scipy.special import ndtr, ndtri
 
 from lqrsim.control.uncertainty import GAIN, Uncertainty, Unknown
 from lqrsim.errors import Array, InputError, check_number
@@ -35,7 +35,7 @@ from lqrsim.simulation.plant import Plant
 
 CUT = 3.0  # standard deviations
 # Of a standard normal number that is cut there.
-CUT_STD = float(np.sqrt(1 - 2 * CUT * np.exp(-(CUT**2) / 2) / np.sqrt(2 * np.pi) / (ndtr(CUT) - ndtr(-CUT))))
+CUT_STD = math.sqrt(1 - 2 * CUT * math.exp(-(CUT**2) / 2) / math.sqrt(2 * math.pi) / math.erf(CUT / math.sqrt(2)))
 
 
 @dataclass(frozen=True)
@@ -292,6 +292,8 @@ def driven_by(plant: Plant, body: int) -> str | None:
 
 def cut_normal(generator: np.random.Generator) -> float:
     """A number of the standard normal distribution that is cut there, made of a single uniform one."""
+    from scipy.special import ndtr, ndtri  # a fifth of a second, which only who draws has to wait
+
     low, high = ndtr((-CUT, CUT))
     return float(ndtri(low + (high - low) * generator.random()))
 
