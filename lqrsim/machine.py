@@ -55,8 +55,8 @@ def instruction_set() -> tuple[str, str, str]:
     """What code is compiled for: LLVM's triple, the name of the processor, and its features.
 
     `LQRSIM_CPU_NAME` and `LQRSIM_CPU_FEATURES` replace the last two: with "generic" and "", machines of one
-    architecture run the same instructions. Of AVX-512 only vectors of 256 bits are used, which are faster here; see
-    `python experiments/benchmark_compiling.py --sections features`.
+    architecture run the same instructions. AVX-512 is left out, for LLVM makes slower loops with it:
+    `python experiments/benchmark_compiling.py --sections features` compares.
     """
     import llvmlite.binding as llvm
 
@@ -66,7 +66,7 @@ def instruction_set() -> tuple[str, str, str]:
     if features is None:
         features = "" if name else llvm.get_host_cpu_features().flatten()
         if "+avx512f" in features.split(","):
-            features += ",+prefer-256-bit"
+            features += ",-avx512f"
     return llvm.get_process_triple(), name or llvm.get_host_cpu_name(), features
 
 

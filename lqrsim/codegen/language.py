@@ -30,8 +30,9 @@ Expressions
                     inf, nan, pi, e.
 
 Beside these there are the functions of `kernels/declarations.py`: `stack` for work arrays of constant shape, `call` and
-`call_for_value` for C functions at an address, `at` and `rows_at` for memory at an address, and words that threads
-share. An address is an int or a float64, which has all integers up to 2^53, beyond any address of a process.
+`call_for_value` for C functions at an address, `at` and `rows_at` for memory at an address, words that threads share,
+and `power_of_two`. An address is an int or a float64, which has all integers up to 2^53, beyond any address of a
+process. The decorators `inline`, `outline` and `exact` say how a kernel is compiled.
 """
 
 from dataclasses import dataclass

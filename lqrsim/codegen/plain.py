@@ -100,8 +100,9 @@ def _words(functions: Sequence[Callable[..., None]]) -> dict[str, Any]:
         "stack": lambda *shape: np.empty(shape), "call": call, "call_for_value": call_for_value,
         "at": lambda address: _memory(address, ctypes.c_double),
         "rows_at": lambda at, width: _memory(at, ctypes.c_double)[: _LONG // width * width].reshape(-1, width),
-        "int32": ctypes.c_int32, "claim": _claim, "load": lambda words, index: int(_integers(words)[index]),
-        "store": _store, "fetch_add": _fetch_add,
+        "power_of_two": lambda exponent: np.exp2(min(max(exponent, -1022.0), 1023.0)),
+        "load": lambda words, index: int(_integers(words)[index]), "store": _store, "claim": _claim,
+        "fetch_add": _fetch_add, "int32": ctypes.c_int32,
     }  # fmt: skip
 
 

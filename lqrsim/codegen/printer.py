@@ -5,11 +5,12 @@ that LLVM sees numbers and addresses; variables are slots on the stack, which it
 """
 
 import ast
+import math
 import operator
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeGuard
 
 from lqrsim.codegen.language import (
     BINARY,
@@ -37,6 +38,7 @@ from lqrsim.codegen.sources import Constant, Function, Record, Scope, Word
 
 FAST = "reassoc nsz arcp contract"  # lets LLVM fuse and reorder sums, but keeps NaN and infinity meaningful
 MOST_FACTORS = 64  # of a power with a constant exponent, which becomes a product
+MOST_ON_STACK = 1 << 20  # numbers in one work array: 8 MiB, which is all that a thread has
 
 _COMPARISONS = {
     ast.Lt: ("lt", operator.lt), ast.LtE: ("le", operator.le), ast.Gt: ("gt", operator.gt),
@@ -100,12 +102,15 @@ class Program:
         """LLVM's name of a function for arguments of these types, and the type of what it returns."""
         key = id(function.scope), function.node.name, types
         if key not in self._instances:
-            if key in self._running:
+            if any(running[:2] == key[:2] for running in self._running):
                 raise SubsetError(f"{where(function, function.node)}: got a function that calls itself, want a loop")
             self._running.append(key)
             plain = function.node.name if function.node.name.isascii() else "function"
             name = f"@{plain}.{len(self._instances) + len(self._running)}"  # as many as were begun
-            text, result = _print(self, function, types, name)
+            try:
+                text, result = _print(self, function, types, name)
+            except RecursionError:
+                raise SubsetError(f"{where(function, function.node)}: got too deep a nesting, want less") from None
             self._running.pop()
             self._texts.append(text)
             self._instances[key] = name, result
@@ -132,6 +137,8 @@ class Program:
         What it returns is written after these. Returns the type of that.
         """
         name, result = self.instance(function, types)
+        if result is not None and not {FLOAT, INT, BOOL}.issuperset(scalars(result)):
+            raise SubsetError(f"{where(function, function.node)}: got {describe(result)} returned, want numbers")
         lines, given, place = [], [], 0
         for one in (one for kind in types for one in scalars(kind)):
             loaded = "i64" if one is BOOL else llvm_type(one)
@@ -198,14 +205,19 @@ class _Body:
         self._slots: list[str] = []
         self._names: dict[str, tuple[Type, Any]] = {}
         self._loops: list[tuple[str, str]] = []
+        self._left: set[str] = set()  # the ends of loops that a break leads to
+        self._own: set[str] = set()  # the names of what may be, or have, work arrays of its own
         self._blocks: list[Block] = [Block("body", [])]
+        self._fast = "contract" if "exact" in function.decorators else FAST
         self._empty = False  # whether it returns nothing somewhere
 
     # Lines and blocks.
 
     def run(self) -> None:
         """Print the function."""
-        arguments = self.function.node.args
+        arguments, decorators = self.function.node.args, self.function.node.decorator_list
+        if len(self.function.decorators & {"inline", "outline", "exact"}) < len(decorators):
+            self._refuse(self.function.node, f"`@{ast.unparse(decorators[0])}`", "@inline, @outline, @exact or none")
         if arguments.vararg or arguments.kwarg or arguments.kwonlyargs or arguments.defaults or arguments.posonlyargs:
             self._refuse(self.function.node, "arguments with defaults, * or **", "positional ones")
         if len(arguments.args) != len(self.types):
@@ -336,7 +348,7 @@ class _Body:
         return self._cast(value, INT, node).name
 
     def _condition(self, node: ast.expr) -> Value:
-        value = self._expression(node)
+        value = self._decide(node) if isinstance(node, ast.BoolOp) else self._expression(node)
         if value.constant is not None:
             return _constant(bool(value.constant))
         if value.type is BOOL:
@@ -368,16 +380,27 @@ class _Body:
 
     def _statement_Assign(self, node: ast.Assign) -> None:
         value = self._expression(node.value)
+        if self._has_own(value, node.value):
+            self._own |= {one.id for target in node.targets for one in ast.walk(target) if isinstance(one, ast.Name)}
         for target in node.targets:
             self._assign(target, value)
+
+    def _has_own(self, value: Value, node: ast.expr) -> bool:
+        """Whether a value may be, or have, a work array of this function, which is no more when it returns."""
+        names = {one.id for one in ast.walk(node) if isinstance(one, ast.Name)}
+        return ("stack" in names or bool(names & self._own)) and any(
+            isinstance(one, Pointer | Pointers) for one in scalars(value.type)
+        )
 
     def _statement_AnnAssign(self, node: ast.AnnAssign) -> None:
         if node.value is None:
             self._refuse(node, "a name without a value", "an assignment")
-        self._assign(node.target, self._expression(node.value))
+        self._statement_Assign(ast.copy_location(ast.Assign([node.target], node.value), node))
 
     def _statement_AugAssign(self, node: ast.AugAssign) -> None:
         if isinstance(node.target, ast.Name):
+            if node.target.id not in self._names:
+                self._refuse(node, f"the name {node.target.id}, which has no value yet", "one that has")
             old = self._expression(ast.copy_location(ast.Name(node.target.id, ast.Load()), node.target))
             self._assign(node.target, self._arithmetic(node.op, old, self._expression(node.value), node))
             return
@@ -391,7 +414,7 @@ class _Body:
             case ast.Name(id=name):
                 self._store(name, value, target)
             case ast.Tuple(elts=parts):
-                if len(parts) != len(value.parts):
+                if not isinstance(value.type, Group) or len(parts) != len(value.parts):
                     self._refuse(target, f"{describe(value.type)} for {len(parts)} names", "as many values")
                 for one, part in zip(parts, value.parts, strict=True):
                     self._assign(one, part)
@@ -410,9 +433,12 @@ class _Body:
         elif isinstance(target, ast.Attribute):
             row = self._expression(target.value)
             if isinstance(row.type, Row) and target.attr in row.type.fields:
-                place = row.type.fields.index(target.attr)
-                return self._emit(f"getelementptr inbounds double, ptr {row.name}, i64 {place}")
+                return self._field(row, row.type.fields.index(target.attr))
         self._refuse(target, f"`{ast.unparse(target)}` assigned to", "a name, an entry or a field of a row")
+
+    def _field(self, row: Value, place: int) -> str:
+        """Where a field of a row is."""
+        return self._emit(f"getelementptr inbounds double, ptr {row.name}, i64 {place}")
 
     def _statement_Return(self, node: ast.Return) -> None:
         if node.value is None:
@@ -420,6 +446,10 @@ class _Body:
             self._end("ret void")
             return
         value = self._expression(node.value)
+        if self._has_own(value, node.value):
+            self._refuse(node, "a work array returned", "one that the function is given")
+        if isinstance(value.type, Group) and not value.parts:
+            self._refuse(node, "an empty tuple", "numbers and arrays")
         if self.result is None:
             self.result = value.type
         both = join(self.result, value.type)
@@ -462,17 +492,23 @@ class _Body:
         head, body, end = self._label(), self._label(), self._label()
         self._end(f"br label %{head}")
         self._begin(head)
-        self._branch(self._condition(node.test), body, end)
+        test = self._condition(node.test)
+        if test.constant is not None and not test.constant:
+            return
+        self._branch(test, body, end if test.constant is None else body)
         self._begin(body)
         self._loops.append((head, end))
         self._block(node.body)
         self._loops.pop()
         self._end(f"br label %{head}")
-        self._begin(end)
+        if test.constant is None or end in self._left:
+            self._begin(end)
 
     def _statement_For(self, node: ast.For) -> None:
         match node:
-            case ast.For(target=ast.Name(id=name), iter=ast.Call(func=ast.Name("range"), args=given), orelse=[]):
+            case ast.For(
+                target=ast.Name(id=name), iter=ast.Call(func=ast.Name("range"), args=given, keywords=[]), orelse=[]
+            ) if 1 <= len(given) <= 3:
                 pass
             case _:
                 self._refuse(node, f"`{ast.unparse(node).splitlines()[0]}`", "for NAME in range(...), without an else")
@@ -503,10 +539,18 @@ class _Body:
         self._begin(end)
 
     def _statement_Break(self, node: ast.Break) -> None:
-        self._end(f"br label %{self._loops[-1][1]}")
+        _, end = self._loop(node)
+        self._left.add(end)
+        self._end(f"br label %{end}")
 
     def _statement_Continue(self, node: ast.Continue) -> None:
-        self._end(f"br label %{self._loops[-1][0]}")
+        self._end(f"br label %{self._loop(node)[0]}")
+
+    def _loop(self, node: ast.stmt) -> tuple[str, str]:
+        """Where the loop around a statement goes on, and where it ends."""
+        if not self._loops:
+            self._refuse(node, f"`{ast.unparse(node)}` outside of a loop", "a loop around it")
+        return self._loops[-1]
 
     # Expressions.
 
@@ -519,7 +563,12 @@ class _Body:
     def _expression_Constant(self, node: ast.Constant) -> Value:
         if not isinstance(node.value, bool | int | float):
             self._refuse(node, f"`{ast.unparse(node)}`", "a number")
-        return _constant(node.value)
+        return self._number(node.value, node)
+
+    def _number(self, number: bool | int | float, node: ast.AST) -> Value:
+        if isinstance(number, int) and not -(1 << 63) <= number < 1 << 63:
+            self._refuse(node, "an int of more than 64 bits", "a smaller one")
+        return _constant(number)
 
     def _expression_Name(self, node: ast.Name) -> Value:
         if node.id in self._names:
@@ -539,9 +588,10 @@ class _Body:
         fields = value.type.fields if isinstance(value.type, Group | Row) else ()
         if node.attr not in fields:
             self._refuse(node, f".{node.attr} of {describe(value.type)}", f"one of: {', '.join(fields) or '(none)'}")
+        place = fields.index(node.attr)
         if isinstance(value.type, Row):
-            return Value(FLOAT, self._emit(f"load double, ptr {self._address(node)}"))
-        return value.parts[fields.index(node.attr)]
+            return Value(FLOAT, self._emit(f"load double, ptr {self._field(value, place)}"))
+        return value.parts[place]
 
     def _expression_Subscript(self, node: ast.Subscript) -> Value:
         found = self._entry(self._expression(node.value), node)
@@ -553,6 +603,8 @@ class _Body:
         values = [self._expression(one) for one in indices]
         if any(isinstance(one.constant, int) and one.constant < 0 for one in values):
             self._refuse(node, "a negative index", "one from 0 on")
+        if not values or (not isinstance(base.type, Group) and any(one.type is BOOL for one in values)):
+            self._refuse(node, f"`{ast.unparse(node)}`", "ints as indices")
         match base.type:
             case Pointer(block=block) if len(values) <= len(block) + 1:
                 total = None
@@ -598,14 +650,14 @@ class _Body:
                 else Value(BOOL, self._emit(f"xor i1 {value.name}, true"))
             )
         value = self._expression(node.operand)
-        if isinstance(node.op, ast.UAdd):
-            return value
-        if not isinstance(node.op, ast.USub):
+        if not isinstance(node.op, ast.USub | ast.UAdd):
             self._refuse(node, f"`{ast.unparse(node)}`", "-, + or not")
-        if isinstance(value.constant, bool | int | float):
-            return _constant(-value.constant)
+        if isinstance(node.op, ast.UAdd):
+            return value if value.type is FLOAT else self._cast(value, INT, node)
+        if _is_number(value.constant):
+            return self._number(-value.constant, node)
         if value.type is FLOAT:
-            return Value(FLOAT, self._emit(f"fneg {FAST} double {value.name}"))
+            return Value(FLOAT, self._emit(f"fneg {self._fast} double {value.name}"))
         return Value(INT, self._emit(f"sub nsw i64 0, {self._int(value, node)}"))
 
     def _expression_BinOp(self, node: ast.BinOp) -> Value:
@@ -615,10 +667,11 @@ class _Body:
         if type(op) not in _OPERATORS:
             self._refuse(node, f"`{ast.unparse(node)}`", "+, -, *, /, //, % or **")
         name, plainly = _OPERATORS[type(op)]
-        if left.constant is not None and right.constant is not None:
+        large = name == "pow" and isinstance(right.constant, int) and right.constant > MOST_FACTORS
+        if _is_number(left.constant) and _is_number(right.constant) and not large:
             try:
-                return _constant(plainly(left.constant, right.constant))
-            except (ArithmeticError, TypeError, ValueError):  # as the processor does it, or refused below
+                return self._number(plainly(left.constant, right.constant), node)
+            except (ArithmeticError, TypeError):  # a division by zero and the like: as the processor does it
                 pass
         if name == "pow":
             return self._power(left, right, node)
@@ -630,18 +683,21 @@ class _Body:
             signs = [self._emit(f"fcmp olt double {one}, {_hex(0.0)}") for one in (rest, b)]
             other = self._emit(f"xor i1 {signs[0]}, {signs[1]}")
             there = self._emit(f"fcmp one double {rest}, {_hex(0.0)}")
-            shift = self._emit(f"select i1 {self._emit(f'and i1 {other}, {there}')}, double {b}, double {_hex(0.0)}")
-            rest = self._emit(f"fadd double {rest}, {shift}")
+            down = self._emit(f"and i1 {other}, {there}")
             if name == "mod":
-                return Value(FLOAT, rest)
+                shift = self._emit(f"select i1 {down}, double {b}, double {_hex(0.0)}")
+                return Value(FLOAT, self._emit(f"fadd double {rest}, {shift}"))
             whole = self._emit(f"fdiv double {self._emit(f'fsub double {a}, {rest}')}, {b}")
-            return Value(FLOAT, self._emit(f"call double {self.program.library('llvm.rint.f64', 1)}(double {whole})"))
-        return Value(FLOAT, self._emit(f"f{name} {FAST} double {a}, {b}"))
+            whole = self._emit(f"call double {self.program.library('llvm.rint.f64', 1)}(double {whole})")
+            return Value(FLOAT, self._emit(f"fsub double {whole}, {self._emit(f'uitofp i1 {down} to double')}"))
+        return Value(FLOAT, self._emit(f"f{name} {self._fast} double {a}, {b}"))
 
     def _whole(self, name: str, a: str, b: str) -> Value:
         """Arithmetic of ints."""
         if name in ("add", "sub", "mul"):
             return Value(INT, self._emit(f"{name} nsw i64 {a}, {b}"))
+        none = self._emit(f"icmp eq i64 {b}, 0")  # which would end the process
+        a, b = self._emit(f"select i1 {none}, i64 0, i64 {a}"), self._emit(f"select i1 {none}, i64 1, i64 {b}")
         quotient, rest = self._emit(f"sdiv i64 {a}, {b}"), self._emit(f"srem i64 {a}, {b}")
         # Python rounds down, the processor towards zero.
         signs = self._emit(f"icmp slt i64 {self._emit(f'xor i64 {rest}, {b}')}, 0")
@@ -686,7 +742,7 @@ class _Body:
         if type(op) not in _COMPARISONS:
             self._refuse(node, f"`{ast.unparse(node)}`", "<, <=, >, >=, == or !=")
         name, plainly = _COMPARISONS[type(op)]
-        if left.constant is not None and right.constant is not None:
+        if _is_number(left.constant) and _is_number(right.constant):
             return _constant(bool(plainly(left.constant, right.constant)))
         if left.type in (INT, BOOL) and right.type in (INT, BOOL):
             signed = name if name in ("eq", "ne") else f"s{name}"
@@ -697,11 +753,16 @@ class _Body:
         return Value(BOOL, self._emit(f"fcmp {ordered} double {a}, {b}"))
 
     def _expression_BoolOp(self, node: ast.BoolOp) -> Value:
-        """One after the other, until one decides."""
+        return self._decide(node, of_bools=True)
+
+    def _decide(self, node: ast.BoolOp, of_bools: bool = False) -> Value:
+        """One after the other, until one decides. As a value, rather than a condition, that is a bool only of bools."""
         decides = isinstance(node.op, ast.Or)
         end, slot, pending = self._label(), "", False
         for i, one in enumerate(node.values):
-            value = self._condition(one)
+            value = self._expression(one) if of_bools else self._condition(one)
+            if value.type is not BOOL:
+                self._refuse(node, f"{describe(value.type)} as a value of `{ast.unparse(node)}`", "a bool")
             last = i + 1 == len(node.values)
             if value.constant is not None:
                 if bool(value.constant) != decides and not last:
@@ -755,7 +816,7 @@ class _Body:
         if not isinstance(node.func, ast.Name) or node.keywords:
             self._refuse(node, f"`{ast.unparse(node)}`", "a call by a bare name, of positional arguments")
         name = node.func.id
-        found = self.scope.find(name)
+        found = self.scope.find(name) if name not in self._names else None
         given = [self._expression(one) for one in node.args]
         match found:
             case Function():
@@ -794,7 +855,7 @@ class _Body:
             library = UNARY.get(name) or BINARY[name]
             function = self.program.library(library, count)
             numbers = ", ".join(f"double {self._float(one, node)}" for one in given)
-            fast = f" {FAST}" if library.startswith("llvm.") and name not in ("copysign", "pow") else ""
+            fast = f" {self._fast}" if library.startswith("llvm.") and name not in ("copysign", "pow") else ""
             return Value(FLOAT, self._emit(f"call{fast} double {function}({numbers})"))
         if name in SCALES:
             self._expect(given, 1, 1, node)
@@ -818,7 +879,7 @@ class _Body:
         self._expect(given, 2, 1000, node)
         total = given[0]
         for other in given[1:]:
-            if total.constant is not None and other.constant is not None:
+            if _is_number(total.constant) and _is_number(other.constant):
                 total = _constant(plainly(total.constant, other.constant))
                 continue
             kind = join(total.type, other.type)
@@ -863,12 +924,13 @@ class _Body:
         return _constant(len(given[0].parts))
 
     def _word_stack(self, given: list[Value], node: ast.AST) -> Value:
-        shape = [one.constant for one in given]
-        if not shape or not all(isinstance(size, int) and size >= 0 for size in shape):
+        shape = [one.constant for one in given if isinstance(one.constant, int) and one.constant >= 0]
+        if not shape or len(shape) < len(given):
             self._refuse(node, f"`{ast.unparse(node)}`", "constant sizes")
-        kind = Pointer(tuple(int(size) for size in shape[1:]))  # pyright: ignore[reportArgumentType]
-        total = int(shape[0]) * kind.strides()[0]  # pyright: ignore[reportArgumentType]
-        return Value(kind, self._slot(f"[{max(total, 1)} x double]", 64))
+        total = math.prod(shape)
+        if total > MOST_ON_STACK:
+            self._refuse(node, f"`{ast.unparse(node)}`", f"at most {MOST_ON_STACK} numbers")
+        return Value(Pointer(tuple(shape[1:])), self._slot(f"[{max(total, 1)} x double]", 64))
 
     def _pointer(self, address: Value, node: ast.AST) -> str:
         if address.type not in (FLOAT, INT):
@@ -884,13 +946,20 @@ class _Body:
 
     def _word_rows_at(self, given: list[Value], node: ast.AST) -> Value:
         self._expect(given, 2, 2, node)
-        if not isinstance(given[1].constant, int):
-            self._refuse(node, "a width that is not constant", "a constant one")
+        if not isinstance(given[1].constant, int) or given[1].constant < 1:
+            self._refuse(node, "a width that is not constant", "a constant one, of at least 1")
         return Value(Pointer((given[1].constant,)), self._pointer(given[0], node))
 
     def _word_int32(self, given: list[Value], node: ast.AST) -> Value:
         self._expect(given, 1, 1, node)
         return Value(INT32, self._emit(f"trunc i64 {self._int(given[0], node)} to i32"))
+
+    def _word_power_of_two(self, given: list[Value], node: ast.AST) -> Value:
+        self._expect(given, 1, 1, node)
+        # Added to 1.5 2^52, it stands in the last bits of the sum; moved up by 52 bits, it is the exponent.
+        biased = self._emit(f"fadd double {self._float(given[0], node)}, {_hex(1.5 * 2.0**52 + 1023)}")
+        bits = self._emit(f"shl i64 {self._emit(f'bitcast double {biased} to i64')}, 52")
+        return Value(FLOAT, self._emit(f"bitcast i64 {bits} to double"))
 
     def _c_call(self, kind: str, given: list[Value], node: ast.AST) -> str:
         self._expect(given, 1, 1000, node)
@@ -934,6 +1003,10 @@ class _Body:
 def _hex(number: float) -> str:
     """A float64 as LLVM reads it, to the last bit."""
     return f"0x{struct.unpack('<Q', struct.pack('<d', number))[0]:016X}"
+
+
+def _is_number(constant: Constant | None) -> TypeGuard[bool | int | float]:
+    return isinstance(constant, bool | int | float)
 
 
 def _constant(number: Constant) -> Value:

@@ -24,7 +24,7 @@ from lqrsim.results.hashing import sha256
 # What kernels declare and the language has.
 WORDS = (
     "stack", "call", "call_for_value", "at", "rows_at", "int32", "claim", "load", "store", "fetch_add",
-    "inline", "outline",
+    "power_of_two", "inline", "outline", "exact",
 )  # fmt: skip
 PYTHON = ("range", "len", "abs", "min", "max", "int", "float")
 

@@ -5,9 +5,8 @@ steps they are told, of which the last holds from there on; the radius of each b
 of each obstacle. What `places` and `places_jacobian` are, `Places` says.
 """
 
-from math import exp
-
 from lqrsim.kernels.declarations import ROW, N, places, places_jacobian, stack
+from lqrsim.kernels.exponential import exponential
 from lqrsim.kernels.linear_algebra import clear
 from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
 
@@ -28,7 +27,7 @@ def value(x, u, t, data):
             radius = data[AT + 4 + k]
             for i in range(int(data[AT + 2])):
                 distance = signed_distance(data, obstacles + ROW * i, at[3 * k], at[3 * k + 1], at[3 * k + 2])
-                total += exp(-data[AT] * (distance - radius))
+                total += exponential(-data[AT] * (distance - radius))
     return data[AT + 1] * total
 
 
@@ -50,7 +49,7 @@ def derivatives(x, u, t, data, hessian, gradient):
                 distance = signed_distance_derivatives(
                     data, obstacles + ROW * i, at[3 * k], at[3 * k + 1], at[3 * k + 2], normal, curve
                 )
-                cost = data[AT + 1] * exp(-sharpness * (distance - data[AT + 4 + k]))
+                cost = data[AT + 1] * exponential(-sharpness * (distance - data[AT + 4 + k]))
                 total += cost
                 for j in range(3):
                     force[j] -= cost * normal[j]

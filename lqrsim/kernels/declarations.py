@@ -62,6 +62,11 @@ def outline(function: Callable) -> Callable:
     return function
 
 
+def exact(function: Callable) -> Callable:
+    """Decorates a kernel whose sums are taken in the order in which they stand."""
+    return function
+
+
 def call(function, *arguments) -> None:
     """Call the C function at an address with arrays, by their addresses, floats, ints of 64 bits, and `int32`; records
     are taken apart."""
@@ -85,6 +90,11 @@ def rows_at(address, width: int):
 def int32(number: int) -> int:
     """An int of 32 bits, to call a C function with."""
     return number
+
+
+def power_of_two(exponent: float) -> float:
+    """2 to a whole number from -1022 to 1023, which is a float; beyond, any number."""
+    return 2.0**exponent
 
 
 def claim(flags, index) -> int:

@@ -1,5 +1,8 @@
 """From what a solver found to the `Solution` that users get."""
 
+from dataclasses import fields
+from typing import Any
+
 import numpy as np
 
 from lqrsim.codegen import distances
@@ -34,7 +37,11 @@ def assemble(
     multipliers: tuple[Multipliers, ...] = (),
     candidates: tuple[Candidate, ...] = (),
 ) -> Solution:
-    """The Solution of what a solver found."""
+    """The Solution of what a solver found, in memory of its own."""
+    states, controls, law = states.copy(), controls.copy(), (law[0].copy(), law[1].copy())
+    if inverse_law is not None:
+        inverse_law = inverse_law[0].copy(), inverse_law[1].copy()
+    cost_to_go, cost_to_come = _copied(cost_to_go), _copied(cost_to_come)
     if problem.noise is not None:
         options = options | {"noise": repr(problem.noise), "risk": problem.risk}
 
@@ -69,6 +76,13 @@ def assemble(
         goal=problem.weighed_goal,
         goal_radius=_radius(problem),
     )
+
+
+def _copied(value: Any) -> Any:
+    """A value function in memory of its own."""
+    if value is None:
+        return None
+    return type(value)(*(np.array(getattr(value, field.name)) for field in fields(value)))
 
 
 def _radius(problem: Problem) -> float | None:

@@ -1,5 +1,6 @@
 """The method from one start, as far as it has got; and the safeguard, where it fails."""
 
+import threading
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,10 +11,15 @@ from lqrsim.kernels import declarations
 from lqrsim.kernels.records import LOG, CostToGo, Plan, Policy, Rows, Settings
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
+from lqrsim.solvers import compiled
 from lqrsim.solvers.certify import certified
 from lqrsim.solvers.common import Callback, SmootherSettings, Stop, Termination, check_outcome, iterate
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.workspace import Workspace
+
+MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # attempts, and bytes of each, whose memory waits for the next solve
+_idle: "list[Attempt]" = []
+_lending = threading.Lock()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,14 +73,38 @@ class Attempt:
         self._begin(initial_guess)
         self._loop = self.work.core.lay_out("smoother", *self._arguments(0, 0, self._log))
 
-    def restart(self, problem: Problem, initial_guess: InitialGuess, start: Array, stop: Stop) -> None:
-        """Begin anew in the same memory, with a problem of the same structure and as many steps.
+    @classmethod
+    def lent(
+        cls, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, stop: Stop
+    ) -> "Attempt":
+        """One in memory that an earlier solve gave back, where there is some, for allocating takes its time.
 
-        What the last run returned is written over. Not for a backward pass that comes first.
+        What the earlier solve returned is written over, so that it has to be copied before.
         """
-        self.problem, self.stop = problem, stop
-        self.work.begin(problem, initial_guess, start)
-        self._begin(initial_guess)
+        core, steps = compiled.core(problem, settings.form), problem.steps
+        if settings.first_pass == "forward":
+            with _lending:
+                for attempt in reversed(_idle):
+                    if attempt.work.core is core and attempt.problem.steps == steps:
+                        _idle.remove(attempt)
+                        attempt.problem, attempt.settings, attempt.stop = problem, settings, stop
+                        break
+                else:
+                    attempt = None
+            if attempt is not None:
+                attempt.work.begin(problem, settings, initial_guess, start)
+                if len(attempt._log) != settings.max_iterations:
+                    attempt._log = np.zeros(settings.max_iterations, LOG)
+                attempt._begin(initial_guess)
+                return attempt
+        return cls(problem, settings, initial_guess, start, stop)
+
+    def give_back(self) -> None:
+        """Leave the memory to another solve."""
+        if self.problem.steps * self.problem.bytes_per_step <= LARGEST_KEPT:
+            with _lending:
+                _idle.append(self)
+                del _idle[:-MOST_KEPT]
 
     def _begin(self, initial_guess: InitialGuess) -> None:
         self.initial_guess = initial_guess
@@ -280,9 +310,9 @@ class Attempt:
     def candidate(self, name: str, found: AttemptResult | None) -> Candidate:
         """It, as one of several; `found` if it was run to its end."""
         if found is None:
-            plan = Trajectory(self.work.states, self.work.controls, self.problem.dt)
+            plan = Trajectory(self.work.states.copy(), self.work.controls.copy(), self.problem.dt)
             return Candidate(name, self.cost, len(self.termination.iterations), None, plan)
-        plan = Trajectory(found.states, found.controls, self.problem.dt)
+        plan = Trajectory(found.states.copy(), found.controls.copy(), self.problem.dt)
         return Candidate(name, found.cost, len(found.iterations), found.status, plan)
 
     def run_opening_pass(self) -> bool:

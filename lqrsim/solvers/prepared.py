@@ -69,7 +69,6 @@ class PreparedSolver:
         self._controls = problem.applied_coordinates
         self._structure = compiled.structure(problem)
         self._pace = 0.0  # s, of a slow iteration
-        self._idle: dict[int, list[Attempt]] = {}  # with memory for so many steps, which no solve is using
         self._compile()
 
     def _compile(self) -> None:
@@ -134,7 +133,7 @@ class PreparedSolver:
         stop = Stop() if time_limit is None else Stop(clock + check_number("time_limit", time_limit, above=0.0))
         stop.reserve = self._pace
         guess = start if isinstance(start, InitialGuess) else _initial_guess(start, problem)
-        attempt = self._attempt(problem, guess, np.asarray(state, dtype=np.float64), stop)
+        attempt = Attempt.lent(problem, self.settings, guess, np.asarray(state, dtype=np.float64), stop)
         best = _Best(attempt)
         with problem.dynamics.solving(1):
             found = _run(attempt, best)
@@ -142,17 +141,8 @@ class PreparedSolver:
         self._pace = max(0.5 * self._pace, max((one.seconds for one in found.iterations), default=0.0))
         best.consider(found)
         answer = self._answer(problem, best, found, clock, iterating)
-        self._idle.setdefault(problem.steps, []).append(attempt)  # not where something was raised
+        attempt.give_back()  # but not where something was raised
         return answer
-
-    def _attempt(self, problem: Problem, guess: InitialGuess, state: Array, stop: Stop) -> Attempt:
-        """A solve that begins, in memory that there is already where there is some."""
-        try:
-            attempt = self._idle.get(problem.steps, []).pop()
-        except IndexError:  # the first solve, or another thread is in one
-            return Attempt(problem, self.settings, guess, state, stop)
-        attempt.restart(problem, guess, state, stop)
-        return attempt
 
     def _answer(self, problem: Problem, best: "_Best", found: AttemptResult, clock: float, iterating: float) -> Replan:
         # The next solve writes over the memory that this one has worked in.

@@ -184,7 +184,7 @@ def _solve(
     first = resolve(given[0][1], problem).penalised(problem, settings.penalty)
     check_functions(problem, start, first.offset[0].copy())
     initial_guesses = [first, *(resolve(one, problem) for _, one in given[1:])]
-    attempts = [Attempt(problem, settings, initial_guess, start, Stop()) for initial_guess in initial_guesses]
+    attempts = [Attempt.lent(problem, settings, initial_guess, start, Stop()) for initial_guess in initial_guesses]
     stop = settings.stop_early()  # from now on: compiling does not count
     for attempt in attempts:
         attempt.stop = stop
@@ -206,6 +206,8 @@ def _solve(
         certificate=found.certificate, gap=found.gap, candidates=search.candidates(), multipliers=found.multipliers,
         **found.values,
     )  # fmt: skip
+    for attempt in attempts:
+        attempt.give_back()
     return stop.finish(solution)
 
 

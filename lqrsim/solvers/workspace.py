@@ -40,7 +40,6 @@ class Workspace:
         n, steps, zeros = len(start), problem.steps, np.zeros
         m = initial_guess.offset.shape[1]
         self.dual = settings.form == "dual"
-        self._tolerance = settings.constraint_tolerance
         self.core, self._costs = compiled.core(problem, settings.form), compiled.costs_module(problem)
         self.no_prior = Prior(zeros(n), zeros((steps + 1, n)))
         self.memory_rows = zeros(1, MEMORY)
@@ -62,11 +61,11 @@ class Workspace:
             eased=None, prior=self.no_prior, guess=plan(), plan=plan(), rollout=plan(), kept=policy(),
             certificate=zeros(1, CERTIFICATE),
         )  # fmt: skip
-        self.begin(problem, initial_guess, start)
+        self.begin(problem, settings, initial_guess, start)
 
-    def begin(self, problem: Problem, initial_guess: InitialGuess, start: Array) -> None:
-        """Begin a solve; after another one, of a problem of the same structure with as many steps."""
-        self._problem, steps = problem, problem.steps
+    def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
+        """Begin a solve; after another one, of a problem of the same size with as many steps."""
+        self._problem, self._tolerance, steps = problem, settings.constraint_tolerance, problem.steps
         self.fixed = isinstance(problem.initial, FixedState)
         self.prior, self.prior_iterations = self.no_prior, 0
         if initial_guess.prior is not None:
@@ -80,23 +79,19 @@ class Workspace:
         self.multipliers = multipliers
         self.model = compiled.arguments(problem, multipliers=multipliers)
         arrays = self.arrays = self.arrays._replace(eased=self.model.stage, prior=self.prior)
-        # What ran before leaves nothing.
-        for record in (arrays.to_go, arrays.to_come, arrays.smoothing, arrays.rollout, arrays.kept):
-            for array in record:
-                array[...] = 0.0
-        arrays.x_hats[...] = 0.0
-        self.memory_rows[...], arrays.certificate[...] = 0.0, 0.0
+        # All else is written before it is read.
+        self.memory_rows[...] = 0.0
         arrays.start[...] = arrays.x_hat[...] = start
         arrays.policy.gain[...], arrays.policy.offset[...] = initial_guess.gain, initial_guess.offset
-        if initial_guess.cost_to_go is not None:
-            value = initial_guess.cost_to_go
-            for array, given in zip(arrays.to_go, (value.hessian, value.gradient, value.constant), strict=True):
-                array[...] = given
+        value = initial_guess.cost_to_go
+        known = (0.0, 0.0, 0.0) if value is None else (value.hessian, value.gradient, value.constant)
+        for array, given in zip(arrays.to_go, known, strict=True):
+            array[...] = given
         # Without a trajectory to begin with: the start, and the controls with which the dynamics can run backwards.
-        known = initial_guess.trajectory
-        for plan in (arrays.guess, arrays.plan):
-            plan.states[...] = start if known is None else known.states
-            plan.controls[...] = initial_guess.offset if known is None else known.controls
+        plan = initial_guess.trajectory
+        for array in (arrays.guess, arrays.plan):
+            array.states[...] = start if plan is None else plan.states
+            array.controls[...] = initial_guess.offset if plan is None else plan.controls
 
     @property
     def start(self) -> Array:
