@@ -16,6 +16,7 @@ from lqrsim.codegen import compiled_module, disk_cache
 from lqrsim.codegen.compiled_module import CompiledModule
 from lqrsim.codegen.fingerprint import fingerprint
 from lqrsim.codegen.sources import text_source
+from lqrsim.codegen.user_functions import address_of
 
 # The smallest problem there is, in a file of its own so that two processes trace the same function.
 SYSTEM = """
@@ -71,6 +72,7 @@ import numpy as np
 from lqrsim.codegen import compiled_module
 from lqrsim.codegen.compiled_module import CompiledModule
 from lqrsim.codegen.sources import text_source
+from lqrsim.codegen.user_functions import address_of
 
 for factor in sys.argv[1:]:
     lines = "".join(f"    total = cos(total + {factor} * sin(x[0] * {i}))\\n" for i in range(40))
@@ -309,6 +311,42 @@ def test_what_may_change_unseen_has_no_fingerprint() -> None:
     assert fingerprint(lambda x, u, p: [scale.__globals__["FACTOR"] * x[0]]) is None
     assert fingerprint(lambda x, u, p: [x[0] * np.random.default_rng().normal()]) is None
     assert fingerprint(lambda x, u, p: [pytest.approx(x[0])]) is None
+
+
+TABLE = np.linspace(0, 1, 200_000)  # numba refers to what is over a megabyte by its address
+
+
+def test_code_with_addresses_of_this_process_is_not_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+    dynamics = ls.Dynamics(
+        numba.njit(lambda x, u, p: (u[0] - TABLE[min(int(abs(x[0]) * 1000), 199_999)],)),
+        states={"x": ""}, controls={"u": ""},
+    )  # fmt: skip
+    assert fingerprint(dynamics.f) is not None
+    assert address_of(dynamics.functions[0]) > 0
+    assert disk_cache.items() == []
+
+
+GAIN = 1.0
+
+
+def test_what_numba_compiled_with_an_old_global_is_not_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+
+    @numba.njit
+    def drag(v):
+        return GAIN * v
+
+    def kept(gain: float) -> int:
+        monkeypatch.setitem(globals(), "GAIN", gain)
+        function = numba.njit(lambda x, u, p: (u[0] - drag(x[0]),))
+        dynamics = ls.Dynamics(function, states={"x": ""}, controls={"u": ""})
+        dynamics.functions[0].call(np.ones(1), np.ones(1), {})  # as the solvers do first
+        address_of(dynamics.functions[0])
+        return len(disk_cache.items())
+
+    assert kept(1.0) == 1
+    assert kept(50.0) == 1  # numba's drag still has a gain of 1: under the name of 50 it would be wrong elsewhere
 
 
 def test_sources_are_kept_by_what_each_name_is() -> None:

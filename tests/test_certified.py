@@ -104,7 +104,6 @@ class TestPlanarQuadrotor:
         assert np.linalg.norm(solution.trajectory.states[-1][:2] - (1.92, 0.63)) < planar_quadrotor.RADIUS
         assert "times the weight of obstacles and goal" in solution.summary()
 
-    @pytest.mark.long
     def test_what_does_not_get_anywhere_hands_over(self) -> None:
         """Undamped, it swings about until the limit of 500 iterations comes."""
         problem = planar_quadrotor.problem((-1.42, 0.16), (1.94, 0.04), steps=257, clearance=False, effort=10.0)
@@ -128,7 +127,6 @@ class TestLimits:
         if not solution.success:
             assert solution.status in (Status.MAX_ITERATIONS, Status.INFEASIBLE)
 
-    @pytest.mark.long
     def test_a_slack_constraint_behind_a_solve_that_fails_ends(self) -> None:
         """Once it called itself until Python gave up."""
         scenario = ls.scenarios.differential_drive()

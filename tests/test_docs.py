@@ -198,7 +198,6 @@ def test_commands_of_pages_exist() -> None:
         )
 
 
-@pytest.mark.long
 def test_replanning_in_simulations_and_on_a_robot() -> None:
     names = run_page("replanning.md")
     assert names["replan"].trajectory.steps == 150

@@ -207,7 +207,6 @@ def test_wrong_environments_are_refused(drive_solution: ls.Solution, quadrotor_s
         assert str(caught.value).startswith(line)
 
 
-@pytest.mark.long
 def test_any_mjcf_and_any_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("cart.xml").write_text(f"<mujoco>{cart(np.random.default_rng(0))}</mujoco>", encoding="utf-8")

@@ -49,6 +49,7 @@ FLOORS_WITHIN = {
         ("sources",),
         ("fingerprint", "plain", "printer"),
         ("compiled_module", "symbolic"),
+        ("numba_functions",),
         ("user_functions",),
     ),
     "problem": (("dynamics", "linear_quadratic"), ("balls", "noise"), ("costs",), ("constraints",), ("problem",)),

@@ -219,7 +219,6 @@ def test_a_problem_can_be_copied_and_sent_to_another_process(level: str) -> None
         np.testing.assert_array_equal(ls.ilqr(other, max_iterations=2).policy.gain, want.policy.gain)
 
 
-@pytest.mark.long
 def test_what_a_plain_function_raises_ends_the_solve_with_its_words() -> None:
     calls = []
 
@@ -373,7 +372,6 @@ def test_what_numba_can_not_compile_gets_one_line() -> None:
         swing(DYNAMICS["symbolic"], COSTS["symbolic"], final_cost=ls.FunctionCost(bump))
 
 
-@pytest.mark.long
 def test_kinks_and_jumps_have_derivatives_almost_everywhere() -> None:
     def hinge(x, u, p):
         import sympy

@@ -129,7 +129,6 @@ class TestLinearQuadratic:
 
 
 @pytest.mark.parametrize("steps", [2, 10, 30])
-@pytest.mark.long
 def test_full_thrust_ahead_and_then_back(steps: int) -> None:
     """Nothing else gets there, and the limits are kept to the last bit."""
     solution = ls.smooth(bang_bang(steps))

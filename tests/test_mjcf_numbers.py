@@ -129,7 +129,6 @@ def swing(robot: ls.MjcfRobot) -> ls.Problem:
     )  # fmt: skip
 
 
-@pytest.mark.long
 def test_a_problem_takes_them_and_compiles_nothing() -> None:
     robot = ls.MjcfRobot(scene_from_xml(mjcf_files.draw("cart", 4, "implicitfast").xml, "cart"))
     problem, plant = swing(robot), ls.Plant(robot, robot.scene)

@@ -318,7 +318,6 @@ def test_a_kick_is_what_it_says(robot):
             np.testing.assert_array_equal(kicked.frames[trial, each, 7:], calm.frames[trial, each, 7:])
 
 
-@pytest.mark.long
 def test_limits_and_constraints_under_noise(drive):
     """Plans keep both, as without noise."""
     plant, problem, _ = drive
@@ -331,7 +330,6 @@ def test_limits_and_constraints_under_noise(drive):
     assert solution.cost > ls.smooth(dataclasses.replace(limited, noise=None)).cost
 
 
-@pytest.mark.long
 def test_solved_again_on_the_way_under_noise(drive):
     """A prepared solver goes on from its own plan, and what it expects is no more than that costs."""
     _, problem, solution = drive

@@ -168,7 +168,6 @@ def thrust(controls: Array, states: Array) -> npt.NDArray[np.float64]:
     return controls.sum(axis=1)[:, None] * upward
 
 
-@pytest.mark.long
 def test_in_a_steady_wind_the_new_plan_leans_into_it(
     quadrotor: ls.Scenario, flown: tuple[ls.Solution, ls.OffsetFree]
 ) -> None:
@@ -204,7 +203,6 @@ def test_in_a_steady_wind_the_new_plan_leans_into_it(
     assert np.abs(np.arctan2(-first[:, 0], first[:, 2])).max() < 0.05 * tilt
 
 
-@pytest.mark.long
 def test_each_trial_gets_what_it_gets_alone(quadrotor: ls.Scenario, flown: tuple[ls.Solution, ls.OffsetFree]) -> None:
     solution, law = flown
     noise = [WIND, ls.MeasurementNoise(0.003), ls.ForceNoise(0.05)]

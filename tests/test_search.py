@@ -179,7 +179,6 @@ def arcs(x: Array, u: Array, p: Any) -> list[float]:
 
 
 class TestWithoutAWay:
-    @pytest.mark.long
     def test_plain_functions_are_searched_with_too(self) -> None:
         """One thread, two, and formulas: all the same."""
         problem = in_the_plane(plain=True)

@@ -201,7 +201,6 @@ def optimum(singular: bool) -> tuple[float, Array]:
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("singular", [False, True], ids=["whole", "singular"])
-@pytest.mark.long
 def test_ends_that_are_not_quadratic_or_leave_a_state_free(form: str, singular: bool) -> None:
     """Eqs. (23), (31). SciPy's optimum to 1e-6, its own accuracy at finite differences."""
     problem = smooth_ends(curved=True, singular=singular)

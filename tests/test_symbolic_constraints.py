@@ -183,7 +183,6 @@ class TestEquality:
         assert contradictions(case, solution) == []
 
     @pytest.mark.parametrize("soft", [False, pytest.param(True, marks=pytest.mark.long)])
-    @pytest.mark.long
     def test_of_state_and_control_is_the_dense_kkt_solution(self, soft: bool) -> None:
         """At all steps but the last, which has no control. From a given start it leaves nothing free."""
         constraint = ls.SymbolicConstraint(steered, parameters={"gain": 0.4}, equality=True)
@@ -213,7 +212,6 @@ class TestInequality:
     @pytest.mark.parametrize(
         ("soft", "most", "room"), [(False, 1.35, 0.35), pytest.param(True, 1.1, 0.25, marks=pytest.mark.long)]
     )
-    @pytest.mark.long
     def test_of_state_and_control_with_a_goal(self, soft: bool, most: float, room: float) -> None:
         kept = [
             ls.GoalState([1, 0]),
@@ -237,7 +235,6 @@ class TestInequality:
         assert all((one.values >= 0).all() for one in solution.multipliers[1:])
         assert contradictions(case, solution) == []
 
-    @pytest.mark.long
     def test_at_the_final_step_alone(self) -> None:
         case = problem(ls.SymbolicConstraint(past, parameters={"least": 1.0}, at="final"))
         solution, dense = ls.smooth(case, constraint_tolerance=1e-6), Dense(case)
@@ -279,7 +276,6 @@ def swing(x, u, p):
     return [x[1], u[0] - p.gravity * sin(x[0])]
 
 
-@pytest.mark.long
 def test_a_pendulum_up_within_its_power() -> None:
     """Not linear, and far from the goal where it begins: SLSQP finds nothing better from there."""
 
@@ -399,7 +395,6 @@ def test_what_does_not_fit_is_refused_in_a_line(state: Callable[[], object], lin
     assert len(str(caught.value).splitlines()) == 1
 
 
-@pytest.mark.long
 def test_a_constraint_that_is_kept_anyway_changes_nothing() -> None:
     bare = problem(weight=10.0)
     kept = dataclasses.replace(bare, constraints=[ls.SymbolicConstraint(past, parameters={"least": -5.0})])

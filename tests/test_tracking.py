@@ -178,7 +178,6 @@ def test_at_the_end_only_the_position_is_tolerated_less() -> None:
     np.testing.assert_allclose(weights.end, [1 / 0.005**2, 1 / 0.005**2, 1 / 0.2**2], rtol=1e-12)
 
 
-@pytest.mark.long
 def test_they_keep_to_a_plan_that_a_cost_was_indifferent_to() -> None:
     """About a plan of the linear-quadratic solver: pushed off, the law is back while the plan's own drifts away."""
     system = linear([[0, 1], [0, 0]], [[0], [1]], [[0], [1]], start=[1.0, 0.0], controls=np.zeros((60, 1)))

@@ -12,6 +12,7 @@ import importlib.metadata
 import inspect
 import sys
 import types
+import weakref
 from collections.abc import Iterator
 from typing import Any
 
@@ -56,6 +57,29 @@ def _versions() -> tuple[str, ...]:
         inspect.getsource(rotations),
         inspect.getsource(rotation_ratios),
     )
+
+
+def _helpers(function: Any) -> list[Any]:
+    """The numba functions that a function with a fingerprint refers to, at any depth."""
+    seen: dict[int, Any] = {}
+    for _ in _function(function, seen):
+        pass
+    return [found for found in seen.values() if found is not function and hasattr(found, "py_func")]
+
+
+_seen_fresh: weakref.WeakKeyDictionary[Any, str | None] = weakref.WeakKeyDictionary()
+
+
+def note_helpers(function: Any) -> None:
+    """Remember which helpers are not compiled yet: their globals will be what they are now."""
+    if fingerprint(function) is not None:
+        fresh = (helper for helper in _helpers(function) if not helper.overloads)
+        _seen_fresh.update((helper, fingerprint(helper)) for helper in fresh)
+
+
+def stale(function: Any) -> bool:
+    """Whether a helper may have been compiled when its globals were others: numba keeps them as they were."""
+    return any(one.overloads and _seen_fresh.get(one, "") != fingerprint(one) for one in _helpers(function))
 
 
 def _function(function: Any, seen: dict[int, Any]) -> Iterator[str]:

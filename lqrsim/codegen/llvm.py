@@ -38,8 +38,31 @@ def _machine() -> Any:
 
 def object_code(text: str) -> bytes:
     """Machine code, as an object file, of IR."""
+    return _emitted(_binding().parse_assembly(text))
+
+
+def object_code_of_one(text: str, name: str, symbol: str) -> tuple[bytes, list[str]]:
+    """That of IR in which only the function `name` is seen from outside, as `symbol`; and what it needs of others."""
+    module = _binding().parse_assembly(text)
+    needed = []
+    for part in (*module.functions, *module.global_variables):
+        if part.is_declaration:
+            needed += [] if part.name.startswith("llvm.") else [part.name]
+        elif part.name == name:
+            part.name = symbol
+        else:
+            part.linkage = "internal"
+    return _emitted(module), needed
+
+
+def are_there(names: list[str]) -> bool:
+    """Whether functions and variables of these names can be found."""
+    llvm = _binding()
+    return all(llvm.address_of_symbol(name) for name in names)
+
+
+def _emitted(module: Any) -> bytes:
     llvm, machine = _binding(), _machine()
-    module = llvm.parse_assembly(text)
     module.triple, module.data_layout = llvm.get_process_triple(), str(machine.target_data)
     module.verify()
     options = llvm.create_pipeline_tuning_options(speed_level=3)

@@ -1,15 +1,13 @@
 """A user's own function, numba's or plain Python's, at an address that compiled code can call.
 
 Compiled code knows only that there is a function, so it serves all functions of the same sizes. A numba function is
-compiled behind C's calling convention, once in a process; a plain one is called back through Python, microseconds a
-call.
+compiled behind C's calling convention (see `numba_functions.py`); a plain one is called back through Python,
+microseconds a call.
 """
 
 import collections
 import ctypes
 import inspect
-import logging
-import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -18,11 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.codegen.compiled_module import compilations, compiling
-from lqrsim.codegen.fingerprint import fingerprint
+from lqrsim.codegen import numba_functions
+from lqrsim.codegen.compiled_module import compiling
+from lqrsim.codegen.fingerprint import fingerprint, note_helpers
 from lqrsim.errors import Array, InputError, check_name, excerpt
-
-logger = logging.getLogger("lqrsim")
 
 LEVELS = ("symbolic", "compiled", "plain")
 
@@ -118,6 +115,8 @@ class UserFunction:
           InputError: it fails, or does not return what it should.
         """
         plain = getattr(self.function, "py_func", self.function)
+        if not self.held:  # before the first call compiles them
+            note_helpers(self.function)
         written: list[Array] = [np.zeros(shape) for shape in self.writes]
         try:
             with np.errstate(all="ignore"):  # NaN and infinity are dealt with where they arrive
@@ -258,79 +257,13 @@ def address_of(function: UserFunction) -> float:
     """
     with compiling:
         if not function.held:
-            function.held.append(_compile(function) if function.level == "compiled" else function.called_back)
+            if function.level == "compiled":
+                text, names = function.adapter()
+                count = 3 + (len(function.writes) or 1)
+                function.held.append(numba_functions.compiled(function.function, text, names, count, function.name))
+            else:
+                function.held.append(function.called_back)
     return float(function.held[0][1])
-
-
-def _compile(function: UserFunction) -> tuple[Any, int]:
-    """A numba function behind C's calling convention: what must be kept alive, and its address."""
-    try:
-        import numba
-    except ImportError as error:
-        raise InputError(
-            f"{function.name}: level: got 'compiled', which needs numba, want pip install 'lqrsim[numba]'"
-        ) from error
-    text, more = function.adapter()
-    key = fingerprint(function.function), text, function.parameters
-    if key in _compiled:
-        return _compiled[key]
-    # Compiled anew, for numba keeps the globals of a function as they were when it was first compiled.
-    plain = getattr(function.function, "py_func", function.function)
-    options = getattr(function.function, "targetoptions", _NUMBA)
-    options = {name: value for name, value in options.items() if name != "nopython"}
-    what = function.name
-    compilations.append(what)
-    logger.debug(f"compiling {what} ...")
-    pointer = numba.types.CPointer(numba.types.float64)
-    try:
-        from numba import carray  # pyright: ignore[reportPrivateImportUsage]
-
-        names = {"function": numba.njit(**options)(plain), "carray": carray, "readonly": _readonly()}
-        names |= {**more, "nan": float("nan")}
-        exec(compile(text, "<lqrsim>", "exec"), names)
-        made = numba.cfunc(numba.types.void(*[pointer] * (3 + (len(function.writes) or 1))), **_NUMBA)(names["adapter"])
-    except Exception as error:  # mostly NumbaError, and whatever else goes wrong within numba
-        raise InputError(f"{function.name}: got code that numba cannot compile, want {_reason(error)}") from error
-    assert made.address is not None
-    if key[0] is not None:
-        _compiled[key] = made, made.address
-    return made, made.address
-
-
-# What was compiled in this process, by what each function does.
-_compiled: dict[tuple[Any, ...], tuple[Any, int]] = {}
-
-
-# `contract` and the like let LLVM fuse and reorder sums, as in kernels, but keep NaN and infinity meaningful.
-_NUMBA: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
-
-
-@cache
-def _readonly() -> Any:
-    """What makes of a numba array the same one, of a type that refuses to be written to."""
-    from numba.extending import intrinsic
-
-    def readonly(typingctx: Any, array: Any) -> Any:
-        def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            return args[0]
-
-        return array.copy(readonly=True)(array), generate
-
-    made: Any = intrinsic
-    return made(readonly)
-
-
-def _reason(error: Exception) -> str:
-    """The line of numba's pages of explanation that says what is wrong."""
-    if isinstance(error, AttributeError) and "NoneType" in str(error):
-        return "a function that returns on every path, and does not change x and u"
-    if "readonly" in str(error) and "setitem" in str(error):
-        return "a function that does not change x and u, which are readonly"
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    telling = [
-        line for line in lines if not re.match(r"Failed in|During:|File |\^|- Resolution|<source|raised from", line)
-    ]
-    return f"its subset of Python ({' '.join(telling[:3])})"
 
 
 def _view(address: int, size: int) -> Array:
