@@ -1,7 +1,8 @@
 """What a plan really is, worked out from the problem by a short path of its own. The kernels' subset.
 
 Nothing of the passes, rollouts and line searches that found the plan is used: only the problem's own functions, their
-derivatives, and a Cholesky factor. `certify.py` compares with what a solver claims.
+derivatives, and a Cholesky factor. The cost is the one that derivatives come with, not what rollouts added up.
+`certify.py` compares with what a solver claims.
 """
 
 from math import nan
@@ -14,7 +15,7 @@ from lqrsim.kernels.declarations import (
     stack,
 )
 from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve
-from lqrsim.kernels.model_functions import cost_quadratic, cost_value, noise_quadratic, step_jacobian
+from lqrsim.kernels.model_functions import cost_added, cost_quadratic, noise_quadratic, step_jacobian
 from lqrsim.kernels.records import Ahead, Limits, Stage, Step
 
 
@@ -44,8 +45,8 @@ def certify(settings, own, plan, policy, to_go, model, found):
         size[i], beyond[i], nowhere[i] = 1.0, 0.0, 0.0
         for t in range(steps + 1):
             size[i] = max(size[i], abs(states[t, i]))
-    cost = cost_value(states[steps], none, steps, model.final)
-    cost_quadratic(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
+    cost = cost_quadratic(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
+    cost -= cost_added(states[steps], none, steps, model.final)
     scale = scale_of(states[steps], none, stage)
     for i in range(N):
         costate[i] = stage.gradient[i]
@@ -54,9 +55,9 @@ def certify(settings, own, plan, policy, to_go, model, found):
                 hessians[steps, i, j] = stage.hessian[i, j]
     for t in range(steps - 1, -1, -1):
         x, u = states[t], plan.controls[t]
-        cost += cost_value(x, u, t, model.stage)
         step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
-        cost_quadratic(x, u, t, model.stage, stage.hessian, stage.gradient)
+        cost += cost_quadratic(x, u, t, model.stage, stage.hessian, stage.gradient)
+        cost -= cost_added(x, u, t, model.stage)
         if NOISY:  # of the policy as it is, the slope ahead is the costate
             slope = Ahead(
                 step.jacobian,
@@ -78,8 +79,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
         if own:
             closed_loop_hessian(step.jacobian, stage.hessian, policy.gain[t], room, hessians[t + 1], hessians[t])
     if not settings.fixed:
-        cost += cost_value(states[0], none, 0, model.initial)
-        cost_quadratic(states[0], none, 0, model.initial, stage.hessian, stage.gradient)
+        cost += cost_quadratic(states[0], none, 0, model.initial, stage.hessian, stage.gradient)
         scale += scale_of(states[0], none, stage)
         decrease += promised_of_start(stage, hessians[0], costate)
     motion = 0.0

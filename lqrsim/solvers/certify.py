@@ -50,8 +50,11 @@ def certified(
       tolerance: of the optimality; None where only the cost was asked for.
     """
     numbers, n = np.zeros(1, CERTIFICATE), states.shape[1]
-    none = CostToGo(np.zeros((len(states), n, n)), np.zeros((len(states), n)), np.zeros(len(states)))
-    work(declarations.CERTIFY, none if value is None else CostToGo(*map(in_c_order, _parts(value))), numbers)
+
+    def none() -> CostToGo:
+        return CostToGo(np.zeros((len(states), n, n)), np.zeros((len(states), n)), np.zeros(len(states)))
+
+    work(declarations.CERTIFY, none() if value is None else CostToGo(*map(in_c_order, _parts(value))), numbers)
     certificate = certificate_of(problem, numbers[0], states, violation=violation)
     if value is None:
         certificate = replace(certificate, optimality=np.inf)
@@ -60,7 +63,7 @@ def certified(
     if tolerance is not None and not certificate.optimality < SLACK * tolerance:
         # Where controls stand at their limits, the Hessians of the Riccati pass are not those of the policy.
         own = np.zeros(1, CERTIFICATE)
-        work(declarations.EVALUATE, none, own)
+        work(declarations.EVALUATE, none(), own)
         optimality = certificate_of(problem, own[0], states, violation=violation).optimality
         certificate = replace(certificate, optimality=optimality)
     rest = REST * float(numbers["scale"][0])

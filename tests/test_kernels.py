@@ -1,0 +1,602 @@
+"""Every kernel, compiled, against itself as plain Python.
+
+Whole problems are worked through in plain Python. What each kernel was given and what it made of that is recorded, and
+compiled on its own it has to make the same.
+"""
+
+import ast
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mjcf_files
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lqrsim as ls
+from lqrsim import kernels
+from lqrsim.codegen.compiled_module import Call, Entry
+from lqrsim.codegen.language import Row, Rows, type_of
+from lqrsim.codegen.llvm import Loaded, object_code
+from lqrsim.codegen.plain import plain_functions
+from lqrsim.codegen.printer import Program
+from lqrsim.codegen.sources import Function, Source, source_of, text_source
+from lqrsim.control.law import turning_of
+from lqrsim.errors import Array
+from lqrsim.kernels import (
+    augmented_lagrangian,
+    ball_constraint,
+    ball_places,
+    damped_iterations,
+    declarations,
+    estimation,
+    exponential,
+    iterations,
+    linear_algebra,
+    mjcf_places,
+    model_functions,
+    noise_matrices,
+    policy_evaluation,
+    projection,
+    rotation_ratios,
+    signed_distance,
+)
+from lqrsim.kernels import noise as noise_kernel
+from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Limits, Measured, Plan, Policy, Predictor
+from lqrsim.kernels.records import MEMORY as MEMORY_ROW
+from lqrsim.kernels.records import Settings as KernelSettings
+from lqrsim.problem.balls import Places
+from lqrsim.problem.noise import numbers_of
+from lqrsim.scenes.scene import scene_from_xml
+from lqrsim.solvers import compiled
+from lqrsim.solvers.attempt import Attempt
+from lqrsim.solvers.common import SmootherSettings, Stop
+from lqrsim.solvers.initial_guess import resolve
+
+MEMORY = 1 << 20  # numbers from which an array is memory at an address, which has no end
+MADE: dict[Any, tuple[Loaded, Entry]] = {}  # what was compiled, by all that it depends on
+EACH = 2  # calls of a kernel that are compared, of each entry
+COMPARED: Counter[str] = Counter()  # by module and name
+# Two return arrays, which only kernels can take; one waits for other threads; one takes another slot the second time.
+LEFT_OUT = ("forward_jacobian", "job_columns", "help_out", "take_slot")
+
+
+@dataclass
+class Recorded:
+    """A call of a kernel: the types of its arguments, these before and after, and what it returned."""
+
+    function: Function
+    types: tuple[Any, ...]
+    before: Any
+    after: Any
+    returned: Any
+
+
+def snapshot(value: Any, known: dict[int, Any]) -> Any:
+    """A copy in which what was the same array still is; a row becomes an array of one."""
+    if isinstance(value, tuple):
+        parts = [snapshot(one, known) for one in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    if isinstance(value, np.void):
+        return np.array([value.item()], dtype=value.dtype)
+    if isinstance(value, np.ndarray) and value.size < MEMORY:
+        if id(value) not in known:
+            known[id(value)] = np.array(value, order="C", subok=False)
+        return known[id(value)]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def kind_of(value: Any) -> Any:
+    return Row(value.dtype.names or ()) if isinstance(value, np.void) else type_of(value)
+
+
+def replay(source: Source, sizes: dict[str, int], name: str, *arguments: Any) -> Any:
+    """Call a kernel in plain Python, and compare every kernel that it calls; returns what it returns."""
+    seen: Counter[tuple[str, str]] = Counter()
+
+    def caller(function: Function, run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
+        key = function.scope.source.what, function.node.name
+        seen[key] += 1
+        if seen[key] > EACH or function.node.name in LEFT_OUT:
+            return run(*given)
+        types, before = tuple(map(kind_of, given)), snapshot(given, {})
+        returned = run(*given)
+        compare(Recorded(function, types, before, snapshot(given, {}), snapshot(returned, {})))
+        return returned
+
+    with np.errstate(all="ignore"):
+        return plain_functions(source, sizes, [name], caller=caller)[name](*arguments)
+
+
+def compare(one: Recorded) -> None:
+    """Compile the function for these types, once, and have it do the same; at once, for memory may change."""
+    scope = one.function.scope
+    key = scope.source, tuple(sorted(scope.sizes.items())), one.function.node.name, one.types
+    if key not in MADE:
+        program = Program()
+        returns = program.entry(one.function, one.types, "entry")
+        loaded = Loaded(object_code(program.text), tuple(program.libraries))
+        laid_out = tuple(Rows(kind.fields) if isinstance(kind, Row) else kind for kind in one.types)
+        MADE[key] = loaded, Entry(laid_out, loaded.address("entry"), returns)
+    size = max((np.abs(array[np.isfinite(array)]).max(initial=0.0) for array in arrays_of(one.before)), default=0.0)
+    returned = Call(MADE[key][1], one.before)()
+    where = f"{one.function.scope.source.what}: {one.function.node.name}"
+    if not any(isinstance(part, np.ndarray) for part in flat(one.returned)):
+        same(returned, one.returned, size, f"what {where} returns")
+    for found, wanted in zip(arrays_of(one.before), arrays_of(one.after), strict=True):
+        same(found, wanted, size, where)
+    COMPARED[f"{one.function.scope.source.module}.{one.function.node.name}"] += 1
+
+
+def flat(value: Any) -> list[Any]:
+    return [part for one in value for part in flat(one)] if isinstance(value, tuple) else [value]
+
+
+def arrays_of(arguments: Any) -> list[Array]:
+    """All arrays of numbers; of rows their numbers."""
+    found = [one for one in flat(arguments) if isinstance(one, np.ndarray) and one.size < MEMORY]
+    return [np.array(one.tolist()).reshape(-1) if one.dtype.names else one for one in found]
+
+
+def same(found: Any, wanted: Any, size: float, where: str) -> None:
+    """To rounding: a kernel rounds some thousand times, in an order that LLVM chooses, numbers of the size of what it
+    is given or of what it makes of that; and what is solved for amplifies it.
+    """
+    a, b = (np.array([np.nan if one is None else one for one in flat(part)] if isinstance(part, tuple) else
+                     [np.nan if part is None else part] if not isinstance(part, np.ndarray) else part,
+                     dtype=np.float64) for part in (found, wanted))  # fmt: skip
+    finite = np.isfinite(b)
+    np.testing.assert_array_equal(np.isfinite(a), finite, err_msg=where)
+    np.testing.assert_array_equal(np.isnan(a), np.isnan(b), err_msg=where)
+    own = np.abs(b[finite]).max(initial=0.0)
+    np.testing.assert_allclose(a[finite], b[finite], rtol=1e-9, atol=1e-10 * own + 1e-12 * size, err_msg=where)
+
+
+# Problems.
+
+
+def cart(x, u, p):
+    from sympy import cos, sin
+
+    return [p.speed * u[0] * cos(x[2]), p.speed * u[0] * sin(x[2]) + p.slip * x[1], u[1]]
+
+
+CART = ls.Dynamics(
+    cart, states={"x": "m", "y": "m", "heading": "rad"}, controls={"drive": "m/s", "turn": "rad/s"},
+    parameters={"speed": 1.0, "slip": 0.05}, position=("x", "y"), angles=("heading",), control_limits=(-1.0, 1.2),
+)  # fmt: skip
+
+
+def obstacle(name: str, kind: str, place: tuple[float, ...], size: tuple[float, ...]) -> ls.Obstacle:
+    turned = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    return ls.Obstacle(name, kind, np.array(place), turned, np.array(size))
+
+
+WORLD = ls.World([
+    obstacle("ball", "sphere", (0.6, 0.2, 0.0), (0.2, 0.0, 0.0)),
+    obstacle("wall", "plane", (0.0, -1.0, 0.0), (0.0, 0.0, 0.0)),
+    obstacle("pill", "capsule", (1.0, 0.7, 0.1), (0.1, 0.3, 0.0)),
+    obstacle("can", "cylinder", (0.2, 0.9, 0.1), (0.1, 0.2, 0.0)),
+    obstacle("crate", "box", (1.3, -0.4, 0.0), (0.2, 0.1, 0.3)),
+])  # fmt: skip
+
+
+def shaken(x, u, p):
+    return [[p.size * u[0], 0], [0, p.size], [0, p.size * x[2]]]
+
+
+def problem(**changed: Any) -> ls.Problem:
+    stated: dict[str, Any] = {
+        "dynamics": CART, "dt": 0.2, "steps": 6, "initial": ls.QuadraticCost([50.0, 50.0, 5.0], about=[0, 0, 0.3]),
+        "stage_cost": ls.ControlCost([1.0, 0.3], about=[0.2, 0.0]) + ls.ObstacleCost(WORLD, radius=0.1, sharpness=4.0),
+        "final_cost": ls.QuadraticCost([40.0, 40.0, 4.0], about=[1.4, 0.5, 0.0]),
+    }  # fmt: skip
+    return ls.Problem(**{**stated, **changed})
+
+
+def settings_of(**changed: Any) -> SmootherSettings:
+    stated: dict[str, Any] = {
+        "form": "dual", "first_pass": "forward", "safeguard": True, "stop": "optimal", "tolerance": 1e-4,
+        "gap_tolerance": 1e-3, "max_iterations": 4, "time_limit": None, "start": None, "starts": 1,
+        "constraint_tolerance": 1e-3,
+    }  # fmt: skip
+    return SmootherSettings(**{**stated, **changed})
+
+
+def sizes_of(one: ls.Problem) -> dict[str, int]:
+    n, m = len(one.dynamics.state_coordinates), len(one.dynamics.control_coordinates)
+    return {"N": n, "M": m, "W": n + m, "NOISY": int(one.noise_term is not None)}
+
+
+def with_rows(value: Any) -> Any:
+    """Rows as plain Python can read them, by fields."""
+    if isinstance(value, tuple):
+        parts = [with_rows(one) for one in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return value.view(np.recarray) if isinstance(value, np.ndarray) and value.dtype.names else value
+
+
+def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str = "", penalty: float = 0.0) -> None:
+    """Iterations of all kinds, in plain Python, with every kernel compared."""
+    wanted = settings_of(form=form)
+    begin = np.zeros(3) if one.start is None else one.start
+    attempt = Attempt(one, wanted, resolve(start, one), begin, Stop())
+    work, log = attempt.work, np.zeros(3, LOG)
+    for array in work.multipliers:
+        array[0] = penalty
+        array[declarations.HEADER :] = 0.5
+    source, sizes = compiled._with_form(form, "entry_points"), sizes_of(one)
+    if task == "opening":
+        model = work.model
+        replay(source, sizes, "opening_pass", one.steps, False, work.arrays.guess, work.prior, model,
+               work.arrays.policy, work.arrays.to_go)  # fmt: skip
+        return
+    replay(source, sizes, "smoother", *with_rows(attempt._arguments(0, len(log), log)))
+    attempt.roll_out()
+    work.memory["merit"] = work.memory["plan_cost"]
+    work.memory["reach"], work.memory["ilqr_next"] = (1.0, 2.0) if task != "reach" else (0.0, 2.0)
+    trial = Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
+    if task:
+        replay(source, sizes, "smoother", *with_rows(attempt._damped_arguments(0, 2, np.zeros(2, LOG), 2, trial)))
+    found = attempt.result(replace(attempt.termination, outcome=declarations.MAX_ITERATIONS))
+    for check in (declarations.CERTIFY, declarations.EVALUATE) if task else ():
+        arguments = attempt._check_arguments(check, found, work.arrays.to_go, np.zeros(1, CERTIFICATE))
+        replay(source, sizes, "smoother", *with_rows(arguments))
+
+
+class TestSolvers:
+    def test_dual_form_with_limits_and_constraints(self) -> None:
+        kept = [
+            ls.Clearance(WORLD, radius=0.1, margin=0.02), ls.GoalState([1.4], states=("x",)),
+            ls.StateBounds(low={"heading": -0.2}, high={"y": 0.6}),
+        ]  # fmt: skip
+        smoothed(problem(constraints=kept), task="damped", penalty=30.0)
+
+    @settings(max_examples=4)
+    @given(seed=st.integers(0, 2**32 - 1))
+    def test_problems_with_other_numbers(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        goal, start = rng.uniform(0.5, 2.0, size=3), rng.uniform(-0.3, 0.3, size=3)
+        scale = 10.0 ** rng.uniform(-2, 2, size=4)
+        one = problem(
+            initial=ls.QuadraticCost(scale[0] * np.ones(3), about=start), dt=rng.uniform(0.05, 0.4),
+            stage_cost=ls.ControlCost(scale[1] * np.ones(2))
+            + ls.ObstacleCost(WORLD, radius=0.1, sharpness=rng.uniform(1, 8), weight=scale[2]),
+            final_cost=ls.QuadraticCost(scale[3] * np.ones(3), about=goal),
+            control_limits=(-1.0, rng.uniform(0.1, 1.2)), constraints=[ls.Clearance(WORLD, radius=0.1)],
+        )  # fmt: skip
+        smoothed(one, task="damped", penalty=10.0 ** rng.uniform(-1, 3))
+
+    def test_dual_form_from_a_fixed_start_at_reach_0(self) -> None:
+        smoothed(problem(initial=ls.FixedState([0.0, 0.0, 0.3])), task="reach")
+
+    @pytest.mark.parametrize("task", ["", "opening"])
+    def test_primal_form(self, task: str) -> None:
+        smoothed(problem(), "primal", task=task)
+
+    def test_continuation_from_a_prior(self) -> None:
+        smoothed(problem(), start=ls.InitialPrior([0.0, 0.0, 1.0], about=[0.0, 0.0, 0.5], iterations=2))
+
+    @pytest.mark.parametrize(("form", "risk"), [("dual", 0.0), ("dual", 0.05), ("primal", -0.05)])
+    def test_noise(self, form: str, risk: float) -> None:
+        noise = ls.Noise(shaken, size=2, parameters={"size": 0.02})
+        smoothed(problem(noise=noise, risk=risk, steps=4), form, task="damped" if form == "dual" else "")
+
+    def test_ilqr(self) -> None:
+        one = problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=5)
+        states, controls = np.zeros((6, 3)), np.zeros((5, 2))
+        states[0] = (0.0, 0.0, 0.3)
+        work = Descent(
+            start=states[0].copy(), policy=Policy(np.zeros((5, 2, 3)), np.full((5, 2), 0.2)),
+            to_go=CostToGo(np.zeros((6, 3, 3)), np.zeros((6, 3)), np.zeros(6)), plan=Plan(states, controls),
+            trial=Plan(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
+        )  # fmt: skip
+        options = KernelSettings(5, 3, 1e-4, 0.0, True, True, False, 0)
+        source, sizes = compiled._with_form("dual", "entry_points"), sizes_of(one)
+        for task in (declarations.ITERATE, declarations.CERTIFY):
+            given = task, 0, 3, options, compiled.arguments(one), work, np.zeros(4, LOG)
+            replay(source, sizes, "ilqr", *with_rows(given))
+
+    def test_what_is_done_after_failures(self) -> None:
+        for reach, weight in ((1.0, 0.0), (0.25, 0.0), (0.0, 1e-4)):
+            memory = np.zeros(1, MEMORY_ROW).view(np.recarray)
+            memory["reach"], memory["weight"], memory["ilqr_next"] = reach, weight, 2.0
+            replay(source_of(damped_iterations), SIZES, "tighten_damping", memory[0])
+        model = compiled.arguments(problem(noise=ls.Noise(0.1 * np.eye(3))))
+        for good, risk in ((True, 0.0), (False, 0.0), (True, 1.0)):
+            model.noise.risk[1] = risk
+            replay(source_of(iterations), SIZES | {"NOISY": 1}, "failure", good, model)
+        replay(source_of(linear_algebra), SIZES, "finite", np.array([[1.0, np.nan], [0.0, 1.0]]), 2, 2)
+
+    @pytest.mark.parametrize("form", ["dual", "primal"])
+    def test_linear_quadratic_passes(self, form: str) -> None:
+        from lqrsim.kernels.records import CostToCome, Passes, Smoothing, Stage, Step
+
+        rng, n, m, steps = np.random.default_rng(0), 3, 2, 4
+        root = rng.normal(size=(steps, 5, 5))
+        costs = Stage(root @ root.transpose(0, 2, 1), rng.normal(size=(steps, 5)))
+        jacobian = np.concatenate([np.eye(3) + 0.1 * rng.normal(size=(steps, 3, 3)), rng.normal(size=(steps, 3, 2))], 2)
+        forward = Step(jacobian, rng.normal(size=(steps, 3)))
+        value = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
+        go, come = (tuple(array.copy() for array in value) for _ in range(2))
+        go[0][-1] = come[0][0] = np.eye(3)
+        work = Passes(
+            Policy(np.zeros((steps, m, n)), np.zeros((steps, m))), CostToGo(*go), CostToCome(*come),
+            Smoothing(np.zeros((steps, n, n)), np.zeros((steps, n)), np.zeros((steps, m, n)), np.zeros((steps, m))),
+            np.zeros((steps + 1, n)),
+        )  # fmt: skip
+        source = compiled._with_form(form, "linear_quadratic_passes")
+        sizes = {"N": n, "M": m, "W": n + m, "NOISY": 0}
+        replay(source, sizes, "lq_passes", steps, forward, forward, costs, np.zeros(steps), work)
+
+
+# What problems bring.
+
+X, U = np.array([0.45, 0.3, 0.2]), np.array([0.7, -0.2])
+SIZES = {"N": 3, "M": 2, "W": 5}
+
+
+def of_term(term: ls.Term, x: Array = X, u: Array = U) -> None:
+    n, m = len(x), len(u)
+    sizes, data = {"N": n, "M": m, "W": n + m}, compiled.numbers(term)
+    replay(term.code, sizes, "value", x, u, 2, data)
+    replay(term.code, sizes, "derivatives", x, u, 2, data, np.zeros((n + m, n + m)), np.zeros(n + m))
+
+
+def of_constraint(term: ls.ConstraintTerm, equality: int = 0) -> None:
+    data, source = compiled.numbers(term), source_of(augmented_lagrangian)
+    pairs = {"constraint_value": (term.code, "value"), "constraint_slope": (term.code, "slope")}
+    if term.balls:
+        source = source_of(ball_constraint, PLACES=3 * term.balls)
+        pairs |= {name: (term.code, name) for name in ("places", "places_jacobian")}
+    source, sizes = source.filled(**pairs), SIZES | {"EQUALITY": equality}
+    multipliers = np.concatenate([[3.0, term.rows, 0.0, 0.01], np.linspace(0.0, 2.0, 4 * term.rows)])
+    replay(source, sizes, "augment", X, U, 2, data, multipliers, np.zeros((5, 5)), np.zeros(5))
+    replay(source, sizes, "augmentation", X, U, 2, data, multipliers)
+    replay(source, sizes, "constraint_values", X, U, 2, 1, data, multipliers, np.zeros(4 * term.rows))
+    replay(source, sizes, "add_slope", X, U, 2, term.rows - 1, data, np.zeros(5))
+
+
+def two_balls(x, p):
+    from sympy import cos
+
+    return [[x[0], x[1], 0], [x[0] + p.speed * cos(x[2]) / 5, x[1], 0.1]]
+
+
+def plainly(x, p):
+    return [[x[0], x[1], 0.0], [x[0] + p.speed * np.cos(x[2]) / 5, x[1], 0.1]]
+
+
+def turned(x, p, slopes):
+    slopes[0, 0, 0] = slopes[0, 1, 1] = slopes[1, 0, 0] = slopes[1, 1, 1] = 1.0
+    slopes[1, 0, 2] = -p.speed * np.sin(x[2]) / 5
+
+
+BALLS = {
+    "formula": ls.Balls(two_balls, [0.1, 0.05]),
+    "plain": ls.Balls(plainly, [0.1, 0.05], level="plain"),
+    "plain with Jacobian": ls.Balls(plainly, [0.1, 0.05], jacobian=turned, level="plain"),
+}
+
+
+class TestParts:
+    @pytest.mark.parametrize("seed", range(6))
+    def test_obstacles_in_the_plane_and_in_space(self, seed: int) -> None:
+        """At random places, inside and outside of all kinds, so that each branch has its turn."""
+        rng = np.random.default_rng(seed)
+        of_term(ls.ObstacleCost(WORLD, radius=0.1, sharpness=3.0).bind(CART), rng.uniform(-1, 1.5, size=3))
+        data, points = np.array(WORLD.table).ravel(), rng.uniform(-1.2, 1.6, size=(6, 3))
+        points[:2, 2] = 0.05
+        count = len(WORLD)
+        source = source_of(signed_distance)
+        replay(source, {}, "nearest", count, 6, data, points, np.zeros(6))
+        replay(source, {}, "nearest_displaced", count, 6, 3, data, points, np.zeros((2, 3 * count)), np.zeros(6))
+        normals = np.zeros((6 * count, 3))
+        replay(source, {}, "each_with_normal", count, 6, data, points, np.zeros(6 * count), normals)
+        at = np.zeros(3), np.zeros((3, 3))
+        for i in range(count):  # at the rim of the cylinder, in the box and about it
+            place = WORLD.obstacles[i].position + rng.normal(size=3) * 0.25
+            replay(source, {}, "signed_distance_derivatives", data, declarations.ROW * i, *place.tolist(), *at)
+
+    def test_quadratic_costs(self) -> None:
+        of_term(ls.QuadraticCost([1.0, 2.0, 3.0], about=[0.1, 0.2, 0.3]).bind(CART))
+        of_term(ls.ControlCost([1.0, 2.0], about=[0.1, 0.2]).bind(CART))
+
+    @pytest.mark.parametrize("given", [False, True])
+    def test_costs_that_are_functions(self, given: bool) -> None:
+        def cost(x, u, p):
+            return x[0] ** 2 * p.a + x[1] * u[0]
+
+        def slopes(x, u, p, gradient, hessian):
+            gradient[0], gradient[1], gradient[3] = 2 * p.a * x[0], u[0], x[1]
+            hessian[0, 0], hessian[1, 3], hessian[3, 1] = 2 * p.a, 1.0, 1.0
+
+        of_term(ls.FunctionCost(cost, derivatives=slopes if given else None, parameters={"a": 0.7}).bind(CART))
+
+    @pytest.mark.parametrize("level", BALLS)
+    def test_balls(self, level: str) -> None:
+        balls = BALLS[level]
+        of_term(ls.ObstacleCost(WORLD, balls=balls, sharpness=3.0).bind(CART))
+        of_constraint(ls.Clearance(WORLD, balls=balls, margin=0.05).bind(CART))
+        self.places(balls.bind(CART), 6, X)
+
+    @staticmethod
+    def places(places: Places, coordinates: int, x: Array) -> None:
+        source = source_of(ball_places).filled(places=places.code, places_jacobian=places.code)
+        data, n = compiled.numbers(places), len(x)  # pyright: ignore[reportArgumentType]
+        states, sizes = np.array([x, 1.1 * x]), {"N": n, "M": 1, "W": n + 1}
+        replay(source, sizes, "places_of", 2, states, data, np.zeros((2, coordinates)))
+        outputs = np.zeros((2, coordinates)), np.zeros((2, coordinates, n))
+        replay(source, sizes, "slopes_of", 2, states, data, *outputs)
+
+    def test_constraints(self) -> None:
+        of_constraint(ls.Clearance(WORLD, radius=0.1).bind(CART))
+        of_constraint(ls.StateBounds(low={"x": 0.5}, high={"y": 0.2}).bind(CART))
+        of_constraint(ls.GoalState([1.0, 0.0, 0.0]).bind(CART), equality=1)
+
+    @pytest.mark.parametrize("seed", range(4))
+    def test_projection(self, seed: int) -> None:
+        root = np.random.default_rng(seed).normal(size=(5, 5))
+        source = source_of(projection, SUPPORT=(0, 1, 3), K=3)
+        replay(source, SIZES, "project", root + root.T - 2 * (seed > 1) * np.eye(5))
+
+    def test_noise(self) -> None:
+        def plain(x, u, p):
+            return [[0.1 * u[0], 0.0], [0.0, 0.2], [0.0, 0.1 * x[2]]]
+
+        kinds = [
+            ls.Noise(shaken, size=2, parameters={"size": 0.1}), ls.Noise(0.1 * np.eye(3)[:, :2]),
+            ls.Noise(plain, size=2, level="plain"), ls.Noise(shaken, size=2, parameters={"size": 0.1}).scaled(2.0),
+        ]  # fmt: skip
+        for noise in kinds:
+            one = problem(noise=noise, steps=3)
+            term = noise.bind(CART)
+            filled = {"noise_values": term.source, "noise_slopes": term.source}
+            outputs = np.zeros((2, len(term.rows), 2))
+            matrices = source_of(noise_matrices).filled(noise_values=term.source)
+            states, controls = np.array([X, -X]), np.array([U, -U])
+            replay(matrices, SIZES, "matrices_of", 2, states, controls, numbers_of(term), outputs)
+            source = source_of(noise_kernel, **term.filled).filled(**filled)
+            policy, costs = Policy(np.zeros((3, 2, 3)), np.full((3, 2), 0.1)), np.zeros(2)
+            draws = np.random.default_rng(0).normal(size=(6, 2))
+            replay(source, SIZES, "noisy_costs", 2, 3, X.copy(), policy, compiled.arguments(one), draws, costs)
+            from lqrsim.kernels.records import Ahead, Stage
+
+            ahead = Ahead(np.eye(3, 5), X, 2 * np.eye(3), -X)
+            for risk in (0.0, 0.1, -0.3, 1e6):
+                stage, risky = Stage(np.zeros((5, 5)), np.zeros(5)), np.array([risk, 0.0])
+                replay(source, SIZES, "noise_quadratic", X, U, numbers_of(term), risky, ahead, 0, stage)
+                replay(source, SIZES, "noise_value", X, U, numbers_of(term), risky, ahead)
+
+    @pytest.mark.parametrize("given", [False, True])
+    def test_dynamics_that_are_functions(self, given: bool) -> None:
+        def rate(x, u, p):
+            return [u[0] * np.cos(x[2]), u[0] * np.sin(x[2]), p.a * u[1]]
+
+        def jacobian(x, u, p, fx, fu):
+            fx[0, 2], fx[1, 2] = -u[0] * np.sin(x[2]), u[0] * np.cos(x[2])
+            fu[0, 0], fu[1, 0], fu[2, 1] = np.cos(x[2]), np.sin(x[2]), p.a
+
+        dynamics = ls.Dynamics(
+            rate, states={"x": "", "y": "", "h": ""}, controls={"v": "", "w": ""}, parameters={"a": 0.5},
+            jacobian=jacobian if given else None, level="plain",
+        )  # fmt: skip
+        self.steps(dynamics, X, U, 0.1)
+
+    @staticmethod
+    def steps(dynamics: ls.Dynamics, x: Array, u: Array, dt: float) -> None:
+        n, m = len(x), len(u)
+        sizes, numbers = {"N": n, "M": m, "W": n + m}, compiled.numbers(dynamics)
+        replay(dynamics.step_source, sizes, "advance", x, u, numbers, dt, np.zeros(n))
+        replay(dynamics.step_source, sizes, "step_jacobian", x, u, numbers, dt, np.zeros(n), np.zeros((n, n + m)))
+
+    @pytest.mark.parametrize("size", [0.05, 1.5])
+    def test_rotations(self, size: float) -> None:
+        """Near zero by series, and beyond."""
+        x = size * np.linspace(0.3, 1.0, 12)
+        self.steps(ls.Quadrotor().dynamics, x, np.full(4, 1.2), 0.05)
+        for name in [one for one in vars(rotation_ratios) if "ratio" in one]:
+            replay(source_of(rotation_ratios), {}, name, size**2)
+        replay(source_of(exponential), {}, "exponential", -size)
+
+    @pytest.mark.parametrize("kind", mjcf_files.KINDS)
+    def test_mujoco(self, kind: str) -> None:
+        """MuJoCo's own steps, called from plain Python and from compiled code; it starts each from nothing."""
+        drawn = mjcf_files.draw(kind, 3, "Euler")  # whose steps can be had in parts
+        robot = ls.MjcfRobot(scene_from_xml(drawn.xml, kind))
+        dynamics = robot.dynamics
+        n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+        x = robot.at() + 0.1 * np.random.default_rng(0).normal(size=n)
+        self.steps(dynamics, x, 0.3 * np.ones(m), 0.005 * drawn.substeps)
+        if robot.balls is not None:
+            places = robot.balls.bind(dynamics)
+            assert places.code == source_of(mjcf_places)
+            self.places(places, 3 * len(robot.balls), x)
+
+    def test_sums_of_costs_of_many(self) -> None:
+        one = problem(constraints=[ls.Clearance(WORLD, radius=0.1)], steps=3)
+        model, source = compiled.arguments(one), source_of(model_functions)
+        plans = Plan(np.tile(X, (8, 1)), np.tile(U, (6, 1)))
+        replay(source, SIZES, "costs_of", 2, 3, plans, model, np.zeros(2))
+        replay(source, SIZES, "cost_of_each", 2, 1, plans, model.stage, np.zeros(2))
+        values = (np.zeros(4 * len(WORLD)),)
+        replay(source, SIZES, "evaluate_constraints", 3, plans.states, plans.controls, model.stage.constraints, values)
+        replay(source, SIZES, "slope_of_constraint", 0, 1, X, U, 1, model.stage.constraints, np.zeros(5))
+
+
+class TestControl:
+    @pytest.mark.parametrize("kind", ["angles", "rotations"])
+    def test_laws_of_many_states(self, kind: str) -> None:
+        turns: dict[str, Any] = {"angles": ("a", "c")} if kind == "angles" else {"rotation_vectors": [("b", "c", "d")]}
+        dynamics = ls.Dynamics(
+            lambda x, u, p: [u[0]] * 4, states=dict.fromkeys("abcd", ""), controls={"u": ""}, **turns
+        )
+        space = dynamics.state_coordinates
+        rng, sizes, source = np.random.default_rng(0), {"N": 4, "M": 2, "W": 6}, source_of(policy_evaluation)
+        near, law = 5 * rng.normal(size=(3, 4)), Policy(rng.normal(size=(2, 4)), rng.normal(size=2))
+        near[0, 1:] = 0.0
+        limits, turning = Limits(np.full(2, -1.0), np.full(2, 1.0)), turning_of(space)
+        replay(source, sizes, "apply_law", 3, near, law, rng.normal(size=4), turning, limits, np.zeros((3, 2)))
+        replay(source, sizes, "turn_all", 2, 2, 5 * rng.normal(size=(4, 4)), rng.normal(size=(2, 4)), turning)
+
+    @pytest.mark.parametrize("lag", [0, 2])
+    def test_estimation(self, lag: int) -> None:
+        from lqrsim.kernels.records import SensorModel
+
+        text = "def measure(x, data, out):\n    out[0] = x[0] * data[0]\n    out[1] = sin(x[2])\n"
+        text += "def measure_slope(x, data, out):\n    out[0, 0] = data[0]\n    out[1, 2] = cos(x[2])\n"
+        module = compiled.module_of(text_source(text), "sensors", **SIZES)
+        measure, slope = module.addresses("measure", "measure_slope")
+        sensor, dynamics = SensorModel(measure, slope, np.array([1.5])), compiled.dynamics_model(CART)
+        z, d, p = 3 + lag + 2, 2, 1
+        source = source_of(estimation, LAG=lag, D=d, Y=2, P=p, Z=z, V=p + 4, NUMBERS=2, HELD=d)
+        rng, k = np.random.default_rng(1), 3
+        estimates, turning = rng.normal(size=(k, z)), turning_of(CART.state_coordinates)
+        states, controls = rng.normal(size=(k, 3)), rng.normal(size=(k, 2))
+        measured = Measured(states, np.array([0.0, 1.0, 0.0]))
+        replay(
+            source,
+            SIZES,
+            "correct",
+            k,
+            measured,
+            X,
+            rng.normal(size=(z, 2)),
+            sensor,
+            turning,
+            estimates,
+            np.zeros((k, 2)),
+        )
+        predictor = Predictor(
+            dynamics, 0.1, np.array([1.0]), np.array([0.5, 0.6]), 0.9 * np.eye(2), 0.1 * rng.normal(size=(5, 2))
+        )
+        replay(source, SIZES, "predict", k, controls, predictor, estimates)
+        law, limits = Policy(rng.normal(size=(2, z)), np.zeros(2)), Limits(np.full(2, -1.0), np.full(2, 1.0))
+        replay(source, SIZES, "command", k, estimates, X, law, limits, turning, np.zeros((k, 2)))
+        estimates[1, 2] = np.inf
+        replay(source, SIZES, "diverged", k, estimates, np.zeros(k))
+        for name in ("sensor_slopes", "measurements"):
+            out = np.zeros((k, 2, 3)) if name == "sensor_slopes" else np.zeros((k, 2))
+            replay(source, SIZES, name, k, states, sensor, out)
+        given = k, states, controls, dynamics, 0.1
+        replay(source, SIZES, "slopes_along", *given, np.zeros((k, 3)), np.zeros((k, 3, 5)))
+        which, changes = np.array([0.0]), np.array([1e-5])
+        replay(source, SIZES, "parameter_slopes", *given, which, changes, np.zeros((k, 3, 1)))
+
+
+def test_no_kernel_is_left_out() -> None:
+    """All of them, but those in `LEFT_OUT`."""
+    folder = Path(str(kernels.__file__)).parent
+    written = {
+        f"lqrsim.kernels.{path.stem}.{node.name}"
+        for path in folder.glob("*.py")
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.FunctionDef) and path.stem not in ("declarations", "records")
+    }
+    forms = "cost_to_come_dual.forward_jacobian", "cost_to_come_primal.forward_jacobian"
+    left_out = (*forms, *(f"mjcf_dynamics.{name}" for name in ("job_columns", "help_out", "take_slot")))
+    assert sorted(written - COMPARED.keys()) == sorted(f"lqrsim.kernels.{name}" for name in left_out)
