@@ -21,9 +21,10 @@ Statements
     calls           Of other kernels, for what they write. No recursion, no keywords.
 
 Expressions
-    + - * / // %    As in Python, signs too. A division by zero gives infinity or NaN.
+    + - * / // %    As in Python, signs too. A division by zero gives infinity or NaN; // and % of ints give 0.
     **              Of any float; a whole exponent is best constant.
-    < <= == ...     Chained, too; and, or, not, conditional expressions.
+    < <= == ...     Chained, too, where all parts are worked out; and, or, not of bools, and in conditions of ints;
+                    conditional expressions.
     a[i, j]         Indices are ints, not negative; of a tuple, any int if its entries have one type.
     min, max        Of two or more. abs, int, float, len of a tuple.
     math            The functions in `UNARY`, `BINARY` and `TESTS`, of which floor, ceil and trunc return floats; and

@@ -207,6 +207,10 @@ class _Body:
         self._loops: list[tuple[str, str]] = []
         self._left: set[str] = set()  # the ends of loops that a break leads to
         self._own: set[str] = set()  # the names of what may be, or have, work arrays of its own
+        self._local = {one.arg for one in function.node.args.args}  # names, whatever they mean elsewhere
+        for one in ast.walk(function.node):
+            if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store):
+                self._local.add(one.id)
         self._blocks: list[Block] = [Block("body", [])]
         self._fast = "contract" if "exact" in function.decorators else FAST
         self._empty = False  # whether it returns nothing somewhere
@@ -399,8 +403,6 @@ class _Body:
 
     def _statement_AugAssign(self, node: ast.AugAssign) -> None:
         if isinstance(node.target, ast.Name):
-            if node.target.id not in self._names:
-                self._refuse(node, f"the name {node.target.id}, which has no value yet", "one that has")
             old = self._expression(ast.copy_location(ast.Name(node.target.id, ast.Load()), node.target))
             self._assign(node.target, self._arithmetic(node.op, old, self._expression(node.value), node))
             return
@@ -574,6 +576,8 @@ class _Body:
         if node.id in self._names:
             return self._get(*self._names[node.id])
         found = self.scope.find(node.id)
+        if node.id in self._local:
+            self._refuse(node, f"the name {node.id}, which has no value yet", "one that has")
         if found is None:
             self._refuse(node, f"the name {node.id}, which nothing has", "one that is defined")
         if isinstance(found, Function | Word | Record):
@@ -816,7 +820,7 @@ class _Body:
         if not isinstance(node.func, ast.Name) or node.keywords:
             self._refuse(node, f"`{ast.unparse(node)}`", "a call by a bare name, of positional arguments")
         name = node.func.id
-        found = self.scope.find(name) if name not in self._names else None
+        found = self.scope.find(name) if name not in self._local else None
         given = [self._expression(one) for one in node.args]
         match found:
             case Function():

@@ -1,0 +1,33 @@
+"""Kernels compiled on their own, without the cache, to hold them against plain Python."""
+
+from typing import Any
+
+from lqrsim.codegen.compiled_module import Call, Entry
+from lqrsim.codegen.language import type_of
+from lqrsim.codegen.llvm import Loaded, object_code
+from lqrsim.codegen.printer import Program
+from lqrsim.codegen.sources import Function, Scope, text_source
+
+
+class Compiled:
+    """A function compiled for arguments like these; called with such ones."""
+
+    def __init__(self, function: Function, *arguments: Any) -> None:
+        program = Program()
+        types = tuple(map(type_of, arguments))
+        self.returns = program.entry(function, types, "entry")
+        self._loaded = Loaded(object_code(program.text), tuple(program.libraries))
+        self._entry = Entry(types, self._loaded.address("entry"), self.returns)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return Call(self._entry, arguments)()
+
+
+def compiled(text: str, name: str, *arguments: Any, **sizes: int) -> Compiled:
+    """A function of a text."""
+    return Compiled(Scope(text_source(text), sizes).function(name), *arguments)
+
+
+def run(text: str, name: str, *arguments: Any, **sizes: int) -> Any:
+    """What it returns for these."""
+    return compiled(text, name, *arguments, **sizes)(*arguments)
