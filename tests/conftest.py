@@ -10,7 +10,7 @@ hypothesis.settings.load_profile("untimed")
 
 # The files that take longest begin first: what a file takes is not divided among processors, and all would wait for one
 # that begins last. In this order the first two do not compile the same at the same time, nor those that follow.
-LONGEST = ("reproduce", "campaign", "experiments", "docs", "balls", "packaging", "whole_problems", "viewer")
+LONGEST = ("reproduce", "kernels", "campaign", "experiments", "docs", "balls", "packaging", "whole_problems", "viewer")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

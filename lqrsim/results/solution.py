@@ -93,7 +93,7 @@ class Solution:
     goal_radius: float | None = None
 
     @classmethod
-    def assembled(cls, later: Mapping[str, Callable[[], Any]], **parts: Any) -> "Solution":
+    def _assembled(cls, later: Mapping[str, Callable[[], Any]], **parts: Any) -> "Solution":
         """A solver's own, whose parts fit each other: without a check, and with parts that are made when they are read.
 
         Args:

@@ -57,7 +57,7 @@ def assemble(
         "clearance": lambda: clearance_of(problem, states),
         "problem_digest": lambda: problem.digest,
     }
-    return Solution.assembled(
+    return Solution._assembled(
         later,
         status=status,
         detail=detail,
