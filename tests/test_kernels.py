@@ -9,7 +9,7 @@ import ctypes
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -99,6 +99,14 @@ def entry({names}, out):
 DIVIDED = {"lqrsim.kernels.cost_differences.derivatives": 4 * 2.0**-52 / 1.2e-4**2}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """MuJoCo writes its log into the current folder; drawn states give it reason to."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("kernels"))
+        yield
+
+
 @dataclass
 class Recorded:
     """A call of a kernel: the types of its arguments, these before and after, and what it returned."""
@@ -146,7 +154,7 @@ def replay(source: Source, sizes: dict[str, int], name: str, *arguments: Any, bu
             function, types = writing_out(function, len(given)), (*types, Pointer(shape[1:]))
             before, after, value = (*before, np.zeros(shape)), (*after, np.array(returned[: shape[0]])), None
         if function.node.name == "take_slot":
-            let_go(given[0], int(value))
+            let_go(given[0], int(returned))
         compare(Recorded(name, function, types, before, after, snapshot(value, {})))
         return returned
 
