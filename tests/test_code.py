@@ -9,7 +9,7 @@ import lqrsim
 PACKAGE = Path(lqrsim.__file__).parent
 TESTS = Path(__file__).parent
 
-LINES_OF_A_FUNCTION = 80
+LINES_OF_A_FUNCTION = 90
 POSITIONAL_ARGUMENTS = 8
 
 

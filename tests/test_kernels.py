@@ -96,7 +96,10 @@ def entry({names}, out):
             out[i, j] = found[i, j]
 """
 # Second derivatives by differences: rounding of the function is divided by the square of the step, 1.2e-4.
-DIVIDED = {"lqrsim.kernels.cost_differences.derivatives": 4 * 2.0**-52 / 1.2e-4**2}
+DIVIDED = {
+    "lqrsim.kernels.cost_differences.derivatives": 4 * 2.0**-52 / 1.2e-4**2,
+    "lqrsim.kernels.curvature_differences.step_curvature": 16 * 2.0**-52 / 1.2e-4**2,
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -268,7 +271,7 @@ def settings_of(**changed: Any) -> SmootherSettings:
     stated: dict[str, Any] = {
         "form": "dual", "first_pass": "forward", "safeguard": True, "stop": "optimal", "tolerance": 1e-4,
         "gap_tolerance": 1e-3, "max_iterations": 4, "time_limit": None, "start": None, "starts": 1,
-        "constraint_tolerance": 1e-3,
+        "constraint_tolerance": 1e-3, "finish": None,
     }  # fmt: skip
     return SmootherSettings(**{**stated, **changed})
 
@@ -359,6 +362,20 @@ class TestSolvers:
         noise = ls.Noise(shaken, size=2, parameters={"size": 0.02})
         smoothed(problem(noise=noise, risk=risk, steps=4), form, task="damped" if form == "dual" else "")
 
+    @pytest.mark.parametrize("form", ["dual", "primal"])
+    def test_newton(self, form: str) -> None:
+        assert descended(problem(steps=4), form) in (declarations.CONVERGED, declarations.MAX_ITERATIONS)
+
+    def test_newton_with_noise(self) -> None:
+        noise = ls.Noise(shaken, size=2, parameters={"size": 0.02})
+        descended(problem(noise=noise, risk=0.05, steps=3, initial=ls.FixedState([0.0, 0.0, 0.3])), count=2)
+
+    def test_newton_to_its_end(self) -> None:
+        """At once, where that is enough; and where a gap of nothing is asked for, after some more steps."""
+        assert descended(problem(steps=3), tolerance=1e9) == declarations.CONVERGED
+        assert descended(problem(steps=3), tolerance=1e9, small_changes=9.0) == declarations.CONVERGED
+        assert descended(problem(steps=3), merit=-1e9) == declarations.STALLED
+
     def test_ilqr(self) -> None:
         one = problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=5)
         states, controls = np.zeros((6, 3)), np.zeros((5, 2))
@@ -425,6 +442,25 @@ class Begun:
         trial = Plan(np.zeros_like(self.work.states), np.zeros_like(self.work.controls))
         given = self.attempt._damped_arguments(first, last, self.log, last + 1, trial)
         return replay(self.source, self.sizes, "smoother", *with_rows(given))
+
+
+def descended(one: ls.Problem, form: str = "dual", count: int = 3, tolerance: float = 1e-12, **memory: float) -> int:
+    """Newton iterations, in plain Python, from where a first iteration of smoothing leads; how they end."""
+    settings = settings_of(form=form, finish="newton", tolerance=tolerance)
+    begin = np.zeros(3) if one.start is None else one.start
+    attempt = Attempt(one, settings, resolve(None, one), begin, Stop())
+    attempt.run(1, each=False)
+    work, log, outcome = attempt.work, np.zeros(count, LOG), declarations.RUNNING
+    work.memory["merit"], work.memory["share"] = work.memory["plan_cost"], -1.0
+    for name, number in memory.items():
+        work.memory[name] = number
+    trial = Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
+    source, sizes = compiled._with_form(form, "entry_points"), sizes_of(one)
+    for done in range(count):
+        if outcome == declarations.RUNNING:
+            arguments = attempt._newton_arguments(done, done + 1, log, count, trial)
+            _, outcome, _, _ = replay(source, sizes, "smoother", *with_rows(arguments))
+    return outcome
 
 
 def with_numbers(cost: CostModel, term: int, first: int, change: Callable[[Array], Array]) -> CostModel:
@@ -824,6 +860,9 @@ class TestParts:
         sizes, numbers = {"N": n, "M": m, "W": n + m}, compiled.numbers(dynamics)
         replay(dynamics.step_source, sizes, "advance", x, u, numbers, dt, np.zeros(n))
         replay(dynamics.step_source, sizes, "step_jacobian", x, u, numbers, dt, np.zeros(n), np.zeros((n, n + m)))
+        if dynamics.curvature_source is not None:
+            arrays = np.linspace(-1.0, 2.0, n), np.zeros(n), np.zeros((n, n + m)), np.zeros((n + m, n + m))
+            replay(dynamics.curvature_source, sizes, "step_curvature", x, u, numbers, dt, *arrays)
 
     @pytest.mark.parametrize("size", [0.05, 1.5])
     def test_rotations(self, size: float) -> None:

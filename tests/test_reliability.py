@@ -102,8 +102,8 @@ def test_converged_means_that_first_order_conditions_hold(reports: list[tuple[Ca
         assert report.decrease < TOLERANCE, case
         if solution.cost > 1e-26 * report.scale:  # of less, they are shares of rounding
             assert report.stationarity < CANCELS * TOLERANCE**0.5, case
-            # 1 %: at a box's edge, curvature jumps.
-            assert solution.optimality == pytest.approx(report.decrease, rel=1e-2, abs=1e-9), case
+            # 1 %: at a box's edge, curvature jumps. What Newton's own model promises is of second order.
+            assert solution.optimality == pytest.approx(report.decrease, rel=1e-2, abs=1e-8), case
         last = solution.iterations[-1]
         assert abs(last.improvement) < TOLERANCE, case
         assert last.gap < 1e-3, case

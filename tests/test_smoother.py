@@ -238,7 +238,7 @@ class TestSafeguard:
 
     def test_its_answer_is_whole(self, stiff: ls.Problem) -> None:
         """The policy is undamped and makes the plan; the value functions are of the plan."""
-        solution = ls.smooth(stiff)
+        solution = ls.smooth(stiff, finish=None)
         plan = solution.trajectory
         x = plan.states[0]
         for t in range(stiff.steps):

@@ -58,6 +58,7 @@ LONG = ("smoother", "ilqr")
 _SIGNATURES: dict[str, tuple[str | Scalar, ...]] = {
     "advance": ("", "", "", FLOAT, ""),  # x, u, p, h, out
     "step_jacobian": ("", "", "", FLOAT, "", "W"),  # x, u, p, h, out, jacobian
+    "step_curvature": ("", "", "", FLOAT, "", "", "W", "W"),  # x, u, p, h, weights, out, jacobian, hessian
     "value": ("", "", INT, ""),  # x, u, t, data
     "derivatives": ("", "", INT, "", "W", ""),  # x, u, t, data, hessian, gradient
     "project": ("W",),  # hessian

@@ -153,7 +153,7 @@ def write_function(
     """Source of a function that evaluates SymPy expressions, with common subexpressions shared.
 
     Args:
-      arguments: the signature. data: the argument that holds the parameters p0, p1, ...; x and u are those named so.
+      arguments: the signature. data: the argument that holds the parameters p0, p1, ...; x, u and w are those named so.
       assignments: target (`out[0]`, `hessian[1, 2]`, ...; `+=` if it ends in `+`) -> expression.
       of: what messages call the user's function.
       returns: the target, among `assignments`, that is returned instead of stored.
@@ -191,7 +191,7 @@ def write_function(
     shared, reduced = sympy.cse(list(assignments.values()), symbols=sympy.numbered_symbols("s"))
     used = set().union(*(e.free_symbols for e in [*reduced, *(value for _, value in shared)]))
     lines = [f"def {name}({arguments}):"]
-    for symbol in sorted((s for s in used if str(s)[0] in "xup"), key=lambda s: (str(s)[0], int(str(s)[1:]))):
+    for symbol in sorted((s for s in used if str(s)[0] in "xupw"), key=lambda s: (str(s)[0], int(str(s)[1:]))):
         letter, index = str(symbol)[0], str(symbol)[1:]
         lines.append(f"    {symbol} = {data if letter == 'p' else letter}[{index}]")
     try:

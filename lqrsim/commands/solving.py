@@ -54,8 +54,10 @@ class Solve:
     """smooth: iterated LQR smoothing. ilqr: the baseline with line search, from the scenario's exact start."""
     stop: Literal["optimal", "cost"] = "optimal"
     """cost: stop when the cost has settled, as in the paper. optimal: also require gap and first-order optimality."""
-    tolerance: float = 1e-4
-    """Relative change of the cost below which it has settled; scales the other tests too."""
+    tolerance: Annotated[float | None, optional("SHARE")] = None
+    """Share of the cost that may be left to save. By default 1e-8, and 1e-4 without Newton's method."""
+    finish: Literal["newton", "none"] = "newton"
+    """newton: smooth leaves the last iterations to Newton's method. none: the paper's method has them all."""
     max_iterations: Annotated[int | None, optional("INT")] = None
     """Stop after this many iterations. By default the solver's own limit."""
     time_limit: Annotated[float | None, optional("SECONDS")] = None
@@ -93,7 +95,13 @@ class Solve:
             problem = replace(problem, constraints=[*problem.constraints, kept])
         if self.control_limits is not None:
             problem = replace(problem, control_limits=self.control_limits)
-        options: dict[str, object] = {"stop": self.stop, "tolerance": self.tolerance}
+        options: dict[str, object] = {"stop": self.stop}
+        if self.tolerance is not None:
+            options["tolerance"] = self.tolerance
+        if self.finish == "none":
+            if self.solver != "smooth":
+                raise InputError(f"--finish: got it for {self.solver}, want it with --solver smooth")
+            options["finish"] = None
         if self.max_iterations is not None:
             options["max_iterations"] = self.max_iterations
         if self.time_limit is not None:

@@ -107,7 +107,7 @@ def damped_step(settings, model, work, memory):
             weigh_plan(settings.steps, model, work, memory)
         smallest = 0.1 if reach > 0 else 1e-8
         bound = memory.merit + 1e-12 * abs(memory.merit)  # what differs by rounding is not refused
-        merit, cost, fraction = line_search(settings.steps, shift, work, model, bound, smallest, work.rollout)
+        merit, cost, fraction = line_search(settings.steps, shift, work, model, bound, 0.0, smallest, work.rollout)
     return merit, cost, fraction, nothing
 
 
@@ -152,19 +152,29 @@ def turn_to_ilqr(memory):
 def relinearize(settings, settled, nothing, model, work, memory, row):
     """Policy and value functions about the plan, without a weight. Returns the outcome, and the step that failed or -1.
 
-    Writes optimality and residual to the row of the log, and to the memory how far the states of least total cost are
-    from the plan: where motions are unstable, rounding can spoil the cost-to-come while the rest is right.
+    Writes optimality and residual to the row of the log.
     """
-    steps, plan, policy, shift = settings.steps, work.plan, work.policy, stack(N)
-    failed, _, left = differential_pass(steps, plan, model, 0.0, 1, policy, work.to_go)
+    steps, plan, policy, to_go, shift = settings.steps, work.plan, work.policy, work.to_go, stack(N)
+    failed, _, left = differential_pass(steps, plan, model, 0.0, 0.0, 1, policy, to_go, to_go)
     if failed >= 0:
         return RUNNING, failed
     if NOISY:
         weigh_plan(steps, model, work, memory)
         row.cost = memory.plan_cost
     if not settings.fixed:
-        left += initial_step(plan.states[0], model, work.to_go, shift)
-    left = relative_optimality(failed, left, memory.merit, nothing)
+        left += initial_step(plan.states[0], model, 0.0, to_go, shift)
+    row.optimality = left = relative_optimality(failed, left, memory.merit, nothing)
+    model_come_to(settings, model, work, memory, row)
+    return outcome_of(settled and left < settings.tolerance, settings, left, memory.plan_cost, False), -1
+
+
+def model_come_to(settings, model, work, memory, row):
+    """What is left after a pass about the plan: its policy as one that makes the plan, and the cost-to-come.
+
+    Writes the residual to the row of the log, and to the memory how far the states of least total cost are from the
+    plan: where motions are unstable, rounding can spoil the cost-to-come while the rest is right.
+    """
+    steps, plan, policy = settings.steps, work.plan, work.policy
     copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
     failed, _ = forward_pass(settings, model, Linearization(plan, True, 1.0, 0.0, work.prior), work)
     memory.final_gap = inf
@@ -173,11 +183,10 @@ def relinearize(settings, settled, nothing, model, work, memory, row):
     # The forward pass has left it at the end; what comes next begins at the start.
     copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
     for t in range(steps):
-        for i in range(M):  # the policy that makes the plan
+        for i in range(M):
             policy.offset[t, i] = plan.controls[t, i]
             for j in range(N):
                 policy.offset[t, i] -= policy.gain[t, i, j] * plan.states[t, j]
-    row.optimality, row.residual = left, dynamics_residual(steps, work.x_hats, policy, model, plan.states)
+    row.residual = dynamics_residual(steps, work.x_hats, policy, model, plan.states)
     if isnan(row.gap):  # of an iteration that was rejected
         row.gap = 0.0
-    return outcome_of(settled and left < settings.tolerance, settings, left, memory.plan_cost, False), -1

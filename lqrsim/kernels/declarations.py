@@ -18,10 +18,10 @@ EQUALITY = 0  # 1 for a constraint whose numbers are to be zero
 # How iterations end; see `Status`. Of those without a status of their own, NO_START is a first trajectory that is not
 # finite, STALLED a line search that found no lower cost, CYCLING that the same costs come again and again, and
 # NO_PROGRESS that the least cost so far does not fall. TIMED_OUT is for the drivers: no kernel looks at a clock.
-# RISK_TOO_HIGH is a pass that failed because no expectation exists.
+# RISK_TOO_HIGH is a pass that failed because no expectation exists. IN_VALLEY is where Newton's method can go on.
 RUNNING, CONVERGED, COST_CONVERGED, MAX_ITERATIONS, DIVERGED = 0, 1, 2, 3, 4
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NO_START, STALLED, CYCLING = 5, 6, 7, 8, 9
-NO_PROGRESS, TIMED_OUT, RISK_TOO_HIGH = 10, 11, 12
+NO_PROGRESS, TIMED_OUT, RISK_TOO_HIGH, IN_VALLEY = 10, 11, 12, 13
 LONGEST_CYCLE = 8
 # After how many iterations without a lower cost, and after how many in which it fell by less than a thousandth, there
 # is no progress. `python experiments/benchmark_reliability.py --sections overhead` shows that neither is met where the
@@ -31,10 +31,10 @@ ROW = 16  # numbers that an obstacle takes in `World.table`: kind, position (3),
 HEADER = 4  # numbers that come before the multipliers; see `augmented_lagrangian.py`
 
 # What an entry is to do; see `entry_points.py`.
-ITERATE, DAMP, CERTIFY, EVALUATE = 0, 1, 2, 3
+ITERATE, DAMP, FINISH, CERTIFY, EVALUATE = 0, 1, 2, 3, 4
 
 # What an iteration was; see `Iteration.method`.
-SMOOTH, DAMPED, REJECTED, ILQR = 0, 1, 2, 3
+SMOOTH, DAMPED, REJECTED, ILQR, NEWTON = 0, 1, 2, 3, 4
 
 # After how many damped iterations without an end iLQR has its turn.
 PATIENCE = 50
@@ -125,6 +125,10 @@ def rate(x, u, p, out) -> None:
 
 def rate_jacobian(x, u, p, out, fx, fu) -> None:
     """Write f (N,), and the entries of df/dx (N, N) and df/du (N, M) that are not zero everywhere."""
+
+
+def rate_curvature(x, u, p, w, curve) -> None:
+    """Write the second derivatives of `sum_i w[i] f[i]` in the entries that `step_curvature.py` takes, but zeros."""
 
 
 def constraint_value(x, u, t, row, data) -> float:

@@ -5,14 +5,15 @@ All that a solve can need is compiled at once, before it begins, and what its pa
 
 from lqrsim.kernels.certificate import certify
 from lqrsim.kernels.damped_iterations import damped_iterations
-from lqrsim.kernels.declarations import CERTIFY, DAMP, EVALUATE
+from lqrsim.kernels.declarations import CERTIFY, DAMP, EVALUATE, FINISH
 from lqrsim.kernels.iterations import ilqr_iterations, smoother_iterations
+from lqrsim.kernels.newton_iterations import newton_iterations
 from lqrsim.kernels.passes import opening_pass as opening_pass
 from lqrsim.kernels.rollouts import rollout as rollout
 
 
 def smoother(task, first, last, settings, model, work, memory, log):
-    """Undamped or damped iterations; or the certificate of the rollout and the policy kept.
+    """Undamped, damped or Newton iterations; or the certificate of the rollout and the policy kept.
 
     To evaluate is to certify with Hessians of the policy's own, which take the place of the cost-to-go's.
     """
@@ -22,6 +23,8 @@ def smoother(task, first, last, settings, model, work, memory, log):
         return 0, 0, False, -1
     if task == DAMP:
         return damped_iterations(first, last, settings, model, work, memory[0], log)
+    if task == FINISH:
+        return newton_iterations(first, last, settings, model, work, memory[0], log)
     return smoother_iterations(first, last, settings, model, work, memory[0], log)
 
 

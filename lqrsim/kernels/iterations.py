@@ -13,6 +13,7 @@ from lqrsim.kernels.declarations import (
     CYCLING,
     DIVERGED,
     ILQR,
+    IN_VALLEY,
     LONGEST_CYCLE,
     MAX_ITERATIONS,
     NO_FALL,
@@ -95,6 +96,9 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         settled = abs(improvement) < settings.tolerance and (gap < settings.gap_tolerance or not settings.optimal)
         full = done + 1 == settings.max_iterations
         left, residual = nan, nan
+        if gap < settings.valley and improvement >= 0 and not full:
+            write_row(log[done], cost, improvement, gap, left, residual, SMOOTH)
+            return done + 1, IN_VALLEY, False, -1
         if settled or full:
             left = optimality(settings, work.rollout, model, cost, nothing)
             residual = dynamics_residual(steps, work.x_hats, work.policy, model, work.rollout.states)
@@ -175,9 +179,9 @@ def optimality(settings, plan, model, cost, nothing):
     """What a linear-quadratic model about a trajectory promises, relative to its cost; infinite if there is none."""
     policy, to_go = Policy(stack(1, M, N), stack(1, M)), CostToGo(stack(1, N, N), stack(1, N), stack(1))
     shift = stack(N)
-    failed, _, left = differential_pass(settings.steps, plan, model, 0.0, 0, policy, to_go)
+    failed, _, left = differential_pass(settings.steps, plan, model, 0.0, 0.0, 0, policy, to_go, to_go)
     if not settings.fixed:
-        left += initial_step(plan.states[0], model, to_go, shift)
+        left += initial_step(plan.states[0], model, 0.0, to_go, shift)
     return relative_optimality(failed, left, cost, nothing)
 
 
@@ -226,14 +230,14 @@ def ilqr_iterations(first, last, settings, model, work, log):
             return 0, NO_START, False, -1
     cost = log[first - 1 if first > 0 else settings.max_iterations].cost
     if first == last:
-        failed, _, _ = differential_pass(steps, plan, model, 0.0, 1, policy, to_go)
+        failed, _, _ = differential_pass(steps, plan, model, 0.0, 0.0, 1, policy, to_go, to_go)
         return last, RUNNING, failed >= 0, failed
     for done in range(first, last):
         damping[0] *= 0.1
-        failed, good, _ = differential_pass(steps, plan, model, damping[0], 1, policy, to_go)
+        failed, good, _ = differential_pass(steps, plan, model, damping[0], 0.0, 1, policy, to_go, to_go)
         while failed >= 0 and good and damping[0] < 1e25:
             damping[0] = max(10 * damping[0], 1.0)
-            failed, good, _ = differential_pass(steps, plan, model, damping[0], 1, policy, to_go)
+            failed, good, _ = differential_pass(steps, plan, model, damping[0], 0.0, 1, policy, to_go, to_go)
         if failed >= 0:
             return done, failure(good, model), True, failed
         if not damping[0] > 1.0:
@@ -241,14 +245,14 @@ def ilqr_iterations(first, last, settings, model, work, log):
         if NOISY:  # with the cost-to-go that the new policy has
             cost, _ = plan_cost(steps, plan, model, to_go)
         old = cost
-        cost, _, fraction = line_search(steps, no_shift, work, model, old, 1e-8, work.trial)
+        cost, _, fraction = line_search(steps, no_shift, work, model, old, 0.0, 1e-8, work.trial)
         if fraction > 0:
             keep_plan(steps, work.trial, plan)
         improvement = relative_improvement(old, cost, 0.0)
         settled = abs(improvement) < settings.tolerance
         left = nan
         if settled or done + 1 == settings.max_iterations:
-            failed, _, left = differential_pass(steps, plan, model, 0.0, 1, policy, to_go)
+            failed, _, left = differential_pass(steps, plan, model, 0.0, 0.0, 1, policy, to_go, to_go)
             if NOISY:
                 cost, _ = plan_cost(steps, plan, model, to_go)
             left = relative_optimality(failed, left, cost, 0.0)
@@ -258,6 +262,6 @@ def ilqr_iterations(first, last, settings, model, work, log):
             outcome = STALLED
         if outcome != RUNNING:
             if isnan(left):  # not worked out; but policy and cost-to-go are to be about the trajectory that was found
-                failed, _, _ = differential_pass(steps, plan, model, 0.0, 1, policy, to_go)
+                failed, _, _ = differential_pass(steps, plan, model, 0.0, 0.0, 1, policy, to_go, to_go)
             return done + 1, outcome, failed >= 0, failed
     return last, RUNNING, False, -1

@@ -4,7 +4,7 @@ So the passes and iterations are compiled once for a size, and serve all problem
 signatures are in `codegen/compiled_module.py`.
 """
 
-from lqrsim.kernels.declarations import W, call, call_for_value
+from lqrsim.kernels.declarations import W, call, call_for_value, stack
 from lqrsim.kernels.linear_algebra import clear
 
 VALUE, DERIVATIVES = 0, 1  # columns of `CostModel.functions`
@@ -61,6 +61,40 @@ def cost_quadratic(x, u, t, cost, hessian, gradient):
             x, u, t, constraints.data[k], constraints.multipliers[k], hessian, gradient,
         )  # fmt: skip
     return total
+
+
+def cost_second_order(x, u, t, cost, share, hessian, gradient):
+    """The same with the Hessian that share of the way from the projected one to the true one."""
+    total, constraints = 0.0, cost.constraints
+    clear(hessian, W, W)
+    for i in range(W):
+        gradient[i] = 0.0
+    for k in range(cost.size):
+        total += call_for_value(cost.functions[k, DERIVATIVES], x, u, t, cost.data[k], hessian, gradient)
+        if k + 1 == cost.indefinite and share < 1 and cost.project != 0:
+            projected = stack(W, W)
+            for i in range(W):
+                for j in range(W):
+                    projected[i, j] = hessian[i, j]
+            call(cost.project, projected)
+            for i in range(W):
+                for j in range(W):
+                    hessian[i, j] = share * hessian[i, j] + (1 - share) * projected[i, j]
+    for k in range(constraints.size):
+        total += call_for_value(
+            constraints.functions[k, AUGMENT],
+            x, u, t, constraints.data[k], constraints.multipliers[k], hessian, gradient,
+        )  # fmt: skip
+    return total
+
+
+def step_second_order(x, u, model, weights, out, jacobian, hessian):
+    """As `step_jacobian`; and add the step's second derivatives, each state's times its weight (N,), to a Hessian."""
+    dynamics = model.dynamics
+    if dynamics.step_curvature != 0:
+        call(dynamics.step_curvature, x, u, dynamics.parameters, model.dt, weights, out, jacobian, hessian)
+    else:
+        step_jacobian(x, u, model, model.dt, out, jacobian)
 
 
 def evaluate_constraints(steps, states, controls, constraints, values):

@@ -195,7 +195,8 @@ class Settings(NamedTuple):
     """Of a solve: how long, and when it has converged.
 
     `optimal` asks for more than a cost that has settled; with `fixed` the start is given; with `guided` the first
-    iteration linearises about the guess; the prior acts in the first `prior_iterations`.
+    iteration linearises about the guess; the prior acts in the first `prior_iterations`. `valley` is the gap below
+    which smoothing leaves the rest to Newton's method; 0 where it does not.
     """
 
     steps: int
@@ -206,6 +207,7 @@ class Settings(NamedTuple):
     fixed: bool
     guided: bool
     prior_iterations: int
+    valley: float = 0.0
 
 
 class Workspace(NamedTuple):
@@ -310,10 +312,12 @@ def _row(*names: str) -> np.dtype[np.void]:
 # changes there were in a row; of iterations at reach 0, iLQR's, how many are left, how many there will be the next
 # time, and how many others there were since. At the end, how far the states of least total cost are from the plan; at
 # the beginning, whether that was made. `watched` is 1 where undamped iterations are to end when they make no progress,
-# because there is a safeguard to go on.
+# because there is a safeguard to go on. Of Newton's method: the share of the second order that the next pass may have;
+# the step at which the last one failed; what it promised, as the slope of the merit and as a share of it; and a cost
+# that is as good as none.
 MEMORY = _row(
     "plan_cost", "merit", "reach", "weight", "small_changes", "ilqr_left", "ilqr_next", "since_ilqr", "final_gap",
-    "started", "watched",
+    "started", "watched", "share", "failed", "decrease", "promised", "nothing",
 )  # fmt: skip
 
 # A line of the log: NaN where something was not worked out.

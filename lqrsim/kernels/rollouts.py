@@ -18,10 +18,12 @@ from lqrsim.kernels.model_functions import (
     advance,
     cost_added,
     cost_quadratic,
+    cost_second_order,
     cost_value,
     noise_quadratic,
     noise_value,
     step_jacobian,
+    step_second_order,
 )
 from lqrsim.kernels.passes import copy, end_model
 from lqrsim.kernels.records import Ahead, Limits, Stage
@@ -63,16 +65,19 @@ def plan_cost(steps, plan, model, to_go):
     return cost + noise_cost(steps, plan, model, to_go), added
 
 
-def differential_pass(steps, plan, model, damping, keep, policy, to_go):
+def differential_pass(steps, plan, model, damping, share, keep, policy, to_go, known):
     """The backward pass of iLQR about a feasible trajectory; the policy is relative to it, the cost-to-go is about the
     origin.
 
-    `damping` is a weight on changes of the controls. With `keep` of 1 all steps are written; with 0 each overwrites the
-    one after it, for those who only ask what the model predicts.
+    `share` is how much of the second order there is in the models: 0 for those of iLQR, with costs projected and
+    dynamics linearised; 1 for those of Newton's method, the Hessians of costs as they are and that of the dynamics
+    times the costate. Noise is then weighed by a cost-to-go that is `known`. `damping` is a weight on changes of the
+    controls. With `keep` of 1 all steps are written; with 0 each overwrites the one after it, for those who only ask
+    what the model predicts.
 
     Returns as every pass does, and the decrease of cost that the linear-quadratic model predicts.
     """
-    stage, arrived = Stage(stack(W, W), stack(W)), stack(N)
+    stage, arrived, weights = Stage(stack(W, W), stack(W)), stack(N), stack(N)
     jacobian, none, no_change = stack(N, W), stack(M), stack(N)
     slope, curve = stack(N), stack(N, N)
     hessian, gradient, room = stage.hessian, stage.gradient, Limits(stack(M), stack(M))
@@ -81,7 +86,7 @@ def differential_pass(steps, plan, model, damping, keep, policy, to_go):
         no_change[i] = 0.0
     for i in range(M):
         none[i] = 0.0
-    value = cost_quadratic(states[steps], none, steps, model.final, hessian, gradient)
+    value = stated_quadratic(states[steps], none, steps, model.final, share, hessian, gradient)
     predicted, ahead = 0.0, value
     for i in range(N):
         slope[i] = gradient[i]
@@ -91,10 +96,17 @@ def differential_pass(steps, plan, model, damping, keep, policy, to_go):
     k[last] = end_model(hessian, gradient, value, states[steps], S[last], s[last])
     for t in range(steps - 1, -1, -1):
         at, x, u = t * keep, states[t], controls[t]
-        step_jacobian(x, u, model, model.dt, arrived, jacobian)
-        ahead += cost_quadratic(x, u, t, model.stage, hessian, gradient)
+        ahead += stated_quadratic(x, u, t, model.stage, share, hessian, gradient)
+        if share > 0:
+            for i in range(N):
+                weights[i] = share * slope[i]
+            step_second_order(x, u, model, weights, arrived, jacobian, hessian)
+        else:
+            step_jacobian(x, u, model, model.dt, arrived, jacobian)
         if NOISY:
             beyond = Ahead(jacobian, arrived, curve, s[(t + 1) * keep])
+            if share > 0:
+                beyond = Ahead(jacobian, arrived, known.hessian[t + 1], known.gradient[t + 1])
             ahead += noise_quadratic(x, u, model.noise, beyond, False, stage)
         congruence(jacobian, curve, slope, hessian, gradient)
         for i in range(M):
@@ -116,14 +128,21 @@ def differential_pass(steps, plan, model, damping, keep, policy, to_go):
     return -1, True, predicted
 
 
-def initial_step(x0, model, to_go, direction):
+def stated_quadratic(x, u, t, cost, share, hessian, gradient):
+    """Write the quadratic model of a cost, with that share of the second order; return its value."""
+    if share > 0:
+        return cost_second_order(x, u, t, cost, share, hessian, gradient)
+    return cost_quadratic(x, u, t, cost, hessian, gradient)
+
+
+def initial_step(x0, model, share, to_go, direction):
     """Write where the soft start x0 would best move, given the cost-to-go at 0; return what that promises, or NaN."""
     S, s = to_go.hessian[0], to_go.gradient[0]
     hessian, gradient, none = stack(W, W), stack(W), stack(M)
     total, slope = stack(N, N), stack(N)
     for i in range(M):
         none[i] = 0.0
-    cost_quadratic(x0, none, 0, model.initial, hessian, gradient)
+    stated_quadratic(x0, none, 0, model.initial, share, hessian, gradient)
     for i in range(N):
         slope[i] = gradient[i] + s[i]
         for j in range(N):
@@ -179,8 +198,9 @@ def dynamics_residual(steps, x_hats, policy, model, states):
     return residual
 
 
-def line_search(steps, shift, work, model, bound, smallest, trial):
-    """Try steps 1, 1/2, 1/4, ... along the changes of start and controls until the merit falls below `bound`.
+def line_search(steps, shift, work, model, bound, slope, smallest, trial):
+    """Try steps 1, 1/2, 1/4, ... along the changes of start and controls until the merit falls below `bound`, by that
+    part of `slope` too.
 
     The changes are from the plan, by the policy in the workspace. The merit is the true cost, expected where there is
     noise, and what the augmented Lagrangian adds to it. Writes the trajectory. Returns its merit, its cost, and the
@@ -206,7 +226,7 @@ def line_search(steps, shift, work, model, bound, smallest, trial):
         if NOISY:
             cost += noise_cost(steps, trial, model, work.to_go)
         added += cost_added(trial.states[steps], trial.controls[steps - 1], steps, model.final)
-        if cost + added < bound:
+        if cost + added < bound - fraction * slope:
             return cost + added, cost, fraction
         fraction *= 0.5
     return bound, bound, 0.0

@@ -26,7 +26,13 @@ from lqrsim.errors import (
     excerpt,
     numbers_of,
 )
-from lqrsim.kernels import finite_differences, function_dynamics, runge_kutta
+from lqrsim.kernels import (
+    curvature_differences,
+    finite_differences,
+    function_dynamics,
+    runge_kutta,
+    step_curvature,
+)
 from lqrsim.results.coordinates import Coordinates
 
 Limits = tuple[npt.ArrayLike, npt.ArrayLike]
@@ -167,7 +173,11 @@ class Dynamics:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is derived and cannot be pickled."""
-        return {name: value for name, value in vars(self).items() if name not in ("_plain", "disturbed", "compiled")}
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if name not in ("_plain", "disturbed", "compiled", "step_curvature")
+        }
 
     @property
     def name(self) -> str:
@@ -199,7 +209,7 @@ class Dynamics:
         if self.disturbances.keys() <= self.parameters.keys():
             return self
         other = copy.copy(self)
-        for name in ("source", "step_source", "compiled"):
+        for name in ("source", "step_source", "compiled", "curvature_source", "step_curvature"):
             vars(other).pop(name, None)
         other.parameters = self.parameters | self.disturbances
         return other
@@ -244,6 +254,32 @@ class Dynamics:
         n, m = len(self.state_coordinates), len(self.control_coordinates)
         return module_of(self.step_source, f"{self.name} ({n} states, {m} controls)", N=n, M=m, W=n + m)
 
+    @cached_property
+    def curvature_source(self) -> Source | None:
+        """Source of `step_curvature`, as `kernels/step_curvature.py` has it; None where that is zero everywhere."""
+        if self.level != "symbolic":
+            return source_of(curvature_differences).filled(rate=self.source, rate_jacobian=self.source)
+        names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
+        details = ("second derivatives", *names, *self.constants.items())
+        made = symbolic.kept(self.f, details, self._trace_curvature, source=str, support=list)
+        support = tuple(made["support"])
+        if not support:
+            return None
+        states = sum(i < len(self.state_coordinates) for i in support)
+        curved = text_source(made["source"], f"second derivatives of {self.name}(x, u, p)")
+        names = [name for name in ("rate_jacobian", "chain") if self.source.has(name)]
+        open_source = source_of(step_curvature, SUPPORT=support, K=len(support), STATES=states)
+        return open_source.filled(rate_curvature=curved, **dict.fromkeys(names, self.source))
+
+    @cached_property
+    def step_curvature(self) -> float:
+        """The address of the second derivatives of a step; 0 where they are zero everywhere. Compiles them."""
+        if self.curvature_source is None:
+            return 0.0
+        n, m = len(self.state_coordinates), len(self.control_coordinates)
+        module = module_of(self.curvature_source, f"{self.name} ({n} states, {m} controls)", N=n, M=m, W=n + m)
+        return module.addresses("step_curvature")[0]
+
     @property
     def constants(self) -> dict[str, float]:
         """The disturbances that are taken for granted."""
@@ -267,6 +303,27 @@ class Dynamics:
                 symbolic.write_chain(n, slopes),
             ]
         )
+
+    def _trace_curvature(self) -> dict[str, Any]:
+        """Source of `rate_curvature` of `kernels/declarations.py`, and in which entries of (x, u) f is curved."""
+        import sympy
+
+        n, m = len(self.state_coordinates), len(self.control_coordinates)
+        rates, x, u = symbolic.trace(self.f, n, m, list(self.parameters), constants=self.constants)
+        z = [*x, *u]
+        total = sum(sympy.Symbol(f"w{i}", real=True) * rate for i, rate in enumerate(rates))
+        slopes = [sympy.diff(total, one) for one in z]
+        curves = {(i, j): slopes[i].diff(z[j]) for i in range(n + m) for j in range(i, n + m)}
+        curves = {pair: curve for pair, curve in curves.items() if curve != 0}
+        support = sorted({i for pair in curves for i in pair})
+        place = {i: k for k, i in enumerate(support)}
+        values = {f"curve[{place[i]}, {place[j]}]": curve for (i, j), curve in curves.items()}
+        values |= {f"curve[{place[j]}, {place[i]}]": curve for (i, j), curve in curves.items()}
+        of = f"{self.name}(x, u, p)"
+        return {
+            "source": symbolic.write_function("rate_curvature", "x, u, p, w, curve", "p", values, of=of),
+            "support": support,
+        }
 
     def period_near(self, dt: float) -> float:
         """The possible duration of a step nearest to `dt`: `dt` itself, except where MuJoCo does the steps.

@@ -119,6 +119,11 @@ class MjcfDynamics(Dynamics):
             other._set_mjcf(with_numbers(self.xml, self.physics.model, stated, self.name))
         return other
 
+    @cached_property
+    def curvature_source(self) -> Source | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """None: MuJoCo has no second derivatives, and differences of its first ones are mostly rounding."""
+        return None
+
     def period_near(self, dt: float) -> float:
         """The whole number of physics steps nearest to `dt`, in seconds."""
         timestep = float(self.physics.model.opt.timestep)

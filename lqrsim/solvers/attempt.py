@@ -18,6 +18,10 @@ from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.workspace import Workspace
 
 MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # attempts, and bytes of each, whose memory waits for the next solve
+# Newton's method takes over where the states of least total cost are so near to the rollout, relative to its range:
+# smoothing has then found the valley, and what is left is the way along it. Damped iterations, which come there slowly,
+# end where the cost falls by less than NEARLY, twice, with a gap below NEAR.
+VALLEY, NEARLY, NEAR = 0.2, 1e-2, 0.1
 _idle: "list[Attempt]" = []
 _lending = threading.Lock()
 
@@ -60,6 +64,8 @@ class Attempt:
     Attributes:
       initial_guess: where it starts from. work: its memory.
       termination: how it stands; its outcome is RUNNING until it has ended.
+      newton: whether Newton's method has the last iterations. final, rough: the tolerances of the answer, and of what
+        smoothing comes to; see `SmootherSettings`.
     """
 
     def __init__(
@@ -110,6 +116,9 @@ class Attempt:
         self.initial_guess = initial_guess
         self.work.memory["watched"] = float(self.settings.safeguard)
         self.termination = Termination((), declarations.RUNNING, False, -1, "")
+        settings, problem = self.settings, self.problem
+        self.newton, self.final, self.rough = settings.newton(problem), settings.final(problem), settings.rough(problem)
+        self._valley = VALLEY if self.newton else 0.0
         self._shares = initial_guess.prior.obstacles if initial_guess.prior is not None else ()
 
     @property
@@ -149,24 +158,64 @@ class Attempt:
         self._loop(*self._arguments(0, 0, self._log))
 
     def finish(self, *, each: bool, callback: Callback | None = None, look_back: bool = True) -> AttemptResult:
-        """The method, and its safeguard where that fails.
+        """The method, Newton's where that has found the valley, and its safeguard where it fails.
 
         With `look_back`, what is stopped has the best plan so far; it takes another pass to make its policy.
         """
         settings = self.settings
         self.run(settings.max_iterations, each=each, callback=callback)
+        if self.termination.outcome == declarations.IN_VALLEY:
+            kept = self._kept()
+            found = self.descend(self.termination.iterations, each=each, callback=callback)
+            if found.success or self.stop.due or not self.iterations_left(found.iterations):
+                return found
+            self._go_on(kept, found.iterations)
+            self.run(settings.max_iterations, each=each, callback=callback)
         termination = check_outcome(
             self.problem, self.termination, self.work.start, self.initial_guess.offset[0], refuse=each
         )
         lost = termination is not self.termination  # a function that is not finite at the start: nothing can help
         found = self.result(termination)
-        if lost or found.success:
+        if lost or (found.success and not self.newton):
             return found
         if termination.outcome == declarations.TIMED_OUT or (
             settings.safeguard and self.iterations_left(found.iterations) == 0
         ):
             return self.best(found) if look_back else found
+        if found.success:
+            return self.descend(found.iterations, each=each, callback=callback)
         return self.rescue(found, each=each, callback=callback) if settings.safeguard else found
+
+    def descend(
+        self, before: tuple[Iteration, ...], *, each: bool, callback: Callback | None, detail: str = ""
+    ) -> AttemptResult:
+        """Newton's method from the best plan so far, which took these iterations."""
+        work, log = self.work, self._log[len(before) :]
+        last, trial = len(log), Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
+        work.memory["merit"], work.memory["share"] = work.memory["plan_cost"], -1.0
+        done = iterate(
+            self.problem, lambda first, to: self._loop(*self._newton_arguments(first, to, log, last, trial)), log, last,
+            before=before, look=lambda: self._violation_of(work.plan), each=each, stop=self.stop, callback=callback,
+        )  # fmt: skip
+        if done.outcome == declarations.STALLED:
+            detail = f"{detail}; Newton's method comes no further".removeprefix("; ")
+        return self.damped_result(done, done.status, detail)
+
+    def _kept(self) -> list[Array]:
+        """Copies of what smoothing goes on from."""
+        return [array.copy() for array in self._going_on]
+
+    def _go_on(self, kept: list[Array], iterations: tuple[Iteration, ...]) -> None:
+        """Have smoothing go on from there, after iterations of Newton's method that came to nothing."""
+        for array, copy in zip(self._going_on, kept, strict=True):
+            array[...] = copy
+        self._valley = 0.0
+        self.termination = replace(self.termination, iterations=iterations, outcome=declarations.RUNNING)
+
+    @property
+    def _going_on(self) -> tuple[Array, ...]:
+        arrays = self.work.arrays
+        return *arrays.policy, *arrays.kept, *arrays.to_go, arrays.x_hat
 
     def iterations_left(self, iterations: tuple[Iteration, ...]) -> int:
         """How many iterations may still follow these."""
@@ -216,15 +265,32 @@ class Attempt:
         """The safeguard: iterations from the best plan so far."""
         work, detail = self.work, f"the undamped method failed ({found.detail or found.status.meaning})"
         work.memory["merit"] = work.memory["plan_cost"]
-        damped = self.run_damped(before=found.iterations, each=each, callback=callback)
+        damped, before = None, found.iterations
+        for least in ((NEARLY, NEAR), (0.0, 0.0)) if self.newton else ((0.0, 0.0),):
+            damped = self.run_damped(before=before, least=least, each=each, callback=callback)
+            before = damped.iterations
+            if not (self.newton and damped.success) or self.stop.due or not self.iterations_left(before):
+                break
+            found = self.descend(before, each=each, callback=callback, detail=detail)
+            if found.success or self.stop.due or not self.iterations_left(found.iterations):
+                return found
+            before = found.iterations
+        assert damped is not None
         if not np.isfinite(work.memory["plan_cost"]):
             # Nothing that was tried leads anywhere. What is left is how it failed.
             status = Status.DIVERGED if found.status is Status.MAX_ITERATIONS else found.status
             return replace(found, status=status, detail=detail, iterations=damped.iterations, values={})
+        if self.newton and damped.success:
+            return found
         status = damped.status
         if damped.outcome == declarations.STALLED:
             status, detail = self.termination.status, f"{detail}; from the best plan, no step lowers the cost any more"
         return self.damped_result(damped, status, detail)
+
+    def law_about_plan(self) -> tuple[Array, Array]:
+        """Gain and offset that make the plan in the memory, by the last pass about it."""
+        gain, (states, controls) = self.work.arrays.policy.gain, self.work.plan
+        return gain, controls - np.einsum("tij,tj->ti", gain, states[:-1])
 
     def run_damped(
         self,
@@ -299,7 +365,7 @@ class Attempt:
             self.problem, lambda task, to_go, out: self._loop(*self._check_arguments(task, found, to_go, out)),
             found.states, value, violation=violation, kept=self.work.keeps(values),
             claimed=found.iterations[-1].cost if found.success else None,
-            tolerance=self.settings.tolerance if found.status is Status.CONVERGED else None,
+            tolerance=self.final if found.status is Status.CONVERGED else None,
         )  # fmt: skip
         cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
         found = replace(found, certificate=certificate, cost=cost, violation=violation)
@@ -335,14 +401,14 @@ class Attempt:
         """What the loop takes, for the iterations from `first` up to `last`, or fewer: of a continuation, one."""
         settings, work = self.settings, self.work
         share = 1.0 if again else self._obstacle_share(first)
-        tolerance = settings.tolerance
+        tolerance, valley = self.rough, 0.0 if again else self._valley
         if share != 1:
             last = min(last, first + 1)
-            tolerance = 0.0  # what is not all of the cost does not settle
+            tolerance = valley = 0.0  # what is not all of the cost does not settle
         guided = self.initial_guess.trajectory is not None and settings.first_pass == "forward" and not again
         prior, count = (work.no_prior, 0) if again else (work.prior, work.prior_iterations)
         options = self._settings(len(log), tolerance, settings.gap_tolerance)._replace(
-            guided=guided, prior_iterations=count
+            guided=guided, prior_iterations=count, valley=valley
         )
         arrays = work.arrays._replace(eased=work.eased(share), prior=prior)
         return declarations.ITERATE, first, last, options, work.model, arrays, work.memory_rows, log
@@ -352,9 +418,16 @@ class Attempt:
     ) -> tuple[Any, ...]:
         """What it takes for damped iterations, of which there are to be `most`; `trial` is written to on the way."""
         settings, work = self.settings, self.work
-        options = self._settings(most, max(settings.tolerance, least[0]), max(settings.gap_tolerance, least[1]))
+        options = self._settings(most, max(self.rough, least[0]), max(settings.gap_tolerance, least[1]))
         arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
         return declarations.DAMP, first, last, options, work.model, arrays, work.memory_rows, log
+
+    def _newton_arguments(self, first: int, last: int, log: Rows, most: int, trial: Plan) -> tuple[Any, ...]:
+        """What it takes for Newton iterations, of which there are to be `most`; `trial` is written to on the way."""
+        settings, work = self.settings, self.work
+        options = self._settings(most, self.final, settings.gap_tolerance)
+        arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
+        return declarations.FINISH, first, last, options, work.model, arrays, work.memory_rows, log
 
     def _check_arguments(self, task: int, found: AttemptResult, to_go: CostToGo, certificate: Rows) -> tuple[Any, ...]:
         """What it takes to certify a plan and its policy, with this cost-to-go."""
@@ -363,7 +436,7 @@ class Attempt:
             to_go=to_go, rollout=Plan(found.states, found.controls),
             kept=Policy(*found.law), certificate=certificate,
         )  # fmt: skip
-        options = self._settings(0, settings.tolerance, settings.gap_tolerance)
+        options = self._settings(0, self.final, settings.gap_tolerance)
         return task, 0, 0, options, work.model, arrays, work.memory_rows, self._log
 
     def _settings(self, most: int, tolerance: float, gap_tolerance: float) -> Settings:

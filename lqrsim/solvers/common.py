@@ -50,6 +50,7 @@ _STATUS = {
     declarations.NO_PROGRESS: Status.MAX_ITERATIONS,
     declarations.TIMED_OUT: Status.TIME_LIMIT,
     declarations.RISK_TOO_HIGH: Status.RISK_TOO_HIGH,
+    declarations.IN_VALLEY: Status.MAX_ITERATIONS,
 }
 
 
@@ -58,8 +59,10 @@ _METHODS = {
     declarations.DAMPED: "damped",
     declarations.REJECTED: "rejected",
     declarations.ILQR: "ilqr",
+    declarations.NEWTON: "newton",
 }
 MOST_STARTS, MOST_THREADS = 10_000, 1024
+ROUGH, FINE = 1e-4, 1e-8  # the tolerances of smoothing and of Newton's method, by default
 ATTENTION = 0.1  # s, after which compiled code comes back to heed Ctrl-C
 
 
@@ -68,7 +71,7 @@ class Settings:
     """When to stop, and from where to start; see `ilqr` for what each means."""
 
     stop: str
-    tolerance: float
+    tolerance: float | None
     max_iterations: int
     time_limit: float | None
     start: StartLike
@@ -78,7 +81,8 @@ class Settings:
         if callable(self.start) and not isinstance(self.start, AffinePolicy):
             check_function("start", self.start, "a function of a Problem, or what it returns", arguments=1)
         # What is kept is plain Python's: NumPy's numbers would be other types for the compiler, and not for JSON.
-        object.__setattr__(self, "tolerance", check_number("tolerance", self.tolerance, above=0.0))
+        if self.tolerance is not None:
+            object.__setattr__(self, "tolerance", check_number("tolerance", self.tolerance, above=0.0))
         # The log of so many takes 48 MB.
         most = check_count("max_iterations", self.max_iterations, at_most=1_000_000)
         object.__setattr__(self, "max_iterations", most)
@@ -110,9 +114,11 @@ class SmootherSettings(Settings):
     starts: int | None
     constraint_tolerance: float
     penalty: float | None = None
+    finish: str | None = "newton"
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_name("finish", self.finish or "newton", ("newton",))
         if self.starts is not None:
             object.__setattr__(self, "starts", check_count("starts", self.starts, at_most=MOST_STARTS))
             if self.starts > 1 and self.start is not None:
@@ -131,6 +137,19 @@ class SmootherSettings(Settings):
     @property
     def core_form(self) -> str:
         return self.form
+
+    def newton(self, problem: Problem) -> bool:
+        """Whether Newton's method has the last iterations. With "cost", the paper's test ends the paper's method."""
+        return self.finish is not None and self.stop == "optimal" and not problem.constraints
+
+    def final(self, problem: Problem) -> float:
+        """What the optimality of the answer is to be below."""
+        return self.tolerance or (FINE if self.newton(problem) else ROUGH)
+
+    def rough(self, problem: Problem) -> float:
+        """The same of what smoothing comes to: where Newton's method goes on from there, it need not be less."""
+        final = self.final(problem)
+        return max(final, ROUGH) if self.newton(problem) else final
 
 
 @dataclass

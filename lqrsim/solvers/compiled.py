@@ -78,17 +78,18 @@ def structure(problem: Problem) -> tuple[Any, ...]:
 _FIELDS = ("initial", "stage_cost", "final_cost")
 
 
-def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> Model:
+def arguments(problem: Problem, *, multipliers: Sequence[Array] = (), second_order: bool = False) -> Model:
     """The problem as the passes take it; compiles what it brings, if that is new.
 
     Args:
       multipliers: of each constraint, as `augmented_lagrangian.py` has them; by default none act.
+      second_order: whether second derivatives of the dynamics are wanted, too.
     """
     multipliers = multipliers or [no_multipliers(problem, term) for term in problem.constraint_terms]
     pairs = list(zip(problem.constraint_terms, multipliers, strict=True))
     space, term = problem.control_coordinates, problem.noise_term
     return Model(
-        dynamics_model(problem.dynamics), float(problem.dt),
+        dynamics_model(problem.dynamics, second_order=second_order), float(problem.dt),
         initial=_cost(problem, "initial", []), stage=_cost(problem, "stage_cost", pairs),
         final=_cost(problem, "final_cost", [pair for pair in pairs if not pair[0].uses_control]),
         limits=Limits(np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64)),
@@ -96,10 +97,11 @@ def arguments(problem: Problem, *, multipliers: Sequence[Array] = ()) -> Model:
     )  # fmt: skip
 
 
-def dynamics_model(dynamics: Dynamics) -> DynamicsModel:
-    """Dynamics as compiled code takes them."""
+def dynamics_model(dynamics: Dynamics, *, second_order: bool = False) -> DynamicsModel:
+    """Dynamics as compiled code takes them, with second derivatives where these are wanted."""
     advance, step_jacobian = dynamics.compiled.addresses("advance", "step_jacobian")
-    return DynamicsModel(advance, step_jacobian, 0.0, numbers(dynamics))
+    curvature = dynamics.step_curvature if second_order else 0.0
+    return DynamicsModel(advance, step_jacobian, curvature, numbers(dynamics))
 
 
 def numbers(part: Dynamics | Term | ConstraintTerm) -> Array:

@@ -138,6 +138,7 @@ def _check(problem: Problem, settings: Settings) -> None:
 def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callback | None = None) -> Solution:
     """Solve; with `each`, a look after each iteration (see `iterate`)."""
     assert problem.start is not None
+    assert settings.tolerance is not None
     initial_guess = resolve(settings.start, problem)
     if initial_guess.prior is not None:  # of a function, too
         raise InputError(_NO_PRIOR)

@@ -25,10 +25,11 @@ ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
 def prepare(
     problem: Problem,
     *,
-    tolerance: float = 1e-4,
+    tolerance: float | None = None,
     gap_tolerance: float = 1e-3,
     constraint_tolerance: float = 1e-3,
     max_iterations: int = 100,
+    finish: str | None = "newton",
 ) -> "PreparedSolver":
     """Compile all that solving problems of this structure can need, now: nothing is compiled while a robot runs.
 
@@ -38,6 +39,7 @@ def prepare(
       gap_tolerance: as in `smooth`.
       constraint_tolerance: as in `smooth`.
       max_iterations: as in `smooth`.
+      finish: as in `smooth`.
 
     Returns:
       A PreparedSolver.
@@ -48,7 +50,7 @@ def prepare(
     settings = SmootherSettings(
         form="dual", first_pass="forward", safeguard=True, stop="optimal", tolerance=tolerance,
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=None, start=None, starts=1,
-        constraint_tolerance=constraint_tolerance,
+        constraint_tolerance=constraint_tolerance, finish=finish,
     )  # fmt: skip
     return PreparedSolver(problem, settings)
 
@@ -216,16 +218,19 @@ class _Best:
         self._copies: tuple[Array, ...] = ()
 
     def __call__(self, iteration: Iteration) -> None:
-        if iteration.optimality < self._attempt.settings.tolerance and iteration.violation == 0:
+        if iteration.optimality < self._attempt.final and iteration.violation == 0:
             return  # the last, most likely, and considered as such
-        if iteration.method == "smooth" and self._beaten_by(iteration.cost, iteration.violation):
+        if iteration.method in ("smooth", "newton") and self._beaten_by(iteration.cost, iteration.violation):
             arrays = self._work.arrays
-            there = *arrays.rollout, *arrays.kept, *arrays.to_go
+            if iteration.method == "newton":
+                there = *arrays.plan, *self._attempt.law_about_plan()
+            else:
+                there = *arrays.rollout, *arrays.kept, *arrays.to_go
             # The next iteration writes over these; and what is allocated anew each time is slow to write to.
-            self._copies = self._copies or tuple(np.empty_like(array) for array in there)
-            for copy, array in zip(self._copies, there, strict=True):
+            self._copies = self._copies or tuple(np.empty_like(array) for array in (*there, *arrays.to_go)[:7])
+            for copy, array in zip(self._copies, there, strict=False):
                 np.copyto(copy, array)
-            self._keep(iteration.cost, iteration.violation, self._copies)
+            self._keep(iteration.cost, iteration.violation, self._copies[: len(there)])
 
     def consider(self, found: AttemptResult) -> None:
         """What it ended with: that, if it converged and is as good; and if it is better in any case."""
@@ -249,4 +254,5 @@ class _Best:
     def _keep(self, cost: float, violation: float, arrays: tuple[Array, ...]) -> None:
         states, controls, gain, offset, *to_go = arrays
         self.cost, self.violation, self.improved = cost, violation, True
-        self.plan, self.law, self.cost_to_go = (states, controls), (gain, offset), Quadratic(*to_go)
+        self.plan, self.law = (states, controls), (gain, offset)
+        self.cost_to_go = Quadratic(*to_go) if to_go else None

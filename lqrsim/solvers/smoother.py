@@ -35,7 +35,7 @@ def smooth(
     first_pass: str = "forward",
     safeguard: bool = True,
     stop: str = "optimal",
-    tolerance: float = 1e-4,
+    tolerance: float | None = None,
     gap_tolerance: float = 1e-3,
     max_iterations: int = 500,
     time_limit: float | None = None,
@@ -43,6 +43,7 @@ def smooth(
     starts: int | None = None,
     constraint_tolerance: float = 1e-3,
     penalty: float | None = None,
+    finish: str | None = "newton",
     noise: Noise | None = None,
     risk: float | None = None,
     threads: int | None = None,
@@ -52,6 +53,7 @@ def smooth(
 
     Each iteration is a forward pass (cost-to-come), a backward pass (cost-to-go) and a rollout of the new policy; both
     passes linearise about the states of least total cost. No trajectory is needed to start from. Paper: Sec. V.
+    Once these states are near the rollout, Newton's method takes over.
 
     Which local optimum it ends in depends on the start. With an ObstacleCost, unless a start is given, several are
     tried for a few iterations each, and the most promising goes on; see `solvers/multistart.py`.
@@ -66,7 +68,8 @@ def smooth(
         `kernels/damped_iterations.py`. Where it converges, the safeguard changes nothing, to the last bit.
       stop: "optimal" (change of cost, gap and first-order optimality all within tolerance) or "cost", the paper's
         test, which looks at the change of cost alone and can pass early.
-      tolerance: of the relative change of cost, and of the optimality (see `Iteration`).
+      tolerance: of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8, and 1e-4
+        without Newton's method.
       gap_tolerance: of the gap (see `Iteration`).
       max_iterations: the most iterations that lead to the answer, the safeguard's and those with constraints included.
         Of a search, each start has as many.
@@ -84,6 +87,8 @@ def smooth(
         to 1e-6, or to this where it is smaller.
       penalty: the initial penalty of all constraints, in cost per square of their unit; they then act from the first
         iteration. It needs a start. By default they come in after a solve without them, with penalties from curvature.
+      finish: "newton" leaves the last iterations to Newton's method; see `kernels/newton_iterations.py`. None is the
+        paper's method to the end; so are `stop="cost"` and problems with constraints.
       noise: replaces the problem's own; see `Noise`. The cost is then an expectation, in the log, line searches and
         the choice among starts.
       risk: replaces the problem's own; see `Problem`.
@@ -100,7 +105,7 @@ def smooth(
     settings = SmootherSettings(
         form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start, starts=starts,
-        constraint_tolerance=constraint_tolerance, penalty=penalty,
+        constraint_tolerance=constraint_tolerance, penalty=penalty, finish=finish,
     )  # fmt: skip
     check_callback(callback)
     check_problem(problem)
@@ -118,7 +123,7 @@ def smooth_many(
     first_pass: str = "forward",
     safeguard: bool = True,
     stop: str = "optimal",
-    tolerance: float = 1e-4,
+    tolerance: float | None = None,
     gap_tolerance: float = 1e-3,
     max_iterations: int = 500,
     time_limit: float | None = None,
@@ -126,6 +131,7 @@ def smooth_many(
     starts: int | None = None,
     constraint_tolerance: float = 1e-3,
     penalty: float | None = None,
+    finish: str | None = "newton",
     noise: Noise | None = None,
     risk: float | None = None,
     progress: Callable[[int, int], object] | None = None,
@@ -151,6 +157,7 @@ def smooth_many(
       starts: as in `smooth`, for all.
       constraint_tolerance: as in `smooth`, for all.
       penalty: as in `smooth`, for all.
+      finish: as in `smooth`, for all.
       noise: as in `smooth`, for all.
       risk: as in `smooth`, for all.
       progress: called with how many are done, of how many, as each one ends.
@@ -165,7 +172,7 @@ def smooth_many(
     settings = SmootherSettings(
         form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start, starts=starts,
-        constraint_tolerance=constraint_tolerance, penalty=penalty,
+        constraint_tolerance=constraint_tolerance, penalty=penalty, finish=finish,
     )  # fmt: skip
     return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)
 
@@ -200,7 +207,8 @@ def _solve(
     assert found.certificate is not None
     detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
     solution = assemble(
-        problem, solver="smooth", options=settings.options(chosen.initial_guess), status=found.status,
+        problem, solver="smooth", options=settings.options(chosen.initial_guess) | {"tolerance": chosen.final},
+        status=found.status,
         detail=detail, iterations=found.iterations, states=found.states, controls=found.controls,
         law=found.law,
         certificate=found.certificate, gap=found.gap, candidates=search.candidates(), multipliers=found.multipliers,

@@ -77,7 +77,7 @@ class Workspace:
         for array, known in zip(multipliers, initial_guess.multipliers, strict=False):
             array[0], array[declarations.HEADER :] = known.penalty, known.values.ravel()
         self.multipliers = multipliers
-        self.model = compiled.arguments(problem, multipliers=multipliers)
+        self.model = compiled.arguments(problem, multipliers=multipliers, second_order=settings.newton(problem))
         arrays = self.arrays = self.arrays._replace(eased=self.model.stage, prior=self.prior)
         # All else is written before it is read.
         self.memory_rows[...] = 0.0

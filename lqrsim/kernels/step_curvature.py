@@ -1,0 +1,105 @@
+"""Second derivatives of a Runge-Kutta step, each state's times a weight. The kernels' subset.
+
+One sweep backwards through the stages tells what the weights of a step are for each of its rates; what these are curved
+by is then seen in the step's own states and controls, by the slopes of the stages.
+"""
+
+from lqrsim.kernels.declarations import M, N, W, rate_curvature, rate_jacobian, stack
+from lqrsim.kernels.linear_algebra import clear
+from lqrsim.kernels.runge_kutta import chain
+
+SUPPORT = (0,)  # the entries of (x, u) in which the rates are curved, states first
+K = 1  # how many these are
+STATES = 1  # how many of them are states
+
+
+def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
+    """Write a step and its Jacobian as `runge_kutta.py` does; add `sum_i weights[i] d2 out[i] / d(x, u)2`, (W, W)."""
+    k, z2, z3, z4, curve = stack(N), stack(N), stack(N), stack(N), stack(K, K)
+    fu, fx1, fx2, fx3, fx4 = stack(N, M), stack(N, N), stack(N, N), stack(N, N), stack(N, N)
+    slope1, slope2, slope3, slope4 = stack(N, W), stack(N, W), stack(N, W), stack(N, W)
+    w1, w2, w3, w4 = stack(N), stack(N), stack(N), stack(N)
+    clear(fu, N, M)
+    clear(fx1, N, N)
+    clear(fx2, N, N)
+    clear(fx3, N, N)
+    clear(fx4, N, N)
+    rate_jacobian(x, u, p, k, fx1, fu)
+    for i in range(N):
+        out[i] = k[i]
+        z2[i] = x[i] + 0.5 * h * k[i]
+        for j in range(N):
+            slope1[i, j] = fx1[i, j]
+        for j in range(M):
+            slope1[i, N + j] = fu[i, j]
+    rate_jacobian(z2, u, p, k, fx2, fu)
+    chain(fx2, fu, slope1, 0.5 * h, slope2)
+    for i in range(N):
+        out[i] += 2 * k[i]
+        z3[i] = x[i] + 0.5 * h * k[i]
+    rate_jacobian(z3, u, p, k, fx3, fu)
+    chain(fx3, fu, slope2, 0.5 * h, slope3)
+    for i in range(N):
+        out[i] += 2 * k[i]
+        z4[i] = x[i] + h * k[i]
+    rate_jacobian(z4, u, p, k, fx4, fu)
+    chain(fx4, fu, slope3, h, slope4)
+    for i in range(N):
+        out[i] = x[i] + h / 6 * (out[i] + k[i])
+        w4[i] = h / 6 * weights[i]
+        for j in range(W):
+            jacobian[i, j] = h / 6 * (slope1[i, j] + 2 * slope2[i, j] + 2 * slope3[i, j] + slope4[i, j])
+        jacobian[i, i] += 1
+    back(fx4, w4, h, h / 3, weights, w3)
+    back(fx3, w3, 0.5 * h, h / 3, weights, w2)
+    back(fx2, w2, 0.5 * h, h / 6, weights, w1)
+    clear(curve, K, K)
+    rate_curvature(x, u, p, w1, curve)
+    for a in range(K):
+        for b in range(K):
+            hessian[SUPPORT[a], SUPPORT[b]] += curve[a, b]
+    add_curvature(z2, u, p, w2, 0.5 * h, slope1, hessian)
+    add_curvature(z3, u, p, w3, 0.5 * h, slope2, hessian)
+    add_curvature(z4, u, p, w4, h, slope3, hessian)
+
+
+def back(fx, after, ahead, share, weights, before):
+    """Write the weights of a stage's rates, given those of the stage after it."""
+    for j in range(N):
+        total = 0.0
+        for i in range(N):
+            total += fx[i, j] * after[i]
+        before[j] = share * weights[j] + ahead * total
+
+
+def add_curvature(z, u, p, weights, ahead, slope, total):
+    """Add that of the rates at a stage (W, W); the stage's state is `x + ahead k`, `slope` (N, W) k's."""
+    curve, rows, product = stack(K, K), stack(STATES + 1, W), stack(K, W)
+    line = stack(W)  # and not a row of a matrix, so that it stays in registers
+    clear(curve, K, K)
+    rate_curvature(z, u, p, weights, curve)
+    for a in range(STATES):
+        for j in range(W):
+            rows[a, j] = ahead * slope[SUPPORT[a], j]
+        rows[a, SUPPORT[a]] += 1
+    for a in range(K):
+        for j in range(W):
+            line[j] = 0.0
+        for b in range(STATES):
+            for j in range(W):
+                line[j] += curve[a, b] * rows[b, j]
+        for b in range(STATES, K):  # controls are held: their rows are those of the identity
+            line[SUPPORT[b]] += curve[a, b]
+        for j in range(W):
+            product[a, j] = line[j]
+    for i in range(W):
+        for j in range(W):
+            line[j] = total[i, j]
+        for a in range(STATES):
+            for j in range(W):
+                line[j] += rows[a, i] * product[a, j]
+        for j in range(W):
+            total[i, j] = line[j]
+    for a in range(STATES, K):
+        for j in range(W):
+            total[SUPPORT[a], j] += product[a, j]
