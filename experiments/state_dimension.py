@@ -44,8 +44,8 @@ ROBOTS = ("drive", "quadrotor")
 AS_THEY_ARE, EQUAL = "with their obstacles", "without obstacles"
 DUAL, PRIMAL, ILQR = "smoothing, dual form", "smoothing, primal form", "iLQR"
 SOLVERS: dict[str, Callable[..., ls.Solution]] = {
-    DUAL: partial(ls.smooth, safeguard=False),
-    PRIMAL: partial(ls.smooth, safeguard=False, form="primal"),
+    DUAL: partial(ls.smooth, safeguard=False, finish=None),
+    PRIMAL: partial(ls.smooth, safeguard=False, finish=None, form="primal"),
     ILQR: ls.ilqr,
 }
 MARKERS = {DUAL: "o", PRIMAL: "s", ILQR: "D"}

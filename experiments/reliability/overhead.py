@@ -23,7 +23,12 @@ def measure(config: Config) -> dict[str, Any]:
             for _ in range(config.rounds):
                 for safeguard in order:
                     clock = time.perf_counter()
-                    options: dict[str, Any] = {"threads": 1, "safeguard": safeguard, "start": paper_start()}
+                    options: dict[str, Any] = {
+                        "threads": 1,
+                        "safeguard": safeguard,
+                        "start": paper_start(),
+                        "finish": None,
+                    }
                     (solutions[safeguard],) = ls.smooth_many([problem], **options)
                     seconds[safeguard].append(time.perf_counter() - clock)
                 order.reverse()

@@ -16,7 +16,7 @@ Job = TypeVar("Job")
 Taken = TypeVar("Taken")
 Section = Literal["speed", "peers", "scaling", "threads", "startup"]
 # The smoother as in the paper, which is what the reference does.
-PAPER = partial(ls.smooth_many, start=ls.scenarios.quadrotor().paper_start)
+PAPER = partial(ls.smooth_many, start=ls.scenarios.quadrotor().paper_start, finish=None)
 MANY: dict[str, Callable[..., list[ls.Solution]]] = {"smooth": PAPER, "ilqr": ls.ilqr_many}
 PRIMAL = {"primal": partial(PAPER, form="primal")}  # the form that the reference has
 

@@ -18,7 +18,10 @@ import lqrsim as ls
 from solver_benchmark.common import MANY, Config, median, progress
 
 # As many iterations as are asked for, and no safeguard that goes on after.
-SOLVERS: dict[str, Callable[..., ls.Solution]] = {"smooth": partial(ls.smooth, safeguard=False), "ilqr": ls.ilqr}
+SOLVERS: dict[str, Callable[..., ls.Solution]] = {
+    "smooth": partial(ls.smooth, safeguard=False, finish=None),
+    "ilqr": ls.ilqr,
+}
 
 
 def measure(config: Config) -> dict[str, Any]:

@@ -18,7 +18,7 @@ NOISES = {
     "quadrotor, gusts, risk": (quadrotor, gusts(0.02), 0.05),
 }
 SOLVERS = {
-    "smoother": lambda problem: ls.smooth_many([problem] * 5, starts=1, threads=1),
+    "smoother": lambda problem: ls.smooth_many([problem] * 5, starts=1, threads=1, finish=None),
     "iLQR": lambda problem: ls.ilqr_many([problem] * 5, threads=1),
 }
 

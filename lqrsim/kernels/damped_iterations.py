@@ -22,7 +22,7 @@ from lqrsim.kernels.declarations import (
 )
 from lqrsim.kernels.iterations import outcome_of, relative_improvement, relative_optimality, write_row
 from lqrsim.kernels.passes import backward_pass, copy, forward_pass, minimizers
-from lqrsim.kernels.records import Linearization
+from lqrsim.kernels.records import Linearization, Order
 from lqrsim.kernels.rollouts import (
     about_plan,
     differential_pass,
@@ -155,7 +155,7 @@ def relinearize(settings, settled, nothing, model, work, memory, row):
     Writes optimality and residual to the row of the log.
     """
     steps, plan, policy, to_go, shift = settings.steps, work.plan, work.policy, work.to_go, stack(N)
-    failed, _, left = differential_pass(steps, plan, model, 0.0, 0.0, 1, policy, to_go, to_go)
+    failed, _, left = differential_pass(steps, plan, model, Order(0.0, 0.0, to_go), 1, policy, to_go)
     if failed >= 0:
         return RUNNING, failed
     if NOISY:

@@ -32,7 +32,7 @@ from lqrsim.kernels.declarations import (
     stack,
 )
 from lqrsim.kernels.passes import backward_pass, copy, forward_pass
-from lqrsim.kernels.records import CostToGo, Linearization, Model, Policy, Prior
+from lqrsim.kernels.records import CostToGo, Linearization, Model, Order, Policy, Prior
 from lqrsim.kernels.rollouts import (
     differential_pass,
     dynamics_residual,
@@ -179,7 +179,7 @@ def optimality(settings, plan, model, cost, nothing):
     """What a linear-quadratic model about a trajectory promises, relative to its cost; infinite if there is none."""
     policy, to_go = Policy(stack(1, M, N), stack(1, M)), CostToGo(stack(1, N, N), stack(1, N), stack(1))
     shift = stack(N)
-    failed, _, left = differential_pass(settings.steps, plan, model, 0.0, 0.0, 0, policy, to_go, to_go)
+    failed, _, left = differential_pass(settings.steps, plan, model, Order(0.0, 0.0, to_go), 0, policy, to_go)
     if not settings.fixed:
         left += initial_step(plan.states[0], model, 0.0, to_go, shift)
     return relative_optimality(failed, left, cost, nothing)
@@ -230,14 +230,14 @@ def ilqr_iterations(first, last, settings, model, work, log):
             return 0, NO_START, False, -1
     cost = log[first - 1 if first > 0 else settings.max_iterations].cost
     if first == last:
-        failed, _, _ = differential_pass(steps, plan, model, 0.0, 0.0, 1, policy, to_go, to_go)
+        failed, _, _ = differential_pass(steps, plan, model, Order(0.0, 0.0, to_go), 1, policy, to_go)
         return last, RUNNING, failed >= 0, failed
     for done in range(first, last):
         damping[0] *= 0.1
-        failed, good, _ = differential_pass(steps, plan, model, damping[0], 0.0, 1, policy, to_go, to_go)
+        failed, good, _ = differential_pass(steps, plan, model, Order(damping[0], 0.0, to_go), 1, policy, to_go)
         while failed >= 0 and good and damping[0] < 1e25:
             damping[0] = max(10 * damping[0], 1.0)
-            failed, good, _ = differential_pass(steps, plan, model, damping[0], 0.0, 1, policy, to_go, to_go)
+            failed, good, _ = differential_pass(steps, plan, model, Order(damping[0], 0.0, to_go), 1, policy, to_go)
         if failed >= 0:
             return done, failure(good, model), True, failed
         if not damping[0] > 1.0:
@@ -252,7 +252,7 @@ def ilqr_iterations(first, last, settings, model, work, log):
         settled = abs(improvement) < settings.tolerance
         left = nan
         if settled or done + 1 == settings.max_iterations:
-            failed, _, left = differential_pass(steps, plan, model, 0.0, 0.0, 1, policy, to_go, to_go)
+            failed, _, left = differential_pass(steps, plan, model, Order(0.0, 0.0, to_go), 1, policy, to_go)
             if NOISY:
                 cost, _ = plan_cost(steps, plan, model, to_go)
             left = relative_optimality(failed, left, cost, 0.0)
@@ -262,6 +262,6 @@ def ilqr_iterations(first, last, settings, model, work, log):
             outcome = STALLED
         if outcome != RUNNING:
             if isnan(left):  # not worked out; but policy and cost-to-go are to be about the trajectory that was found
-                failed, _, _ = differential_pass(steps, plan, model, 0.0, 0.0, 1, policy, to_go, to_go)
+                failed, _, _ = differential_pass(steps, plan, model, Order(0.0, 0.0, to_go), 1, policy, to_go)
             return done + 1, outcome, failed >= 0, failed
     return last, RUNNING, False, -1

@@ -22,7 +22,7 @@ from lqrsim.kernels.declarations import (
 )
 from lqrsim.kernels.iterations import failure, relative_improvement, relative_optimality, write_row
 from lqrsim.kernels.passes import copy
-from lqrsim.kernels.records import CostToGo
+from lqrsim.kernels.records import CostToGo, Order
 from lqrsim.kernels.rollouts import differential_pass, initial_step, keep_plan, line_search
 
 # The shares that are tried where a pass with more of the second order has no minimum.
@@ -94,7 +94,7 @@ def newton_pass(settings, model, work, memory):
     failed, good, left = -1, True, nan
     second = CostToGo(work.to_come.matrix, work.to_come.vector, work.to_come.constant)
     if NOISY:  # what noise costs is what smoothing takes it to cost
-        failed, good, _ = differential_pass(steps, plan, model, 0.0, 0.0, 1, work.kept, work.to_go, work.to_go)
+        failed, good, _ = differential_pass(steps, plan, model, Order(0.0, 0.0, work.to_go), 1, work.kept, work.to_go)
         memory.failed = failed
         if failed >= 0:
             return good
@@ -102,9 +102,8 @@ def newton_pass(settings, model, work, memory):
     for k in range(len(SHARES)):
         share = SHARES[k]
         if share <= begin:
-            failed, good, left = differential_pass(
-                steps, plan, model, 0.0, share, 1, work.policy, second, work.to_go
-            )  # fmt: skip
+            order = Order(0.0, share, work.to_go)
+            failed, good, left = differential_pass(steps, plan, model, order, 1, work.policy, second)
             copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
             if failed < 0 and not settings.fixed:
                 left += initial_step(plan.states[0], model, share, second, shift)
@@ -140,7 +139,6 @@ def come_to_plan(settings, model, work, memory, row):
 def value_functions(settings, model, work, memory, row):
     """Make those of the plan, without the second order; the policy becomes one that makes the plan."""
     if not NOISY:
-        differential_pass(
-            settings.steps, work.plan, model, 0.0, 0.0, 1, work.kept, work.to_go, work.to_go
-        )  # fmt: skip
+        order = Order(0.0, 0.0, work.to_go)
+        differential_pass(settings.steps, work.plan, model, order, 1, work.kept, work.to_go)
     model_come_to(settings, model, work, memory, row)

@@ -149,6 +149,19 @@ class Linearization(NamedTuple):
     prior: Prior
 
 
+class Order(NamedTuple):
+    """What the models of a pass about a plan are made of.
+
+    `damping` is a weight on changes of the controls. `share` is how much of the second order there is: 0 for the models
+    of iLQR, with costs projected and dynamics linearised; 1 for those of Newton's method, the Hessians of costs as they
+    are and that of the dynamics times the costate. Noise is then weighed by a cost-to-go that is `known`.
+    """
+
+    damping: float
+    share: float
+    known: CostToGo
+
+
 class Step(NamedTuple):
     """A linearised step: [A B] (N, W) and c (N,)."""
 

@@ -65,19 +65,16 @@ def plan_cost(steps, plan, model, to_go):
     return cost + noise_cost(steps, plan, model, to_go), added
 
 
-def differential_pass(steps, plan, model, damping, share, keep, policy, to_go, known):
+def differential_pass(steps, plan, model, order, keep, policy, to_go):
     """The backward pass of iLQR about a feasible trajectory; the policy is relative to it, the cost-to-go is about the
     origin.
 
-    `share` is how much of the second order there is in the models: 0 for those of iLQR, with costs projected and
-    dynamics linearised; 1 for those of Newton's method, the Hessians of costs as they are and that of the dynamics
-    times the costate. Noise is then weighed by a cost-to-go that is `known`. `damping` is a weight on changes of the
-    controls. With `keep` of 1 all steps are written; with 0 each overwrites the one after it, for those who only ask
-    what the model predicts.
+    With `keep` of 1 all steps are written; with 0 each overwrites the one after it, for those who only ask what the
+    model predicts.
 
     Returns as every pass does, and the decrease of cost that the linear-quadratic model predicts.
     """
-    stage, arrived, weights = Stage(stack(W, W), stack(W)), stack(N), stack(N)
+    share, stage, arrived, weights = order.share, Stage(stack(W, W), stack(W)), stack(N), stack(N)
     jacobian, none, no_change = stack(N, W), stack(M), stack(N)
     slope, curve = stack(N), stack(N, N)
     hessian, gradient, room = stage.hessian, stage.gradient, Limits(stack(M), stack(M))
@@ -106,11 +103,11 @@ def differential_pass(steps, plan, model, damping, share, keep, policy, to_go, k
         if NOISY:
             beyond = Ahead(jacobian, arrived, curve, s[(t + 1) * keep])
             if share > 0:
-                beyond = Ahead(jacobian, arrived, known.hessian[t + 1], known.gradient[t + 1])
+                beyond = Ahead(jacobian, arrived, order.known.hessian[t + 1], order.known.gradient[t + 1])
             ahead += noise_quadratic(x, u, model.noise, beyond, False, stage)
         congruence(jacobian, curve, slope, hessian, gradient)
         for i in range(M):
-            hessian[N + i, N + i] += damping
+            hessian[N + i, N + i] += order.damping
             room.low[i], room.high[i] = model.limits.low[i] - u[i], model.limits.high[i] - u[i]
         decrease, good = minimize_within(stage, no_change, room, policy.gain[at], policy.offset[at], curve, slope)
         if not good:
