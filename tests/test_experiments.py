@@ -82,7 +82,7 @@ def test_benchmark_of_peers_recomputes_what_they_claim(results: dict[str, Any]) 
     if "skipped" in peers:
         assert "installed" in peers["skipped"]
         pytest.skip(peers["skipped"])
-    assert set(peers) == {"smooth, hover", "ilqr, hover", "FDDP, hover", "FDDP, line"}
+    assert set(peers) == {"smooth, hover", "Newton, hover", "ilqr, hover", "FDDP, hover", "FDDP, line"}
     for found in peers.values():
         assert found["converged"] == [True, True]
         assert found["cost_difference"] < 1e-8

@@ -5,6 +5,7 @@ import time
 from collections import namedtuple
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.problem.costs import terms_of
 from solver_benchmark.by_hand import compiled, quadrotor_rate
-from solver_benchmark.common import MANY, Config, make_problems, median, take_turns
+from solver_benchmark.common import MANY, PAPER, Config, make_problems, median, take_turns
 
 
 @dataclass(frozen=True)
@@ -36,10 +37,10 @@ def measure(config: Config) -> dict[str, Any]:
     problems = [exactly(problem) for problem in make_problems(config)]
     crocoddyl = peers.Crocoddyl(problems[0])
 
-    def ours(solver: str) -> Callable[[ls.Problem], Solved]:
+    def ours(solver: Callable[..., list[ls.Solution]], stop: str = "cost") -> Callable[[ls.Problem], Solved]:
         def run(problem: ls.Problem) -> Solved:
             clock = time.perf_counter()
-            (solution,) = MANY[solver]([problem], threads=1, stop="cost")
+            (solution,) = solver([problem], threads=1, stop=stop)
             seconds, policy = time.perf_counter() - clock, solution.policy
             return Solved(
                 seconds, len(solution.iterations), solution.success, policy.gain, policy.offset, solution.cost
@@ -58,8 +59,9 @@ def measure(config: Config) -> dict[str, Any]:
         return run
 
     contestants = {
-        "smooth, hover": ours("smooth"),
-        "ilqr, hover": ours("ilqr"),
+        "smooth, hover": ours(MANY["smooth"]),
+        "Newton, hover": ours(partial(PAPER, finish="newton"), "optimal"),
+        "ilqr, hover": ours(MANY["ilqr"]),
         "FDDP, hover": theirs(crocoddyl.from_hover),
         "FDDP, line": theirs(crocoddyl.from_line),
     }
