@@ -121,7 +121,7 @@ class MjcfDynamics(Dynamics):
 
     @cached_property
     def curvature_source(self) -> Source | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """None: MuJoCo has no second derivatives, and differences of its first ones are mostly rounding."""
+        """None: MuJoCo has no second derivatives."""
         return None
 
     def period_near(self, dt: float) -> float:

@@ -88,7 +88,7 @@ def smooth(
       penalty: the initial penalty of all constraints, in cost per square of their unit; they then act from the first
         iteration. It needs a start. By default they come in after a solve without them, with penalties from curvature.
       finish: "newton" leaves the last iterations to Newton's method; see `kernels/newton_iterations.py`. None is the
-        paper's method to the end; so are `stop="cost"` and problems with constraints.
+        paper's method to the end; so are `stop="cost"`, problems with constraints and the steps of an MJCF.
       noise: replaces the problem's own; see `Noise`. The cost is then an expectation, in the log, line searches and
         the choice among starts.
       risk: replaces the problem's own; see `Problem`.
