@@ -186,6 +186,21 @@ class TestConvergence:
 
 
 class TestPolicy:
+    @pytest.mark.parametrize("limit", [0.24, 0.26, 0.27, 0.28])
+    def test_a_control_at_its_limit_has_no_gain(self, limit: float) -> None:
+        """Narrow limits, at which the wheels stand for long; with 0.27 one is there that the next step would free."""
+        problem = ls.scenarios.differential_drive().problem
+        assert problem.start is not None
+        exact = dataclasses.replace(
+            problem, initial=ls.FixedState(problem.start), control_limits=(-limit, limit)
+        )  # fmt: skip
+        solution = ls.smooth(exact)
+        at_limit = np.abs(solution.trajectory.controls) == limit
+        assert solution.status is ls.Status.CONVERGED
+        assert at_limit.any()
+        assert (solution.policy.gain[at_limit] == 0).all()
+        assert claims.contradictions(exact, solution) == []
+
     def test_is_that_of_the_optima_from_neighbouring_starts(self) -> None:
         """The gain is the derivative of the optimal control in the start. That of smoothing's convex models is not."""
         start, far = np.array([0.2, 0.0]), 1e-4

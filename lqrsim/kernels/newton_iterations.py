@@ -17,6 +17,7 @@ from lqrsim.kernels.declarations import (
     REJECTED,
     RUNNING,
     STALLED,
+    M,
     N,
     stack,
 )
@@ -137,8 +138,18 @@ def come_to_plan(settings, model, work, memory, row):
 
 
 def value_functions(settings, model, work, memory, row):
-    """Make those of the plan, without the second order; the policy becomes one that makes the plan."""
+    """Make those of the plan, without the second order; the policy becomes one that makes the plan.
+
+    A control at a limit has no gain, be it one that the next step would take off it, by less than counts.
+    """
+    policy, controls = work.policy, work.plan.controls
     if not NOISY:
         order = Order(0.0, 0.0, work.to_go)
         differential_pass(settings.steps, work.plan, model, order, 1, work.kept, work.to_go)
     model_come_to(settings, model, work, memory, row)
+    for t in range(settings.steps):
+        for i in range(M):
+            if controls[t, i] == model.limits.low[i] or controls[t, i] == model.limits.high[i]:
+                policy.offset[t, i] = controls[t, i]
+                for j in range(N):
+                    policy.gain[t, i, j] = 0.0
