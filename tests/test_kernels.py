@@ -101,6 +101,7 @@ def entry({names}, out):
 DIVIDED = {
     "lqrsim.kernels.cost_differences.derivatives": 4 * 2.0**-52 / 1.2e-4**2,
     "lqrsim.kernels.curvature_differences.step_curvature": 16 * 2.0**-52 / 1.2e-4**2,
+    "lqrsim.kernels.jacobian_differences.step_curvature": 16 * 2.0**-52 / 6e-6,
 }
 
 # Kernels that are little more than calls of others, and take long to compile with all of these. They are compared where

@@ -18,6 +18,7 @@ from whole_problems import claims
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from lqrsim.problem import dynamics as dynamics_module
 from lqrsim.solvers import compiled
 
 HOVER = np.full(4, 1.225)  # N, a quarter of the quadrotor's weight
@@ -33,6 +34,13 @@ def swing(x, u, p):
 def swing_in_numbers(x, u, p):
     angle, speed = x
     return [speed, (u[0] * math.cos(angle) - p.drag * speed**3) / p.inertia - p.gravity * math.sin(angle)]
+
+
+def slope_in_numbers(x, u, p, fx, fu):
+    fx[0, 1] = 1.0
+    fx[1, 0] = -u[0] * math.sin(x[0]) / p.inertia - p.gravity * math.cos(x[0])
+    fx[1, 1] = -3 * p.drag * x[1] ** 2 / p.inertia
+    fu[1, 0] = math.cos(x[0]) / p.inertia
 
 
 def pendulum(f=swing, **options) -> ls.Dynamics:
@@ -101,12 +109,19 @@ class TestSecondDerivatives:
         # Central differences with a step of 1e-5 are good to some 1e-10 of the function's size, and to rounding.
         np.testing.assert_allclose(found, wanted, atol=1e-7 * max(1.0, np.abs(wanted).max()))
 
-    @pytest.mark.parametrize("level", ["plain", "symbolic"])
-    def test_of_a_users_function(self, level: str) -> None:
-        dynamics = pendulum(swing_in_numbers if level == "plain" else swing, level=level)
+    @pytest.mark.parametrize("level", ["plain", "plain with Jacobian", "a formula that is too long"])
+    def test_by_differences(self, level: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(dynamics_module, "LONGEST", 5)
+        if level.startswith("plain"):
+            given = slope_in_numbers if "Jacobian" in level else None
+            dynamics = pendulum(swing_in_numbers, level="plain", jacobian=given)
+        else:
+            dynamics = pendulum()
         x, u, weights = np.array([0.7, -1.3]), np.array([0.4]), np.array([0.3, -2.0])
         found = second_derivatives(dynamics, x, u, weights, 0.1)
         wanted = by_differences(pendulum(), x, u, weights, 0.1)
+        assert dynamics.curvature_source is not None
+        assert "differences" in dynamics.curvature_source.module
         # Second differences with a step of 1e-4 leave some 1e-8, and rounding as much.
         np.testing.assert_allclose(found, wanted, atol=1e-6)
 

@@ -30,12 +30,14 @@ from lqrsim.kernels import (
     curvature_differences,
     finite_differences,
     function_dynamics,
+    jacobian_differences,
     runge_kutta,
     step_curvature,
 )
 from lqrsim.results.coordinates import Coordinates
 
 Limits = tuple[npt.ArrayLike, npt.ArrayLike]
+LONGEST = 1500  # operations of a formula whose second derivatives are derived: that takes up to some five seconds
 
 
 class Dynamics:
@@ -257,19 +259,24 @@ class Dynamics:
     @cached_property
     def curvature_source(self) -> Source | None:
         """Source of `step_curvature`, as `kernels/step_curvature.py` has it; None where that is zero everywhere."""
-        if self.level != "symbolic":
+        if self.level != "symbolic" and self.jacobian is None:
             return source_of(curvature_differences).filled(rate=self.source, rate_jacobian=self.source)
+        kept = [name for name in ("rate", "rate_jacobian", "chain") if self.source.has(name)]
+        by_differences = source_of(jacobian_differences).filled(**dict.fromkeys(kept, self.source))
+        if self.level != "symbolic":
+            return by_differences
         names = tuple(self.state_coordinates.names), tuple(self.control_coordinates.names), tuple(self.parameters)
-        details = ("second derivatives", *names, *self.constants.items())
+        details = ("second derivatives", LONGEST, *names, *self.constants.items())
         made = symbolic.kept(self.f, details, self._trace_curvature, source=str, support=list)
         support = tuple(made["support"])
+        if not made["source"]:  # the formula would be too long
+            return by_differences
         if not support:
             return None
         states = sum(i < len(self.state_coordinates) for i in support)
         curved = text_source(made["source"], f"second derivatives of {self.name}(x, u, p)")
-        names = [name for name in ("rate_jacobian", "chain") if self.source.has(name)]
         open_source = source_of(step_curvature, SUPPORT=support, K=len(support), STATES=states)
-        return open_source.filled(rate_curvature=curved, **dict.fromkeys(names, self.source))
+        return open_source.filled(rate_curvature=curved, **dict.fromkeys(kept, self.source))
 
     @cached_property
     def step_curvature(self) -> float:
@@ -305,11 +312,16 @@ class Dynamics:
         )
 
     def _trace_curvature(self) -> dict[str, Any]:
-        """Source of `rate_curvature` of `kernels/declarations.py`, and in which entries of (x, u) f is curved."""
+        """Source of `rate_curvature` of `kernels/declarations.py`, and in which entries of (x, u) f is curved.
+
+        Of a formula of more than LONGEST operations there is no source: deriving it would take minutes.
+        """
         import sympy
 
         n, m = len(self.state_coordinates), len(self.control_coordinates)
         rates, x, u = symbolic.trace(self.f, n, m, list(self.parameters), constants=self.constants)
+        if sum(sympy.count_ops(rate) for rate in rates) > LONGEST:
+            return {"source": "", "support": []}
         z = [*x, *u]
         total = sum(sympy.Symbol(f"w{i}", real=True) * rate for i, rate in enumerate(rates))
         slopes = [sympy.diff(total, one) for one in z]
