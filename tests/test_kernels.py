@@ -87,7 +87,7 @@ MEMORY = 1 << 20  # numbers from which an array is memory at an address, which h
 MADE: dict[Any, tuple[Loaded, Entry]] = {}  # what was compiled, by all that it depends on
 PLAIN: dict[Any, Callable[..., Any]] = {}  # kernels as plain Python, and whom their calls are told to
 CALLERS: list[Callable[..., Any]] = []
-EACH = 2  # calls of a kernel that are compared, of each entry
+EACH = 1  # calls of a kernel that are compared, of each entry
 COMPARED: Counter[str] = Counter()  # by module and name
 # An array that is returned only kernels can take: it is written out.
 WRITING_OUT = """\
