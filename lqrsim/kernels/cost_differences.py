@@ -5,6 +5,7 @@ The step is the fourth root of the machine's precision, as a second derivative w
 
 from lqrsim.kernels.declarations import M, N, W, stack
 from lqrsim.kernels.function_cost import value
+from lqrsim.kernels.linear_algebra import moved
 
 AXES = (0,)  # the entries of (x, u) that the cost depends on
 
@@ -35,16 +36,5 @@ def derivatives(x, u, t, data, hessian, gradient):
 def shifted(z, i, a, j, b, t, data):
     """The cost at z, the entry i moved by a and the entry j by b."""
     x, u = stack(N), stack(M)
-    for k in range(N):
-        x[k] = z[k]
-    for k in range(M):
-        u[k] = z[N + k]
-    if i < N:
-        x[i] += a
-    else:
-        u[i - N] += a
-    if j < N:
-        x[j] += b
-    else:
-        u[j - N] += b
+    moved(z, i, a, j, b, x, u)
     return value(x, u, t, data)

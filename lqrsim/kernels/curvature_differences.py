@@ -4,6 +4,7 @@ The step is the fourth root of the machine's precision, as a second derivative w
 """
 
 from lqrsim.kernels.declarations import M, N, W, stack
+from lqrsim.kernels.linear_algebra import moved
 from lqrsim.kernels.runge_kutta import advance, step_jacobian
 
 
@@ -30,18 +31,7 @@ def step_curvature(x, u, p, h, weights, out, jacobian, hessian):
 def weighted(z, i, a, j, b, p, h, weights):
     """The weighted sum of where a step leads from z, the entry i moved by a and the entry j by b; less z's own."""
     x, u, out = stack(N), stack(M), stack(N)
-    for k in range(N):
-        x[k] = z[k]
-    for k in range(M):
-        u[k] = z[N + k]
-    if i < N:
-        x[i] += a
-    else:
-        u[i - N] += a
-    if j < N:
-        x[j] += b
-    else:
-        u[j - N] += b
+    moved(z, i, a, j, b, x, u)
     advance(x, u, p, h, out)
     total = 0.0
     for k in range(N):

@@ -55,6 +55,22 @@ def cholesky_solve(a, size, b):
         b[i] = total * a[i, i]
 
 
+def moved(z, i, a, j, b, x, u):
+    """Write the state and the control of z (W,), the entry i moved by a and the entry j by b."""
+    for k in range(N):
+        x[k] = z[k]
+    for k in range(M):
+        u[k] = z[N + k]
+    if i < N:
+        x[i] += a
+    else:
+        u[i - N] += a
+    if j < N:
+        x[j] += b
+    else:
+        u[j - N] += b
+
+
 def about_origin(hessian, gradient, x, u, value):
     """Turn the gradient at (x, u) into the slope at the origin, in place; return the constant term. Eq. (27)."""
     constant = value

@@ -47,39 +47,28 @@ def cost_quadratic(x, u, t, cost, hessian, gradient):
     The sum of what may be indefinite is projected to the nearest positive-semidefinite matrix; what is convex is added
     after.
     """
-    total, constraints = 0.0, cost.constraints
+    return cost_of_order(x, u, t, cost, 0.0, hessian, gradient)
+
+
+def cost_of_order(x, u, t, cost, share, hessian, gradient):
+    """The same with a Hessian that is that share of the way from the projected one to the true one."""
+    total, constraints, projected = 0.0, cost.constraints, stack(W, W)
     clear(hessian, W, W)
     for i in range(W):
         gradient[i] = 0.0
     for k in range(cost.size):
         total += call_for_value(cost.functions[k, DERIVATIVES], x, u, t, cost.data[k], hessian, gradient)
         if k + 1 == cost.indefinite and cost.project != 0:
-            call(cost.project, hessian)
-    for k in range(constraints.size):
-        total += call_for_value(
-            constraints.functions[k, AUGMENT],
-            x, u, t, constraints.data[k], constraints.multipliers[k], hessian, gradient,
-        )  # fmt: skip
-    return total
-
-
-def cost_second_order(x, u, t, cost, share, hessian, gradient):
-    """The same with the Hessian that share of the way from the projected one to the true one."""
-    total, constraints = 0.0, cost.constraints
-    clear(hessian, W, W)
-    for i in range(W):
-        gradient[i] = 0.0
-    for k in range(cost.size):
-        total += call_for_value(cost.functions[k, DERIVATIVES], x, u, t, cost.data[k], hessian, gradient)
-        if k + 1 == cost.indefinite and share < 1 and cost.project != 0:
-            projected = stack(W, W)
-            for i in range(W):
-                for j in range(W):
-                    projected[i, j] = hessian[i, j]
-            call(cost.project, projected)
-            for i in range(W):
-                for j in range(W):
-                    hessian[i, j] = share * hessian[i, j] + (1 - share) * projected[i, j]
+            if share == 0:
+                call(cost.project, hessian)
+            elif share < 1:
+                for i in range(W):
+                    for j in range(W):
+                        projected[i, j] = hessian[i, j]
+                call(cost.project, projected)
+                for i in range(W):
+                    for j in range(W):
+                        hessian[i, j] = share * hessian[i, j] + (1 - share) * projected[i, j]
     for k in range(constraints.size):
         total += call_for_value(
             constraints.functions[k, AUGMENT],

@@ -126,15 +126,12 @@ def newton_pass(settings, model, work, memory):
 
 def come_to_plan(settings, model, work, memory, row):
     """Make policy and value functions of the answer; whether it is one. If not, there is a pass to go on with."""
-    if memory.small_changes < MORE:
-        value_functions(settings, model, work, memory, row)
-        if memory.final_gap < settings.gap_tolerance:
-            return True
-        memory.small_changes += 1
-        newton_pass(settings, model, work, memory)
-        return False
     value_functions(settings, model, work, memory, row)
-    return True
+    if memory.final_gap < settings.gap_tolerance or memory.small_changes >= MORE:
+        return True
+    memory.small_changes += 1
+    newton_pass(settings, model, work, memory)
+    return False
 
 
 def value_functions(settings, model, work, memory, row):

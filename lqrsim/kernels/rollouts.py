@@ -17,8 +17,7 @@ from lqrsim.kernels.linear_algebra import affine, cholesky, cholesky_solve, cong
 from lqrsim.kernels.model_functions import (
     advance,
     cost_added,
-    cost_quadratic,
-    cost_second_order,
+    cost_of_order,
     cost_value,
     noise_quadratic,
     noise_value,
@@ -83,7 +82,7 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
         no_change[i] = 0.0
     for i in range(M):
         none[i] = 0.0
-    value = stated_quadratic(states[steps], none, steps, model.final, share, hessian, gradient)
+    value = cost_of_order(states[steps], none, steps, model.final, share, hessian, gradient)
     predicted, ahead = 0.0, value
     for i in range(N):
         slope[i] = gradient[i]
@@ -93,7 +92,7 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
     k[last] = end_model(hessian, gradient, value, states[steps], S[last], s[last])
     for t in range(steps - 1, -1, -1):
         at, x, u = t * keep, states[t], controls[t]
-        ahead += stated_quadratic(x, u, t, model.stage, share, hessian, gradient)
+        ahead += cost_of_order(x, u, t, model.stage, share, hessian, gradient)
         if share > 0:
             for i in range(N):
                 weights[i] = share * slope[i]
@@ -125,13 +124,6 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
     return -1, True, predicted
 
 
-def stated_quadratic(x, u, t, cost, share, hessian, gradient):
-    """Write the quadratic model of a cost, with that share of the second order; return its value."""
-    if share > 0:
-        return cost_second_order(x, u, t, cost, share, hessian, gradient)
-    return cost_quadratic(x, u, t, cost, hessian, gradient)
-
-
 def initial_step(x0, model, share, to_go, direction):
     """Write where the soft start x0 would best move, given the cost-to-go at 0; return what that promises, or NaN."""
     S, s = to_go.hessian[0], to_go.gradient[0]
@@ -139,7 +131,7 @@ def initial_step(x0, model, share, to_go, direction):
     total, slope = stack(N, N), stack(N)
     for i in range(M):
         none[i] = 0.0
-    stated_quadratic(x0, none, 0, model.initial, share, hessian, gradient)
+    cost_of_order(x0, none, 0, model.initial, share, hessian, gradient)
     for i in range(N):
         slope[i] = gradient[i] + s[i]
         for j in range(N):

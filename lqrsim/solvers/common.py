@@ -118,7 +118,8 @@ class SmootherSettings(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_name("finish", self.finish or "newton", ("newton",))
+        if self.finish is not None:
+            check_name("finish", self.finish, ("newton",))
         if self.starts is not None:
             object.__setattr__(self, "starts", check_count("starts", self.starts, at_most=MOST_STARTS))
             if self.starts > 1 and self.start is not None:
@@ -141,8 +142,8 @@ class SmootherSettings(Settings):
     def newton(self, problem: Problem) -> bool:
         """Whether Newton's method has the last iterations. With "cost", the paper's test ends the paper's method.
 
-        Steps of an MJCF have no second derivatives. Without these, smoothing takes fewer iterations and less time: 18
-        in 0.4 s against 54 in 0.7 s to swing up the pole of `experiments/compare_checkouts.py`, to 1e-8.
+        Steps of an MJCF have no second derivatives. Without these it is Gauss-Newton's, of which an iteration of
+        smoothing is worth several; see `experiments/convergence.py`.
         """
         exact = not problem.dynamics.discrete and not problem.constraints
         return self.finish is not None and self.stop == "optimal" and exact

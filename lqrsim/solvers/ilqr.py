@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from lqrsim.errors import InputError
+from lqrsim.errors import InputError, check_number
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Plan, Policy, Rows
 from lqrsim.kernels.records import Settings as KernelSettings
@@ -123,6 +123,7 @@ _NO_PRIOR = "start: got an InitialPrior, want controls, a Trajectory, an AffineP
 
 def _check(problem: Problem, settings: Settings) -> None:
     check_problem(problem)
+    check_number("tolerance", settings.tolerance, above=0.0)
     if isinstance(settings.start, InitialPrior):
         raise InputError(_NO_PRIOR)
     if problem.constraints:

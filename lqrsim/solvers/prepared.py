@@ -227,10 +227,12 @@ class _Best:
             else:
                 there = *arrays.rollout, *arrays.kept, *arrays.to_go
             # The next iteration writes over these; and what is allocated anew each time is slow to write to.
-            self._copies = self._copies or tuple(np.empty_like(array) for array in (*there, *arrays.to_go)[:7])
-            for copy, array in zip(self._copies, there, strict=False):
+            if not self._copies:
+                self._copies = tuple(np.empty_like(array) for array in (*arrays.plan, *arrays.kept, *arrays.to_go))
+            copies = self._copies[: len(there)]  # about Newton's plans the cost-to-go is worked out at the end
+            for copy, array in zip(copies, there, strict=True):
                 np.copyto(copy, array)
-            self._keep(iteration.cost, iteration.violation, self._copies[: len(there)])
+            self._keep(iteration.cost, iteration.violation, copies)
 
     def consider(self, found: AttemptResult) -> None:
         """What it ended with: that, if it converged and is as good; and if it is better in any case."""
