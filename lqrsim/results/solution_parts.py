@@ -94,7 +94,7 @@ class Status(enum.StrEnum):
 
 
 _STATUS_TEXT = {
-    Status.CONVERGED: ("cost change, optimality and, with a cost-to-come, the gap are within tolerance", ""),
+    Status.CONVERGED: ("optimality and, with a cost-to-come, the gap are within tolerance", ""),
     Status.COST_CONVERGED: (
         "the change of cost is within tolerance; gap and optimality were not asked for",
         'look at the gap, or solve with stop="optimal"',
@@ -152,7 +152,7 @@ class Iteration:
         constraints it is of the cost with the augmented Lagrangian, and so is the optimality.
       gap: largest difference between the minimal-total-cost states and that rollout, each state relative to its
         range along the rollout (at least 1 unit). Where the safeguard went part of the way, they are taken there; 0 for
-        steps of iLQR, which has none.
+        steps of iLQR and Newton's method, which have none.
       optimality: the decrease that a linear-quadratic model about the rollout still predicts, relative to the cost; NaN
         where it was not evaluated (it is once the other tests pass, and after the last iteration).
       dynamics_residual: how far one step of the true dynamics takes a minimal-total-cost state from the next one, at
@@ -160,8 +160,9 @@ class Iteration:
       violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all inequalities are
         kept and there are no equalities, which are off by rounding at least; NaN where it was not evaluated.
       seconds: time this iteration took.
-      method: "smooth", the paper's; of the safeguard's: "damped", "ilqr" where its step is that of iLQR, or "rejected"
-        (it would have cost more, or a pass failed; cost is that of the plan that was kept).
+      method: "smooth", the paper's; "newton", at the end; of the safeguard's "damped", or "ilqr" where its step is that
+        of iLQR; of the last three "rejected" (it would have cost more, or a pass failed; cost is that of the plan that
+        was kept).
     """
 
     cost: float

@@ -66,8 +66,8 @@ def smooth(
         which cannot, it runs forwards.
       safeguard: where the method fails, go on from the best plan so far by steps that lower its cost; see
         `kernels/damped_iterations.py`. Where it converges, the safeguard changes nothing, to the last bit.
-      stop: "optimal" (change of cost, gap and first-order optimality all within tolerance) or "cost", the paper's
-        test, which looks at the change of cost alone and can pass early.
+      stop: "optimal" (gap and first-order optimality within tolerance, and of smoothing the change of cost) or "cost",
+        the paper's test, which looks at the change of cost alone and can pass early.
       tolerance: of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8, and 1e-4
         without Newton's method.
       gap_tolerance: of the gap (see `Iteration`).
