@@ -187,6 +187,38 @@ class Stage(NamedTuple):
     gradient: Arrays
 
 
+class ConstraintRows(NamedTuple):
+    """The numbers of all constraints, row by row, of which there are `count` at each step.
+
+    Attributes:
+      first: (C,) the row with which each constraint begins. support: (count, W) 0 where a row does not depend on that
+        state or control. multipliers: ((T+1) count,); those of up to `least` are as good as none.
+    """
+
+    count: int
+    least: float
+    first: Arrays
+    support: Arrays
+    multipliers: Arrays
+
+
+class StageModels(NamedTuple):
+    """Of all stages, at a plan that need not be a motion.
+
+    Attributes:
+      hessian: (T+1, W, W) of the cost and of steps and constraints times costates and multipliers. convex: (T+1, W, W)
+        of the cost alone, projected. gradient: (T+1, W) of the cost. jacobian: (T, N, W) of the steps.
+      arrived: (T, N) where these lead. slopes: ((T+1) count, W) of the constraints, row by row.
+    """
+
+    hessian: Arrays
+    convex: Arrays
+    gradient: Arrays
+    jacobian: Arrays
+    arrived: Arrays
+    slopes: Arrays
+
+
 class Reduced(NamedTuple):
     """A step and its stage with the control eliminated by u = w - F x - h, for the dual form.
 

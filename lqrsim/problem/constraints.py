@@ -321,9 +321,11 @@ def violation_of(term: ConstraintTerm, values: Array) -> float:
     return missed if not np.isnan(missed) else np.inf
 
 
-def allowed_violation(term: ConstraintTerm, tolerance: float) -> float:
-    """The violation that is none: constraints are solved for to `tolerance`, which inequalities have to spare."""
-    return min(tolerance, EQUALITY_TOLERANCE) if term.equality else 0.0
+def allowed_violation(term: ConstraintTerm, tolerance: float, *, spared: bool = True) -> float:
+    """The violation that is none. Where `tolerance` is aimed at to spare, inequalities may not be missed at all."""
+    if term.equality:
+        return min(tolerance, EQUALITY_TOLERANCE)
+    return 0.0 if spared else tolerance
 
 
 def _written(signature: str, assignments: Mapping[str, Any], of: str, returns: str | None = None) -> str:

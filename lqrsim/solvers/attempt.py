@@ -187,12 +187,18 @@ class Attempt:
         return self.rescue(found, each=each, callback=callback) if settings.safeguard else found
 
     def descend(
-        self, before: tuple[Iteration, ...], *, each: bool, callback: Callback | None, detail: str = ""
+        self,
+        before: tuple[Iteration, ...],
+        *,
+        each: bool,
+        callback: Callback | None,
+        detail: str = "",
+        added: float = 0.0,
     ) -> AttemptResult:
-        """Newton's method from the best plan so far, which took these iterations."""
+        """Newton's method from the best plan so far, which took these iterations; `added` is what constraints add."""
         work, log = self.work, self._log[len(before) :]
         last, trial = len(log), Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
-        work.memory["merit"], work.memory["share"] = work.memory["plan_cost"], -1.0
+        work.memory["merit"], work.memory["share"] = work.memory["plan_cost"] + added, -1.0
         done = iterate(
             self.problem, lambda first, to: self._loop(*self._newton_arguments(first, to, log, last, trial)), log, last,
             before=before, look=lambda: self._violation_of(work.plan), each=each, stop=self.stop, callback=callback,

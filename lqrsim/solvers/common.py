@@ -63,6 +63,7 @@ _METHODS = {
 }
 MOST_STARTS, MOST_THREADS = 10_000, 1024
 ROUGH, FINE = 1e-4, 1e-8  # the tolerances of smoothing and of Newton's method, by default
+MISSED, SPARED = 1e-6, 1e-3  # those of constraints, by the interior point and by the augmented Lagrangian
 ATTENTION = 0.1  # s, after which compiled code comes back to heed Ctrl-C
 
 
@@ -112,7 +113,7 @@ class SmootherSettings(Settings):
     first_pass: str
     safeguard: bool
     starts: int | None
-    constraint_tolerance: float
+    constraint_tolerance: float | None = None
     penalty: float | None = None
     finish: str | None = "newton"
 
@@ -125,8 +126,9 @@ class SmootherSettings(Settings):
             if self.starts > 1 and self.start is not None:
                 raise InputError(f"starts: got {self.starts} beside a start, want one of the two")
         object.__setattr__(self, "gap_tolerance", check_number("gap_tolerance", self.gap_tolerance, above=0.0))
-        number = check_number("constraint_tolerance", self.constraint_tolerance, above=0.0)
-        object.__setattr__(self, "constraint_tolerance", number)
+        if self.constraint_tolerance is not None:
+            number = check_number("constraint_tolerance", self.constraint_tolerance, above=0.0)
+            object.__setattr__(self, "constraint_tolerance", number)
         if self.penalty is not None:
             object.__setattr__(self, "penalty", check_number("penalty", self.penalty, above=0.0))
             if self.start is None:
@@ -140,13 +142,17 @@ class SmootherSettings(Settings):
         return self.form
 
     def newton(self, problem: Problem) -> bool:
-        """Whether Newton's method has the last iterations. With "cost", the paper's test ends the paper's method.
+        """Whether the last iterations are of second order. With "cost", the paper's test ends the paper's method.
 
         Steps of an MJCF have no second derivatives. Without these it is Gauss-Newton's, of which an iteration of
-        smoothing is worth several; see `experiments/convergence.py`.
+        smoothing is worth several; see `experiments/convergence.py`. Nor has what noise costs.
         """
-        exact = not problem.dynamics.discrete and not problem.constraints
+        exact = not problem.dynamics.discrete and not (problem.constraints and problem.noise_term is not None)
         return self.finish is not None and self.stop == "optimal" and exact
+
+    def missed(self, problem: Problem) -> float:
+        """By how much constraints may be missed, or what is to spare where the augmented Lagrangian keeps them."""
+        return self.constraint_tolerance or (MISSED if self.newton(problem) else SPARED)
 
     def final(self, problem: Problem) -> float:
         """What the optimality of the answer is to be below."""

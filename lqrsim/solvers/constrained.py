@@ -38,8 +38,7 @@ def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) ->
         tried = found.iterations
         attempt = _again(attempt, attempt.problem, dataclasses.replace(attempt.initial_guess, multipliers=()), tried)
     found = attempt.finish(each=each, callback=callback)
-    if attempt.problem.constraints:
-        attempt, found = _with_constraints(attempt, found, each=each, callback=callback)
+    attempt, found = _with_constraints(attempt, found, each=each, callback=callback)
     return attempt.certified(dataclasses.replace(found, iterations=(*tried, *found.iterations)))
 
 
@@ -157,7 +156,7 @@ def _undamped(
             break
         # From the optimum without constraints they soon settle, or cycle: then damped ones are far quicker.
         last, limits = done[-1], attempt.settings
-        off = max(last.gap / limits.gap_tolerance, last.violation / limits.constraint_tolerance)
+        off = max(last.gap / limits.gap_tolerance, last.violation / limits.missed(attempt.problem))
         stale = 0 if off < CLOSER * nearest else stale + 1
         nearest = min(off, nearest)
         if stale == STALE and before and limits.safeguard:

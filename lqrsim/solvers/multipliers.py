@@ -49,7 +49,7 @@ class AugmentedLagrangian:
     def __init__(self, attempt: Attempt) -> None:
         self._problem, self._work = attempt.problem, attempt.work
         self._terms = attempt.problem.constraint_terms
-        self._near = tolerance = attempt.settings.constraint_tolerance
+        self._near = tolerance = attempt.settings.missed(attempt.problem)
         # Of inequalities and of equalities, if there are any.
         self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in self._terms}
         self.kept = self.solved = self.nearly = False

@@ -21,8 +21,8 @@ from lqrsim.results.solution_parts import Candidate
 from lqrsim.solvers.assembly import clearance_of
 from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import Callback, SmootherSettings, Stop, workers
-from lqrsim.solvers.constrained import finish, refine
 from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, resolve
+from lqrsim.solvers.strategy import finish, refine
 
 # `python experiments/benchmark_quality.py --sections ingredients` shows what each of these choices brings.
 STARTS = 7

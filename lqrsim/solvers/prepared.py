@@ -27,7 +27,7 @@ def prepare(
     *,
     tolerance: float | None = None,
     gap_tolerance: float = 1e-3,
-    constraint_tolerance: float = 1e-3,
+    constraint_tolerance: float | None = None,
     max_iterations: int = 100,
     finish: str | None = "newton",
 ) -> "PreparedSolver":
@@ -47,6 +47,8 @@ def prepare(
     Raises:
       InputError: an argument is not as described.
     """
+    if getattr(problem, "constraints", ()):
+        finish = None
     settings = SmootherSettings(
         form="dual", first_pass="forward", safeguard=True, stop="optimal", tolerance=tolerance,
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=None, start=None, starts=1,

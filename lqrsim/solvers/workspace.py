@@ -1,6 +1,7 @@
 """The arrays of one solve, and what can be read from them."""
 
 import contextlib
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -65,14 +66,15 @@ class Workspace:
 
     def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
         """Begin a solve; after another one, of a problem of the same size with as many steps."""
-        self._problem, self._tolerance, steps = problem, settings.constraint_tolerance, problem.steps
+        self._problem, self._tolerance, steps = problem, settings.missed(problem), problem.steps
+        self._exact = settings.newton(problem)
         self.fixed = isinstance(problem.initial, FixedState)
         self.prior, self.prior_iterations = self.no_prior, 0
         if initial_guess.prior is not None:
             about = np.broadcast_to(initial_guess.prior.about, (steps + 1, len(start))).copy()
             self.prior = Prior(initial_guess.prior.weight.copy(), about)
             self.prior_iterations = initial_guess.prior.iterations
-        spare = self._tolerance
+        spare = 0.0 if self._exact else self._tolerance
         multipliers = [compiled.no_multipliers(problem, one, spare) for one in problem.constraint_terms]
         for array, known in zip(multipliers, initial_guess.multipliers, strict=False):
             array[0], array[declarations.HEADER :] = known.penalty, known.values.ravel()
@@ -160,6 +162,7 @@ class Workspace:
         return max((violation_of(term, one) for term, one in zip(terms, values, strict=True)), default=0.0)
 
     def keeps(self, values: list[Array]) -> bool:
-        """Whether values are those of a plan that keeps all constraints, the equalities within their tolerance."""
+        """Whether values are those of a plan that keeps all constraints, within what they may be missed by."""
         pairs = zip(self._problem.constraint_terms, values, strict=True)
-        return all(violation_of(term, one) <= allowed_violation(term, self._tolerance) for term, one in pairs)
+        allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)
+        return all(violation_of(term, one) <= allowed(term) for term, one in pairs)

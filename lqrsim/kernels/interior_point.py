@@ -1,0 +1,221 @@
+"""What an iteration of the interior point takes of a problem, and the step that it makes. The kernels' subset.
+
+The plan need not be a motion: where a step leads and where the next state is are apart by a gap, which the iterations
+close. `solvers/interior_point.py` has the method.
+"""
+
+from lqrsim.kernels.cost_to_go import minimize_control
+from lqrsim.kernels.declarations import M, N, W, stack
+from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, congruence
+from lqrsim.kernels.model_functions import (
+    USES_CONTROL,
+    advance,
+    cost_of_order,
+    cost_quadratic,
+    cost_value,
+    slope_of_constraint,
+    step_second_order,
+)
+
+TINY = 1e-9  # what is left of a control's own curvature when that is as good as none
+STEP = 6e-6  # of differences of slopes, relative to a number and at least 1: the cube root of rounding
+
+
+def models(steps, soft, plan, costates, model, rows, out):
+    """Write the models of all stages at a plan: those of its cost, its steps and its constraints. Return the cost.
+
+    Args:
+      soft: 1 where there is an initial cost. costates: (T+1, N), of where each step leads.
+      rows: `records.ConstraintRows`, with the constraints' multipliers. out: `records.StageModels`.
+    """
+    gradient, none, total = stack(W), stack(M), 0.0
+    for i in range(M):
+        none[i] = 0.0
+    for t in range(steps + 1):
+        x, u = plan.states[t], plan.controls[min(t, steps - 1)]
+        if t < steps:
+            total += cost_of_order(x, u, t, model.stage, 1.0, out.hessian[t], out.gradient[t])
+            cost_quadratic(x, u, t, model.stage, out.convex[t], gradient)
+            step_second_order(x, u, model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
+        else:
+            total += cost_of_order(x, none, t, model.final, 1.0, out.hessian[t], out.gradient[t])
+            cost_quadratic(x, none, t, model.final, out.convex[t], gradient)
+        constraint_models(x, u, t, steps, model.stage.constraints, rows, out)
+    if soft == 1:
+        total += add_initial(plan.states[0], none, model, out)
+    return total
+
+
+def add_initial(x, none, model, out):
+    """Add the initial cost to the first stage; return its value."""
+    hessian, gradient = stack(W, W), stack(W)
+    cost = cost_of_order(x, none, 0, model.initial, 1.0, hessian, gradient)
+    for i in range(N):
+        out.gradient[0, i] += gradient[i]
+        for j in range(N):
+            out.hessian[0, i, j] += hessian[i, j]
+    cost_quadratic(x, none, 0, model.initial, hessian, gradient)
+    for i in range(N):
+        for j in range(N):
+            out.convex[0, i, j] += hessian[i, j]
+    return cost
+
+
+def constraint_models(x, u, t, steps, constraints, rows, out):
+    """Write the slopes of all constraints at a step, and subtract their Hessians times the multipliers."""
+    slope = stack(W)
+    for k in range(constraints.size):
+        own, begin, acts = int(constraints.multipliers[k][1]), constraints.multipliers[k][2], t >= 0
+        acts = t >= begin and not (t == steps and constraints.functions[k, USES_CONTROL] != 0)
+        for row in range(own):
+            place = int(rows.first[k]) + row
+            at = rows.count * t + place
+            for i in range(W):
+                slope[i] = 0.0
+            if acts:
+                slope_of_constraint(k, row, x, u, t, constraints, slope)
+            for i in range(W):
+                out.slopes[at, i] = slope[i]
+            if acts and abs(rows.multipliers[at]) > rows.least:
+                subtract_curvature(k, row, x, u, t, constraints, rows.support[place], rows.multipliers[at], out.hessian[t])
+
+
+def subtract_curvature(k, row, x, u, t, constraints, support, weight, hessian):
+    """Subtract the Hessian of one of a constraint's numbers times a weight: differences of its slope.
+
+    `support` (W,) is 0 for entries that it does not depend on.
+    """
+    y, v, ahead, behind = stack(N), stack(M), stack(W), stack(W)
+    for i in range(N):
+        y[i] = x[i]
+    for i in range(M):
+        v[i] = u[i]
+    for j in range(W):
+        if support[j] == 0:
+            continue
+        z = x[j] if j < N else u[j - N]
+        far = STEP * max(1.0, abs(z))
+        for i in range(W):
+            ahead[i], behind[i] = 0.0, 0.0
+        put(y, v, j, z + far)
+        slope_of_constraint(k, row, y, v, t, constraints, ahead)
+        put(y, v, j, z - far)
+        slope_of_constraint(k, row, y, v, t, constraints, behind)
+        put(y, v, j, z)
+        for i in range(W):
+            half = 0.5 * weight * (ahead[i] - behind[i]) / (2 * far)
+            hessian[i, j] -= half
+            hessian[j, i] -= half
+
+
+def put(y, v, j, number):
+    """Write one entry of a state and a control, joined."""
+    if j < N:
+        y[j] = number
+    else:
+        v[j - N] = number
+
+
+def trial(steps, soft, plan, model, arrived):
+    """The cost of a plan; writes where each of its steps leads, (T, N)."""
+    none = stack(M)
+    for i in range(M):
+        none[i] = 0.0
+    total = cost_value(plan.states[0], none, 0, model.initial) if soft == 1 else 0.0
+    for t in range(steps):
+        total += cost_value(plan.states[t], plan.controls[t], t, model.stage)
+        advance(plan.states[t], plan.controls[t], model, model.dt, arrived[t])
+    return total + cost_value(plan.states[steps], none, steps, model.final)
+
+
+def adjoint(steps, gradient, jacobian, costates, slopes):
+    """The costates (T+1, N) of a sum of stages with these gradients (T+1, W), and its slopes in the controls (T, M)."""
+    for i in range(N):
+        costates[steps, i] = gradient[steps, i]
+    for t in range(steps - 1, -1, -1):
+        for j in range(W):
+            total = gradient[t, j]
+            for i in range(N):
+                total += jacobian[t, i, j] * costates[t + 1, i]
+            if j < N:
+                costates[t, j] = total
+            else:
+                slopes[t, j - N] = total
+
+
+def direction(steps, free, hessian, gradient, jacobian, gaps, policy, to_go, changes):
+    """The step to the minimum of the stages' models, the gaps closed: a Riccati recursion, and where it leads.
+
+    Args:
+      free: (N,) 0 for the states that the start fixes. hessian, gradient, jacobian: (T+1, W, W), (T+1, W), (T, N, W).
+      gaps: (T, N). policy: gets the gains, and the changes of controls where states do not change. to_go: gets the
+        cost-to-go of changes; its gradients are the costates where the step leads. changes: gets those of the plan.
+
+    Returns:
+      The step whose control block is not positive definite, steps + 1 where it is the start's, or else -1.
+    """
+    stage, slope, ahead, least = stack(W, W), stack(W), stack(N), stack(M)
+    for i in range(N):
+        to_go.gradient[steps, i] = gradient[steps, i]
+        for j in range(N):
+            to_go.hessian[steps, i, j] = hessian[steps, i, j]
+    for t in range(steps - 1, -1, -1):
+        for i in range(W):
+            slope[i] = gradient[t, i]
+            for j in range(W):
+                stage[i, j] = hessian[t, i, j]
+        for i in range(M):
+            least[i] = TINY * abs(stage[N + i, N + i])
+        for i in range(N):
+            ahead[i] = to_go.gradient[t + 1, i]
+            for j in range(N):
+                ahead[i] += to_go.hessian[t + 1, i, j] * gaps[t, j]
+        congruence(jacobian[t], to_go.hessian[t + 1], ahead, stage, slope)
+        if not definite(stage, least):
+            return t
+        if minimize_control(stage, slope, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]) < 0:
+            return t
+    if not first_change(free, to_go, changes.states[0]):
+        return steps + 1
+    for t in range(steps):
+        for i in range(M):
+            total = policy.offset[t, i]
+            for j in range(N):
+                total += policy.gain[t, i, j] * changes.states[t, j]
+            changes.controls[t, i] = total
+        for i in range(N):
+            total = gaps[t, i]
+            for j in range(N):
+                total += jacobian[t, i, j] * changes.states[t, j]
+            for j in range(M):
+                total += jacobian[t, i, N + j] * changes.controls[t, j]
+            changes.states[t + 1, i] = total
+    for t in range(steps + 1):
+        for i in range(N):
+            for j in range(N):
+                to_go.gradient[t, i] += to_go.hessian[t, i, j] * changes.states[t, j]
+    return -1
+
+
+def first_change(free, to_go, change):
+    """Write by how much the start moves, (N,); whether that has a minimum. What is fixed does not move."""
+    curve = stack(N, N)
+    for i in range(N):
+        change[i] = -to_go.gradient[0, i] * free[i]
+        for j in range(N):
+            curve[i, j] = to_go.hessian[0, i, j] * free[i] * free[j]
+        if free[i] == 0:
+            curve[i, i] = 1.0
+    good = cholesky(curve, N)
+    cholesky_solve(curve, N, change)
+    return good
+
+
+def definite(stage, least):
+    """Whether a control block is positive definite when so much is subtracted from its diagonal, (M,)."""
+    block = stack(M, M)
+    for i in range(M):
+        for j in range(M):
+            block[i, j] = stage[N + i, N + j]
+        block[i, i] -= least[i]
+    return cholesky(block, M)

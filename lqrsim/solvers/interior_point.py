@@ -1,0 +1,647 @@
+"""Constraints by a primal-dual interior point with exact second derivatives, on states and controls at once.
+
+Each iteration takes a step to the minimum of a quadratic model of the Lagrangian with a logarithmic barrier, subject to
+the linearised dynamics, by a Riccati recursion; gaps between the steps of the plan are closed on the way. The barrier
+falls by Mehrotra's rule where the last step was long. A filter decides how much of a step is taken (Waechter and
+Biegler, 2006). Where a model has no minimum, the Hessian is mixed with that of the projected cost until it has.
+
+A row d of an inequality is d >= 0, of an equality d = 0; limits of controls are rows, too. With a multiplier y, held
+between a lowest and a highest one, `d = s - p` has two slacks: s, whose product with y - lowest is the barrier's
+parameter, and p, whose product with highest - y is. An inequality has 0 for the lowest; without a highest there is no
+p. A highest multiplier is the price, in cost a unit, for which a constraint may be missed: then it is elastic.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from lqrsim.codegen.compiled_module import in_c_order, module_of
+from lqrsim.codegen.sources import source_of
+from lqrsim.errors import Array
+from lqrsim.kernels import declarations
+from lqrsim.kernels import interior_point as kernel
+from lqrsim.kernels.records import ConstraintRows, CostToGo, Plan, Policy, StageModels
+from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.solvers import compiled
+
+MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # shares of the projected Hessian, tried in turn
+WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)  # on changes of controls, where not even that has a minimum; relative to the cost
+REGULARISATION = 1e-8  # of equalities, relative
+LONG = 0.3  # the part of a step from which the next one takes Mehrotra's rule
+BOUNDARY = 0.99  # of the way to where a slack is zero, how much is taken at least
+SHORTEST = 1e-7  # part of a step
+MARGIN = 1e-5  # by which a filter wants something to be better
+ARMIJO = 1e-4  # of what a step promises, what there has to be of it
+FORCED = 6  # steps that are taken though no part of them is better
+WIDE = 1e10  # how far a product of slack and multiplier may be from the barrier's parameter
+CROSSINGS = 8  # steps without a barrier, at the end
+EDGE = 0.05  # how far inside of their limits controls begin, relative to their range
+
+
+class Measures(NamedTuple):
+    """How far a plan is from an optimum.
+
+    Attributes:
+      cost: of it. stationarity: the largest slope of the Lagrangian in a control, times the control's range, relative
+        to the cost. violation: of the worst constraint, in its unit. gap: the largest between two steps, relative to
+        the states' ranges. complementarity: the largest product of a multiplier and what is left to spare, relative to
+        the cost.
+    """
+
+    cost: float
+    stationarity: float
+    violation: float
+    gap: float
+    complementarity: float
+
+
+@dataclass(kw_only=True)
+class Found:
+    """What it came to.
+
+    Attributes:
+      plan: states and controls, a motion but for gaps. gain: (T, m, n) about it. measures: of it.
+      multipliers: of each constraint (T+1, rows); of the limits (T, m), positive where a control presses against the
+        upper one. solved: whether all measures are within tolerance. iterations: how many there were.
+      control_size, row_size: by how much controls (m,) and rows (R,) change. scale: the cost that is relative to.
+    """
+
+    plan: Plan
+    gain: Array
+    measures: Measures
+    multipliers: tuple[Array, ...]
+    pressing: Array
+    solved: bool
+    iterations: int
+    control_size: Array
+    row_size: Array
+    scale: float
+
+
+class Stages:
+    """A problem as the iterations see it: models of its stages, and all constraints and limits as rows.
+
+    Attributes:
+      live: (T+1, R) which rows act at which step. equality: (R,) which are to be zero. owners: (R,) the constraint that
+        a row is of; -1 for limits. models: `records.StageModels` of the last plan; slopes (T+1, R, n+m) of its rows.
+      free: (n,) which of the start's states are not fixed. limits: of each row that is one its sign, the control, and
+        where it ends.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self.steps = problem, problem.steps
+        n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
+        self.n, self.m, steps = n, m, problem.steps
+        self.free = np.full(n, 0.0 if isinstance(problem.initial, FixedState) else 1.0)
+        self._soft = 0 if isinstance(problem.initial, FixedState) else 1
+        terms = problem.constraint_terms
+        own = [compiled.no_multipliers(problem, term) for term in terms]
+        self._model = compiled.arguments(problem, multipliers=own, second_order=True)
+        self._module = module_of(source_of(kernel), f"interior point, {n} states and {m} controls", N=n, M=m, W=n + m)
+        self._costs = compiled.costs_module(problem)
+        self._values = tuple(np.empty((steps + 1) * term.rows) for term in terms)
+
+        limits = self._model.limits
+        self.low, self.high = limits.low, limits.high
+        self.limits = [
+            (sign, i, side[i]) for sign, side in ((1.0, limits.low), (-1.0, limits.high)) for i in range(m)
+            if np.isfinite(side[i])
+        ]  # fmt: skip
+        counts = [term.rows for term in terms]
+        rows = sum(counts) + len(self.limits)
+        self.equality = np.repeat([*(term.equality for term in terms), False], [*counts, len(self.limits)]).astype(bool)
+        self.owners = np.repeat([*range(len(terms)), -1], [*counts, len(self.limits)])
+        self.live = np.ones((steps + 1, rows), dtype=bool)
+        for k, (term, array) in enumerate(zip(terms, own, strict=True)):
+            self.live[: int(array[2]), self.owners == k] = False
+            self.live[steps, self.owners == k] &= not term.uses_control
+        self.live[steps, self.owners == -1] = False
+        self.slopes = np.zeros((steps + 1, rows, n + m))
+        for row, (sign, i, _) in enumerate(self.limits, start=sum(counts)):
+            self.slopes[:steps, row, n + i] = sign
+        self.models = StageModels(
+            np.zeros((steps + 1, n + m, n + m)), np.zeros((steps + 1, n + m, n + m)), np.zeros((steps + 1, n + m)),
+            np.zeros((steps, n, n + m)), np.zeros((steps, n)), self.slopes.reshape(-1, n + m),
+        )  # fmt: skip
+        first = np.cumsum([0, *counts])[:-1].astype(np.float64)
+        self._rows = ConstraintRows(rows, np.inf, first, np.zeros((rows, n + m)), np.zeros((steps + 1) * rows))
+        self.gain, self._offset = np.zeros((steps, m, n)), np.zeros((steps, m))
+        self.to_go = CostToGo(np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1))
+        self.changes = Plan(np.zeros((steps + 1, n)), np.zeros((steps, m)))
+
+    def values(self, plan: Plan) -> Array:
+        """The rows' numbers (T+1, R); of no meaning where they do not act."""
+        if self._values:
+            constraints = self._model.stage.constraints
+            self._costs.evaluate_constraints(self.steps, plan.states, plan.controls, constraints, self._values)
+        shaped = [one.reshape(self.steps + 1, -1) for one in self._values]
+        held = np.concatenate([plan.controls, plan.controls[-1:]])
+        limits = [(sign * (held[:, i] - side))[:, None] for sign, i, side in self.limits]
+        return np.concatenate([*shaped, *limits, np.zeros((self.steps + 1, 0))], axis=1)
+
+    def trial(self, plan: Plan) -> tuple[float, Array]:
+        """The cost of a plan, and where its steps lead (T, n)."""
+        arrived = np.empty((self.steps, self.n))
+        return self._module.trial(self.steps, self._soft, plan, self._model, arrived), arrived
+
+    def linearize(self, plan: Plan, costates: Array, multipliers: Array, least: float) -> float:
+        """Make the models about a plan, with costates (T+1, n) and multipliers (T+1, R); return its cost."""
+        support = self._rows.support
+        rows = self._rows._replace(least=float(least), multipliers=in_c_order(multipliers).reshape(-1))
+        cost = self._module.models(self.steps, self._soft, plan, costates, self._model, rows, self.models)
+        support[...] = np.maximum(support, (self.slopes != 0).any(axis=0))
+        return cost
+
+    def look_about(self, plan: Plan) -> None:
+        """Find out which rows act, and which entries each depends on: slopes at the plan or a little beside it tell."""
+        self.live &= ~np.isposinf(self.values(plan))  # so a constraint says that it does not act at a step
+        wiggle = np.sin(1.0 + np.arange(self.n + self.m))
+        nowhere, none = np.zeros((self.steps + 1, self.n)), np.zeros(self.live.shape)
+        for far in (1e-3, 0.0):
+            beside = Plan(plan.states + far * wiggle[: self.n], plan.controls + far * wiggle[self.n :])
+            self.linearize(beside, nowhere, none, np.inf)
+
+    def adjoint(self, gradient: Array) -> tuple[Array, Array]:
+        """Costates (T+1, n) of stages with these gradients (T+1, n+m), and their slopes in the controls (T, m)."""
+        costates, slopes = np.zeros((self.steps + 1, self.n)), np.zeros((self.steps, self.m))
+        self._module.adjoint(self.steps, gradient, self.models.jacobian, costates, slopes)
+        return costates, slopes
+
+    def direction(self, hessian: Array, gradient: Array, gaps: Array) -> bool:
+        """Write the step to the minimum of models, and the costates there; whether there is one."""
+        failed = self._module.direction(
+            self.steps, self.free, in_c_order(hessian), in_c_order(gradient), self.models.jacobian, in_c_order(gaps),
+            Policy(self.gain, self._offset), self.to_go, self.changes,
+        )  # fmt: skip
+        return failed == -1
+
+    def joined(self) -> Array:
+        """The changes of states and controls side by side, (T+1, n+m)."""
+        return np.concatenate([self.changes.states, np.pad(self.changes.controls, ((0, 1), (0, 0)))], axis=1)
+
+
+class Point(NamedTuple):
+    """Where the iterations stand: a plan, its cost, where its steps lead, the live rows' numbers (K,); slacks (P,)."""
+
+    plan: Plan
+    cost: float
+    arrived: Array
+    numbers: Array
+    slack: Array
+
+
+class Step(NamedTuple):
+    """A change of plan, slacks (P,), multipliers (K,), and the costates where it leads."""
+
+    plan: Plan
+    slack: Array
+    multipliers: Array
+    costates: Array
+
+
+class InteriorPoint:
+    """The iterations from one plan.
+
+    Args:
+      problem: with constraints, limits, or neither.
+      plan: states (T+1, n) and controls (T, m) to begin with, which need not be a motion or keep anything.
+      barrier: its first parameter for each row, as a share of the cost divided by the number of rows.
+      room: what slacks are at first, at least: relative to a row's size, or to a control's range.
+      price: of missing a constraint by its size, relative to the cost: then it is elastic. Infinite: it is not.
+      multipliers: known ones of the constraints, (T+1, rows) each, or none.
+      stages: to use again, of the same problem.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        plan: Plan,
+        *,
+        barrier: float = 1.0,
+        room: float = 0.02,
+        price: float = np.inf,
+        multipliers: tuple[Array, ...] = (),
+        stages: Stages | None = None,
+    ) -> None:
+        self.stages = stages = Stages(problem) if stages is None else stages
+        finite = np.isfinite(stages.high - stages.low)
+        controls = plan.controls
+        size = np.maximum(np.abs(controls).max(axis=0), 1e-3)
+        self._range = np.where(finite, stages.high - stages.low, size)
+        edge = EDGE * np.where(finite, stages.high - stages.low, 0.0)
+        states = plan.states.copy()
+        if isinstance(problem.initial, FixedState):
+            fixed = stages.free == 0
+            states[0, fixed] = np.asarray(problem.start)[fixed]
+        plan = Plan(in_c_order(states), in_c_order(np.clip(controls, stages.low + edge, stages.high - edge)))
+        self._sizes(problem, plan)
+        self._rows_of(plan, barrier, room, price, multipliers)
+        self.iterations, self.gain = 0, stages.gain
+        self._filter: list[tuple[float, float]] = []
+        self._mixed, self._part, self._forced = False, 1.0, 0
+        stages.linearize(plan, self._costates, self._spread(self._force), np.inf)
+        self._costates, self._slopes = self._adjoint()
+        self._measure()
+
+    def _sizes(self, problem: Problem, plan: Plan) -> None:
+        """The sizes of states, and of rows (R,): by how much they change where states and controls do."""
+        stages = self.stages
+        reach = np.ptp(plan.states, axis=0)
+        if problem.goal is not None and problem.start is not None:
+            reach = np.maximum(reach, np.abs(np.nan_to_num(problem.goal - problem.start)))
+        self._state_size = np.where(reach > 1e-6, reach, 1.0)
+        stages.look_about(plan)
+        both = np.concatenate([self._state_size, self._range])
+        counts = np.maximum(stages.live.sum(axis=0), 1)
+        size = np.sqrt(((stages.slopes * both) ** 2).sum(axis=2).sum(axis=0) / counts)
+        self._row_size = np.where(size > 0, size, 1.0)
+
+    def _rows_of(
+        self, plan: Plan, barrier: float, room: float, price: float, multipliers: tuple[Array, ...]
+    ) -> None:
+        """Set up slacks and multipliers."""
+        stages, live = self.stages, self.stages.live
+        cost, arrived = stages.trial(plan)
+        numbers = stages.values(plan)[live]
+        self._floor = max(1e-6 * abs(cost), 1e-300) if np.isfinite(cost) else 1.0
+        self._scale = self._scale_of(cost)
+        shape = live.shape
+        size = np.broadcast_to(self._row_size, shape)[live]
+        equality = np.broadcast_to(stages.equality, shape)[live]
+        limit = np.broadcast_to(stages.owners == -1, shape)[live]
+        self._size = size
+        highest = np.where(limit, np.inf, price * self._scale / size)
+        lowest = np.where(equality, -highest, 0.0)
+        below, above = np.flatnonzero(np.isfinite(lowest)), np.flatnonzero(np.isfinite(highest))
+        # Slacks come in pairs with what is between a multiplier and its bound; `row` says whose.
+        self._row = np.concatenate([below, above])
+        self._sign = np.concatenate([np.ones(len(below)), -np.ones(len(above))])
+        self._bound = np.concatenate([lowest[below], highest[above]])
+        self._hard = np.concatenate([~np.isfinite(highest[below]), np.zeros(len(above), dtype=bool)])
+        self._regularised = np.where(np.isfinite(lowest), 0.0, REGULARISATION * size**2 / self._scale)
+        # In units of cost.
+        self._first = barrier * self._scale / max(len(self._row), 1)
+        self.parameter = self._first
+        known = np.zeros(shape)
+        for k, one in enumerate(multipliers):
+            known[:, stages.owners == k] = one
+        force = known[live]
+        least = room * size
+        pressed = (force > 0) & ~equality
+        if multipliers:
+            least = np.where(pressed, np.minimum(least, self.parameter / np.where(pressed, force, 1.0)), least)
+        spare = np.maximum(numbers[below] * np.where(equality[below], 0.0, 1.0), least[below])
+        spare = np.where(equality[below], np.maximum(numbers[below], 0.0) + least[below], spare)
+        filled = np.zeros(len(numbers))
+        filled[below] = spare
+        slack = np.concatenate([spare, np.maximum(filled[above] - numbers[above], 1e-3 * least[above])])
+        if len(multipliers):
+            middle = self.parameter / filled[below]
+            within = np.clip(force[below], 0.1 * middle, 10 * middle)
+            force[below] = np.where(equality[below], force[below], within)
+        else:
+            force[below] = np.where(equality[below], 0.0, self.parameter / filled[below])
+        far = np.where(np.isfinite(highest), 0.9 * highest, np.inf)
+        self._force = np.clip(force, np.where(equality, -far, 0.0), far)
+        self._costates = np.zeros((stages.steps + 1, stages.n))
+        self.point = Point(plan, cost, arrived, numbers, slack)
+
+    def run(
+        self,
+        *,
+        tolerance: float,
+        violation: float,
+        most: int,
+        watch: Callable[[Measures], bool] = lambda measures: False,
+    ) -> Found:
+        """Go on until the measures are within tolerance, or no step helps, or `watch` says so.
+
+        Args:
+          tolerance: of stationarity, gaps and complementarity. violation: of the constraints, in their units.
+          most: iterations. watch: called with the measures after each; True ends it.
+        """
+        solved = self._within(tolerance, violation)
+        while not solved and self.iterations < most and np.isfinite(self.measures.cost):
+            if not self._iterate(tolerance):
+                break
+            solved = self._within(tolerance, violation)
+            if watch(self.measures):
+                break
+        if solved:
+            self._cross(tolerance, violation)
+        return self._found(solved)
+
+    def _found(self, solved: bool) -> Found:
+        stages, spread = self.stages, self._spread(self._force)
+        known = tuple(spread[:, stages.owners == k].copy() for k in range(len(stages.problem.constraint_terms)))
+        pressing = np.zeros((stages.steps, stages.m))
+        for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
+            pressing[:, i] -= sign * spread[:-1, row]
+        return Found(
+            plan=self.point.plan, gain=stages.gain, measures=self.measures, multipliers=known, pressing=pressing,
+            solved=solved, iterations=self.iterations, control_size=self._range, row_size=self._row_size,
+            scale=self._scale,
+        )  # fmt: skip
+
+    def _cross(self, tolerance: float, violation: float) -> None:
+        """Leave the barrier: rows that press are zero from now on, others do not matter; where that is right.
+
+        So controls come to stand at their limits, and multipliers lose what the barrier added.
+        """
+        stages, size = self.stages, self._size
+        equality = np.broadcast_to(stages.equality, stages.live.shape)[stages.live]
+        if len(self._row) == 0 or not self._hard.all():
+            return
+        slack = np.ones(len(size))
+        slack[self._row] = self.point.slack
+        presses = equality | (self._force * size / self._scale > slack / size)
+        kept = self.point, self._force, self._costates, self.measures
+        right = False
+        for _ in range(CROSSINGS):
+            numbers = self.point.numbers
+            sigma = np.where(presses, self._scale / (REGULARISATION * size**2), 0.0)
+            self._force = np.where(presses, self._force, 0.0)
+            stages.linearize(self.point.plan, self._costates, self._spread(self._force), 0.0)
+            gaps = stages.models.arrived - self.point.plan.states[1:]
+            spread = self._spread(sigma)
+            barrier = np.matmul((stages.slopes * spread[:, :, None]).transpose(0, 2, 1), stages.slopes)
+            gradient = stages.models.gradient - self._pull(self._force - sigma * numbers)
+            if not stages.direction(stages.models.hessian + barrier, gradient, gaps):
+                break
+            moved = np.matmul(stages.slopes, stages.joined()[:, :, None])[:, :, 0][stages.live]
+            self._force = self._force - sigma * (numbers + moved)
+            self._costates = stages.to_go.gradient.copy()
+            step = Step(stages.changes, np.zeros(len(self._row)), np.zeros(0), self._costates)
+            there = self._at(step, 1.0)
+            if there is None:
+                break
+            self.point = there._replace(slack=self.point.slack)
+            stages.linearize(there.plan, self._costates, self._spread(self._force), 0.0)
+            self._measure()
+            wrong = ~presses & (there.numbers < 0) | presses & ~equality & (self._force < 0)
+            presses ^= wrong
+            right, found = not wrong.any(), self.measures
+            if right and max(found.stationarity, found.gap) < 1e-3 * tolerance and found.violation < 1e-3 * violation:
+                break
+        found = self.measures
+        if not (right and found.stationarity < tolerance and found.gap < tolerance and found.violation <= violation):
+            self.point, self._force, self._costates, self.measures = kept
+
+    def _within(self, tolerance: float, violation: float) -> bool:
+        found = self.measures
+        others = found.stationarity < tolerance and found.gap < tolerance and found.complementarity < tolerance
+        return others and found.violation <= violation
+
+    def _scale_of(self, cost: float) -> float:
+        """What is relative to the cost is so to this: the cost, or a millionth of the first one."""
+        return max(abs(cost), self._floor) if np.isfinite(cost) else self._floor
+
+    def _spread(self, rows: Array) -> Array:
+        """Numbers of the live rows (K,) where they belong, (T+1, R); others are zero."""
+        spread = np.zeros(self.stages.live.shape)
+        spread[self.stages.live] = rows
+        return spread
+
+    def _pull(self, rows: Array) -> Array:
+        """The sum of the slopes (T+1, n+m) of the live rows times these numbers."""
+        return np.matmul(self._spread(rows)[:, None, :], self.stages.slopes)[:, 0, :]
+
+    def _adjoint(self) -> tuple[Array, Array]:
+        return self.stages.adjoint(in_c_order(self.stages.models.gradient - self._pull(self._force)))
+
+    def _missed(self, point: Point) -> Array:
+        """By how much rows are not their slacks, (K,)."""
+        return point.numbers - np.bincount(self._row, self._sign * point.slack, len(point.numbers))
+
+    def _duals(self, force: Array) -> Array:
+        """What is between multipliers and their bounds, (P,)."""
+        return self._sign * (force[self._row] - self._bound)
+
+    def _measure(self) -> None:
+        """Work out the measures where the models are made."""
+        stages, point = self.stages, self.point
+        self._gaps = stages.models.arrived - point.plan.states[1:]
+        start, slopes = self._adjoint()
+        self._scale = self._scale_of(point.cost)
+        stationarity = float((np.abs(slopes) * self._range).max())
+        stationarity = max(stationarity, float((np.abs(start[0]) * self._state_size * stages.free).max()))
+        equality = np.broadcast_to(stages.equality, stages.live.shape)[stages.live]
+        numbers = point.numbers
+        missed = float(np.where(equality, np.abs(numbers), -numbers).max(initial=0.0))
+        self._products = point.slack * self._duals(self._force)
+        # What is left to spare times the multiplier; of what is elastic and missed, the product of the other slack.
+        largest = float(self._products.max(initial=0.0))
+        if self._hard.all():
+            largest = float(np.where(equality, 0.0, np.abs(numbers) * self._force).max(initial=0.0))
+        self.measures = Measures(
+            cost=point.cost, stationarity=stationarity / self._scale, violation=missed,
+            gap=float((np.abs(self._gaps) / self._state_size).max()), complementarity=largest / self._scale,
+        )  # fmt: skip
+
+    def _iterate(self, tolerance: float) -> bool:
+        """One iteration; whether there was a step."""
+        stages, point, scale = self.stages, self.point, self._scale
+        least = 0.1 * tolerance * scale
+        if self._mixed or self._part < LONG:
+            self._lower_barrier(least)
+        duals = self._duals(self._force)
+        ratio = point.slack / duals
+        sigma = 1 / (self._regularised + np.bincount(self._row, ratio, len(point.numbers)))
+        spread = self._spread(sigma)
+        barrier = np.matmul((stages.slopes * spread[:, :, None]).transpose(0, 2, 1), stages.slopes)
+        mix = self._mix(barrier, sigma, duals)
+        if mix is None:
+            return False
+        self.iterations += 1
+        corrections = np.zeros(len(point.slack))
+        self._mixed = mix > 0
+        hessian = self._hessian(mix, barrier)
+        if not self._mixed and self._part >= LONG and len(self._row):
+            corrections = self._predict(hessian, sigma, duals, least)
+            self._solve(hessian, sigma, duals, corrections, self._missed(point) * 0)
+        step = self._step(sigma, duals, corrections)
+        slope = self._slope(step)
+        taken = self._search(step, slope, hessian, sigma, duals, corrections)
+        if taken is None:
+            self._forced += 1
+            if self._forced > FORCED or not self._solve(
+                self._hessian(1.0, barrier), sigma, duals, np.zeros(len(point.slack)), self._missed(point) * 0
+            ):
+                return False
+            self._filter = []
+            step = self._step(sigma, duals, np.zeros(len(point.slack)))
+            taken = self._search(step, self._slope(step), None, sigma, duals, corrections)
+            if taken is None:  # a little of it, be it better or not
+                part = 0.1 * self._longest(point.slack, step.slack)
+                tried = self._at(step, part)
+                if tried is None:
+                    return False
+                taken = tried, part, step
+        before = self._off(point), self._merit(point)
+        new, part, step = taken
+        self._filter.append(((1 - MARGIN) * before[0], before[1] - MARGIN * before[0]))
+        self._part = part
+        dual_part = self._longest(duals, self._sign * step.multipliers[self._row])
+        held = np.isfinite(self._regularised) & (self._regularised > 0)
+        self._force = self._force + np.where(held, part, dual_part) * step.multipliers
+        self._costates = self._costates + part * (step.costates - self._costates)
+        self._tidy(new.slack)
+        self.point = new
+        stages.linearize(new.plan, self._costates, self._spread(self._force), 1e-10 * scale)
+        self._measure()
+        return True
+
+    def _lower_barrier(self, least: float) -> None:
+        """Lower its parameter while the measures are within reach of it."""
+        missed = float((np.abs(self._missed(self.point)) / self._size).max(initial=0.0))
+        for _ in range(4):
+            off = max(
+                self.measures.stationarity * self._scale, max(missed, self.measures.gap) * self._scale,
+                float(np.abs(self._products - self.parameter).max(initial=0.0)),
+            )  # fmt: skip
+            if off > 10 * self.parameter or self.parameter <= least:
+                break
+            lower = self._scale * (self.parameter / self._scale) ** 1.5
+            self.parameter, self._filter = max(least, min(0.2 * self.parameter, lower)), []
+
+    def _hessian(self, mix: float, barrier: Array) -> Array:
+        models = self.stages.models
+        mixed = models.hessian if mix == 0 else (1 - mix) * models.hessian + mix * models.convex
+        return mixed + barrier
+
+    def _mix(self, barrier: Array, sigma: Array, duals: Array) -> float | None:
+        """The least share of the projected Hessian with which there is a step, which is in `stages`; None if none."""
+        none = np.zeros(len(self.point.slack))
+        nothing = np.zeros(len(self.point.numbers))
+        for mix in MIXES:
+            if self._solve(self._hessian(mix, barrier), sigma, duals, none, nothing):
+                return mix
+        hessian, n = self._hessian(1.0, barrier), self.stages.n
+        for weight in WEIGHTS:
+            heavier = hessian.copy()
+            diagonal = np.arange(n, n + self.stages.m)
+            heavier[:, diagonal, diagonal] += weight * self._scale / self._range**2
+            if self._solve(heavier, sigma, duals, none, nothing):
+                return 1.0
+        return None
+
+    def _solve(self, hessian: Array, sigma: Array, duals: Array, corrections: Array, beyond: Array) -> bool:
+        """Find the step, of plan and costates; `beyond` is added to what the rows miss."""
+        pull = self._force - sigma * (self._target(duals, corrections) + beyond)
+        gradient = self.stages.models.gradient - self._pull(pull)
+        return self.stages.direction(hessian, gradient, self._gaps + self._more)
+
+    _more: Array | float = 0.0  # gaps that a correction adds
+
+    def _target(self, duals: Array, corrections: Array) -> Array:
+        """What the rows are to change by, but for their response to multipliers, (K,)."""
+        wanted = self._sign * (self.parameter - corrections) / duals
+        return self.point.numbers - np.bincount(self._row, wanted, len(self.point.numbers))
+
+    def _step(self, sigma: Array, duals: Array, corrections: Array, beyond: Array | float = 0.0) -> Step:
+        """The step of slacks and multipliers that belongs to that of the plan in `stages`."""
+        stages, point = self.stages, self.point
+        moved = np.matmul(stages.slopes, stages.joined()[:, :, None])[:, :, 0][stages.live]
+        multipliers = -sigma * (moved + self._target(duals, corrections) + beyond)
+        ratio = point.slack / duals
+        slack = (self.parameter - corrections) / duals - point.slack - self._sign * ratio * multipliers[self._row]
+        plan = Plan(stages.changes.states.copy(), stages.changes.controls.copy())
+        return Step(plan, slack, multipliers, stages.to_go.gradient.copy())
+
+    def _predict(self, hessian: Array, sigma: Array, duals: Array, least: float) -> Array:
+        """Mehrotra's rule: the barrier's parameter from a step without one, and what its products add, (P,)."""
+        point, none = self.point, np.zeros(len(self.point.slack))
+        self.parameter = 0.0
+        self._solve(hessian, sigma, duals, none, np.zeros(len(point.numbers)))
+        step = self._step(sigma, duals, none)
+        moved = self._sign * step.multipliers[self._row]
+        primal, dual = self._longest(point.slack, step.slack, 1.0), self._longest(duals, moved, 1.0)
+        average = float(self._products.mean())
+        after = float(((point.slack + primal * step.slack) * (duals + dual * moved)).mean())
+        self.parameter = max(least, min(10 * self._first, (after / average) ** 3 * average))
+        self._filter = []
+        return step.slack * moved if primal > 0.5 else none
+
+    def _longest(self, numbers: Array, changes: Array, share: float | None = None) -> float:
+        """The part of the changes, at most 1, that leaves positive numbers a share above zero."""
+        share = max(BOUNDARY, 1 - self.parameter / self._scale) if share is None else share
+        falling = changes < 0
+        return min(1.0, float((-share * numbers[falling] / changes[falling]).min())) if falling.any() else 1.0
+
+    def _off(self, point: Point) -> float:
+        """By how much a point misses the dynamics and its rows, in all; relative to their sizes."""
+        gaps = np.abs(point.arrived - point.plan.states[1:]) / self._state_size
+        return float(gaps.sum() + (np.abs(self._missed(point)) / self._size).sum())
+
+    def _merit(self, point: Point) -> float:
+        """Cost, prices and barrier."""
+        paid = -float((self._sign * self._bound) @ point.slack)
+        return point.cost + paid - self.parameter * float(np.log(point.slack).sum())
+
+    def _slope(self, step: Step) -> float:
+        """Of the merit along a step."""
+        joined = np.concatenate([step.plan.states, np.pad(step.plan.controls, ((0, 1), (0, 0)))], axis=1)
+        slacks = -self._sign * self._bound - self.parameter / self.point.slack
+        return float((self.stages.models.gradient * joined).sum() + slacks @ step.slack)
+
+    def _at(self, step: Step, part: float) -> Point | None:
+        """The point a part of a step further; None where it is not finite."""
+        plan = Plan(
+            in_c_order(self.point.plan.states + part * step.plan.states),
+            in_c_order(self.point.plan.controls + part * step.plan.controls),
+        )
+        cost, arrived = self.stages.trial(plan)
+        numbers = self.stages.values(plan)[self.stages.live]
+        if not np.isfinite(cost) or not np.isfinite(numbers).all() or not np.isfinite(arrived).all():
+            return None
+        slack = self.point.slack + part * step.slack
+        slack = np.where(self._hard, np.maximum(slack, numbers[self._row]), slack)
+        return Point(plan, cost, arrived, numbers, slack)
+
+    def _acceptable(self, tried: Point, part: float, slope: float) -> bool:
+        """Whether the filter takes it."""
+        off, merit = self._off(tried), self._merit(tried)
+        before, at_first = self._off(self.point), self._merit(self.point)
+        if not np.isfinite(merit) or any(off > worst and merit > dearest for worst, dearest in self._filter):
+            return False
+        small = 1e-4 * max(1.0, 1e-2 * self._gaps.size)
+        if before < small and slope < 0 and (-part * slope) ** 2.3 > before**1.1:
+            return merit <= at_first + ARMIJO * part * slope + 1e-12 * abs(at_first)
+        at_rest = off < 1e-9 and merit <= at_first + 1e-11 * abs(at_first)
+        return off <= (1 - MARGIN) * before or merit <= at_first - MARGIN * before or at_rest
+
+    def _search(
+        self, step: Step, slope: float, hessian: Array | None, sigma: Array, duals: Array, corrections: Array
+    ) -> tuple[Point, float, Step] | None:
+        """The longest part of a step that is acceptable, by halves; of the first one also its correction.
+
+        A Hessian of None is for steps without a correction, which is a step of the second order: it closes what the
+        whole step leaves open, for neither rows nor dynamics are linear.
+        """
+        part, first = self._longest(self.point.slack, step.slack), True
+        while part > SHORTEST:
+            tried = self._at(step, part)
+            if tried is not None and self._acceptable(tried, part, slope):
+                return tried, part, step
+            if first and tried is not None and hessian is not None and self._off(tried) >= self._off(self.point):
+                beyond = part * self._missed(self.point) + self._missed(tried) - self._missed(self.point)
+                self._more = part * self._gaps + tried.arrived - tried.plan.states[1:] - self._gaps
+                good = self._solve(hessian, sigma, duals, corrections, beyond)
+                self._more = 0.0
+                if good:
+                    other = self._step(sigma, duals, corrections, beyond)
+                    corrected = self._at(other, self._longest(self.point.slack, other.slack))
+                    if corrected is not None and self._acceptable(corrected, part, slope):
+                        # Multipliers and costates go where the step that was meant leads.
+                        return corrected, part, step
+            first = False
+            part /= 2
+        return None
+
+    def _tidy(self, slack: Array) -> None:
+        """Keep the products of slacks and multipliers within reach of the barrier's parameter, where rows are hard."""
+        row = self._row[self._hard]
+        middle = self.parameter / slack[self._hard]
+        self._force[row] = np.clip(self._force[row], middle / WIDE, WIDE * middle)

@@ -1,0 +1,263 @@
+"""What a solve from one start tries, top to bottom, until something converges.
+
+Without constraints: the method, Newton's where it has found the valley, the safeguard where it fails; see `Attempt`.
+With constraints, whatever comes first is followed by the interior point, which has the end:
+
+    the plan of another solution, with its multipliers;
+    a trajectory or a policy that the caller gave;
+    the valley that smoothing finds without the constraints;
+    the same with constraints that may be missed at a price, and from there without;
+    what the augmented Lagrangian comes to;
+    the start itself, with a large barrier.
+
+Where none of these converges, the plan that misses the constraints least is the answer. It is INFEASIBLE if two starts
+came to plans about which no change lessens what is missed.
+
+Problems with noise and constraints, those of an MJCF, and `finish=None` have the augmented Lagrangian alone.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from lqrsim.codegen.compiled_module import in_c_order
+from lqrsim.errors import Array
+from lqrsim.kernels import declarations
+from lqrsim.kernels.records import Plan
+from lqrsim.results.solution_parts import Iteration, Status, Trajectory
+from lqrsim.solvers import compiled, constrained
+from lqrsim.solvers.attempt import Attempt, AttemptResult
+from lqrsim.solvers.common import Callback, check_outcome
+from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures, Stages
+from lqrsim.solvers.multipliers import AugmentedLagrangian
+
+OPENING = 10  # iterations of smoothing at most, before constraints come in
+MOST = 150  # of the interior point from one plan
+INTERIOR = "interior point"  # what an iteration of it is called
+ROUGHLY = 1e-4  # how closely constraints at a price are solved for
+MUCH, LITTLE = (1.0, 0.02), (0.01, 0.01)  # barrier and room of a first plan, and of one that is near to the answer
+PRICE = 100.0  # of missing a constraint by its size, relative to the cost
+PENALTY = 8.0  # of the augmented Lagrangian that holds the policy to the constraints, in the same unit
+AT_LIMIT = 1e-9  # of its range, within which a control that presses against its limit is put there
+
+
+def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
+    """Run an attempt to its end, certified."""
+    if not attempt.problem.constraints:
+        return attempt.certified(attempt.finish(each=each, callback=callback))
+    if not attempt.newton:
+        return constrained.finish(attempt, each=each, callback=callback)
+    return Ladder(attempt, each=each, callback=callback).climb()
+
+
+def refine(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
+    """Run an attempt to its end from where its first policy leads, and stay on that way round; certified."""
+    if not (attempt.problem.constraints and attempt.newton):
+        return constrained.refine(attempt, each=each, callback=callback)
+    return Ladder(attempt, each=each, callback=callback).climb(stay=True)
+
+
+class Ladder:
+    """The ways to a plan that keeps constraints, one after the other."""
+
+    def __init__(self, attempt: Attempt, *, each: bool, callback: Callback | None) -> None:
+        self._attempt, self._problem, self._each, self._callback = attempt, attempt.problem, each, callback
+        self._allowed = attempt.settings.missed(attempt.problem)
+        self._stages = Stages(attempt.problem)
+        self._iterations: tuple[Iteration, ...] = ()
+        self._best: AttemptResult | None = None
+        self._given: AttemptResult | None = None
+        self._valley: Plan | None = None
+
+    def climb(self, *, stay: bool = False) -> AttemptResult:
+        """Try one after the other; with `stay`, only what begins where the first policy leads."""
+        guess = self._attempt.initial_guess
+        start = self._start()
+        given = guess.trajectory is not None or guess.gain.any() or stay
+        if given and start.violation <= self._allowed:
+            self._given = start  # never left behind
+        rungs: list[Callable[[], AttemptResult | None]] = []
+        if guess.multipliers and any(one.values.any() for one in guess.multipliers):
+            known = tuple(one.values for one in guess.multipliers)
+            rungs.append(lambda: self._interior(_plan(start), LITTLE, multipliers=known))
+        if given:
+            near = LITTLE if self._given is not None else MUCH
+            rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
+        if not stay:
+            rungs += [self._from_valley, self._at_a_price, self._augmented]
+        rungs.append(lambda: self._interior(_plan(start), MUCH))
+        for rung in rungs:
+            found = rung()
+            if found is not None and found.success and not self._worse(found):
+                break
+            if self._attempt.stop.due or not self._attempt.iterations_left(self._iterations):
+                break
+        return self._answer(start)
+
+    def _from_valley(self) -> AttemptResult | None:
+        attempt = self._attempt
+        attempt.run(min(OPENING, attempt.settings.max_iterations), each=self._each, callback=self._callback)
+        termination = check_outcome(
+            self._problem, attempt.termination, attempt.work.start, attempt.initial_guess.offset[0], refuse=self._each
+        )
+        self._iterations += termination.iterations
+        plan = attempt.work.arrays.rollout if np.isfinite(attempt.cost) else attempt.work.plan
+        if termination is not attempt.termination or not np.isfinite(attempt.work.memory["plan_cost"]):
+            return None
+        self._valley = Plan(plan.states.copy(), plan.controls.copy())
+        return None if attempt.stop.due else self._interior(self._valley, MUCH)
+
+    def _at_a_price(self) -> AttemptResult | None:
+        if self._valley is None:
+            return None
+        priced = self._run(self._valley, MUCH, price=PRICE, tolerance=ROUGHLY)
+        if priced is None or self._attempt.stop.due or not np.isfinite(priced.measures.cost):
+            return None
+        return self._interior(priced.plan, LITTLE, multipliers=priced.multipliers)
+
+    def _augmented(self) -> AttemptResult | None:
+        return None
+
+    def _interior(
+        self, plan: Plan, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()
+    ) -> AttemptResult | None:
+        """The interior point from a plan, and what becomes of it."""
+        found = self._run(plan, barrier, multipliers=multipliers)
+        if found is None or not np.isfinite(found.plan.states).all():
+            return None
+        if found.solved and (result := self._kept(found)) is not None and result.success:
+            return self._note(result)
+        return self._note(self._rolled_out(found.plan, found.gain))
+
+    def _run(
+        self, plan: Plan, barrier: tuple[float, float], *, price: float = np.inf,
+        multipliers: tuple[Array, ...] = (), tolerance: float | None = None,
+    ) -> Found | None:  # fmt: skip
+        """Iterations of the interior point, with a line of the log each; None where they were interrupted."""
+        stop, left = self._attempt.stop, self._attempt.iterations_left(self._iterations) - 1
+        before, clock = np.inf, time.perf_counter()
+
+        def watch(measures: Measures) -> bool:
+            nonlocal before, clock
+            improvement = (before - measures.cost) / max(abs(measures.cost), 1e-300)
+            now = time.perf_counter()
+            iteration = Iteration(
+                measures.cost, improvement, measures.gap, max(measures.stationarity, measures.complementarity),
+                measures.gap, measures.violation, now - clock, INTERIOR,
+            )  # fmt: skip
+            before, clock = measures.cost, now
+            self._iterations += (iteration,)
+            if self._callback is not None:
+                self._callback(iteration)
+            return stop.due
+
+        try:
+            with np.errstate(all="ignore"):
+                point = InteriorPoint(
+                    self._problem, plan, barrier=barrier[0], room=barrier[1], price=price, multipliers=multipliers,
+                    stages=self._stages,
+                )  # fmt: skip
+                return point.run(
+                    tolerance=self._attempt.final if tolerance is None else tolerance, violation=self._allowed,
+                    most=min(MOST, left), watch=watch,
+                )  # fmt: skip
+        except BaseException as error:  # the callback's, or Ctrl-C: raised again when there is a solution
+            stop.error = error
+            return None
+
+    def _start(self) -> AttemptResult:
+        """Where the policy leads that it all begins with."""
+        work = self._attempt.work
+        guess = self._attempt.initial_guess
+        states, controls = compiled.rollout(self._problem, guess.gain, guess.offset, work.start.copy())
+        return self._result(states, controls, (guess.gain, guess.offset))
+
+    def _rolled_out(self, plan: Plan, gain: Array) -> AttemptResult:
+        """Where a plan leads with gains about it; or without, if that misses less."""
+        candidates = []
+        for gains in (gain, np.zeros_like(gain)):
+            offset = plan.controls - np.einsum("tij,tj->ti", gains, plan.states[:-1])
+            states, controls = compiled.rollout(self._problem, gains, offset, plan.states[0].copy())
+            candidates.append(self._result(states, controls, (gains.copy(), offset)))
+        return min(candidates, key=lambda one: (not np.isfinite(one.cost), one.violation, one.cost))
+
+    def _result(self, states: Array, controls: Array, law: tuple[Array, Array]) -> AttemptResult:
+        """A plan that has not converged."""
+        cost, _ = self._stages.trial(Plan(in_c_order(states), in_c_order(controls)))
+        work = self._attempt.work
+        violation = work.violation(work.constraint_values(states, controls)) if np.isfinite(states).all() else np.inf
+        return AttemptResult(
+            status=Status.MAX_ITERATIONS, detail="", iterations=(), states=states, controls=controls, law=law,
+            cost=cost if np.isfinite(cost) else np.inf, violation=violation, gap=np.nan,
+        )  # fmt: skip
+
+    def _kept(self, found: Found) -> AttemptResult | None:
+        """The end: controls at their limits are put there, and Newton's method makes policy and value functions.
+
+        Its cost has the augmented Lagrangian at the multipliers that were found, about which the plan is a minimum.
+        """
+        attempt, work, stages = self._attempt, self._attempt.work, self._stages
+        low, high = stages.low, stages.high
+        controls, gain = found.plan.controls.copy(), found.gain.copy()
+        for side, sign in ((low, -1.0), (high, 1.0)):
+            room = np.abs(side - controls) / found.control_size
+            force = sign * found.pressing * found.control_size / found.scale
+            there = (room < AT_LIMIT) & (force > room)
+            controls = np.where(there, side, controls)
+            gain[there] = 0.0
+        offset = controls - np.einsum("tij,tj->ti", gain, found.plan.states[:-1])
+        states, controls = compiled.rollout(self._problem, gain, offset, found.plan.states[0].copy())
+        if not np.isfinite(states).all():
+            return None
+        values = work.constraint_values(states, controls)
+        for k, (term, numbers) in enumerate(zip(self._problem.constraint_terms, values, strict=True)):
+            array, size = work.multipliers[k], found.row_size[stages.owners == k]
+            array[0] = PENALTY * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
+            force = found.multipliers[k]
+            acts = term.equality | (force > array[0] * numbers)
+            array[declarations.HEADER :] = np.where(acts & np.isfinite(numbers), force, 0.0).ravel()
+        work.plan.states[...], work.plan.controls[...] = states, controls
+        work.memory["plan_cost"] = self._stages.trial(Plan(in_c_order(states), in_c_order(controls)))[0]
+        lagrangian = AugmentedLagrangian(attempt)
+        lagrangian.evaluate(states, controls)
+        before = self._iterations
+        result = attempt.descend(before, each=self._each, callback=None, added=lagrangian.added())
+        self._iterations = result.iterations
+        if len(result.iterations) == len(before) + 1 and before:  # no step: a look at the plan
+            last = result.iterations[-1]
+            self._iterations = (*before[:-1], replace(last, method=INTERIOR, seconds=last.seconds + before[-1].seconds))
+        lagrangian.evaluate(result.states, result.controls)
+        result = replace(result, multipliers=lagrangian.multipliers())
+        return result if lagrangian.kept else replace(result, status=Status.MAX_ITERATIONS)
+
+    def _note(self, found: AttemptResult) -> AttemptResult:
+        """Keep it, if it is the best so far, in memory of its own."""
+        if self._best is None or found.rank < self._best.rank:
+            law = found.law[0].copy(), found.law[1].copy()
+            self._best = replace(found, states=found.states.copy(), controls=found.controls.copy(), law=law)
+            if found.success and self._attempt.work.arrays.policy.gain is not found.law[0]:
+                self._best = replace(self._best, values={})
+        return found
+
+    def _worse(self, found: AttemptResult) -> bool:
+        """Whether a plan costs more than one that was given and keeps the constraints."""
+        return self._given is not None and found.cost > self._given.cost * (1 + 1e-9) + 1e-12
+
+    def _answer(self, start: AttemptResult) -> AttemptResult:
+        """The best of all, certified."""
+        attempt = self._attempt
+        best = start if self._best is None else self._best
+        if self._given is not None and self._worse(best):
+            best = self._given
+        if not best.success:
+            lagrangian = AugmentedLagrangian(attempt)
+            lagrangian.evaluate(best.states, best.controls)
+            status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS
+            best = replace(best, status=status, detail=lagrangian.worst())
+        return attempt.certified(replace(best, iterations=self._iterations))
+
+
+def _plan(of: AttemptResult | Trajectory) -> Plan:
+    return Plan(of.states.copy(), of.controls.copy())
