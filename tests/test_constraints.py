@@ -63,7 +63,7 @@ class TestOfTheControl:
 
 
 def test_a_plan_that_keeps_them_anyway_is_the_same_to_the_last_bit(differential_drive: ls.Scenario) -> None:
-    drive_solution = ls.smooth(differential_drive.problem, finish=None)
+    drive_solution = ls.smooth(differential_drive.problem)
     (cost,) = differential_drive.problem.obstacle_costs
     kept = [ls.Clearance(cost.world, radius=cost.radius, margin=0.1)]
     solution = ls.smooth(replace(differential_drive.problem, constraints=kept))

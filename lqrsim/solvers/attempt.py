@@ -48,9 +48,10 @@ class AttemptResult:
     final: bool = False
 
     @property
-    def rank(self) -> tuple[bool, float, float]:
-        """The smaller, the better: success first, then constraints, then the cost."""
-        return not self.success, 0.0 if self.success else self.violation, self.cost
+    def rank(self) -> tuple[bool, float, bool, float]:
+        """The smaller, the better: success first, then constraints, then what is known of why not, then the cost."""
+        missed = 0.0 if self.success else float(f"{self.violation:.2g}")
+        return not self.success, missed, self.status is not Status.INFEASIBLE, self.cost
 
     @property
     def success(self) -> bool:
@@ -165,11 +166,11 @@ class Attempt:
         settings = self.settings
         self.run(settings.max_iterations, each=each, callback=callback)
         if self.termination.outcome == declarations.IN_VALLEY:
-            kept = self._kept()
+            kept = self.kept()
             found = self.descend(self.termination.iterations, each=each, callback=callback)
             if found.success or self.stop.due or not self.iterations_left(found.iterations):
                 return found
-            self._go_on(kept, found.iterations)
+            self.go_on(kept, found.iterations)
             self.run(settings.max_iterations, each=each, callback=callback)
         termination = check_outcome(
             self.problem, self.termination, self.work.start, self.initial_guess.offset[0], refuse=each
@@ -207,12 +208,12 @@ class Attempt:
             detail = f"{detail}; Newton's method comes no further".removeprefix("; ")
         return self.damped_result(done, done.status, detail)
 
-    def _kept(self) -> list[Array]:
+    def kept(self) -> list[Array]:
         """Copies of what smoothing goes on from."""
         return [array.copy() for array in self._going_on]
 
-    def _go_on(self, kept: list[Array], iterations: tuple[Iteration, ...]) -> None:
-        """Have smoothing go on from there, after iterations of Newton's method that came to nothing."""
+    def go_on(self, kept: list[Array], iterations: tuple[Iteration, ...]) -> None:
+        """Have smoothing go on from there, after others' iterations that came to nothing."""
         for array, copy in zip(self._going_on, kept, strict=True):
             array[...] = copy
         self._valley = 0.0

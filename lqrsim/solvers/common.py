@@ -63,6 +63,7 @@ _METHODS = {
 }
 MOST_STARTS, MOST_THREADS = 10_000, 1024
 ROUGH, FINE = 1e-4, 1e-8  # the tolerances of smoothing and of Newton's method, by default
+INSIDE = 1e-3  # of what they may be missed by, what constraints that press have to spare for rounding
 MISSED, SPARED = 1e-6, 1e-3  # those of constraints, by the interior point and by the augmented Lagrangian
 ATTENTION = 0.1  # s, after which compiled code comes back to heed Ctrl-C
 

@@ -25,12 +25,14 @@ from lqrsim.kernels import interior_point as kernel
 from lqrsim.kernels.records import ConstraintRows, CostToGo, Plan, Policy, StageModels
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
+from lqrsim.solvers.common import INSIDE
 
 MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # shares of the projected Hessian, tried in turn
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)  # on changes of controls, where not even that has a minimum; relative to the cost
 REGULARISATION = 1e-8  # of equalities, relative
 LONG = 0.3  # the part of a step from which the next one takes Mehrotra's rule
 BOUNDARY = 0.99  # of the way to where a slack is zero, how much is taken at least
+NOTHING = 1e-4  # of what it typically costs to change all, a cost that is as good as none
 SHORTEST = 1e-7  # part of a step
 MARGIN = 1e-5  # by which a filter wants something to be better
 ARMIJO = 1e-4  # of what a step promises, what there has to be of it
@@ -65,7 +67,8 @@ class Found:
       plan: states and controls, a motion but for gaps. gain: (T, m, n) about it. measures: of it.
       multipliers: of each constraint (T+1, rows); of the limits (T, m), positive where a control presses against the
         upper one. solved: whether all measures are within tolerance. iterations: how many there were.
-      control_size, row_size: by how much controls (m,) and rows (R,) change. scale: the cost that is relative to.
+      control_size, row_size, state_size: by how much controls (m,), rows (R,) and states (n,) change. scale: the cost
+        that is relative to. shares: of each constraint (T+1, rows), the multipliers relative to what missing it costs.
     """
 
     plan: Plan
@@ -78,6 +81,8 @@ class Found:
     control_size: Array
     row_size: Array
     scale: float
+    state_size: Array
+    shares: list[Array]
 
 
 class Stages:
@@ -228,15 +233,13 @@ class InteriorPoint:
         self.stages = stages = Stages(problem) if stages is None else stages
         finite = np.isfinite(stages.high - stages.low)
         controls = plan.controls
-        size = np.maximum(np.abs(controls).max(axis=0), 1e-3)
-        self._range = np.where(finite, stages.high - stages.low, size)
         edge = EDGE * np.where(finite, stages.high - stages.low, 0.0)
         states = plan.states.copy()
         if isinstance(problem.initial, FixedState):
             fixed = stages.free == 0
             states[0, fixed] = np.asarray(problem.start)[fixed]
         plan = Plan(in_c_order(states), in_c_order(np.clip(controls, stages.low + edge, stages.high - edge)))
-        self._sizes(problem, plan)
+        self._sizes(problem, plan, finite)
         self._rows_of(plan, barrier, room, price, multipliers)
         self.iterations, self.gain = 0, stages.gain
         self._filter: list[tuple[float, float]] = []
@@ -245,18 +248,27 @@ class InteriorPoint:
         self._costates, self._slopes = self._adjoint()
         self._measure()
 
-    def _sizes(self, problem: Problem, plan: Plan) -> None:
-        """The sizes of states, and of rows (R,): by how much they change where states and controls do."""
+    def _sizes(self, problem: Problem, plan: Plan, finite: Array) -> None:
+        """The sizes of states, of controls, of rows (R,), by how much they change where these do, and of the cost.
+
+        A control without limits has the size with which it moves states by theirs.
+        """
         stages = self.stages
         reach = np.ptp(plan.states, axis=0)
         if problem.goal is not None and problem.start is not None:
             reach = np.maximum(reach, np.abs(np.nan_to_num(problem.goal - problem.start)))
         self._state_size = np.where(reach > 1e-6, reach, 1.0)
         stages.look_about(plan)
+        moved = np.abs(stages.models.jacobian[:, :, stages.n :]).sum(axis=0) / self._state_size[:, None]
+        enough = 1 / np.maximum(moved.max(axis=0), 1e-6)
+        enough = np.maximum(enough, np.abs(plan.controls).max(axis=0))
+        self._range = np.where(finite, stages.high - stages.low, enough)
         both = np.concatenate([self._state_size, self._range])
         counts = np.maximum(stages.live.sum(axis=0), 1)
         size = np.sqrt(((stages.slopes * both) ** 2).sum(axis=2).sum(axis=0) / counts)
         self._row_size = np.where(size > 0, size, 1.0)
+        curvature = np.abs(np.einsum("tww->w", stages.models.convex)) @ both**2
+        self._typical = 0.5 * float(curvature) or 1.0
 
     def _rows_of(
         self, plan: Plan, barrier: float, room: float, price: float, multipliers: tuple[Array, ...]
@@ -265,14 +277,15 @@ class InteriorPoint:
         stages, live = self.stages, self.stages.live
         cost, arrived = stages.trial(plan)
         numbers = stages.values(plan)[live]
-        self._floor = max(1e-6 * abs(cost), 1e-300) if np.isfinite(cost) else 1.0
-        self._scale = self._scale_of(cost)
+        # A cost of next to nothing, as of standing still, says nothing about what there is to pay.
+        self._scale = cost if NOTHING * self._typical < cost < np.inf else 1e-2 * self._typical
         shape = live.shape
         size = np.broadcast_to(self._row_size, shape)[live]
         equality = np.broadcast_to(stages.equality, shape)[live]
         limit = np.broadcast_to(stages.owners == -1, shape)[live]
         self._size = size
         highest = np.where(limit, np.inf, price * self._scale / size)
+        self._highest, self._elastic = highest, bool(np.isfinite(price))
         lowest = np.where(equality, -highest, 0.0)
         below, above = np.flatnonzero(np.isfinite(lowest)), np.flatnonzero(np.isfinite(highest))
         # Slacks come in pairs with what is between a multiplier and its bound; `row` says whose.
@@ -339,16 +352,20 @@ class InteriorPoint:
         pressing = np.zeros((stages.steps, stages.m))
         for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             pressing[:, i] -= sign * spread[:-1, row]
+        held = np.where(np.isfinite(self._highest), self._force / self._highest, 0.0)
+        spread = self._spread(held)
+        shares = [spread[:, stages.owners == k] for k in range(len(known))]
         return Found(
             plan=self.point.plan, gain=stages.gain, measures=self.measures, multipliers=known, pressing=pressing,
             solved=solved, iterations=self.iterations, control_size=self._range, row_size=self._row_size,
-            scale=self._scale,
+            scale=self._scale, state_size=self._state_size, shares=shares,
         )  # fmt: skip
 
     def _cross(self, tolerance: float, violation: float) -> None:
         """Leave the barrier: rows that press are zero from now on, others do not matter; where that is right.
 
-        So controls come to stand at their limits, and multipliers lose what the barrier added.
+        So controls come to stand at their limits, and multipliers lose what the barrier added. Constraints are kept
+        with as much to spare as rounding takes.
         """
         stages, size = self.stages, self._size
         equality = np.broadcast_to(stages.equality, stages.live.shape)[stages.live]
@@ -358,9 +375,10 @@ class InteriorPoint:
         slack[self._row] = self.point.slack
         presses = equality | (self._force * size / self._scale > slack / size)
         kept = self.point, self._force, self._costates, self.measures
-        right = False
+        limit = np.broadcast_to(stages.owners == -1, stages.live.shape)[stages.live]
+        aim, right = np.where(equality | limit, 0.0, INSIDE * violation), False
         for _ in range(CROSSINGS):
-            numbers = self.point.numbers
+            numbers = self.point.numbers - aim
             sigma = np.where(presses, self._scale / (REGULARISATION * size**2), 0.0)
             self._force = np.where(presses, self._force, 0.0)
             stages.linearize(self.point.plan, self._costates, self._spread(self._force), 0.0)
@@ -392,11 +410,14 @@ class InteriorPoint:
     def _within(self, tolerance: float, violation: float) -> bool:
         found = self.measures
         others = found.stationarity < tolerance and found.gap < tolerance and found.complementarity < tolerance
+        if self._elastic:  # what is missed is in the slacks
+            return others and float((np.abs(self._missed(self.point)) / self._size).max(initial=0.0)) < tolerance
         return others and found.violation <= violation
 
     def _scale_of(self, cost: float) -> float:
-        """What is relative to the cost is so to this: the cost, or a millionth of the first one."""
-        return max(abs(cost), self._floor) if np.isfinite(cost) else self._floor
+        """What is relative to the cost is so to this: the cost, or where all of it cancels a millionth of its parts."""
+        least = 1e-6 * self._typical
+        return max(abs(cost), least) if np.isfinite(cost) else least
 
     def _spread(self, rows: Array) -> Array:
         """Numbers of the live rows (K,) where they belong, (T+1, R); others are zero."""

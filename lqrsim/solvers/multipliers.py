@@ -73,7 +73,7 @@ class AugmentedLagrangian:
         missed = zip(self._terms, self._each(_missed), strict=True)
         self.solved = all(off <= self._tolerance[term.equality] for term, off in missed)
         pairs = zip(self._terms, stated, strict=True)
-        beyond = max(violation_of(term, values) - term.equality * self._near for term, values in pairs)
+        beyond = max((violation_of(term, values) - term.equality * self._near for term, values in pairs), default=0.0)
         self.nearly = not self.kept and beyond <= 0
 
     def start(self) -> None:

@@ -207,7 +207,9 @@ def _solve(
     assert found.certificate is not None
     detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
     solution = assemble(
-        problem, solver="smooth", options=settings.options(chosen.initial_guess) | {"tolerance": chosen.final},
+        problem, solver="smooth",
+        options=settings.options(chosen.initial_guess)
+        | {"tolerance": chosen.final, "constraint_tolerance": settings.missed(problem)},
         status=found.status,
         detail=detail, iterations=found.iterations, states=found.states, controls=found.controls,
         law=found.law,

@@ -30,15 +30,18 @@ from lqrsim.results.solution_parts import Iteration, Status, Trajectory
 from lqrsim.solvers import compiled, constrained
 from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import Callback, check_outcome
+from lqrsim.solvers.infeasibility import Evidence, evidence
 from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures, Stages
 from lqrsim.solvers.multipliers import AugmentedLagrangian
 
+FAR = 100.0  # times what may be missed: then the price is too low, or there is no way to keep all
+STARTS = 2  # from which what is missed has to be stationary, before that is called infeasible
 OPENING = 10  # iterations of smoothing at most, before constraints come in
 MOST = 150  # of the interior point from one plan
 INTERIOR = "interior point"  # what an iteration of it is called
 ROUGHLY = 1e-4  # how closely constraints at a price are solved for
 MUCH, LITTLE = (1.0, 0.02), (0.01, 0.01)  # barrier and room of a first plan, and of one that is near to the answer
-PRICE = 100.0  # of missing a constraint by its size, relative to the cost
+PRICES = (1e2, 1e4)  # of missing a constraint by its size, relative to the cost
 PENALTY = 8.0  # of the augmented Lagrangian that holds the policy to the constraints, in the same unit
 AT_LIMIT = 1e-9  # of its range, within which a control that presses against its limit is put there
 
@@ -46,7 +49,7 @@ AT_LIMIT = 1e-9  # of its range, within which a control that presses against its
 def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
     """Run an attempt to its end, certified."""
     if not attempt.problem.constraints:
-        return attempt.certified(attempt.finish(each=each, callback=callback))
+        return attempt.certified(_without_constraints(attempt, each=each, callback=callback))
     if not attempt.newton:
         return constrained.finish(attempt, each=each, callback=callback)
     return Ladder(attempt, each=each, callback=callback).climb()
@@ -57,6 +60,22 @@ def refine(attempt: Attempt, *, each: bool, callback: Callback | None = None) ->
     if not (attempt.problem.constraints and attempt.newton):
         return constrained.refine(attempt, each=each, callback=callback)
     return Ladder(attempt, each=each, callback=callback).climb(stay=True)
+
+
+def _without_constraints(attempt: Attempt, *, each: bool, callback: Callback | None) -> AttemptResult:
+    """The method; where controls stand at limits and it does not settle soon, the interior point first."""
+    problem = attempt.problem
+    space = problem.control_coordinates
+    if not attempt.newton or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
+        return attempt.finish(each=each, callback=callback)
+    attempt.run(min(OPENING, attempt.settings.max_iterations), each=each, callback=callback)
+    controls = attempt.work.plan.controls
+    pressed = ((controls <= space.low) | (controls >= space.high)).any()
+    if attempt.termination.outcome == declarations.RUNNING and pressed and np.isfinite(attempt.cost):
+        found = Ladder(attempt, each=each, callback=callback).from_plan(attempt.termination.iterations)
+        if found is not None:
+            return found
+    return attempt.finish(each=each, callback=callback)
 
 
 class Ladder:
@@ -70,6 +89,7 @@ class Ladder:
         self._best: AttemptResult | None = None
         self._given: AttemptResult | None = None
         self._valley: Plan | None = None
+        self._evidence: list[tuple[Evidence, AttemptResult]] = []
 
     def climb(self, *, stay: bool = False) -> AttemptResult:
         """Try one after the other; with `stay`, only what begins where the first policy leads."""
@@ -86,8 +106,8 @@ class Ladder:
             near = LITTLE if self._given is not None else MUCH
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
-            rungs += [self._from_valley, self._at_a_price, self._augmented]
-        rungs.append(lambda: self._interior(_plan(start), MUCH))
+            rungs += [self._from_valley, lambda: self._at_a_price(self._valley), self._augmented]
+        rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._at_a_price(_plan(start))]
         for rung in rungs:
             found = rung()
             if found is not None and found.success and not self._worse(found):
@@ -96,6 +116,16 @@ class Ladder:
                 break
         return self._answer(start)
 
+    def from_plan(self, iterations: tuple[Iteration, ...]) -> AttemptResult | None:
+        """From the best plan so far, which took these iterations; None where that leads nowhere."""
+        kept = self._attempt.kept()
+        self._iterations = iterations
+        found = self._interior(_plan(self._attempt.work.plan), MUCH)
+        if found is not None and found.success:
+            return replace(found, iterations=self._iterations)
+        self._attempt.go_on(kept, self._iterations)
+        return None
+
     def _from_valley(self) -> AttemptResult | None:
         attempt = self._attempt
         attempt.run(min(OPENING, attempt.settings.max_iterations), each=self._each, callback=self._callback)
@@ -103,19 +133,47 @@ class Ladder:
             self._problem, attempt.termination, attempt.work.start, attempt.initial_guess.offset[0], refuse=self._each
         )
         self._iterations += termination.iterations
-        plan = attempt.work.arrays.rollout if np.isfinite(attempt.cost) else attempt.work.plan
+        settled = termination.success or termination.outcome == declarations.IN_VALLEY
+        plan = attempt.work.arrays.rollout if settled else attempt.work.plan  # which is the one of least cost
         if termination is not attempt.termination or not np.isfinite(attempt.work.memory["plan_cost"]):
             return None
         self._valley = Plan(plan.states.copy(), plan.controls.copy())
-        return None if attempt.stop.due else self._interior(self._valley, MUCH)
+        if attempt.stop.due:
+            return None
+        if termination.outcome == declarations.IN_VALLEY and termination.iterations[-1].violation == 0:
+            found = attempt.descend(self._iterations, each=self._each, callback=self._callback)
+            self._iterations = found.iterations
+            if found.success and found.violation == 0:
+                return self._note(found)
+        return self._interior(self._valley, MUCH)
 
-    def _at_a_price(self) -> AttemptResult | None:
-        if self._valley is None:
-            return None
-        priced = self._run(self._valley, MUCH, price=PRICE, tolerance=ROUGHLY)
-        if priced is None or self._attempt.stop.due or not np.isfinite(priced.measures.cost):
-            return None
-        return self._interior(priced.plan, LITTLE, multipliers=priced.multipliers)
+    def _at_a_price(self, plan: Plan | None) -> AttemptResult | None:
+        """With constraints that may be missed; and from where that leads, without."""
+        for price in PRICES:
+            priced = None if plan is None else self._run(plan, MUCH, price=price, tolerance=ROUGHLY)
+            if priced is None or self._attempt.stop.due or not np.isfinite(priced.measures.cost):
+                return None
+            missed = priced.solved and priced.measures.violation > FAR * self._allowed
+            if missed and price == PRICES[-1] and self._look_for_evidence(priced):
+                return None
+            if not missed or price == PRICES[-1]:
+                found = self._interior(priced.plan, LITTLE, multipliers=priced.multipliers)
+                if found is not None and found.success:
+                    return found
+            plan = priced.plan
+        return None
+
+    def _look_for_evidence(self, priced: Found) -> bool:
+        """Whether what is missed there is stationary; if so it is kept."""
+        there = self._rolled_out(priced.plan, priced.gain)
+        sizes = [priced.row_size[self._stages.owners == k] for k in range(len(priced.shares))]
+        found = evidence(
+            self._problem, self._attempt.work, there.states, there.controls, priced.shares, sizes, self._allowed,
+            priced.control_size, priced.state_size,
+        )  # fmt: skip
+        if found is not None:
+            self._evidence.append((found, self._note(there)))
+        return found is not None
 
     def _augmented(self) -> AttemptResult | None:
         return None
@@ -216,7 +274,7 @@ class Ladder:
             array, size = work.multipliers[k], found.row_size[stages.owners == k]
             array[0] = PENALTY * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
             force = found.multipliers[k]
-            acts = term.equality | (force > array[0] * numbers)
+            acts = term.equality | (force > array[0] * (numbers - array[3]))
             array[declarations.HEADER :] = np.where(acts & np.isfinite(numbers), force, 0.0).ravel()
         work.plan.states[...], work.plan.controls[...] = states, controls
         work.memory["plan_cost"] = self._stages.trial(Plan(in_c_order(states), in_c_order(controls)))[0]
@@ -254,10 +312,16 @@ class Ladder:
         if not best.success:
             lagrangian = AugmentedLagrangian(attempt)
             lagrangian.evaluate(best.states, best.controls)
-            status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS
-            best = replace(best, status=status, detail=lagrangian.worst())
+            status, detail = Status.MAX_ITERATIONS, lagrangian.worst()
+            if len(self._evidence) >= STARTS:
+                least, best = min(self._evidence, key=lambda pair: pair[0].missed)
+                lagrangian.evaluate(best.states, best.controls)
+                detail = lagrangian.worst()
+                status = Status.INFEASIBLE
+                detail += f"; against it stand {least.against}" if least.against else ""
+            best = replace(best, status=Status.TIME_LIMIT if attempt.stop.due else status, detail=detail)
         return attempt.certified(replace(best, iterations=self._iterations))
 
 
-def _plan(of: AttemptResult | Trajectory) -> Plan:
+def _plan(of: AttemptResult | Trajectory | Plan) -> Plan:
     return Plan(of.states.copy(), of.controls.copy())

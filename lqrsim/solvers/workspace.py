@@ -23,7 +23,7 @@ from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.value_functions import Moments, Quadratic
 from lqrsim.solvers import compiled
-from lqrsim.solvers.common import SmootherSettings
+from lqrsim.solvers.common import INSIDE, SmootherSettings
 from lqrsim.solvers.initial_guess import InitialGuess
 
 
@@ -74,7 +74,7 @@ class Workspace:
             about = np.broadcast_to(initial_guess.prior.about, (steps + 1, len(start))).copy()
             self.prior = Prior(initial_guess.prior.weight.copy(), about)
             self.prior_iterations = initial_guess.prior.iterations
-        spare = 0.0 if self._exact else self._tolerance
+        spare = INSIDE * self._tolerance if self._exact else self._tolerance
         multipliers = [compiled.no_multipliers(problem, one, spare) for one in problem.constraint_terms]
         for array, known in zip(multipliers, initial_guess.multipliers, strict=False):
             array[0], array[declarations.HEADER :] = known.penalty, known.values.ravel()
