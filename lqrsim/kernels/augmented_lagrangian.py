@@ -10,11 +10,13 @@ and for equalities d = 0, with multipliers of either sign, the same without the 
 
 At the optimum the multipliers are the forces `max(0, lambda - mu d)` and `lambda - mu d`. For inequalities d is what a
 constraint has to spare beyond the tolerance to which it is solved, so that what is within the tolerance keeps the
-constraint itself. Of the curvature only `mu n n'` is taken, n the slope of d: the rest can be negative.
+constraint itself. A constraint may have a price, in cost a unit, for which it may be missed: no force is larger, and
+beyond what one of that size keeps the Lagrangian goes on as a straight line. Of the curvature only `mu n n'` is taken, n the slope of d: the rest can be negative.
 These functions are compiled with each constraint.
 
 `multipliers` is one array a constraint: mu, how many numbers there are at a step, the first step at which they act, the
-tolerance that is to be left to spare, and from HEADER on lambda, step by step. With mu of zero there is nothing.
+tolerance that is to be left to spare, the price, infinite where there is none, and from HEADER on lambda, step by step.
+With mu of zero there is nothing.
 """
 
 from math import inf
@@ -33,14 +35,16 @@ def augment(x, u, t, data, multipliers, hessian, gradient):
             force = multiplier - penalty * (constraint_value(x, u, t, row, data) - multipliers[3])
             total -= multiplier * multiplier
             if EQUALITY or force > 0:
-                total += force * force
+                held = min(max(force, -multipliers[4]), multipliers[4])
+                total += held * (2 * force - held)
+                curvature = penalty if held == force else 0.0
                 for i in range(W):
                     slope[i] = 0.0
                 constraint_slope(x, u, t, row, data, slope)
                 for i in range(W):
-                    gradient[i] -= force * slope[i]
+                    gradient[i] -= held * slope[i]
                     for j in range(W):
-                        hessian[i, j] += penalty * slope[i] * slope[j]
+                        hessian[i, j] += curvature * slope[i] * slope[j]
         total /= 2 * penalty
     return total
 
@@ -55,7 +59,8 @@ def augmentation(x, u, t, data, multipliers):
             force = multiplier - penalty * (constraint_value(x, u, t, row, data) - multipliers[3])
             total -= multiplier * multiplier
             if EQUALITY or force > 0:
-                total += force * force
+                held = min(max(force, -multipliers[4]), multipliers[4])
+                total += held * (2 * force - held)
         total /= 2 * penalty
     return total
 

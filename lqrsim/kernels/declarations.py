@@ -28,7 +28,7 @@ LONGEST_CYCLE = 8
 # method converges on the paper's queries.
 NO_FALL, SLOW_FALL = 12, 30
 ROW = 16  # numbers that an obstacle takes in `World.table`: kind, position (3), rotation (9, row by row), size (3)
-HEADER = 4  # numbers that come before the multipliers; see `augmented_lagrangian.py`
+HEADER = 5  # numbers that come before the multipliers; see `augmented_lagrangian.py`
 
 # What an entry is to do; see `entry_points.py`.
 ITERATE, DAMP, FINISH, CERTIFY, EVALUATE = 0, 1, 2, 3, 4

@@ -117,9 +117,12 @@ class SmootherSettings(Settings):
     constraint_tolerance: float | None = None
     penalty: float | None = None
     finish: str | None = "newton"
+    elastic: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.elastic is not None:
+            object.__setattr__(self, "elastic", check_number("elastic", self.elastic, above=0.0))
         if self.finish is not None:
             check_name("finish", self.finish, ("newton",))
         if self.starts is not None:
@@ -150,6 +153,11 @@ class SmootherSettings(Settings):
         """
         exact = not problem.dynamics.discrete and not (problem.constraints and problem.noise_term is not None)
         return self.finish is not None and self.stop == "optimal" and exact
+
+    @property
+    def price(self) -> float:
+        """What missing constraints costs, a unit; infinite where they are not to be missed."""
+        return np.inf if self.elastic is None else self.elastic
 
     def missed(self, problem: Problem) -> float:
         """By how much constraints may be missed, or what is to spare where the augmented Lagrangian keeps them."""

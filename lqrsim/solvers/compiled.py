@@ -232,9 +232,11 @@ def rollout(
     return states, controls
 
 
-def no_multipliers(problem: Problem, term: ConstraintTerm, tolerance: float = 0.0) -> Array:
+def no_multipliers(
+    problem: Problem, term: ConstraintTerm, tolerance: float = 0.0, price: float = np.inf
+) -> Array:
     """Those of a constraint that does not act yet; see `kernels/augmented_lagrangian.py`."""
     # A fixed start cannot change; its control can.
     first = 1 if isinstance(problem.initial, FixedState) and not term.uses_control else 0
     first, spare = problem.steps if term.final_only else first, 0.0 if term.equality else tolerance
-    return np.concatenate([[0.0, term.rows, first, spare], np.zeros((problem.steps + 1) * term.rows)])
+    return np.concatenate([[0.0, term.rows, first, spare, price], np.zeros((problem.steps + 1) * term.rows)])

@@ -215,6 +215,7 @@ class InteriorPoint:
       barrier: its first parameter for each row, as a share of the cost divided by the number of rows.
       room: what slacks are at first, at least: relative to a row's size, or to a control's range.
       price: of missing a constraint by its size, relative to the cost: then it is elastic. Infinite: it is not.
+      weight: the same, in cost a unit of each constraint.
       multipliers: known ones of the constraints, (T+1, rows) each, or none.
       stages: to use again, of the same problem.
     """
@@ -227,6 +228,7 @@ class InteriorPoint:
         barrier: float = 1.0,
         room: float = 0.02,
         price: float = np.inf,
+        weight: float = np.inf,
         multipliers: tuple[Array, ...] = (),
         stages: Stages | None = None,
     ) -> None:
@@ -240,7 +242,7 @@ class InteriorPoint:
             states[0, fixed] = np.asarray(problem.start)[fixed]
         plan = Plan(in_c_order(states), in_c_order(np.clip(controls, stages.low + edge, stages.high - edge)))
         self._sizes(problem, plan, finite)
-        self._rows_of(plan, barrier, room, price, multipliers)
+        self._rows_of(plan, barrier, room, price, weight, multipliers)
         self.iterations, self.gain = 0, stages.gain
         self._filter: list[tuple[float, float]] = []
         self._mixed, self._part, self._forced = False, 1.0, 0
@@ -271,7 +273,7 @@ class InteriorPoint:
         self._typical = 0.5 * float(curvature) or 1.0
 
     def _rows_of(
-        self, plan: Plan, barrier: float, room: float, price: float, multipliers: tuple[Array, ...]
+        self, plan: Plan, barrier: float, room: float, price: float, weight: float, multipliers: tuple[Array, ...]
     ) -> None:
         """Set up slacks and multipliers."""
         stages, live = self.stages, self.stages.live
@@ -284,8 +286,8 @@ class InteriorPoint:
         equality = np.broadcast_to(stages.equality, shape)[live]
         limit = np.broadcast_to(stages.owners == -1, shape)[live]
         self._size = size
-        highest = np.where(limit, np.inf, price * self._scale / size)
-        self._highest, self._elastic = highest, bool(np.isfinite(price))
+        highest = np.where(limit, np.inf, np.minimum(price * self._scale / size, weight))
+        self._highest, self._elastic = highest, bool(np.isfinite(highest).any())
         lowest = np.where(equality, -highest, 0.0)
         below, above = np.flatnonzero(np.isfinite(lowest)), np.flatnonzero(np.isfinite(highest))
         # Slacks come in pairs with what is between a multiplier and its bound; `row` says whose.
@@ -367,20 +369,20 @@ class InteriorPoint:
         So controls come to stand at their limits, and multipliers lose what the barrier added. Constraints are kept
         with as much to spare as rounding takes.
         """
-        stages, size = self.stages, self._size
+        stages, size, highest = self.stages, self._size, self._highest
         equality = np.broadcast_to(stages.equality, stages.live.shape)[stages.live]
-        if len(self._row) == 0 or not self._hard.all():
-            return
-        slack = np.ones(len(size))
-        slack[self._row] = self.point.slack
-        presses = equality | (self._force * size / self._scale > slack / size)
-        kept = self.point, self._force, self._costates, self.measures
         limit = np.broadcast_to(stages.owners == -1, stages.live.shape)[stages.live]
-        aim, right = np.where(equality | limit, 0.0, INSIDE * violation), False
+        aim = np.where(equality | limit, 0.0, INSIDE * violation)
+        kept = self.point, self._force, self._costates, self.measures
+        numbers = self.point.numbers
+        missed = np.where(equality, np.abs(numbers), -numbers) / size
+        paid = np.isfinite(highest) & (missed > 1 - np.abs(self._force) / highest)
+        presses = ~paid & (equality | (self._force * size / self._scale > numbers / size))
+        right = False
         for _ in range(CROSSINGS):
             numbers = self.point.numbers - aim
             sigma = np.where(presses, self._scale / (REGULARISATION * size**2), 0.0)
-            self._force = np.where(presses, self._force, 0.0)
+            self._force = np.where(presses, self._force, np.where(paid, np.sign(self._force) * highest, 0.0))
             stages.linearize(self.point.plan, self._costates, self._spread(self._force), 0.0)
             gaps = stages.models.arrived - self.point.plan.states[1:]
             spread = self._spread(sigma)
@@ -391,20 +393,24 @@ class InteriorPoint:
             moved = np.matmul(stages.slopes, stages.joined()[:, :, None])[:, :, 0][stages.live]
             self._force = self._force - sigma * (numbers + moved)
             self._costates = stages.to_go.gradient.copy()
-            step = Step(stages.changes, np.zeros(len(self._row)), np.zeros(0), self._costates)
-            there = self._at(step, 1.0)
+            there = self._at(Step(stages.changes, np.zeros(len(self._row)), np.zeros(0), self._costates), 1.0)
             if there is None:
                 break
             self.point = there._replace(slack=self.point.slack)
             stages.linearize(there.plan, self._costates, self._spread(self._force), 0.0)
             self._measure()
-            wrong = ~presses & (there.numbers < 0) | presses & ~equality & (self._force < 0)
-            presses ^= wrong
-            right, found = not wrong.any(), self.measures
-            if right and max(found.stationarity, found.gap) < 1e-3 * tolerance and found.violation < 1e-3 * violation:
+            beyond = presses & (np.abs(self._force) > highest)
+            lifted = presses & ~equality & (self._force < 0)
+            back = paid & (there.numbers * np.sign(self._force) > 0)
+            ignored = ~presses & ~paid & (there.numbers < 0)
+            presses, paid = presses & ~beyond & ~lifted | back | ignored, paid & ~back | beyond
+            right, found = not (beyond | lifted | back | ignored).any(), self.measures
+            off = float(np.abs((there.numbers - aim)[presses]).max(initial=0.0))
+            if right and max(found.stationarity, found.gap) < 1e-3 * tolerance and off < 1e-3 * violation:
                 break
         found = self.measures
-        if not (right and found.stationarity < tolerance and found.gap < tolerance and found.violation <= violation):
+        right = right and found.stationarity < tolerance and found.gap < tolerance
+        if not right or not (self._elastic or found.violation <= violation):
             self.point, self._force, self._costates, self.measures = kept
 
     def _within(self, tolerance: float, violation: float) -> bool:

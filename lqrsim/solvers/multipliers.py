@@ -21,8 +21,8 @@ GROWTH, LARGEST = 5.0, 1e4  # of the penalty; and how far it grows before that i
 def _forces(term: ConstraintTerm, array: Array, values: Array) -> Array:
     """What the multipliers become: lambda - mu d, of inequalities not below 0; 0 where they do not act."""
     acting = np.where(np.isinf(values), 0.0, values)
-    forces = array[declarations.HEADER :] - array[0] * acting
-    return np.where(np.isinf(values), 0.0, forces if term.equality else np.maximum(forces, 0.0))
+    forces = np.clip(array[declarations.HEADER :] - array[0] * acting, -array[4] if term.equality else 0.0, array[4])
+    return np.where(np.isinf(values), 0.0, forces)
 
 
 def _missed(term: ConstraintTerm, array: Array, values: Array) -> float:
@@ -110,10 +110,9 @@ class AugmentedLagrangian:
         """What the augmented Lagrangian adds to the cost of the plan."""
 
         def one(term: ConstraintTerm, array: Array, values: Array) -> float:
+            known, acting = array[declarations.HEADER :], np.where(np.isinf(values), 0.0, values)
             forces = _forces(term, array, values)
-            return float(
-                (forces @ forces - array[declarations.HEADER :] @ array[declarations.HEADER :]) / (2 * array[0])
-            )
+            return float((forces @ (2 * (known - array[0] * acting) - forces) - known @ known) / (2 * array[0]))
 
         return sum(self._each(one))
 

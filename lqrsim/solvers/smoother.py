@@ -44,6 +44,7 @@ def smooth(
     constraint_tolerance: float | None = None,
     penalty: float | None = None,
     finish: str | None = "newton",
+    elastic: float | None = None,
     noise: Noise | None = None,
     risk: float | None = None,
     threads: int | None = None,
@@ -105,7 +106,7 @@ def smooth(
     settings = SmootherSettings(
         form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start, starts=starts,
-        constraint_tolerance=constraint_tolerance, penalty=penalty, finish=finish,
+        constraint_tolerance=constraint_tolerance, penalty=penalty, finish=finish, elastic=elastic,
     )  # fmt: skip
     check_callback(callback)
     check_problem(problem)
@@ -132,6 +133,7 @@ def smooth_many(
     constraint_tolerance: float | None = None,
     penalty: float | None = None,
     finish: str | None = "newton",
+    elastic: float | None = None,
     noise: Noise | None = None,
     risk: float | None = None,
     progress: Callable[[int, int], object] | None = None,
@@ -158,6 +160,7 @@ def smooth_many(
       constraint_tolerance: as in `smooth`, for all.
       penalty: as in `smooth`, for all.
       finish: as in `smooth`, for all.
+      elastic: as in `smooth`, for all.
       noise: as in `smooth`, for all.
       risk: as in `smooth`, for all.
       progress: called with how many are done, of how many, as each one ends.
@@ -172,7 +175,7 @@ def smooth_many(
     settings = SmootherSettings(
         form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start, starts=starts,
-        constraint_tolerance=constraint_tolerance, penalty=penalty, finish=finish,
+        constraint_tolerance=constraint_tolerance, penalty=penalty, finish=finish, elastic=elastic,
     )  # fmt: skip
     return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)
 
@@ -223,6 +226,12 @@ def _solve(
 
 def _check(problem: Problem, settings: SmootherSettings) -> None:
     check_problem(problem)
+    if settings.elastic is not None and not (problem.constraints and settings.newton(problem)):
+        if problem.constraints:
+            why = 'finish="newton" and stop="optimal"'
+            why = "without noise, and dynamics that are not of an MJCF" if settings.finish and settings.stop == "optimal" else why
+            raise InputError(f"elastic: got {settings.elastic:g}, want {why} beside it")
+        raise InputError(f"elastic: got {settings.elastic:g} for a problem without constraints, want None")
     several = settings.start is None and len(problem.obstacle_costs) > 0
     check_attempts(problem, settings.starts or (STARTS if several else 1))
     if settings.form == "primal" and problem.dynamics.discrete:

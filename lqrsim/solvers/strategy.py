@@ -84,7 +84,9 @@ class Ladder:
     def __init__(self, attempt: Attempt, *, each: bool, callback: Callback | None) -> None:
         self._attempt, self._problem, self._each, self._callback = attempt, attempt.problem, each, callback
         self._allowed = attempt.settings.missed(attempt.problem)
+        clock = time.perf_counter()
         self._stages = Stages(attempt.problem)
+        attempt.stop.deadline += time.perf_counter() - clock  # compiling does not count
         self._iterations: tuple[Iteration, ...] = ()
         self._best: AttemptResult | None = None
         self._given: AttemptResult | None = None
@@ -106,7 +108,7 @@ class Ladder:
             near = LITTLE if self._given is not None else MUCH
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
-            rungs += [self._from_valley, lambda: self._at_a_price(self._valley), self._augmented]
+            rungs += [self._from_valley, lambda: self._at_a_price(self._valley)]
         rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._at_a_price(_plan(start))]
         for rung in rungs:
             found = rung()
@@ -149,7 +151,7 @@ class Ladder:
 
     def _at_a_price(self, plan: Plan | None) -> AttemptResult | None:
         """With constraints that may be missed; and from where that leads, without."""
-        for price in PRICES:
+        for price in PRICES if self._attempt.settings.elastic is None else ():
             priced = None if plan is None else self._run(plan, MUCH, price=price, tolerance=ROUGHLY)
             if priced is None or self._attempt.stop.due or not np.isfinite(priced.measures.cost):
                 return None
@@ -174,9 +176,6 @@ class Ladder:
         if found is not None:
             self._evidence.append((found, self._note(there)))
         return found is not None
-
-    def _augmented(self) -> AttemptResult | None:
-        return None
 
     def _interior(
         self, plan: Plan, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()
@@ -214,8 +213,8 @@ class Ladder:
         try:
             with np.errstate(all="ignore"):
                 point = InteriorPoint(
-                    self._problem, plan, barrier=barrier[0], room=barrier[1], price=price, multipliers=multipliers,
-                    stages=self._stages,
+                    self._problem, plan, barrier=barrier[0], room=barrier[1], price=price,
+                    weight=self._attempt.settings.price, multipliers=multipliers, stages=self._stages,
                 )  # fmt: skip
                 return point.run(
                     tolerance=self._attempt.final if tolerance is None else tolerance, violation=self._allowed,

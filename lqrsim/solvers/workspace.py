@@ -67,7 +67,7 @@ class Workspace:
     def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
         """Begin a solve; after another one, of a problem of the same size with as many steps."""
         self._problem, self._tolerance, steps = problem, settings.missed(problem), problem.steps
-        self._exact = settings.newton(problem)
+        self._exact, self._priced = settings.newton(problem), np.isfinite(settings.price)
         self.fixed = isinstance(problem.initial, FixedState)
         self.prior, self.prior_iterations = self.no_prior, 0
         if initial_guess.prior is not None:
@@ -75,7 +75,7 @@ class Workspace:
             self.prior = Prior(initial_guess.prior.weight.copy(), about)
             self.prior_iterations = initial_guess.prior.iterations
         spare = INSIDE * self._tolerance if self._exact else self._tolerance
-        multipliers = [compiled.no_multipliers(problem, one, spare) for one in problem.constraint_terms]
+        multipliers = [compiled.no_multipliers(problem, one, spare, settings.price) for one in problem.constraint_terms]
         for array, known in zip(multipliers, initial_guess.multipliers, strict=False):
             array[0], array[declarations.HEADER :] = known.penalty, known.values.ravel()
         self.multipliers = multipliers
@@ -162,7 +162,10 @@ class Workspace:
         return max((violation_of(term, one) for term, one in zip(terms, values, strict=True)), default=0.0)
 
     def keeps(self, values: list[Array]) -> bool:
-        """Whether values are those of a plan that keeps all constraints, within what they may be missed by."""
+        """Whether values are those of a plan that keeps all constraints, within what they may be missed by.
+
+        Those that have a price may be missed by anything.
+        """
         pairs = zip(self._problem.constraint_terms, values, strict=True)
         allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)
-        return all(violation_of(term, one) <= allowed(term) for term, one in pairs)
+        return self._priced or all(violation_of(term, one) <= allowed(term) for term, one in pairs)
