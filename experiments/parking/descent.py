@@ -13,9 +13,9 @@ from parking.task import Task
 
 Array = np.ndarray
 
-REACHES = (0.03, 0.01, 0.003)  # how far a step changes controls, of the largest ones
+REACH, TRIES = 0.01, 12  # how far the first step changes controls, of the largest ones; how many steps are tried
 SPACE = 2 * judge.INEQUALITY  # what is nearer than this to being missed may not come nearer: solvers leave some space
-CORRECTIONS, STEPS = 3, 3
+CORRECTIONS = 4
 DIFFERENCE = 1e-6
 
 
@@ -23,11 +23,11 @@ def saved(task: Task, controls: Array) -> float:
     """The share of the cost that a few steps save; 0 where none was found."""
     first = float(judge.cost(task, judge.rollout(task, task.start, controls, task.dt), controls))
     keep = np.minimum(_numbers(task, controls)[0], SPACE)
-    for _ in range(STEPS):
-        better = next(filter(lambda found: found is not None, (_step(task, controls, keep, reach) for reach in REACHES)), None)  # fmt: skip
-        if better is None:
-            break
-        controls = better
+    reach = REACH
+    for _ in range(TRIES):
+        better = _step(task, controls, keep, reach)
+        reach *= 0.3 if better is None else 1.5
+        controls = controls if better is None else better
     last = float(judge.cost(task, judge.rollout(task, task.start, controls, task.dt), controls))
     return max(0.0, first - last) / max(first, 1e-12)
 

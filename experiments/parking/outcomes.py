@@ -26,7 +26,7 @@ class Outcome:
       status: that it ended with; the name of the exception where it raised.
       said: what is false about it, or what it says of itself.
       iterations: of the solution.
-      milliseconds: the solve took, without compiling.
+      milliseconds: the solve took; where it was the first of its structure, with compiling or loading.
       cost: of the plan.
       known: the cost of the plan that is known; None for an impossible case.
     """
