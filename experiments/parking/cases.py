@@ -89,8 +89,9 @@ def draw(number: int, *, seed: int = 0, impossible: float = 0.25) -> Case:
     without, trailers = rng.random() < impossible, int(rng.integers(3))
     side: Side = "parallel" if rng.random() < 0.5 else "perpendicular"
     begins = str(rng.choice(["clear", "in a margin", "in an obstacle"], p=[0.7, 0.15, 0.15]))
-    names = [name for name in _SPOILED if trailers or name != "hitch"]
-    spoil = str(rng.choice(names))
+    spoil = str(rng.choice([name for name in _SPOILED if trailers or name != "hitch"]))
+    if without and spoil in ("turned", "hitch"):
+        side = "perpendicular"  # along the road there is hardly a turn to be too large
     while True:
         found = _possible(rng, trailers, side, begins)
         if found is None:
@@ -146,8 +147,7 @@ def _way_back(rng: Generator, task: Task, side: Side) -> Plan | None:
     if side == "parallel":  # out to the left, and straight again
         steering[:, 1:3], steering[:, 3:5] = np.abs(steering[:, 1:3]), -np.abs(steering[:, 3:5])
     speed = rng.uniform(0.3, 0.95, size=(DRIVES, 6)) * task.top[0]
-    if not task.trailers:  # some change direction on the way; with trailers that is no way out
-        speed[: DRIVES // 2, 2] *= -0.5
+    speed[: DRIVES // 2, 2] *= -1.0  # some change direction on the way
     angle = np.array([np.interp(times, knots, one) for one in steering])
     rates = np.clip(np.diff(angle) / task.dt, -0.95 * task.top[1], 0.95 * task.top[1])
     drives = np.stack([np.array([np.interp(times[1:], knots, one) for one in speed]), rates], axis=-1)
@@ -159,7 +159,7 @@ def _way_back(rng: Generator, task: Task, side: Side) -> Plan | None:
         out &= turned < 1.2
     if not out.any():
         return None
-    chosen = int(np.argmax(out))
+    chosen = int(rng.choice(np.flatnonzero(out)))
     controls = -drives[chosen, ::-1]
     return Plan(judge.rollout(task, outward[chosen, -1], controls, task.dt), controls)
 
@@ -251,17 +251,21 @@ def _road(task: Task) -> float:
 
 
 def _steering(task: Task) -> float:
-    """The goal's steering angle is farther beyond its bound than the last step can steer."""
-    return float(abs(task.goal[3]) - task.bounds[0] - task.dt * task.top[1]) if task.exact else -np.inf
+    """The steering begins farther beyond its bound than the first step, after which it is to be within, can steer."""
+    return float(abs(task.start[3]) - task.bounds[0] - task.dt * task.top[1])
 
 
 def _hitch(task: Task) -> float:
-    """The goal's angle of the first trailer is farther beyond its bound than the last step can turn it."""
+    """The goal's heading of the first trailer is farther than the top speed turns it within the bound of its angle."""
     if not (task.exact and task.trailers):
         return -np.inf
-    steered = max(task.bounds[0], abs(task.goal[3]))
-    most = task.top[0] * (np.tan(steered) / task.wheelbase + 1 / task.trailers[0]) * task.dt
-    return float(abs(task.goal[4]) - task.bounds[1] - most) if steered < 1.5 else -np.inf
+    turned = (task.goal[2] - task.goal[4]) - (task.start[2] - task.start[4])
+    steered = max(task.bounds[0], abs(task.start[3]), abs(task.goal[3]))
+    angle = max(task.bounds[1], abs(task.start[4]), abs(task.goal[4]))
+    # At Runge-Kutta's stages the angle can be beyond its bound by what half a step, in their mean, changes it.
+    beyond = task.dt / 2 * task.top[0] * (np.tan(steered) / task.wheelbase + 1 / task.trailers[0])
+    most = task.dt * task.steps * task.top[0] * (angle + beyond) / task.trailers[0]
+    return float(abs(turned) - most) if steered < 1.5 else -np.inf
 
 
 def _stuck(task: Task) -> float:
@@ -325,18 +329,16 @@ def _spoil_road(rng: Generator, task: Task) -> Task:
 
 
 def _spoil_steering(rng: Generator, task: Task) -> Task:
-    return _goal_beyond(rng, task, 3, task.dt * task.top[1])
+    start = task.start.copy()
+    start[3] = rng.choice([-1.0, 1.0]) * (task.bounds[0] + task.dt * task.top[1] + rng.uniform(CLEARLY, 0.2))
+    return replace(task, start=start)
 
 
 def _spoil_hitch(rng: Generator, task: Task) -> Task:
-    turns = task.top[0] * (np.tan(task.bounds[0]) / task.wheelbase + 1 / task.trailers[0])
-    return _goal_beyond(rng, task, 4, task.dt * turns)
-
-
-def _goal_beyond(rng: Generator, task: Task, index: int, step: float) -> Task:
-    goal = task.goal.copy()
-    goal[index] = rng.choice([-1.0, 1.0]) * (task.bounds[index - 3] + step + rng.uniform(CLEARLY, 0.2))
-    return replace(task, goal=goal)
+    """The angle of the first trailer has so narrow a bound; it begins straight."""
+    start, bounds = task.start.copy(), task.bounds.copy()
+    start[4], bounds[1] = 0.0, rng.uniform(0.01, 0.1)
+    return replace(task, start=start, bounds=bounds)
 
 
 def _spoil_stuck(rng: Generator, task: Task) -> Task:
