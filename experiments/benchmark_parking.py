@@ -98,10 +98,11 @@ def false(result: dict[str, Any]) -> list[dict[str, Any]]:
 
 def report(result: dict[str, Any]) -> str:
     rows, verdicts = result["outcomes"], get_args(Verdict)
-    features = [feature for feature in dict.fromkeys(one for row in rows for one in row["features"])]
+    features = sorted({feature for row in rows for feature in row["features"]}, key=_place)
     width = max((len(feature) for feature in features), default=0)
-    lines = [f"{'':<{width}} {'cases':>6} " + " ".join(f"{verdict:>16}" for verdict in verdicts) + f" {'iterations':>11} {'ms':>8}"]  # fmt: skip
-    for feature in sorted(features, key=_place):
+    heads = " ".join(f"{verdict:>16}" for verdict in verdicts)
+    lines = [f"{'':<{width}} {'cases':>6} {heads} {'iterations':>11} {'ms':>8}"]
+    for feature in features:
         own = [row for row in rows if feature in row["features"]]
         counts = Counter(row["verdict"] for row in own)
         shares = " ".join(f"{counts[one]:>6} ({100 * counts[one] / len(own):>5.1f} %)" for one in verdicts)
@@ -111,8 +112,9 @@ def report(result: dict[str, Any]) -> str:
     lines.append("iterations and ms are medians of the right ones")
     unsolved = [row for row in rows if row["verdict"] == "unsolved"]
     for status, count in Counter(row["status"] for row in unsolved).most_common():
-        own = " ".join(str(row["number"]) for row in unsolved if row["status"] == status and "possible" in row["features"])  # fmt: skip
-        lines.append(f"unsolved, {status}: {count}; those with a plan: {own}")
+        known = [row for row in unsolved if row["status"] == status and "possible" in row["features"]]
+        numbers = " ".join(str(row["number"]) for row in known)
+        lines.append(f"unsolved, {status}: {count}; those with a plan: {numbers}")
     for row in false(result):
         again = f"python experiments/benchmark_parking.py --seed {row['seed']} --only {row['number']}"
         lines.append(f"{row['verdict']}: {', '.join(row['features'][1:])}: {row['said']}\n  {again}")

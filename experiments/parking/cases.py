@@ -169,10 +169,10 @@ def _surrounded(rng: Generator, task: Task, plan: Plan, begins: str) -> tuple[Ta
     spare, states = LEAST_SPARE + _log_uniform(rng, 0.001, 0.3), plan.states
     goal = states[-1]
     widest = np.abs(states[1:, 4:]).max(axis=0, initial=0.0) + spare + _log_uniform(rng, 0.001, 0.3)
-    low, high = states[1:, 1].min() - spare - _log_uniform(rng, 0.01, 5.0), states[1:, 1].max() + spare + _log_uniform(rng, 0.01, 5.0)  # fmt: skip
-    task = replace(
-        task, start=states[0], goal=goal, bounds=np.concatenate([task.bounds[:1], widest]), road=(float(low), float(high))
-    )  # fmt: skip
+    low = float(states[1:, 1].min()) - spare - _log_uniform(rng, 0.01, 5.0)
+    high = float(states[1:, 1].max()) + spare + _log_uniform(rng, 0.01, 5.0)
+    bounds = np.concatenate([task.bounds[:1], widest])
+    task = replace(task, start=states[0], goal=goal, bounds=bounds, road=(low, high))
     places = judge.balls(task, states[1:])
     least = RADIUS + task.clearance + spare  # from the middles of the balls
     boxes, turned = bool(rng.random() < 0.5), goal[2]
@@ -218,7 +218,7 @@ def _post(rng: Generator, task: Task, states: Array, least: float, begins: str) 
     return post if judge.distance(post, judge.balls(task, states[1:])).min() >= least else None
 
 
-# Impossible ones. What each is about: by how much, at least, any plan must miss something. Each is a proof.
+# Impossible ones. Each is a proof: by how much, at least, any plan misses something, in metres or radians.
 
 
 def _narrow(task: Task) -> float:
@@ -304,7 +304,8 @@ def _spoil_narrow(rng: Generator, task: Task) -> Task:
 def _spoil_occupied(rng: Generator, task: Task) -> Task:
     """The post stands where one of the balls is to end."""
     ends = judge.balls(task, task.goal)
-    return _moved(task, 3, ends[int(rng.integers(len(ends)))] + rng.uniform(-0.5, 0.5, size=2) - task.obstacles[3].place)  # fmt: skip
+    place = ends[int(rng.integers(len(ends)))] + rng.uniform(-0.5, 0.5, size=2)
+    return _moved(task, 3, place - task.obstacles[3].place)
 
 
 def _spoil_distant(rng: Generator, task: Task) -> Task:

@@ -1,4 +1,4 @@
-"""Whether a plan that is said to be optimal can be made cheaper nearby: steps along linear programs, checked by rollout.
+"""Whether there is a cheaper plan beside one that is said to be optimal: steps along linear programs, checked.
 
 What is found is a plan: it moves by the dynamics, misses nothing by more than the given one, and costs less. Where none
 is found, that is no proof.

@@ -37,7 +37,8 @@ class Found:
     def wrong(self) -> list[str]:
         """What is beyond the tolerances, in words."""
         tolerances = {"start": 0.0, "motion": MOTION, "limits": 0.0, "kept": INEQUALITY, "goal": EQUALITY}
-        return [f"{name} by {getattr(self, name):.3g}" for name, most in tolerances.items() if not getattr(self, name) <= most]  # fmt: skip
+        missed = {name: getattr(self, name) for name in tolerances}
+        return [f"{name} by {missed[name]:.3g}" for name, most in tolerances.items() if not missed[name] <= most]
 
 
 def rate(task: Task, x: Array, u: Array) -> Array:

@@ -39,7 +39,8 @@ class Shape:
 
     @property
     def obstacle(self) -> ls.Obstacle:
-        along, across, up = [np.cos(self.turned), np.sin(self.turned), 0.0], [-np.sin(self.turned), np.cos(self.turned), 0.0], [0.0, 0.0, 1.0]  # fmt: skip
+        c, s = np.cos(self.turned), np.sin(self.turned)
+        along, across, up = [c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]
         position, (length, width) = np.array([*self.place, 0.0]), self.half
         if self.box:
             rotation, size = np.array([along, across, up]).T, np.array([length, width, 1.0])
