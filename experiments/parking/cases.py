@@ -130,7 +130,7 @@ def _possible(rng: Generator, trailers: int, side: Side, begins: str) -> tuple[T
         repulsion=None if rng.random() < 0.5 else (duration / steps * _log_uniform(rng, 0.1, 3.0), rng.uniform(4, 20)),
         clearance=rng.uniform(0.0, 0.05),
         top=np.array([rng.uniform(1.0, 2.0), rng.uniform(0.5, 1.0)]),
-        bounds=np.concatenate([[rng.uniform(0.5, 0.7)], np.full(trailers, np.inf)]),
+        bounds=np.full(1 + trailers, np.inf),
         road=(-np.inf, np.inf),
     )
     plan = _way_back(rng, bare, side)
@@ -142,7 +142,7 @@ def _way_back(rng: Generator, task: Task, side: Side) -> Plan | None:
     n, heading = 4 + len(task.trailers), 0.0 if side == "parallel" else np.pi / 2
     gap = np.concatenate([[0.0, 0.0, heading + rng.uniform(-0.05, 0.05)], np.zeros(n - 3)])
     knots, times = np.linspace(0, 1, 6), np.linspace(0, 1, task.steps + 1)
-    steering = rng.uniform(-0.9, 0.9, size=(DRIVES, 6)) * task.bounds[0]
+    steering = rng.uniform(-0.6, 0.6, size=(DRIVES, 6))
     steering[:, 0] = 0.0
     if side == "parallel":  # out to the left, and straight again
         steering[:, 1:3], steering[:, 3:5] = np.abs(steering[:, 1:3]), -np.abs(steering[:, 3:5])
@@ -152,8 +152,8 @@ def _way_back(rng: Generator, task: Task, side: Side) -> Plan | None:
     rates = np.clip(np.diff(angle) / task.dt, -0.95 * task.top[1], 0.95 * task.top[1])
     drives = np.stack([np.array([np.interp(times[1:], knots, one) for one in speed]), rates], axis=-1)
     outward = judge.rollout(task, gap, drives, task.dt)
-    turned, most = np.abs(outward[..., 2] - heading).max(axis=1), 0.9 * task.bounds[0]
-    out = (outward[:, -1, 1] > 2.5) & (np.abs(outward[..., 3]).max(axis=1) < most) & (turned < 2.0)
+    turned = np.abs(outward[..., 2] - heading).max(axis=1)
+    out = (outward[:, -1, 1] > 2.5) & (np.abs(outward[..., 3]).max(axis=1) < 0.6) & (turned < 2.0)
     out &= np.abs(outward[..., 4:]).max(axis=(1, 2), initial=0.0) < 1.0
     if side == "parallel":
         out &= turned < 1.2
@@ -168,10 +168,9 @@ def _surrounded(rng: Generator, task: Task, plan: Plan, begins: str) -> tuple[Ta
     """The task with bounds and obstacles that the plan keeps, some of them only just."""
     spare, states = LEAST_SPARE + _log_uniform(rng, 0.001, 0.3), plan.states
     goal = states[-1]
-    widest = np.abs(states[1:, 4:]).max(axis=0, initial=0.0) + spare + _log_uniform(rng, 0.001, 0.3)
+    bounds = np.abs(states[1:, 3:]).max(axis=0) + spare + _log_uniform(rng, 0.001, 0.3)
     low = float(states[1:, 1].min()) - spare - _log_uniform(rng, 0.01, 5.0)
     high = float(states[1:, 1].max()) + spare + _log_uniform(rng, 0.01, 5.0)
-    bounds = np.concatenate([task.bounds[:1], widest])
     task = replace(task, start=states[0], goal=goal, bounds=bounds, road=(low, high))
     places = judge.balls(task, states[1:])
     least = RADIUS + task.clearance + spare  # from the middles of the balls

@@ -120,8 +120,8 @@ def examine(task: Task, states: Array, controls: Array) -> Found:
     return Found(
         start=float(np.abs(states[0] - task.start).max()),
         motion=float(motion),
-        limits=max(0.0, float((np.abs(controls) - task.top).max())),
-        kept=max(0.0, -float(inequalities(task, states).min())),
+        limits=float(np.maximum(0.0, (np.abs(controls) - task.top).max())),  # NaN where that is one
+        kept=float(np.maximum(0.0, -inequalities(task, states).min())),
         goal=float(np.abs(states[-1] - task.goal).max()) if task.exact else 0.0,
     )
 
