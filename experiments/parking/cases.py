@@ -65,7 +65,7 @@ class Case:
             return PROOFS[self.impossible](self.task) >= CLEARLY
         found = judge.examine(self.task, self.plan.states, self.plan.controls)
         clear = judge.inequalities(self.task, self.plan.states).min() >= LEAST_SPARE
-        return not found.wrong and found.motion == 0.0 and found.goal == 0.0 and bool(clear)
+        return not found.wrong and found.motion < 1e-12 and found.goal == 0.0 and bool(clear)
 
     @property
     def features(self) -> tuple[str, ...]:
