@@ -46,6 +46,8 @@ class Config:
     """Of the problems."""
     time_limit: float = 10.0
     """Of each solve in seconds."""
+    max_iterations: int = 500
+    """Of each solve. With more of them more say INFEASIBLE."""
     tried: int = 10
     """Every how manieth is tried for a cheaper plan, if it is said to be optimal; with `only` each."""
     workers: int | None = None
@@ -70,12 +72,13 @@ def main(config: Config) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _look(number: int, *, seed: int, time_limit: float, tried: int) -> Outcome:
-    return look(number, seed=seed, time_limit=time_limit, improve=number % tried == 0)
+def _look(config: Config, number: int) -> Outcome:
+    limits = {"time_limit": config.time_limit, "max_iterations": config.max_iterations}
+    return look(number, seed=config.seed, improve=number % config.tried == 0, **limits)
 
 
 def _solved(config: Config, numbers: Iterable[int]) -> Iterator[Outcome]:
-    one = partial(_look, seed=config.seed, time_limit=config.time_limit, tried=1 if config.only else config.tried)
+    one = partial(_look, dataclasses.replace(config, tried=1) if config.only else config)
     workers = processors() if config.workers is None else config.workers
     if workers == 1 or config.only:
         yield from map(one, numbers)

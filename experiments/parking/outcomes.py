@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import lqrsim as ls
 from parking import cases, descent, judge
@@ -61,12 +61,12 @@ def verdict_of(case: Case, solution: ls.Solution, *, improve: bool = False) -> t
     return "right", ""
 
 
-def look(number: int, *, seed: int = 0, time_limit: float = 10.0, improve: bool = False) -> Outcome:
-    """Solve a case and judge it."""
+def look(number: int, *, seed: int = 0, improve: bool = False, **options: Any) -> Outcome:
+    """Solve a case with options of `ls.smooth`, and judge it."""
     case = cases.draw(number, seed=seed)
     clock = time.perf_counter()
     try:
-        solution = ls.smooth(problem_of(case.task), threads=1, time_limit=time_limit)
+        solution = ls.smooth(problem_of(case.task), threads=1, **options)
     except Exception as error:  # whatever it is, it is no answer
         return Outcome(seed, number, case.features, "raised", type(error).__name__, str(error))
     milliseconds = 1e3 * (time.perf_counter() - clock)
