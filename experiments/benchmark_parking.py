@@ -113,15 +113,17 @@ def report(result: dict[str, Any]) -> str:
         iterations, milliseconds = (_median(row[key] for row in solved) for key in ("iterations", "milliseconds"))
         lines.append(f"{feature:<{width}} {len(own):>6} {shares} {iterations:>11.4g} {milliseconds:>8.4g}")
     lines.append("iterations and ms are medians of the right ones")
+    asked = result["config"]
+    limits = f"--max-iterations {asked['max_iterations']} --time-limit {asked['time_limit']:g}"
     unsolved = [row for row in rows if row["verdict"] == "unsolved"]
     for status, count in Counter(row["status"] for row in unsolved).most_common():
         known = [row for row in unsolved if row["status"] == status and "possible" in row["features"]]
         numbers = " ".join(str(row["number"]) for row in known)
         lines.append(f"unsolved, {status}: {count}; those with a plan: {numbers}")
     for row in false(result):
-        again = f"python experiments/benchmark_parking.py --seed {row['seed']} --only {row['number']}"
+        again = f"python experiments/benchmark_parking.py --seed {row['seed']} --only {row['number']} {limits}"
         lines.append(f"{row['verdict']}: {', '.join(row['features'][1:])}: {row['said']}\n  {again}")
-    if result["config"]["only"]:
+    if asked["only"]:
         lines += [f"{key:<12} {value}" for row in rows for key, value in row.items()]
     return "\n".join(lines)
 

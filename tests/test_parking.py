@@ -14,45 +14,41 @@ import lqrsim as ls
 
 # Half of them have a plan that is hard to find: without any trailer, with one and with two, beside the road and along
 # it, some begin in an obstacle. Of the others each has none for another reason. benchmark_parking.py has two thousand.
-SAMPLE = (34, 48, 94, 119, 201, 222, 38, 42, 61, 69, 95, 133)
+SAMPLE = (34, 94, 119, 201, 222, 554, 38, 42, 61, 69, 95, 133)
 pytestmark = pytest.mark.timeout(600)
 
 
 def test_nothing_false_is_said() -> None:
     """However few are solved within the time."""
-    found = [outcomes.look(one, improve=True, time_limit=1.5, max_iterations=3000) for one in SAMPLE]
+    found = [outcomes.look(one, improve=True, time_limit=1.2, max_iterations=3000) for one in SAMPLE]
     assert [(one.number, one.verdict, one.said) for one in found if one.verdict not in ("right", "unsolved")] == []
     assert {"CONVERGED", "INFEASIBLE"} <= {one.status for one in found if one.verdict == "right"}
 
 
-def test_the_sample_has_of_each() -> None:
-    drawn = [cases.draw(number) for number in SAMPLE]
-    assert [case.plan is None for case in drawn] == [False] * 6 + [True] * 6
-    assert {case.impossible for case in drawn[6:]} == set(cases.PROOFS) - {"occupied", "road"}
-    assert {len(case.task.trailers) for case in drawn[:6]} == {0, 1, 2}
-    assert {case.task.exact for case in drawn[:6]} == {case.task.repulsion is None for case in drawn[:6]} == {False, True}
-    assert "in an obstacle" in {case.begins for case in drawn[:6]}
-
-
 def test_what_is_known_is_so() -> None:
-    drawn = [cases.draw(number) for number in range(30)]
+    drawn = [cases.draw(number) for number in SAMPLE]
     assert all(case.proved for case in drawn)
-    assert all((case.plan is None) == bool(case.reason) for case in drawn)
-    assert {len(case.task.trailers) for case in drawn} == {0, 1, 2}
-    begun = [(case.begins, judge.spare(case.task, case.task.start).min()) for case in drawn if case.plan]
-    assert all((spare >= 0) == (begins == "clear") for begins, spare in begun)
+    assert [case.plan is None for case in drawn] == [bool(case.reason) for case in drawn] == [False] * 6 + [True] * 6
+    possible, impossible = drawn[:6], drawn[6:]
+    assert {case.impossible for case in impossible} == set(cases.PROOFS) - {"occupied", "road"}
+    assert {len(case.task.trailers) for case in possible} == {0, 1, 2}
+    assert {case.task.exact for case in possible} == {False, True}
+    assert {case.task.repulsion is None for case in possible} == {False, True}
+    assert {case.begins for case in possible} == {"clear", "in a margin", "in an obstacle"}
+    for case in possible:
+        assert (judge.spare(case.task, case.task.start).min() >= 0) == (case.begins == "clear")
 
 
 def test_a_case_does_not_depend_on_what_else_is_drawn() -> None:
     assert problem_of(cases.draw(5).task).digest == problem_of(cases.draw(5).task).digest
-    assert len({problem_of(cases.draw(number).task).digest for number in range(6)}) == 6
+    assert len({problem_of(cases.draw(number).task).digest for number in range(3)}) == 3
 
 
 @pytest.mark.parametrize("name", cases.PROOFS)
 def test_each_proof_can_fail(name: str) -> None:
     """Of a case that has a plan no proof says that it has none."""
     drawn = (cases.draw(number, impossible=0.0) for number in itertools.count())
-    assert all(cases.PROOFS[name](case.task) < 0 for case in itertools.islice(drawn, 6))
+    assert all(cases.PROOFS[name](case.task) < 0 for case in itertools.islice(drawn, 3))
 
 
 @pytest.fixture(scope="module")
