@@ -66,6 +66,13 @@ class TestTheJudge:
         places = np.random.default_rng(0).uniform(-8, 8, size=(200, 2))
         away = np.stack([judge.distance(shape, places) for shape in case.task.obstacles], axis=-1)
         np.testing.assert_allclose(away, [world.distances([*place, 0.0]) for place in places], rtol=0, atol=1e-12)
+        assert case.plan is not None
+        problem = problem_of(case.task)
+        clearance = problem.constraints[0]
+        assert isinstance(clearance, ls.Clearance)
+        assert clearance.balls is not None
+        centres = clearance.balls.centres(problem.dynamics, case.plan.states)
+        np.testing.assert_allclose(centres[..., :2], judge.balls(case.task, case.plan.states), rtol=0, atol=1e-12)
 
     def test_motion_is_the_package_s(self, case: Case) -> None:
         assert case.plan is not None
