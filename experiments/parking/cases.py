@@ -19,7 +19,6 @@ Side = Literal["parallel", "perpendicular"]
 
 LEAST_SPARE = 0.01  # m or rad, by which a known plan keeps all inequalities
 CLEARLY = 0.02  # m or rad, by which at least no plan can keep what an impossible case asks
-UNTURNED, FAR, ROUND = 0.0, 10.0, 0.0
 DRIVES = 64  # at once
 
 
@@ -188,9 +187,8 @@ def _surrounded(rng: Generator, task: Task, plan: Plan, begins: str) -> tuple[Ta
         if judge.distance(car, judge.balls(task, goal)).min() > RADIUS + 2.5:  # that is no gap
             return None
         cars.append(car)
-    beyond = 0.0 if rng.random() < 0.5 else FAR
-    kerb_top = places[..., 1].min() - least - beyond
-    kerb = Shape("kerb", True, np.array([0.0, kerb_top - 0.5]), UNTURNED, (40.0, 0.5))
+    kerb_top = places[..., 1].min() - least - (0.0 if rng.random() < 0.5 else 10.0)
+    kerb = Shape("kerb", True, np.array([0.0, kerb_top - 0.5]), 0.0, (40.0, 0.5))
     post = _post(rng, task, states, least, begins)
     if post is None:
         return None
@@ -213,7 +211,7 @@ def _post(rng: Generator, task: Task, states: Array, least: float, begins: str) 
         length = float(step[last] @ direction)
         deep = -rng.uniform(0.0, task.clearance) if begins == "in a margin" else rng.uniform(0.0, length)
         middle = start[last] - direction * (RADIUS + radius - deep)
-    post = Shape("post", False, middle, UNTURNED, (ROUND, radius))
+    post = Shape("post", False, middle, 0.0, (0.0, radius))
     return post if judge.distance(post, judge.balls(task, states[1:])).min() >= least else None
 
 
@@ -345,7 +343,7 @@ def _spoil_stuck(rng: Generator, task: Task) -> Task:
     """A post as large as it takes, about the rear axle."""
     place = task.start[:2] + rng.uniform(-0.2, 0.2, size=2)
     size = max(0.1, task.top[0] * task.dt + rng.uniform(0.1, 0.5) - RADIUS)
-    larger = replace(task.obstacles[3], place=place, half=(ROUND, size))
+    larger = replace(task.obstacles[3], place=place, half=(0.0, size))
     return replace(task, obstacles=(*task.obstacles[:3], larger))
 
 
