@@ -35,6 +35,7 @@ from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures, Stages
 from lqrsim.solvers.multipliers import AugmentedLagrangian
 
 FAR = 100.0  # times what may be missed: then the price is too low, or there is no way to keep all
+AUGMENTED = 160  # iterations of the augmented Lagrangian
 STARTS = 2  # from which what is missed has to be stationary, before that is called infeasible
 OPENING = 10  # iterations of smoothing at most, before constraints come in
 MOST = 150  # of the interior point from one plan
@@ -108,7 +109,7 @@ class Ladder:
             near = LITTLE if self._given is not None else MUCH
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
-            rungs += [self._from_valley, lambda: self._at_a_price(self._valley)]
+            rungs += [self._from_valley, self._augmented, lambda: self._at_a_price(self._valley)]
         rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._at_a_price(_plan(start))]
         for rung in rungs:
             found = rung()
@@ -148,6 +149,23 @@ class Ladder:
             if found.success and found.violation == 0:
                 return self._note(found)
         return self._interior(self._valley, MUCH)
+
+    def _augmented(self) -> AttemptResult | None:
+        attempt, settings = self._attempt, self._attempt.settings
+        if self._valley is None or settings.elastic is not None:
+            return None
+        begun = len(self._iterations)
+        attempt.settings = replace(settings, max_iterations=min(begun + AUGMENTED, settings.max_iterations))
+        before = replace(attempt.result(attempt.termination), iterations=self._iterations)
+        found = constrained.satisfy(attempt, before, each=self._each, callback=self._callback, near=True)
+        attempt.settings, self._iterations = settings, found.iterations
+        if attempt.stop.due or not np.isfinite(found.cost):
+            return None
+        plan = Plan(found.states.copy(), found.controls.copy())
+        result = self._interior(plan, LITTLE)
+        if attempt.stop.due or (result is not None and result.success):
+            return result
+        return self._interior(plan, MUCH)
 
     def _at_a_price(self, plan: Plan | None) -> AttemptResult | None:
         """With constraints that may be missed; and from where that leads, without."""
