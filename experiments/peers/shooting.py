@@ -1,0 +1,199 @@
+"""IPOPT and Fatrop for any problem of formulas, through CasADi, with all that the problem asks for.
+
+Direct multiple shooting, as in `ipopt.py` and `fatrop.py`: the states and controls of all knots are variables, the
+steps and the given start are equality constraints, limits of controls and bounds of states are bounds of the variables.
+Derivatives are exact, the Hessian of the Lagrangian among them. Both stop at their own tolerance of 1e-8 and are
+otherwise as they come, on one thread. A solver is made for one problem and serves all that differ in parameters only.
+"""
+
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+import lqrsim as ls
+from lqrsim.errors import Array
+from peers import formulas, ipopt
+from peers.common import Answer
+
+TOLERANCE, MAX_ITERATIONS = 1e-8, 1000
+
+
+@dataclass(frozen=True)
+class Moment:
+    """How far a solver had come.
+
+    Attributes:
+      iterations: how many it had made. seconds: since the solve began.
+      cost, violation: of the plan at that time; the violation is the largest, that of the dynamics among them.
+    """
+
+    iterations: int
+    seconds: float
+    cost: float
+    violation: float
+
+
+class Shooting:
+    """One of the two solvers.
+
+    Args:
+      problem: of the kind that is to be solved.
+      plugin: "ipopt" or "fatrop".
+      compile: to C and with g++, for speed.
+
+    Raises:
+      Unavailable: CasADi is not installed, or g++ where it is needed.
+      NotImplementedError: something of the problem is no formula.
+    """
+
+    def __init__(self, problem: ls.Problem, plugin: Literal["ipopt", "fatrop"], *, compile: bool) -> None:
+        ca = ipopt.casadi()
+        self._plugin = plugin
+        told = formulas.formulas(problem)
+        nlp, self._equal = _nlp(problem, told)
+        self._nlp = nlp
+        self._limits = {"lbg": 0.0, "ubg": np.where(self._equal, 0.0, np.inf)}
+        self._options: dict[str, Any] = {}
+        if plugin == "fatrop":
+            self._options = {"structure_detection": "auto", "equality": self._equal.tolist()}
+        source = nlp
+        if compile:
+            source = ipopt.library(plugin, nlp, {**self._options, plugin: self._settings(MAX_ITERATIONS)})
+        self._source = source
+        self._solver = self._made(MAX_ITERATIONS)
+        self._values = ca.Function("values", [nlp["x"], nlp["p"]], [nlp["f"], nlp["g"]])
+
+    def solve(self, problem: ls.Problem, states: Array, controls: Array) -> Answer:
+        """Solve from states (T+1, n) and controls (T, m), whether or not they belong together."""
+        found = self._run(self._solver, problem, states, controls)
+        stats = self._solver.stats()
+        return Answer(
+            *self._unpacked(problem, found["x"].full().ravel()),
+            cost=float(found["f"]),
+            iterations=stats["iter_count"],
+            # No more than its acceptable level is not what was asked for.
+            converged=bool(stats["success"]) and "Acceptable" not in str(stats["return_status"]),
+        )
+
+    def moments(self, problem: ls.Problem, states: Array, controls: Array, iterations: int) -> list[Moment]:
+        """Solve once more, and look at the plan after each of the iterations.
+
+        IPOPT shows them as it goes. Fatrop does not: it is stopped after one, after two, and so on.
+        """
+        found: list[tuple[float, Array]] = []
+        if self._plugin == "ipopt":
+            ca = ipopt.casadi()
+            watch = _watch(ca, self._nlp["x"].numel(), self._nlp["g"].numel(), found)
+            solver = self._made(MAX_ITERATIONS, iteration_callback=watch)
+            begun = time.perf_counter()
+            self._run(solver, problem, states, controls)
+            found = [(when - begun, values) for when, values in found[1:]]  # the first is the start
+        else:
+            for count in range(iterations):
+                solver = self._made(count)
+                begun = time.perf_counter()
+                values = self._run(solver, problem, states, controls)["x"]
+                found.append((time.perf_counter() - begun, values.full().ravel()))
+        return [
+            Moment(number, seconds, *self._worth(problem, values)) for number, (seconds, values) in enumerate(found, 1)
+        ]
+
+    def _settings(self, iterations: int) -> dict[str, Any]:
+        settings: dict[str, Any] = {"print_level": 0, "max_iter": iterations, "tol": TOLERANCE}
+        # Bounds are kept exactly, and not to 1e-8 as IPOPT has them inside.
+        return settings | ({"sb": "yes", "honor_original_bounds": "yes"} if self._plugin == "ipopt" else {})
+
+    def _made(self, iterations: int, **options: Any) -> Any:
+        own = {**self._options, self._plugin: self._settings(iterations), **options}
+        return ipopt.made(self._plugin, self._source, own)
+
+    def _run(self, solver: Any, problem: ls.Problem, states: Array, controls: Array) -> Any:
+        guess = np.append(np.hstack([states[:-1], controls]), states[-1])
+        low, high = _bounds(problem)
+        return solver(x0=guess, p=formulas.parameters(problem), lbx=low, ubx=high, **self._limits)
+
+    def _unpacked(self, problem: ls.Problem, values: Array) -> tuple[Array, Array]:
+        n = len(problem.dynamics.state_coordinates)
+        stages = values[:-n].reshape(problem.steps, -1)
+        return np.vstack([stages[:, :n], values[-n:]]), stages[:, n:].copy()
+
+    def _worth(self, problem: ls.Problem, values: Array) -> tuple[float, float]:
+        """Cost and violation."""
+        cost, g = self._values(values, formulas.parameters(problem))
+        rows = g.full().ravel()
+        low, high = _bounds(problem)
+        missed = [np.where(self._equal, np.abs(rows), -rows), low - values, values - high]
+        return float(cost), float(max(0.0, *(one.max(initial=0.0) for one in missed)))
+
+
+def _bounds(problem: ls.Problem) -> tuple[Array, Array]:
+    """Of all variables."""
+    sides = []
+    for states, controls in zip(
+        formulas.state_bounds(problem), (problem.control_coordinates.low, problem.control_coordinates.high), strict=True
+    ):
+        stages = np.hstack([states[:-1], np.tile(controls, (problem.steps, 1))])
+        sides.append(np.append(stages, states[-1]))
+    return sides[0], sides[1]
+
+
+def _nlp(problem: ls.Problem, told: formulas.Formulas) -> tuple[dict[str, Any], Array]:
+    """Variables x0, u0, x1, u1 ... xT; constraints knot by knot, each step before what else is asked of its knot.
+
+    Besides, which of the constraints are equalities.
+    """
+    ca, steps = ipopt.casadi(), problem.steps
+    n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
+    stages, last = ca.MX.sym("w", n + m, steps), ca.MX.sym("last", n)
+    p = ca.MX.sym("p", len(formulas.parameters(problem)))
+    x, u = stages[:n, :], stages[n:, :]
+    every = ca.repmat(p, 1, steps)
+    gaps = ca.horzcat(x[:, 1:], last) - told.step.map(steps)(x, u, every)
+    begin, between, end = told.costs
+    cost = begin(x[:, 0], u[:, 0], p) + end(last, p)
+    first, rows, final = told.rows
+    g = [gaps[:, 0], x[:, 0] - p[:n], first(x[:, 0], u[:, 0], p)]
+    equal = [True] * (2 * n) + _equalities(first, told.equalities[0])
+    if steps > 1:
+        rest = ca.repmat(p, 1, steps - 1)
+        cost += ca.sum2(between.map(steps - 1)(x[:, 1:], u[:, 1:], rest))
+        kept = rows.map(steps - 1)(x[:, 1:], u[:, 1:], rest) if rows.numel_out(0) else ca.MX(0, steps - 1)
+        g.append(ca.vec(ca.vertcat(gaps[:, 1:], kept)))
+        equal += ([True] * n + _equalities(rows, told.equalities[1])) * (steps - 1)
+    g.append(final(last, p))
+    equal += _equalities(final, told.equalities[2])
+    return {"x": ca.vertcat(ca.vec(stages), last), "p": p, "f": cost, "g": ca.vertcat(*g)}, np.array(equal)
+
+
+def _equalities(rows: Any, count: int) -> list[bool]:
+    return [row < count for row in range(rows.numel_out(0))]
+
+
+def _watch(ca: Any, variables: int, rows: int, found: list[tuple[float, Array]]) -> Any:
+    """What IPOPT calls after each iteration: it notes when that was, and the variables."""
+    sizes = {"f": 1, "x": variables, "lam_x": variables, "g": rows, "lam_g": rows}
+
+    class Watch(ca.Callback):
+        def __init__(self) -> None:
+            super().__init__()
+            self.construct("watch", {})
+
+        def get_n_in(self) -> int:
+            return ca.nlpsol_n_out()
+
+        def get_n_out(self) -> int:
+            return 1
+
+        def get_name_in(self, i: int) -> str:
+            return ca.nlpsol_out(i)
+
+        def get_sparsity_in(self, i: int) -> Any:
+            return ca.Sparsity.dense(sizes[name]) if (name := ca.nlpsol_out(i)) in sizes else ca.Sparsity(0, 0)
+
+        def eval(self, arguments: Any) -> list[int]:
+            found.append((time.perf_counter(), arguments[0].full().ravel()))
+            return [0]
+
+    return Watch()
