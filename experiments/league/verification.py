@@ -10,6 +10,7 @@ import numpy as np
 from whole_problems import constraints, kkt
 
 import lqrsim as ls
+from lqrsim.errors import Array
 
 VIOLATION = 1e-6  # what counts as kept: dynamics, start, limits and constraints
 COST = 1e-6  # as a share: how closely the cost that is claimed is that of the plan
@@ -41,10 +42,9 @@ def verify(problem: ls.Problem, plan: ls.Trajectory, claimed: float) -> Verified
     if not (np.isfinite(states).all() and np.isfinite(controls).all()):
         return Verified(np.nan, np.inf, np.inf, ("the plan is not finite",))
     assert isinstance(problem.initial, ls.FixedState)
-    rate = kkt.rate_of(problem, kkt.quadrotor_rate if problem.dynamics.f is ls.Quadrotor().dynamics.f else None)
     z = np.hstack([states[:-1], controls])
     with np.errstate(all="ignore"):
-        arrived = kkt.step(rate, states[:-1], controls, kkt.numbers_of(problem), problem.dt)
+        arrived = _step(problem, states[:-1], controls)
         cost = float(
             kkt.cost_values(problem, problem.stage_cost, z, n, first=0).sum()
             + kkt.cost_values(problem, problem.final_cost, states[-1:], n, first=-1)[0]
@@ -65,3 +65,18 @@ def verify(problem: ls.Problem, plan: ls.Trajectory, claimed: float) -> Verified
     if not abs(cost - claimed) <= COST * abs(cost):
         faults.append(f"it costs {cost:.9g}, not {claimed:.9g}")
     return Verified(cost, motion, violation, tuple(faults))
+
+
+def rolled_out(problem: ls.Problem, controls: Array) -> Array:
+    """States (T+1, n) that the controls (T, m) lead to."""
+    assert isinstance(problem.initial, ls.FixedState)
+    states = [np.array(problem.initial.state, dtype=float)]
+    for control in controls:
+        states.append(_step(problem, states[-1], control))
+    return np.array(states)
+
+
+def _step(problem: ls.Problem, states: Array, controls: Array) -> Array:
+    """Where states (..., n) are a step later under controls (..., m)."""
+    written = kkt.quadrotor_rate if problem.dynamics.f is ls.Quadrotor().dynamics.f else None
+    return kkt.step(kkt.rate_of(problem, written), states, controls, kkt.numbers_of(problem), problem.dt)

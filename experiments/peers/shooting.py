@@ -7,6 +7,7 @@ otherwise as they come, on one thread. A solver is made for one problem and serv
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ from lqrsim.errors import Array
 from peers import formulas, ipopt
 from peers.common import Answer
 
-TOLERANCE, MAX_ITERATIONS = 1e-8, 1000
+TOLERANCE, MAX_ITERATIONS = 1e-8, 500  # the latter as lqrsim has it
 
 
 @dataclass(frozen=True)
@@ -77,28 +78,43 @@ class Shooting:
             converged=bool(stats["success"]) and "Acceptable" not in str(stats["return_status"]),
         )
 
-    def moments(self, problem: ls.Problem, states: Array, controls: Array, iterations: int) -> list[Moment]:
-        """Solve once more, and look at the plan after each of the iterations.
+    def first(
+        self, problem: ls.Problem, states: Array, controls: Array, iterations: int, enough: Callable[[Moment], bool]
+    ) -> Moment | None:
+        """When a solve of so many iterations from there has come far enough, found by solving once more; None if never.
 
-        IPOPT shows them as it goes. Fatrop does not: it is stopped after one, after two, and so on.
+        IPOPT shows its plan as it goes. Fatrop does not: it is stopped earlier, where is found by bisection.
         """
-        found: list[tuple[float, Array]] = []
         if self._plugin == "ipopt":
-            ca = ipopt.casadi()
-            watch = _watch(ca, self._nlp["x"].numel(), self._nlp["g"].numel(), found)
+            shown: list[tuple[float, Array]] = []
+            watch = _watch(self._nlp, shown)
             solver = self._made(MAX_ITERATIONS, iteration_callback=watch)
             begun = time.perf_counter()
             self._run(solver, problem, states, controls)
-            found = [(when - begun, values) for when, values in found[1:]]  # the first is the start
-        else:
-            for count in range(iterations):
-                solver = self._made(count)
-                begun = time.perf_counter()
-                values = self._run(solver, problem, states, controls)["x"]
-                found.append((time.perf_counter() - begun, values.full().ravel()))
-        return [
-            Moment(number, seconds, *self._worth(problem, values)) for number, (seconds, values) in enumerate(found, 1)
-        ]
+            # The first is the start.
+            moments = (self._moment(problem, i, when - begun, plan) for i, (when, plan) in enumerate(shown) if i)
+            return next((moment for moment in moments if enough(moment)), None)
+
+        def after(count: int) -> Moment:
+            solver = self._made(count - 1)  # as Fatrop counts, in its last iteration it only looks at what it has
+            begun = time.perf_counter()
+            plan = self._run(solver, problem, states, controls)["x"].full().ravel()
+            return self._moment(problem, count, time.perf_counter() - begun, plan)
+
+        moment = after(iterations)
+        if not enough(moment):
+            return None
+        low, high = 0, iterations  # not enough, and enough
+        while high - low > 1:
+            between = after((low + high) // 2)
+            if enough(between):
+                moment, high = between, between.iterations
+            else:
+                low = between.iterations
+        return moment
+
+    def _moment(self, problem: ls.Problem, count: int, seconds: float, plan: Array) -> Moment:
+        return Moment(count, seconds, *self._worth(problem, plan))
 
     def _settings(self, iterations: int) -> dict[str, Any]:
         settings: dict[str, Any] = {"print_level": 0, "max_iter": iterations, "tol": TOLERANCE}
@@ -171,8 +187,9 @@ def _equalities(rows: Any, count: int) -> list[bool]:
     return [row < count for row in range(rows.numel_out(0))]
 
 
-def _watch(ca: Any, variables: int, rows: int, found: list[tuple[float, Array]]) -> Any:
-    """What IPOPT calls after each iteration: it notes when that was, and the variables."""
+def _watch(nlp: dict[str, Any], shown: list[tuple[float, Array]]) -> Any:
+    """What IPOPT calls at the start and after each iteration: it notes when that was, and the variables."""
+    ca, variables, rows = ipopt.casadi(), nlp["x"].numel(), nlp["g"].numel()
     sizes = {"f": 1, "x": variables, "lam_x": variables, "g": rows, "lam_g": rows}
 
     class Watch(ca.Callback):
@@ -193,7 +210,7 @@ def _watch(ca: Any, variables: int, rows: int, found: list[tuple[float, Array]])
             return ca.Sparsity.dense(sizes[name]) if (name := ca.nlpsol_out(i)) in sizes else ca.Sparsity(0, 0)
 
         def eval(self, arguments: Any) -> list[int]:
-            found.append((time.perf_counter(), arguments[0].full().ravel()))
+            shown.append((time.perf_counter(), arguments[0].full().ravel()))
             return [0]
 
     return Watch()
