@@ -110,8 +110,9 @@ def _family(name: str, config: Config, most: int, bar: Any) -> Result:
     ]
     published = FAMILIES[name].published
     targets = [ABOVE_BEST * cost for cost in best]
-    if by_altro := published is not None and best[0] <= published[1]:
-        targets = [published[1]]
+    by_altro = False
+    if published is not None and best[0] <= published[1]:
+        targets, by_altro = [published[1]], True
     return {
         "instances": len(problems),
         "published": published,

@@ -23,7 +23,7 @@ class Family:
     Attributes:
       make: the problem of a seed, and what a solve begins with: controls (T, m), or a trajectory.
       instances: how many seeds there are; 1 where nothing is random.
-      published: Altro.jl's iterations and cost at its last commit, 4864df2; None where there is none.
+      published: Altro.jl's iterations and cost; None where there are none.
     """
 
     make: Callable[[int], Instance]
@@ -107,10 +107,10 @@ def arm(seed: int) -> Instance:
 
 
 def _nominal(problem: ls.Problem) -> NDArray[np.float64]:
-    return np.tile(problem.nominal_control, (problem.steps, 1))
+    return altro_problems.same(problem, *problem.nominal_control)
 
 
-# The numbers of Altro.jl's own tests and runs. Its counts of the last two are of other costs, or not published with one.
+# Iterations and cost of Altro.jl at commit 4864df2, where both are known.
 PUBLISHED = {
     "double_integrator": (8, 0.74409), "pendulum": (17, 0.02455), "cartpole": (40, 1.5526), "acrobot": (50, 50.052),
     "parallel_park": (13, 0.05558), "three_obstacles": (20, 9.4339), "escape": (13, 0.3344),

@@ -50,21 +50,16 @@ def verify(problem: ls.Problem, plan: ls.Trajectory, claimed: float) -> Verified
             + kkt.cost_values(problem, problem.final_cost, states[-1:], n, first=-1)[0]
         )
         along = constraints.points(plan)
-        missed = [one.violation(along) for one in constraints.of(problem)]
+        missed = max((one.violation(along) for one in constraints.of(problem)), default=0.0)
     motion = float(np.abs(arrived - states[1:]).max())
     start = float(np.abs(states[0] - np.asarray(problem.initial.state)).max())
     low, high = np.array(problem.control_coordinates.low), np.array(problem.control_coordinates.high)
     limits = float(np.maximum(low - controls, controls - high).max())
-    violation = max(0.0, start, limits, *missed)
-    faults: list[str] = []
-    if not motion < VIOLATION:
-        faults.append(f"a state is {motion:.2g} off the dynamics")
-    for what, amount in (("the start", start), ("a limit of the controls", limits), ("a constraint", max(missed, default=0.0))):
-        if not amount < VIOLATION:
-            faults.append(f"{what} is missed by {amount:.2g}")
+    kept = {"the dynamics": motion, "the start": start, "a limit of the controls": limits, "a constraint": missed}
+    faults = [f"{what}: missed by {amount:.2g}" for what, amount in kept.items() if not amount < VIOLATION]
     if not abs(cost - claimed) <= COST * abs(cost):
         faults.append(f"it costs {cost:.9g}, not {claimed:.9g}")
-    return Verified(cost, motion, violation, tuple(faults))
+    return Verified(cost, motion, max(start, limits, missed), tuple(faults))
 
 
 def rolled_out(problem: ls.Problem, controls: Array) -> Array:

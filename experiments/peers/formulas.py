@@ -25,14 +25,14 @@ class Formulas:
     Attributes:
       step: the next state.
       costs: at the first knot, at those between, and at the last.
-      rows: of constraints at the same three, equalities first; inequalities are not to be negative.
-      equalities: how many of the rows are equalities, at the same three.
+      rows: of constraints at the same three; inequalities are not to be negative.
+      equalities: whether each of these rows is one.
     """
 
     step: Any
     costs: tuple[Any, Any, Any]
     rows: tuple[Any, Any, Any]
-    equalities: tuple[int, int, int]
+    equalities: Sequence[list[bool]]
 
 
 def formulas(problem: ls.Problem) -> Formulas:
@@ -53,18 +53,20 @@ def formulas(problem: ls.Problem) -> Formulas:
     second = rate(x + h / 2 * first)
     third = rate(x + h / 2 * second)
     after = x + h / 6 * (first + 2 * second + 2 * third + rate(x + h * third))
-    stage = [(_cost(problem, one, x, u, given), isinstance(one, ls.ObstacleCost)) for one in terms_of(problem.stage_cost)]
-    end = ca.sum1(ca.vertcat(*[_cost(problem, one, x, u, given) for one in terms_of(problem.final_cost)]))
-    between = ca.sum1(ca.vertcat(*[cost for cost, _ in stage]))
-    begin = ca.sum1(ca.vertcat(*[cost for cost, obstacles in stage if not obstacles]))  # which do not act there
-    rows = [_Rows(*_constraint(problem, one, x, u, given)) for one in problem.constraints]
+    begin, between, end = ca.SX(0), ca.SX(0), ca.SX(0)
+    for one in terms_of(problem.stage_cost):
+        cost = _cost(problem, one, x, u, given)
+        between += cost
+        begin += 0 if isinstance(one, ls.ObstacleCost) else cost  # which does not act there
+    for one in terms_of(problem.final_cost):
+        end += _cost(problem, one, x, u, given)
+    rows = [_constraint(problem, one, x, u, given) for one in problem.constraints]
     kinds = [
         [one for one in rows if one.with_control],
         [one for one in rows if not one.at_end],
         [one for one in rows if not one.with_control],
     ]
-    ordered = [sorted(kind, key=lambda one: not one.equality) for kind in kinds]
-    stacked = [ca.vertcat(*[one.values for one in kind]) for kind in ordered]
+    stacked = [ca.vertcat(*[one.values for one in kind]) for kind in kinds]
     return Formulas(
         step=ca.Function("step", [x, u, p], [after]),
         costs=(
@@ -77,7 +79,7 @@ def formulas(problem: ls.Problem) -> Formulas:
             ca.Function("rows", [x, u, p], [stacked[1]]),
             ca.Function("end_rows", [x, p], [stacked[2]]),
         ),
-        equalities=tuple(sum(one.values.numel() for one in kind if one.equality) for kind in ordered),  # pyright: ignore[reportArgumentType]
+        equalities=[[one.equality for one in kind for _ in range(one.values.numel())] for kind in kinds],
     )
 
 
@@ -112,7 +114,7 @@ class _Given:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Numbers of a constraint, and where they act: with a control at the knots that have one, or else at the end, too."""
+    """Numbers of a constraint. They act at the knots that have a control, or at all but the first, or at the last."""
 
     values: Any
     equality: bool = False
@@ -134,25 +136,22 @@ def _cost(problem: ls.Problem, cost: Cost, x: Any, u: Any, given: _Given) -> Any
     raise NotImplementedError(f"the cost {cost.name}")
 
 
-def _constraint(
-    problem: ls.Problem, constraint: ls.Constraint, x: Any, u: Any, given: _Given
-) -> tuple[Any, bool, bool, bool]:
-    """As `_Rows` has them."""
+def _constraint(problem: ls.Problem, constraint: ls.Constraint, x: Any, u: Any, given: _Given) -> _Rows:
     ca = casadi()
     if isinstance(constraint, ls.StateBounds):  # which are bounds of the variables
-        return ca.SX(0, 1), False, False, False
+        return _Rows(ca.SX(0, 1))
     if isinstance(constraint, ls.GoalState):
         names = problem.dynamics.state_coordinates.names
         places = [names.index(name) for name in constraint.states or names]
-        return x[places] - given(len(places)), True, False, True
+        return _Rows(x[places] - given(len(places)), equality=True, at_end=True)
     if isinstance(constraint, ls.SymbolicConstraint):
         numbers = given(len(constraint.parameters))
         values = ca.vertcat(*evaluate(constraint.function, tuple(constraint.parameters), x, u, numbers))
         with_control = bool(ca.depends_on(values, u))
-        return values, constraint.equality, with_control, constraint.at == "final"
+        return _Rows(values, constraint.equality, with_control, constraint.at == "final")
     if isinstance(constraint, ls.Clearance) and isinstance(constraint.margin, float):
         if constraint.balls is None:
-            return _from_obstacles(problem, constraint.world, x) - constraint.radius - constraint.margin, False, False, False
+            return _Rows(_from_obstacles(problem, constraint.world, x) - constraint.radius - constraint.margin)
         balls, dynamics = constraint.balls, problem.dynamics
         values = ca.DM(list(dynamics.parameters.values()))
         places = evaluate(_coordinates(balls), tuple(dynamics.parameters), x, u, values, dynamics.constants)
@@ -161,7 +160,7 @@ def _constraint(
             for ball, radius in enumerate(balls.radii)
             for obstacle in constraint.world.obstacles
         ]
-        return ca.vertcat(*rows), False, False, False
+        return _Rows(ca.vertcat(*rows))
     raise NotImplementedError(f"the constraint {type(constraint).__name__}")
 
 
@@ -229,7 +228,7 @@ def _printer() -> Any:
     from sympy.printing.lambdarepr import LambdaPrinter
 
     class Printer(LambdaPrinter):
-        def _print_Piecewise(self, expr: Any) -> str:
+        def _print_Piecewise(self, expr: Any) -> Any:
             *others, (value, _) = expr.args  # the last is for all other cases
             chosen = self._print(value)
             for other, condition in reversed(others):

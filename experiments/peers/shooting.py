@@ -113,6 +113,10 @@ class Shooting:
                 low = between.iterations
         return moment
 
+    def worth(self, problem: ls.Problem, states: Array, controls: Array) -> tuple[float, float]:
+        """Cost and largest violation of a plan, the dynamics included, as the solver is told of them."""
+        return self._worth(problem, _packed(states, controls))
+
     def _moment(self, problem: ls.Problem, count: int, seconds: float, plan: Array) -> Moment:
         return Moment(count, seconds, *self._worth(problem, plan))
 
@@ -126,7 +130,7 @@ class Shooting:
         return ipopt.made(self._plugin, self._source, own)
 
     def _run(self, solver: Any, problem: ls.Problem, states: Array, controls: Array) -> Any:
-        guess = np.append(np.hstack([states[:-1], controls]), states[-1])
+        guess = _packed(states, controls)
         low, high = _bounds(problem)
         return solver(x0=guess, p=formulas.parameters(problem), lbx=low, ubx=high, **self._limits)
 
@@ -144,14 +148,18 @@ class Shooting:
         return float(cost), float(max(0.0, *(one.max(initial=0.0) for one in missed)))
 
 
+def _packed(states: Array, controls: Array) -> Array:
+    """As the variables are: knot by knot, and the last state."""
+    return np.append(np.hstack([states[:-1], controls]), states[-1])
+
+
 def _bounds(problem: ls.Problem) -> tuple[Array, Array]:
     """Of all variables."""
     sides = []
     for states, controls in zip(
         formulas.state_bounds(problem), (problem.control_coordinates.low, problem.control_coordinates.high), strict=True
     ):
-        stages = np.hstack([states[:-1], np.tile(controls, (problem.steps, 1))])
-        sides.append(np.append(stages, states[-1]))
+        sides.append(_packed(states, np.tile(controls, (problem.steps, 1))))
     return sides[0], sides[1]
 
 
@@ -171,20 +179,16 @@ def _nlp(problem: ls.Problem, told: formulas.Formulas) -> tuple[dict[str, Any], 
     cost = begin(x[:, 0], u[:, 0], p) + end(last, p)
     first, rows, final = told.rows
     g = [gaps[:, 0], x[:, 0] - p[:n], first(x[:, 0], u[:, 0], p)]
-    equal = [True] * (2 * n) + _equalities(first, told.equalities[0])
+    equal = [True] * (2 * n) + told.equalities[0]
     if steps > 1:
         rest = ca.repmat(p, 1, steps - 1)
         cost += ca.sum2(between.map(steps - 1)(x[:, 1:], u[:, 1:], rest))
         kept = rows.map(steps - 1)(x[:, 1:], u[:, 1:], rest) if rows.numel_out(0) else ca.MX(0, steps - 1)
         g.append(ca.vec(ca.vertcat(gaps[:, 1:], kept)))
-        equal += ([True] * n + _equalities(rows, told.equalities[1])) * (steps - 1)
+        equal += ([True] * n + told.equalities[1]) * (steps - 1)
     g.append(final(last, p))
-    equal += _equalities(final, told.equalities[2])
+    equal += told.equalities[2]
     return {"x": ca.vertcat(ca.vec(stages), last), "p": p, "f": cost, "g": ca.vertcat(*g)}, np.array(equal)
-
-
-def _equalities(rows: Any, count: int) -> list[bool]:
-    return [row < count for row in range(rows.numel_out(0))]
 
 
 def _watch(nlp: dict[str, Any], shown: list[tuple[float, Array]]) -> Any:
