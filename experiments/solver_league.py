@@ -18,10 +18,10 @@ box-FDDP          Crocoddyl's, which keeps as much.
 FATROP, IPOPT     through CasADi, with exact Hessians and a tolerance of 1e-8.
 
 The target is Altro.jl's published cost where a verified plan of the league costs no more, and otherwise 1.001 times the
-best final cost of all verified plans. It is reached at the first iteration with no higher cost and every constraint
-kept to 1e-6; of FATROP and IPOPT the dynamics, too. FATROP tells nothing on its way, so its iteration is found by
-bisection. "To 1e-8" is by each solver's own measure of optimality, which are not the same: the decrease of the cost
-that is still promised, relative to the cost, or the residuals of the optimality conditions.
+least cost of all verified plans, whether or not they are said to be optimal. It is reached at the first iteration with
+no higher cost and every constraint kept to 1e-6; of FATROP and IPOPT the dynamics, too. A solver whose final plan costs
+more is not asked when it was there. "To 1e-8" is by each solver's own measure of optimality, which are not the same:
+the decrease of the cost that is still promised, relative to the cost, or the residuals of the optimality conditions.
 
 Each plan that is returned is recomputed in NumPy, apart from all solvers: dynamics and constraints are to be kept to
 1e-6, and the cost is to be the claimed one. What is claimed but not so counts as not solved, and reaches nothing. Of
@@ -100,12 +100,12 @@ def _family(name: str, config: Config, most: int, bar: Any) -> Result:
         except Unavailable as error:
             absent[solver] = str(error)
         except NotImplementedError as error:
-            absent[solver] = f"does not take {error}"
+            absent[solver] = f"which does not take {error}"
         else:
             found[solver] = _solve_all(solve, problems, f"{name}, {solver}")
         bar.update()
     best = [
-        min((one[i].verified.cost for one in found.values() if one[i].solved), default=np.nan)
+        min((one[i].verified.cost for one in found.values() if not one[i].verified.faults), default=np.nan)
         for i in range(len(problems))
     ]
     published = FAMILIES[name].published
@@ -135,7 +135,7 @@ def _solve_all(solve: Solve, problems: Sequence[Instance], name: str) -> list[Ou
 def _summary(outcomes: Sequence[Outcome], targets: Sequence[float], name: str) -> Result:
     """What came of a solver's runs, instance by instance, as JSON."""
     reached = [
-        None if one.refuted else one.run.first(_reaching(target))
+        None if one.verified.faults or one.verified.cost > target else one.run.first(_reaching(target))
         for one, target in _progress(list(zip(outcomes, targets, strict=True)), f"{name}, to the target")
     ]
     exact = [one.run.exact if one.solved else None for one in outcomes]
@@ -144,7 +144,7 @@ def _summary(outcomes: Sequence[Outcome], targets: Sequence[float], name: str) -
         "status": [one.run.status for one in outcomes],
         "faults": [list(one.verified.faults) for one in outcomes],
         "refuted": [one.refuted for one in outcomes],
-        "cost": _numbers(one.verified.cost for one in outcomes),
+        "cost": _numbers(np.nan if one.verified.faults else one.verified.cost for one in outcomes),
         "motion": _numbers(one.verified.motion for one in outcomes),
         "violation": _numbers(one.verified.violation for one in outcomes),
         "target": _moments(reached),
@@ -178,6 +178,7 @@ def report(result: Result) -> str:
         "final cost",
     )  # fmt: skip
     rows, notes = [], []
+    absent: dict[str, list[str]] = {}
     for name, family in result["problems"].items():
         for solver, one in family["solvers"].items():
             rows.append([name, solver, family["instances"], sum(one["solved"]), *_row(one)])
@@ -186,7 +187,8 @@ def report(result: Result) -> str:
                 for i, (faults, refuted) in enumerate(zip(one["faults"], one["refuted"], strict=True))
                 if refuted
             ]
-        notes += [f"{name}: without {solver}: {why}." for solver, why in family["absent"].items()]
+        for solver, why in family["absent"].items():
+            absent.setdefault(f"Without {solver}, {why}", []).append(name)
     targets = [
         (name, *(family["published"] or ("-", "-")), family["target"], _median(family["targets"], ".6g"))
         for name, family in result["problems"].items()
@@ -199,6 +201,7 @@ def report(result: Result) -> str:
             f"Medians over the instances; a dash where no more than half get there. {peers or 'No peers installed.'}",
             table(("problem", "Altro.jl, iterations", "Altro.jl, cost", "target of", "target"), targets),
             *notes,
+            *(f"{what}: {', '.join(names)}." for what, names in absent.items()),
         ]
     )
 

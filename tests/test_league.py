@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -115,8 +117,8 @@ def test_what_is_not_taken_or_not_installed_is_named(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(solver_league.CONTESTANTS, "absent", make)
     config = solver_league.Config(problems=("double_integrator",), solvers=("ilqr", "absent"), quick=True)
     text = solver_league.report(solver_league.main(config))
-    assert "double_integrator: without ilqr: does not take constraints." in text
-    assert "double_integrator: without absent: it is not installed." in text
+    assert "Without ilqr, which does not take constraints: double_integrator." in text
+    assert "Without absent, it is not installed: double_integrator." in text
     with pytest.raises(ls.InputError, match="--solvers"):
         solver_league.main(dataclasses.replace(config, solvers=("nobody",)))
 
@@ -177,3 +179,19 @@ def test_when_others_had_come_far_enough(plugin: str) -> None:
     assert 1 <= found[1e-2] <= found[1e-3] <= found[1e-6] <= answer.iterations
     assert found[1e-2] < found[1e-6]
     assert solver.first(problem, *guess, answer.iterations, lambda one: one.cost < 0) is None
+
+
+@pytest.mark.parametrize("plugin", ["ipopt", "fatrop"])
+def test_ctrl_c_ends_what_is_solved(plugin: str) -> None:
+    problem, start = problems.concar(0)
+    try:
+        solver = Shooting(problem, plugin, compile=False)  # pyright: ignore[reportArgumentType]
+    except peers.Unavailable as error:
+        pytest.skip(str(error))
+    guess = verification.rolled_out(problem, start), start
+    timer = threading.Timer(0.03, signal.raise_signal, [signal.SIGINT])
+    with pytest.raises(KeyboardInterrupt):
+        timer.start()
+        for _ in range(1000):
+            solver.solve(problem, *guess)
+    assert solver.solve(problem, *guess).converged

@@ -45,7 +45,7 @@ def _outside(x: Any, u: Any, p: Any) -> list[Any]:
     return [(x[0] - a) ** 2 + (x[1] - b) ** 2 - r**2 for a, b, r in circles]
 
 
-def concar(seed: int) -> Instance:
+def concar(seed: int) -> tuple[ls.Problem, NDArray[np.float64]]:
     """The car among circles of InteriorPointDDP.jl, drawn anew from its distributions.
 
     The circles are constraints here; there they cost 50 for a unit that they are missed by, which is the same where

@@ -6,8 +6,10 @@ Derivatives are exact, the Hessian of the Lagrangian among them. Both stop at th
 otherwise as they come, on one thread. A solver is made for one problem and serves all that differ in parameters only.
 """
 
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,6 +17,7 @@ import numpy as np
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from lqrsim.process import SIGNALS
 from peers import formulas, ipopt
 from peers.common import Answer
 
@@ -81,44 +84,34 @@ class Shooting:
     def first(
         self, problem: ls.Problem, states: Array, controls: Array, iterations: int, enough: Callable[[Moment], bool]
     ) -> Moment | None:
-        """When a solve of so many iterations from there has come far enough, found by solving once more; None if never.
+        """When a solve of so many iterations from there had first come far enough, by solving again; None if never.
 
-        IPOPT shows its plan as it goes. Fatrop does not: it is stopped earlier, where is found by bisection.
+        IPOPT shows its plan as it goes. Fatrop does not: it is stopped after one iteration, after two, and so on.
         """
-        if self._plugin == "ipopt":
-            shown: list[tuple[float, Array]] = []
-            watch = _watch(self._nlp, shown)
-            solver = self._made(MAX_ITERATIONS, iteration_callback=watch)
-            begun = time.perf_counter()
-            self._run(solver, problem, states, controls)
-            # The first is the start.
-            moments = (self._moment(problem, i, when - begun, plan) for i, (when, plan) in enumerate(shown) if i)
-            return next((moment for moment in moments if enough(moment)), None)
+        moments = self._shown if self._plugin == "ipopt" else self._stopped
+        return next((moment for moment in moments(problem, states, controls, iterations) if enough(moment)), None)
 
-        def after(count: int) -> Moment:
+    def _shown(self, problem: ls.Problem, states: Array, controls: Array, iterations: int) -> Iterator[Moment]:
+        shown: list[tuple[float, Array]] = []
+        watch = _watch(self._nlp, shown)
+        solver = self._made(MAX_ITERATIONS, iteration_callback=watch)
+        begun = time.perf_counter()
+        self._run(solver, problem, states, controls)
+        # Counted back from the last: IPOPT shows its plan once more wherever it begins to restore feasibility.
+        for count, (when, plan) in enumerate(shown, iterations + 1 - len(shown)):
+            if count > 0:
+                yield Moment(count, when - begun, *self._worth(problem, plan))
+
+    def _stopped(self, problem: ls.Problem, states: Array, controls: Array, iterations: int) -> Iterator[Moment]:
+        for count in range(1, iterations + 1):
             solver = self._made(count - 1)  # as Fatrop counts, in its last iteration it only looks at what it has
             begun = time.perf_counter()
             plan = self._run(solver, problem, states, controls)["x"].full().ravel()
-            return self._moment(problem, count, time.perf_counter() - begun, plan)
-
-        moment = after(iterations)
-        if not enough(moment):
-            return None
-        low, high = 0, iterations  # not enough, and enough
-        while high - low > 1:
-            between = after((low + high) // 2)
-            if enough(between):
-                moment, high = between, between.iterations
-            else:
-                low = between.iterations
-        return moment
+            yield Moment(count, time.perf_counter() - begun, *self._worth(problem, plan))
 
     def worth(self, problem: ls.Problem, states: Array, controls: Array) -> tuple[float, float]:
         """Cost and largest violation of a plan, the dynamics included, as the solver is told of them."""
         return self._worth(problem, _packed(states, controls))
-
-    def _moment(self, problem: ls.Problem, count: int, seconds: float, plan: Array) -> Moment:
-        return Moment(count, seconds, *self._worth(problem, plan))
 
     def _settings(self, iterations: int) -> dict[str, Any]:
         settings: dict[str, Any] = {"print_level": 0, "max_iter": iterations, "tol": TOLERANCE}
@@ -132,7 +125,8 @@ class Shooting:
     def _run(self, solver: Any, problem: ls.Problem, states: Array, controls: Array) -> Any:
         guess = _packed(states, controls)
         low, high = _bounds(problem)
-        return solver(x0=guess, p=formulas.parameters(problem), lbx=low, ubx=high, **self._limits)
+        with _signals_wait():
+            return solver(x0=guess, p=formulas.parameters(problem), lbx=low, ubx=high, **self._limits)
 
     def _unpacked(self, problem: ls.Problem, values: Array) -> tuple[Array, Array]:
         n = len(problem.dynamics.state_coordinates)
@@ -146,6 +140,23 @@ class Shooting:
         low, high = _bounds(problem)
         missed = [np.where(self._equal, np.abs(rows), -rows), low - values, values - high]
         return float(cost), float(max(0.0, *(one.max(initial=0.0) for one in missed)))
+
+
+@contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Ctrl-C comes when this is over: CasADi would take it for a failure of the solver, and go on."""
+    came: list[int] = []
+    # Others end the process without asking Python.
+    before = {number: handler for number in SIGNALS if callable(handler := signal.getsignal(number))}
+    for number in before:
+        signal.signal(number, lambda number, frame: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in came[:1]:
+            signal.raise_signal(number)
 
 
 def _packed(states: Array, controls: Array) -> Array:
