@@ -45,7 +45,7 @@ from peers import versions as versions_of_peers
 from peers.shooting import Moment
 from tqdm import tqdm
 
-from lqrsim.errors import check_name
+from lqrsim.errors import check_count, check_name
 
 ABOVE_BEST = 1.001
 
@@ -81,6 +81,7 @@ def main(config: Config) -> Result:
     for field, chosen, names in (("problems", config.problems, FAMILIES), ("solvers", config.solvers, CONTESTANTS)):
         for name in chosen:
             check_name(f"--{field}", name, names)
+    check_count("--seeds", config.seeds)
     result = opening(config) | {"peers": versions_of_peers(), "problems": {}}
     chosen = config.problems[:2] if config.quick else config.problems
     most = min(config.seeds, 2) if config.quick else config.seeds
@@ -135,7 +136,7 @@ def _solve_all(solve: Solve, problems: Sequence[Instance], name: str) -> list[Ou
 def _summary(outcomes: Sequence[Outcome], targets: Sequence[float], name: str) -> Result:
     """What came of a solver's runs, instance by instance, as JSON."""
     reached = [
-        None if one.verified.faults or one.verified.cost > target else one.run.first(_reaching(target))
+        one.run.first(_reaching(target)) if not one.verified.faults and one.verified.cost <= target else None
         for one, target in _progress(list(zip(outcomes, targets, strict=True)), f"{name}, to the target")
     ]
     exact = [one.run.exact if one.solved else None for one in outcomes]

@@ -190,8 +190,7 @@ def test_ctrl_c_ends_what_is_solved(plugin: str) -> None:
         pytest.skip(str(error))
     guess = verification.rolled_out(problem, start), start
     timer = threading.Timer(0.03, signal.raise_signal, [signal.SIGINT])
+    timer.start()
     with pytest.raises(KeyboardInterrupt):
-        timer.start()
-        for _ in range(1000):
-            solver.solve(problem, *guess)
+        [solver.solve(problem, *guess) for _ in range(1000)]
     assert solver.solve(problem, *guess).converged
