@@ -1,9 +1,8 @@
 """A league of solvers at equal accuracy: iterations and time until the same cost, and until 1e-8, on the same problems.
 
-    python experiments/solver_league.py                                        # everything
-    python experiments/solver_league.py --problems acrobot concar --seeds 10   # some of it
-    python experiments/solver_league.py --solvers lqrsim FATROP
-    python experiments/solver_league.py --quick                                # bounded, and too little to trust
+    python experiments/solver_league.py    # everything, ten minutes, and once as many for compiling
+    python experiments/solver_league.py --problems acrobot concar --solvers lqrsim FATROP --seeds 10    # some of it
+    python experiments/solver_league.py --quick    # the first two problems, and too little to trust
 
 Problems: the nine of Altro.jl as `altro_problems.py` has them, with RK4 for the cart-pole as everywhere here, where the
 original has RK3; `concar`, a car among four random circles, of InteriorPointDDP.jl; a planar quadrotor with a wall to
@@ -99,7 +98,7 @@ def _family(name: str, config: Config, most: int, bar: Any) -> Result:
         try:
             solve = CONTESTANTS[solver](problems[0][0], compile=not config.quick)
         except Unavailable as error:
-            absent[solver] = str(error)
+            absent[solver] = f"for {error}"
         except NotImplementedError as error:
             absent[solver] = f"which does not take {error}"
         else:
@@ -189,7 +188,7 @@ def report(result: Result) -> str:
                 if refuted
             ]
         for solver, why in family["absent"].items():
-            absent.setdefault(f"Without {solver}, {why}", []).append(name)
+            absent.setdefault(f"without {solver}, {why}", []).append(name)
     targets = [
         (name, *(family["published"] or ("-", "-")), family["target"], _median(family["targets"], ".6g"))
         for name, family in result["problems"].items()
@@ -202,7 +201,7 @@ def report(result: Result) -> str:
             f"Medians over the instances; a dash where no more than half get there. {peers or 'No peers installed.'}",
             table(("problem", "Altro.jl, iterations", "Altro.jl, cost", "target of", "target"), targets),
             *notes,
-            *(f"{what}: {', '.join(names)}." for what, names in absent.items()),
+            *(f"{', '.join(names)}: {what}." for what, names in absent.items()),
         ]
     )
 

@@ -117,8 +117,8 @@ def test_what_is_not_taken_or_not_installed_is_named(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(solver_league.CONTESTANTS, "absent", make)
     config = solver_league.Config(problems=("double_integrator",), solvers=("ilqr", "absent"), quick=True)
     text = solver_league.report(solver_league.main(config))
-    assert "Without ilqr, which does not take constraints: double_integrator." in text
-    assert "Without absent, it is not installed: double_integrator." in text
+    assert "double_integrator: without ilqr, which does not take constraints." in text
+    assert "double_integrator: without absent, for it is not installed." in text
     with pytest.raises(ls.InputError, match="--solvers"):
         solver_league.main(dataclasses.replace(config, solvers=("nobody",)))
 
