@@ -7,6 +7,9 @@ Crocoddyl  its FDDP, and its box-FDDP, with the limits of the controls; `fddp.py
 Ipopt      IPOPT through CasADi, with the limits of the controls and a clearance to be kept; `ipopt.py`.
 Fatrop     Fatrop through CasADi, with the limits of the controls, from a plan; `fatrop.py`.
 
+For any problem of formulas (`formulas.py`), with all its constraints: IPOPT and Fatrop in `shooting.py`; without
+constraints box-FDDP in `box_fddp.py`.
+
 RotorPy    its SE(3) controller, along the plan of a quadrotor's solution; `rotorpy.py`.
 drake      gains of Drake's linear-quadratic regulators; `drake.py`.
 

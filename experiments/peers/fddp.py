@@ -11,6 +11,7 @@ obstacle cost's Hessian is projected as lqrsim does it; everything else is Croco
 
 import ctypes
 import importlib.util
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -101,6 +102,15 @@ class Crocoddyl:
 @cache
 def _library() -> ctypes.CDLL:
     """The model, compiled against the wheel's headers and linked with its library; kept on disk."""
+    library = linked("Crocoddyl's model (some 15 seconds)", SOURCES)
+    library.make.restype = ctypes.c_void_p
+    library.solve.restype = ctypes.c_int
+    library.release.restype = library.look.restype = None
+    return library
+
+
+def linked(what: str, sources: Sequence[Path]) -> ctypes.CDLL:
+    """The library made of the first of the sources and of Crocoddyl. Raises Unavailable."""
     found = importlib.util.find_spec("crocoddyl")
     if found is None or not found.submodule_search_locations:
         raise Unavailable("Crocoddyl is not installed: pip install 'lqrsim[bench]'")
@@ -111,12 +121,8 @@ def _library() -> ctypes.CDLL:
     flags = [*FLAGS, *EIGEN, f"-I{prefix / 'include'}", f"-I{prefix / 'include' / 'eigen3'}"]
     # DT_RPATH instead of DT_RUNPATH, for the libraries that the library needs in turn.
     link = [f"-L{lib}", "-lcrocoddyl", f"-Wl,-rpath,{lib},--disable-new-dtags"]
-    target = compiled("Crocoddyl's model (some 15 seconds)", SOURCES, flags, link)
+    target = compiled(what, sources, flags, link)
     try:
-        library = ctypes.CDLL(str(target))
+        return ctypes.CDLL(str(target))
     except OSError as error:
-        raise Unavailable(f"Crocoddyl's model cannot be loaded: {error}") from None
-    library.make.restype = ctypes.c_void_p
-    library.solve.restype = ctypes.c_int
-    library.release.restype = library.look.restype = None
-    return library
+        raise Unavailable(f"{what.split(' (')[0]} cannot be loaded: {error}") from None

@@ -118,21 +118,32 @@ def _nlp(problem: ls.Problem, told: Parts, clearance: float | None) -> dict[str,
 
 def solver(plugin: str, nlp: dict[str, Any], options: dict[str, Any], *, compile: bool) -> Any:
     """CasADi's function that solves the problem by that plugin; its functions expanded, or compiled from C."""
-    ca = casadi()
-    options = {"print_time": False, "show_eval_warnings": False, **options}
-    if not compile:
-        return ca.nlpsol("solver", plugin, nlp, {"expand": True, **options})
+    return made(plugin, library(plugin, nlp, options) if compile else nlp, options)
+
+
+def made(plugin: str, source: dict[str, Any] | Path, options: dict[str, Any]) -> Any:
+    """CasADi's function that solves a problem, or one that is compiled, by that plugin."""
+    options = {**_QUIET, **options}
+    if isinstance(source, Path):
+        return casadi().nlpsol("solver", plugin, str(source), options)
+    return casadi().nlpsol("solver", plugin, source, {"expand": True, **options})
+
+
+def library(plugin: str, nlp: dict[str, Any], options: dict[str, Any]) -> Path:
+    """What the plugin needs of the problem, compiled from C; kept on disk."""
     name = f"{plugin}.c"
     with tempfile.TemporaryDirectory() as folder:
         # CasADi writes to the current folder only.
         here = Path.cwd()
         os.chdir(folder)
         try:
-            ca.nlpsol("solver", plugin, nlp, options).generate_dependencies(name)
+            casadi().nlpsol("solver", plugin, nlp, {**_QUIET, **options}).generate_dependencies(name)
         finally:
             os.chdir(here)
-        library = compiled(f"{plugin}'s problem (some 15 seconds)", [Path(folder) / name], FLAGS)
-    return ca.nlpsol("solver", plugin, str(library), options)
+        return compiled(f"{plugin}'s problem (some 15 seconds)", [Path(folder) / name], FLAGS)
+
+
+_QUIET = {"print_time": False, "show_eval_warnings": False}
 
 
 def functions(problem: ls.Problem, told: Parts) -> tuple[Any, Any, Any, Any, Any]:
@@ -153,9 +164,9 @@ def functions(problem: ls.Problem, told: Parts) -> tuple[Any, Any, Any, Any, Any
     after = x + h / 6 * (first + 2 * second + 2 * third + fourth)
     place = x[list(problem.dynamics.state_coordinates.position)]
     place = ca.vertcat(place, *[0.0] * (3 - place.numel()))
-    apart = ca.vertcat(*[_distance(obstacle, place) - told.radius for obstacle in told.world.obstacles])
+    apart = ca.vertcat(*[distance(obstacle, place) - told.radius for obstacle in told.world.obstacles])
     obstacles = told.obstacle_weight * ca.sum1(ca.exp(-told.sharpness * apart))
-    effort, arrival = _quadratic(told.control_weight, u - told.nominal), _quadratic(told.final_weight, x - goal)
+    effort, arrival = quadratic(told.control_weight, u - told.nominal), quadratic(told.final_weight, x - goal)
     return (
         ca.Function("step", [x, u], [after]),
         ca.Function("effort", [u], [effort]),
@@ -165,7 +176,7 @@ def functions(problem: ls.Problem, told: Parts) -> tuple[Any, Any, Any, Any, Any
     )
 
 
-def _quadratic(weight: Array, off: Any) -> Any:
+def quadratic(weight: Array, off: Any) -> Any:
     ca = casadi()
     return 0.5 * ca.bilin(ca.sparsify(ca.DM(weight)), off, off)
 
@@ -179,7 +190,7 @@ def _drive(x: Any, u: Any, p: dict[str, float]) -> Any:
 def _quadrotor(x: Any, u: Any, p: dict[str, float]) -> Any:
     ca = casadi()
     velocity, r, w = x[3:6], x[6:9], x[9:12]
-    sine, cosine, cotangent = _ratios(ca.sumsqr(r))
+    sine, cosine, cotangent = ratios(ca.sumsqr(r))
     up = ca.vertcat(0, 0, 1)
     tilted = up + sine * ca.cross(r, up) + cosine * ca.cross(r, ca.cross(r, up))
     acceleration = (ca.sum1(u) * tilted - p["drag"] * velocity) / p["mass"] - p["gravity"] * up
@@ -190,7 +201,7 @@ def _quadrotor(x: Any, u: Any, p: dict[str, float]) -> Any:
     return ca.vertcat(velocity, acceleration, w + once / 2 + cotangent * ca.cross(r, once), torque / p["inertia"])
 
 
-def _ratios(s: Any) -> list[Any]:
+def ratios(s: Any) -> list[Any]:
     """sin t / t, (1 - cos t) / t^2 and (1 - t/2 cot(t/2)) / t^2 at t^2 = s; below 1/4 by their series."""
     ca = casadi()
     t = ca.sqrt(ca.fmax(s, 0.25))  # both cases are always evaluated, so neither may be singular
@@ -211,7 +222,7 @@ def _ratios(s: Any) -> list[Any]:
     return [ca.if_else(s > 0.25, *pair) for pair in zip(large, small, strict=True)]
 
 
-def _distance(obstacle: ls.Obstacle, place: Any) -> Any:
+def distance(obstacle: ls.Obstacle, place: Any) -> Any:
     """Signed distance in metres; where it has no derivative it has one of zero."""
     ca = casadi()
     local = ca.sparsify(ca.DM(obstacle.rotation.T)) @ (place - obstacle.position)

@@ -59,9 +59,15 @@ def _one(problem: ls.Problem, constraint: ls.Constraint) -> Kept:
     at_end = np.arange(steps + 1) == steps
     if isinstance(constraint, ls.Clearance):
         space = dynamics.state_coordinates
-        obstacles = constraint.world.seen_by(space.plane, space.offset).obstacles
         if isinstance(constraint.margin, np.ndarray):
             raise NotImplementedError("a clearance with a margin for each knot")
+        if constraint.balls is not None:
+            obstacles, count = constraint.world.obstacles, len(constraint.balls)
+            formula = kkt.numeric(_coordinates(constraint.balls), n, m, tuple(dynamics.parameters), True)
+            least = constraint.balls.radii + constraint.margin
+            function = partial(_spare_of_balls, obstacles, formula, n, kkt.numbers_of(problem), least)
+            return Kept(function, np.tile(changeable[:, None], (1, count * len(obstacles))), False)
+        obstacles = constraint.world.seen_by(space.plane, space.offset).obstacles
         function = partial(_spare, obstacles, list(space.position), constraint.radius + constraint.margin)
         return Kept(function, np.tile(changeable[:, None], (1, len(obstacles))), False)
     if isinstance(constraint, ls.GoalState):
@@ -91,6 +97,20 @@ def _spare(obstacles: Any, position: list[int], least: float, z: Values) -> Valu
     return np.stack(away, axis=-1) if away else np.zeros((*z.shape[:-1], 0))
 
 
+def _spare_of_balls(
+    obstacles: Any, formula: Any, n: int, parameters: tuple[float, ...], least: Array, z: Values
+) -> Values:
+    """Ball by ball: what is left between it and each obstacle."""
+    numbers = _formula(formula, n, parameters, z)
+    places = numbers.reshape(*numbers.shape[:-1], -1, 3)
+    away = [
+        kkt.distance(obstacle, places[..., ball, :]) - radius
+        for ball, radius in enumerate(least)
+        for obstacle in obstacles
+    ]
+    return np.stack(away, axis=-1)
+
+
 def _formula(formula: Any, n: int, parameters: tuple[float, ...], z: Values) -> Values:
     entries = list(np.moveaxis(z, -1, 0))
     numbers = formula(entries[:n], entries[n:], parameters)
@@ -106,6 +126,16 @@ def _listed(function: Any) -> Any:
         return list(returned) if isinstance(returned, (list, tuple)) else [returned]
 
     return listed
+
+
+@cache
+def _coordinates(balls: ls.Balls) -> Any:
+    """The middles of all balls as a formula of x, u and p, three numbers a ball."""
+
+    def coordinates(x: Any, u: Any, p: Any) -> list[Any]:
+        return [entry for place in balls.function(x, p) for entry in place]
+
+    return coordinates
 
 
 def _uses_control(function: Any, n: int, m: int, parameters: tuple[str, ...]) -> bool:

@@ -1,0 +1,1 @@
+"""A league of solvers: problems, contestants, and what their plans are worth."""

@@ -1,0 +1,258 @@
+"""Any problem that is stated by formulas, as functions of CasADi's: a step, the costs and the constraints at a knot.
+
+What differs between problems of one kind is a parameter, so that one compiled solver serves all of them: the start, the
+state and control that costs are about, and the numbers of formulas. Obstacles and weights are constants.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+import lqrsim as ls
+from lqrsim.errors import Array
+from lqrsim.problem.constraints import goals_of
+from lqrsim.problem.costs import Cost, terms_of
+from peers.ipopt import casadi, distance, quadratic, ratios
+
+
+@dataclass(frozen=True)
+class Formulas:
+    """The functions, of a state, a control and the parameters; those at the last knot have no control.
+
+    Attributes:
+      step: the next state.
+      costs: at the first knot, at those between, and at the last.
+      rows: of constraints at the same three; inequalities are not to be negative.
+      equalities: whether each of these rows is one.
+    """
+
+    step: Any
+    costs: tuple[Any, Any, Any]
+    rows: tuple[Any, Any, Any]
+    equalities: Sequence[list[bool]]
+
+
+def formulas(problem: ls.Problem) -> Formulas:
+    """Raises NotImplementedError for what is no formula, and Unavailable without CasADi."""
+    ca, dynamics = casadi(), problem.dynamics
+    n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
+    numbers = parameters(problem)
+    x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", len(numbers))
+    given = _Given(p)
+    given(n)  # the start
+    values = given(len(dynamics.parameters))
+
+    def rate(x: Any) -> Any:
+        return ca.vertcat(*evaluate(dynamics.f, tuple(dynamics.parameters), x, u, values, dynamics.constants))
+
+    h = problem.dt
+    first = rate(x)
+    second = rate(x + h / 2 * first)
+    third = rate(x + h / 2 * second)
+    after = x + h / 6 * (first + 2 * second + 2 * third + rate(x + h * third))
+    begin, between, end = ca.SX(0), ca.SX(0), ca.SX(0)
+    for one in terms_of(problem.stage_cost):
+        cost = _cost(problem, one, x, u, given)
+        between += cost
+        begin += 0 if isinstance(one, ls.ObstacleCost) else cost  # which does not act there
+    for one in terms_of(problem.final_cost):
+        end += _cost(problem, one, x, u, given)
+    rows = [_constraint(problem, one, x, u, given) for one in problem.constraints]
+    kinds = [
+        [one for one in rows if one.with_control],
+        [one for one in rows if not one.at_end],
+        [one for one in rows if not one.with_control],
+    ]
+    stacked = [ca.vertcat(*[one.values for one in kind]) for kind in kinds]
+    return Formulas(
+        step=ca.Function("step", [x, u, p], [after]),
+        costs=(
+            ca.Function("begin", [x, u, p], [begin]),
+            ca.Function("between", [x, u, p], [between]),
+            ca.Function("end", [x, p], [end]),
+        ),
+        rows=(
+            ca.Function("begin_rows", [x, u, p], [stacked[0]]),
+            ca.Function("rows", [x, u, p], [stacked[1]]),
+            ca.Function("end_rows", [x, p], [stacked[2]]),
+        ),
+        equalities=[[one.equality for one in kind for _ in range(one.values.numel())] for kind in kinds],
+    )
+
+
+def parameters(problem: ls.Problem) -> Array:
+    """The numbers that `Formulas` take, in their order: the start first."""
+    if not isinstance(problem.initial, ls.FixedState):
+        raise NotImplementedError("a start that is not given exactly")
+    found = [np.asarray(problem.initial.state), np.array(list(problem.dynamics.parameters.values()))]
+    for one in (*terms_of(problem.stage_cost), *terms_of(problem.final_cost)):
+        if isinstance(one, ls.QuadraticCost | ls.ControlCost):
+            found.append(one.about)
+        elif isinstance(one, ls.SymbolicCost):
+            found.append(np.array(list(one.parameters.values())))
+    for one in problem.constraints:
+        if isinstance(one, ls.SymbolicConstraint):
+            found.append(np.array(list(one.parameters.values())))
+        elif isinstance(one, ls.GoalState):
+            found.append(one.goal)
+    return np.concatenate(found)
+
+
+class _Given:
+    """Hands out the parameters, in their order."""
+
+    def __init__(self, symbols: Any) -> None:
+        self._symbols, self._used = symbols, 0
+
+    def __call__(self, count: int) -> Any:
+        self._used += count
+        return self._symbols[self._used - count : self._used]
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Numbers of a constraint. They act at the knots that have a control, or at all but the first, or at the last."""
+
+    values: Any
+    equality: bool = False
+    with_control: bool = False
+    at_end: bool = False
+
+
+def _cost(problem: ls.Problem, cost: Cost, x: Any, u: Any, given: _Given) -> Any:
+    ca = casadi()
+    if isinstance(cost, ls.QuadraticCost):
+        return quadratic(cost.weight, x - given(len(cost.about)))
+    if isinstance(cost, ls.ControlCost):
+        return quadratic(cost.weight, u - given(len(cost.about)))
+    if isinstance(cost, ls.SymbolicCost):
+        return evaluate(cost.function, tuple(cost.parameters), x, u, given(len(cost.parameters)))[0]
+    if isinstance(cost, ls.ObstacleCost) and cost.balls is None:
+        away = _from_obstacles(problem, cost.world, x) - cost.radius
+        return cost.weight * ca.sum1(ca.exp(-cost.sharpness * away))
+    raise NotImplementedError(f"the cost {cost.name}")
+
+
+def _constraint(problem: ls.Problem, constraint: ls.Constraint, x: Any, u: Any, given: _Given) -> _Rows:
+    ca = casadi()
+    if isinstance(constraint, ls.StateBounds):  # which are bounds of the variables
+        return _Rows(ca.SX(0, 1))
+    if isinstance(constraint, ls.GoalState):
+        names = problem.dynamics.state_coordinates.names
+        places = [names.index(name) for name in constraint.states or names]
+        return _Rows(x[places] - given(len(places)), equality=True, at_end=True)
+    if isinstance(constraint, ls.SymbolicConstraint):
+        numbers = given(len(constraint.parameters))
+        values = ca.vertcat(*evaluate(constraint.function, tuple(constraint.parameters), x, u, numbers))
+        with_control = bool(ca.depends_on(values, u))
+        return _Rows(values, constraint.equality, with_control, constraint.at == "final")
+    if isinstance(constraint, ls.Clearance) and isinstance(constraint.margin, float):
+        if constraint.balls is None:
+            return _Rows(_from_obstacles(problem, constraint.world, x) - constraint.radius - constraint.margin)
+        balls, dynamics = constraint.balls, problem.dynamics
+        values = ca.DM(list(dynamics.parameters.values()))
+        places = evaluate(_coordinates(balls), tuple(dynamics.parameters), x, u, values, dynamics.constants)
+        rows = [
+            distance(obstacle, ca.vertcat(*places[3 * ball : 3 * ball + 3])) - radius - constraint.margin
+            for ball, radius in enumerate(balls.radii)
+            for obstacle in constraint.world.obstacles
+        ]
+        return _Rows(ca.vertcat(*rows))
+    raise NotImplementedError(f"the constraint {type(constraint).__name__}")
+
+
+def _coordinates(balls: ls.Balls) -> Callable[[Any, Any, Any], list[Any]]:
+    """The coordinates of all balls as a formula of x, u and p, three a ball."""
+
+    def places(x: Any, u: Any, p: Any) -> list[Any]:
+        return [entry for place in balls.function(x, p) for entry in place]
+
+    return places
+
+
+def _from_obstacles(problem: ls.Problem, world: ls.World, x: Any) -> Any:
+    ca, space = casadi(), problem.dynamics.state_coordinates
+    place = ca.vertcat(x[list(space.position)], *[0.0] * (3 - len(space.position)))
+    seen = world.seen_by(space.plane, space.offset)
+    return ca.vertcat(*[distance(obstacle, place) for obstacle in seen.obstacles])
+
+
+def state_bounds(problem: ls.Problem) -> tuple[Array, Array]:
+    """Bounds (T+1, n) of the states; infinite where there is none, and at the given start."""
+    names = problem.dynamics.state_coordinates.names
+    fixed = goals_of(problem.constraints, problem.dynamics)
+    low = np.full((problem.steps + 1, len(names)), -np.inf)
+    high = -low
+    for one in problem.constraints:
+        if isinstance(one, ls.StateBounds):
+            for side, numbers, tighter in ((low, one.low, np.maximum), (high, one.high, np.minimum)):
+                for name, number in numbers.items():
+                    i = names.index(name)
+                    last = problem.steps if i in fixed else problem.steps + 1
+                    side[1:last, i] = tighter(side[1:last, i], number)
+    return low, high
+
+
+def evaluate(
+    function: Any, names: tuple[str, ...], x: Any, u: Any, numbers: Any, constants: Mapping[str, float] | None = None
+) -> list[Any]:
+    """A formula `function(x, u, p)` of SymPy's, evaluated with CasADi's symbols; its entries, or its only one.
+
+    Of p, `names` have the numbers as their values, and constants their own.
+    """
+    ca = casadi()
+    translated = _translated(function, x.numel(), u.numel(), names, constants or {})
+    values = translated(ca.vertsplit(x), ca.vertsplit(u), ca.vertsplit(numbers) if names else [])
+    return [ca.SX(value) for value in values]
+
+
+def _translated(
+    function: Any, n: int, m: int, names: tuple[str, ...], constants: Mapping[str, float]
+) -> Callable[..., Sequence[Any]]:
+    import sympy
+
+    symbols = [sympy.symbols([f"{letter}{i}" for i in range(size)]) for letter, size in (("x", n), ("u", m))]
+    values = sympy.symbols([f"p_{name}" for name in names])
+    namespace = type("Parameters", (), {**constants, **dict(zip(names, values, strict=True))})
+    found = function(*symbols, namespace)
+    entries = [sympy.sympify(one) for one in (found if isinstance(found, list | tuple) else [found])]
+    return sympy.lambdify([*symbols, values], entries, modules=[_words()], printer=_printer(), cse=True)
+
+
+@cache
+def _printer() -> Any:
+    """SymPy's printer with CasADi's words for what Python's own operators do not do with symbols."""
+    from sympy.printing.lambdarepr import LambdaPrinter
+
+    class Printer(LambdaPrinter):
+        def _print_Piecewise(self, expr: Any) -> Any:
+            *others, (value, _) = expr.args  # the last is for all other cases
+            chosen = self._print(value)
+            for other, condition in reversed(others):
+                chosen = f"if_else({self._print(condition)}, {self._print(other)}, {chosen})"
+            return chosen
+
+        def _print_And(self, expr: Any) -> str:
+            return self._joined("logic_and", expr.args)
+
+        def _print_Or(self, expr: Any) -> str:
+            return self._joined("logic_or", expr.args)
+
+        def _joined(self, word: str, parts: Sequence[Any]) -> str:
+            first, *others = (self._print(part) for part in parts)
+            for other in others:
+                first = f"{word}({first}, {other})"
+            return first
+
+    return Printer({"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": True})
+
+
+def _words() -> dict[str, Any]:
+    ca = casadi()
+    names = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "exp", "log", "sqrt", "tanh", "if_else")
+    words = {name: getattr(ca, name) for name in (*names, "logic_and", "logic_or")}
+    turns = ("sine_ratio", "cosine_ratio", "cotangent_ratio")
+    return words | {name: lambda s, i=i: ratios(s)[i] for i, name in enumerate(turns)} | {"abs": ca.fabs, "pi": np.pi}

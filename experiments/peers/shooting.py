@@ -1,0 +1,231 @@
+"""IPOPT and Fatrop for any problem of formulas, through CasADi, with all that the problem asks for.
+
+Direct multiple shooting, as in `ipopt.py` and `fatrop.py`: the states and controls of all knots are variables, the
+steps and the given start are equality constraints, limits of controls and bounds of states are bounds of the variables.
+Derivatives are exact, the Hessian of the Lagrangian among them. Both stop at their own tolerance of 1e-8 and are
+otherwise as they come, on one thread. A solver is made for one problem and serves all that differ in parameters only.
+"""
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+import lqrsim as ls
+from lqrsim.errors import Array
+from lqrsim.process import SIGNALS
+from peers import formulas, ipopt
+from peers.common import Answer
+
+TOLERANCE, MAX_ITERATIONS = 1e-8, 500  # the latter as lqrsim has it
+
+
+@dataclass(frozen=True)
+class Moment:
+    """How far a solver had come.
+
+    Attributes:
+      iterations: how many it had made. seconds: since the solve began.
+      cost, violation: of the plan at that time; the violation is the largest, that of the dynamics among them.
+    """
+
+    iterations: int
+    seconds: float
+    cost: float
+    violation: float
+
+
+class Shooting:
+    """One of the two solvers.
+
+    Args:
+      problem: of the kind that is to be solved.
+      plugin: "ipopt" or "fatrop".
+      compile: to C and with g++, for speed.
+
+    Raises:
+      Unavailable: CasADi is not installed, or g++ where it is needed.
+      NotImplementedError: something of the problem is no formula.
+    """
+
+    def __init__(self, problem: ls.Problem, plugin: Literal["ipopt", "fatrop"], *, compile: bool) -> None:
+        ca = ipopt.casadi()
+        self._plugin = plugin
+        told = formulas.formulas(problem)
+        nlp, self._equal = _nlp(problem, told)
+        self._nlp = nlp
+        self._limits = {"lbg": 0.0, "ubg": np.where(self._equal, 0.0, np.inf)}
+        self._options: dict[str, Any] = {}
+        if plugin == "fatrop":
+            self._options = {"structure_detection": "auto", "equality": self._equal.tolist()}
+        source = nlp
+        if compile:
+            source = ipopt.library(plugin, nlp, {**self._options, plugin: self._settings(MAX_ITERATIONS)})
+        self._source = source
+        self._solver = self._made(MAX_ITERATIONS)
+        self._values = ca.Function("values", [nlp["x"], nlp["p"]], [nlp["f"], nlp["g"]])
+
+    def solve(self, problem: ls.Problem, states: Array, controls: Array) -> Answer:
+        """Solve from states (T+1, n) and controls (T, m), whether or not they belong together."""
+        found = self._run(self._solver, problem, states, controls)
+        stats = self._solver.stats()
+        return Answer(
+            *self._unpacked(problem, found["x"].full().ravel()),
+            cost=float(found["f"]),
+            iterations=stats["iter_count"],
+            # No more than its acceptable level is not what was asked for.
+            converged=bool(stats["success"]) and "Acceptable" not in str(stats["return_status"]),
+        )
+
+    def first(
+        self, problem: ls.Problem, states: Array, controls: Array, iterations: int, enough: Callable[[Moment], bool]
+    ) -> Moment | None:
+        """When a solve of so many iterations from there had first come far enough, by solving again; None if never.
+
+        IPOPT shows its plan as it goes. Fatrop does not: it is stopped after one iteration, after two, and so on.
+        """
+        moments = self._shown if self._plugin == "ipopt" else self._stopped
+        return next((moment for moment in moments(problem, states, controls, iterations) if enough(moment)), None)
+
+    def _shown(self, problem: ls.Problem, states: Array, controls: Array, iterations: int) -> Iterator[Moment]:
+        shown: list[tuple[float, Array]] = []
+        watch = _watch(self._nlp, shown)
+        solver = self._made(MAX_ITERATIONS, iteration_callback=watch)
+        begun = time.perf_counter()
+        self._run(solver, problem, states, controls)
+        # Counted back from the last: IPOPT shows its plan once more wherever it begins to restore feasibility.
+        for count, (when, plan) in enumerate(shown, iterations + 1 - len(shown)):
+            if count > 0:
+                yield Moment(count, when - begun, *self._worth(problem, plan))
+
+    def _stopped(self, problem: ls.Problem, states: Array, controls: Array, iterations: int) -> Iterator[Moment]:
+        for count in range(1, iterations + 1):
+            solver = self._made(count - 1)  # as Fatrop counts, in its last iteration it only looks at what it has
+            begun = time.perf_counter()
+            plan = self._run(solver, problem, states, controls)["x"].full().ravel()
+            yield Moment(count, time.perf_counter() - begun, *self._worth(problem, plan))
+
+    def worth(self, problem: ls.Problem, states: Array, controls: Array) -> tuple[float, float]:
+        """Cost and largest violation of a plan, the dynamics included, as the solver is told of them."""
+        return self._worth(problem, _packed(states, controls))
+
+    def _settings(self, iterations: int) -> dict[str, Any]:
+        settings: dict[str, Any] = {"print_level": 0, "max_iter": iterations, "tol": TOLERANCE}
+        # Bounds are kept exactly, and not to 1e-8 as IPOPT has them inside.
+        return settings | ({"sb": "yes", "honor_original_bounds": "yes"} if self._plugin == "ipopt" else {})
+
+    def _made(self, iterations: int, **options: Any) -> Any:
+        own = {**self._options, self._plugin: self._settings(iterations), **options}
+        return ipopt.made(self._plugin, self._source, own)
+
+    def _run(self, solver: Any, problem: ls.Problem, states: Array, controls: Array) -> Any:
+        guess = _packed(states, controls)
+        low, high = _bounds(problem)
+        with _signals_wait():
+            return solver(x0=guess, p=formulas.parameters(problem), lbx=low, ubx=high, **self._limits)
+
+    def _unpacked(self, problem: ls.Problem, values: Array) -> tuple[Array, Array]:
+        n = len(problem.dynamics.state_coordinates)
+        stages = values[:-n].reshape(problem.steps, -1)
+        return np.vstack([stages[:, :n], values[-n:]]), stages[:, n:].copy()
+
+    def _worth(self, problem: ls.Problem, values: Array) -> tuple[float, float]:
+        """Cost and violation."""
+        cost, g = self._values(values, formulas.parameters(problem))
+        rows = g.full().ravel()
+        low, high = _bounds(problem)
+        missed = [np.where(self._equal, np.abs(rows), -rows), low - values, values - high]
+        return float(cost), float(max(0.0, *(one.max(initial=0.0) for one in missed)))
+
+
+@contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Ctrl-C comes when this is over: CasADi would take it for a failure of the solver, and go on."""
+    came: list[int] = []
+    # Others end the process without asking Python.
+    before = {number: handler for number in SIGNALS if callable(handler := signal.getsignal(number))}
+    for number in before:
+        signal.signal(number, lambda number, frame: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in came[:1]:
+            signal.raise_signal(number)
+
+
+def _packed(states: Array, controls: Array) -> Array:
+    """As the variables are: knot by knot, and the last state."""
+    return np.append(np.hstack([states[:-1], controls]), states[-1])
+
+
+def _bounds(problem: ls.Problem) -> tuple[Array, Array]:
+    """Of all variables."""
+    sides = []
+    for states, controls in zip(
+        formulas.state_bounds(problem), (problem.control_coordinates.low, problem.control_coordinates.high), strict=True
+    ):
+        sides.append(_packed(states, np.tile(controls, (problem.steps, 1))))
+    return sides[0], sides[1]
+
+
+def _nlp(problem: ls.Problem, told: formulas.Formulas) -> tuple[dict[str, Any], Array]:
+    """Variables x0, u0, x1, u1 ... xT; constraints knot by knot, each step before what else is asked of its knot.
+
+    Besides, which of the constraints are equalities.
+    """
+    ca, steps = ipopt.casadi(), problem.steps
+    n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
+    stages, last = ca.MX.sym("w", n + m, steps), ca.MX.sym("last", n)
+    p = ca.MX.sym("p", len(formulas.parameters(problem)))
+    x, u = stages[:n, :], stages[n:, :]
+    every = ca.repmat(p, 1, steps)
+    gaps = ca.horzcat(x[:, 1:], last) - told.step.map(steps)(x, u, every)
+    begin, between, end = told.costs
+    cost = begin(x[:, 0], u[:, 0], p) + end(last, p)
+    first, rows, final = told.rows
+    g = [gaps[:, 0], x[:, 0] - p[:n], first(x[:, 0], u[:, 0], p)]
+    equal = [True] * (2 * n) + told.equalities[0]
+    if steps > 1:
+        rest = ca.repmat(p, 1, steps - 1)
+        cost += ca.sum2(between.map(steps - 1)(x[:, 1:], u[:, 1:], rest))
+        kept = rows.map(steps - 1)(x[:, 1:], u[:, 1:], rest) if rows.numel_out(0) else ca.MX(0, steps - 1)
+        g.append(ca.vec(ca.vertcat(gaps[:, 1:], kept)))
+        equal += ([True] * n + told.equalities[1]) * (steps - 1)
+    g.append(final(last, p))
+    equal += told.equalities[2]
+    return {"x": ca.vertcat(ca.vec(stages), last), "p": p, "f": cost, "g": ca.vertcat(*g)}, np.array(equal)
+
+
+def _watch(nlp: dict[str, Any], shown: list[tuple[float, Array]]) -> Any:
+    """What IPOPT calls at the start and after each iteration: it notes when that was, and the variables."""
+    ca, variables, rows = ipopt.casadi(), nlp["x"].numel(), nlp["g"].numel()
+    sizes = {"f": 1, "x": variables, "lam_x": variables, "g": rows, "lam_g": rows}
+
+    class Watch(ca.Callback):
+        def __init__(self) -> None:
+            super().__init__()
+            self.construct("watch", {})
+
+        def get_n_in(self) -> int:
+            return ca.nlpsol_n_out()
+
+        def get_n_out(self) -> int:
+            return 1
+
+        def get_name_in(self, i: int) -> str:
+            return ca.nlpsol_out(i)
+
+        def get_sparsity_in(self, i: int) -> Any:
+            return ca.Sparsity.dense(sizes[name]) if (name := ca.nlpsol_out(i)) in sizes else ca.Sparsity(0, 0)
+
+        def eval(self, arguments: Any) -> list[int]:
+            shown.append((time.perf_counter(), arguments[0].full().ravel()))
+            return [0]
+
+    return Watch()

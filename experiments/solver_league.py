@@ -1,0 +1,226 @@
+"""A league of solvers at equal accuracy: iterations and time until the same cost, and until 1e-8, on the same problems.
+
+    python experiments/solver_league.py    # everything, ten minutes, and once as many for compiling
+    python experiments/solver_league.py --problems acrobot concar --solvers lqrsim FATROP --seeds 10    # some of it
+    python experiments/solver_league.py --quick    # the first two problems, and too little to trust
+
+Problems: the nine of Altro.jl as `altro_problems.py` has them, with RK4 for the cart-pole as everywhere here, where the
+original has RK3; `concar`, a car among four random circles, of InteriorPointDDP.jl; a planar quadrotor with a wall to
+get over and a clearance; the paper's quadrotor, whose obstacles are a cost; and an arm of three links among posts. All
+solvers begin with the same: controls and the states that they lead to, or for `escape` states that do not belong
+together.
+
+lqrsim            ls.smooth, its settings the default ones but for constraint_tolerance=1e-6.
+lqrsim, no finish the same with finish=None and tolerance=1e-8.
+ilqr              ls.ilqr with tolerance=1e-8; it keeps no constraints but the limits of the controls.
+box-FDDP          Crocoddyl's, which keeps as much.
+FATROP, IPOPT     through CasADi, with exact Hessians and a tolerance of 1e-8.
+
+The target is Altro.jl's published cost where a verified plan of the league costs no more, and otherwise 1.001 times the
+least cost of all verified plans, whether or not they are said to be optimal. It is reached at the first iteration with
+no higher cost and every constraint kept to 1e-6; of FATROP and IPOPT the dynamics, too. A solver whose final plan costs
+more is not asked when it was there. "To 1e-8" is by each solver's own measure of optimality, which are not the same:
+the decrease of the cost that is still promised, relative to the cost, or the residuals of the optimality conditions.
+
+Each plan that is returned is recomputed in NumPy, apart from all solvers: dynamics and constraints are to be kept to
+1e-6, and the cost is to be the claimed one. What is claimed but not so counts as not solved, and reaches nothing. Of
+random problems iterations, times and costs are medians; an instance where something is never reached counts as
+infinitely long. Times are on one thread and without compiling: of lqrsim those of its iterations, of FATROP and IPOPT
+those of calls through CasADi, their functions compiled from C, which takes a while once. With --quick they are
+evaluated in CasADi. What is not installed is left out, and named.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from league.contestants import CONTESTANTS, Run, Solve
+from league.problems import FAMILIES, Instance, instances
+from league.verification import VIOLATION, Verified, verify
+from paper.common import Result, Settings, opening, run, table
+from peers import Unavailable
+from peers import versions as versions_of_peers
+from peers.shooting import Moment
+from tqdm import tqdm
+
+from lqrsim.errors import check_count, check_name
+
+ABOVE_BEST = 1.001
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(Settings):
+    problems: tuple[str, ...] = tuple(FAMILIES)
+    """Which of them."""
+    solvers: tuple[str, ...] = tuple(CONTESTANTS)
+    """Which of them; the target is the best of these."""
+    seeds: int = 100
+    """The most instances of each random problem."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A solver's run on an instance, and what its plan is by itself."""
+
+    run: Run
+    verified: Verified
+
+    @property
+    def solved(self) -> bool:
+        return self.run.solved and not self.verified.faults
+
+    @property
+    def refuted(self) -> bool:
+        """Whether it claims what is not so."""
+        return self.run.solved and bool(self.verified.faults)
+
+
+def main(config: Config) -> Result:
+    for field, chosen, names in (("problems", config.problems, FAMILIES), ("solvers", config.solvers, CONTESTANTS)):
+        for name in chosen:
+            check_name(f"--{field}", name, names)
+    check_count("--seeds", config.seeds)
+    result = opening(config) | {"peers": versions_of_peers(), "problems": {}}
+    chosen = config.problems[:2] if config.quick else config.problems
+    most = min(config.seeds, 2) if config.quick else config.seeds
+    with tqdm(total=len(chosen) * len(config.solvers), desc="league", leave=False, disable=None) as bar:
+        for name in chosen:
+            result["problems"][name] = _family(name, config, most, bar)
+    return result
+
+
+def _family(name: str, config: Config, most: int, bar: Any) -> Result:
+    """All solvers on all instances of a family."""
+    problems, found, absent = instances(name, most), {}, {}
+    for solver in config.solvers:
+        bar.set_postfix_str(f"{name}, {solver}")
+        try:
+            solve = CONTESTANTS[solver](problems[0][0], compile=not config.quick)
+        except Unavailable as error:
+            absent[solver] = f"for {error}"
+        except NotImplementedError as error:
+            absent[solver] = f"which does not take {error}"
+        else:
+            found[solver] = _solve_all(solve, problems, f"{name}, {solver}")
+        bar.update()
+    best = [
+        min((one[i].verified.cost for one in found.values() if not one[i].verified.faults), default=np.nan)
+        for i in range(len(problems))
+    ]
+    published = FAMILIES[name].published
+    targets = [ABOVE_BEST * cost for cost in best]
+    by_altro = False
+    if published is not None and best[0] <= published[1]:
+        targets, by_altro = [published[1]], True
+    return {
+        "instances": len(problems),
+        "published": published,
+        "target": "Altro.jl" if by_altro else "best",
+        "targets": _numbers(targets),
+        "absent": absent,
+        "solvers": {solver: _summary(outcomes, targets, f"{name}, {solver}") for solver, outcomes in found.items()},
+    }
+
+
+def _solve_all(solve: Solve, problems: Sequence[Instance], name: str) -> list[Outcome]:
+    solve(*problems[0])  # compile
+    outcomes = []
+    for problem, start in _progress(problems, name):
+        answer = solve(problem, start)
+        outcomes.append(Outcome(answer, verify(problem, answer.plan, answer.cost)))
+    return outcomes
+
+
+def _summary(outcomes: Sequence[Outcome], targets: Sequence[float], name: str) -> Result:
+    """What came of a solver's runs, instance by instance, as JSON."""
+    reached = [
+        one.run.first(_reaching(target)) if not one.verified.faults and one.verified.cost <= target else None
+        for one, target in _progress(list(zip(outcomes, targets, strict=True)), f"{name}, to the target")
+    ]
+    exact = [one.run.exact if one.solved else None for one in outcomes]
+    return {
+        "solved": [one.solved for one in outcomes],
+        "status": [one.run.status for one in outcomes],
+        "faults": [list(one.verified.faults) for one in outcomes],
+        "refuted": [one.refuted for one in outcomes],
+        "cost": _numbers(np.nan if one.verified.faults else one.verified.cost for one in outcomes),
+        "motion": _numbers(one.verified.motion for one in outcomes),
+        "violation": _numbers(one.verified.violation for one in outcomes),
+        "target": _moments(reached),
+        "exact": _moments(exact),
+    }
+
+
+def _reaching(target: float) -> Callable[[Moment], bool]:
+    return lambda moment: moment.cost <= target and moment.violation < VIOLATION
+
+
+def _moments(moments: Sequence[Moment | None]) -> Result:
+    return {
+        "iterations": [None if one is None else one.iterations for one in moments],
+        "milliseconds": _numbers(np.nan if one is None else 1e3 * one.seconds for one in moments),
+    }
+
+
+def _numbers(values: Any) -> list[float | None]:
+    """As JSON has them; None for what is not finite."""
+    return [float(f"{value:.9g}") if np.isfinite(value) else None for value in values]
+
+
+def _progress(items: Sequence[Any], name: str) -> Any:
+    return tqdm(items, name, leave=False, delay=2.0, position=1, disable=None)
+
+
+def report(result: Result) -> str:
+    head = (
+        "problem", "solver", "instances", "solved", "at the target", "iterations", "ms", "at 1e-8", "iterations", "ms",
+        "final cost",
+    )  # fmt: skip
+    rows, notes = [], []
+    absent: dict[str, list[str]] = {}
+    for name, family in result["problems"].items():
+        for solver, one in family["solvers"].items():
+            rows.append([name, solver, family["instances"], sum(one["solved"]), *_row(one)])
+            notes += [
+                f"{name}, {solver}, instance {i}: claimed, but {'; '.join(faults)}."
+                for i, (faults, refuted) in enumerate(zip(one["faults"], one["refuted"], strict=True))
+                if refuted
+            ]
+        for solver, why in family["absent"].items():
+            absent.setdefault(f"without {solver}, {why}", []).append(name)
+    targets = [
+        (name, *(family["published"] or ("-", "-")), family["target"], _median(family["targets"], ".6g"))
+        for name, family in result["problems"].items()
+    ]
+    peers = ", ".join(" ".join(one) for one in result["peers"].items())
+    return "\n\n".join(
+        [
+            "## A league of solvers",
+            table(head, rows),
+            f"Medians over the instances; a dash where no more than half get there. {peers or 'No peers installed.'}",
+            table(("problem", "Altro.jl, iterations", "Altro.jl, cost", "target of", "target"), targets),
+            *notes,
+            *(f"{', '.join(names)}: {what}." for what, names in absent.items()),
+        ]
+    )
+
+
+def _row(one: Result) -> list[str]:
+    cells = []
+    for which in ("target", "exact"):
+        counts = one[which]["iterations"]
+        cells += [str(sum(count is not None for count in counts)), _median(counts, "g")]
+        cells.append(_median(one[which]["milliseconds"], ".1f"))
+    return [*cells, _median(one["cost"], ".6g")]
+
+
+def _median(values: Sequence[float | None], spec: str) -> str:
+    """Of numbers of which those that are missing are the largest."""
+    ordered = sorted(np.inf if value is None else value for value in values)
+    middle = np.mean([ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]])
+    return f"{middle:{spec}}" if np.isfinite(middle) else "-"
+
+
+if __name__ == "__main__":
+    run(Config, main, report, lambda result: [], __doc__)  # of the paper's statements, for it has none of this

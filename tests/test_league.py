@@ -1,0 +1,196 @@
+"""The league of solvers: what is counted, that plans are verified, and that all are told the same problem."""
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import peers
+import pytest
+import solver_league
+from league import contestants, problems, verification
+from peers.shooting import Moment, Shooting
+
+import lqrsim as ls
+
+SCRIPT = Path(__file__).parent.parent / "experiments" / "solver_league.py"
+
+
+@pytest.fixture(scope="module")
+def solved() -> tuple[ls.Problem, ls.Solution]:
+    problem, start = problems.FAMILIES["double_integrator"].make(0)
+    return problem, ls.smooth(problem, start=start, constraint_tolerance=1e-6)
+
+
+def test_a_quick_run_counts_what_keeps_the_constraints_at_altros_cost() -> None:
+    command = [sys.executable, SCRIPT, "--quick", "--json", "--solvers", "lqrsim"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    said = json.loads(done.stdout)
+    found = said["result"]["problems"]
+    assert list(found) == ["double_integrator", "pendulum"]
+    for name, family in found.items():
+        one = family["solvers"]["lqrsim"]
+        assert one["solved"] == [True]
+        assert one["faults"] == [[]]
+        assert one["violation"][0] < 1e-6
+        if family["target"] == "Altro.jl":
+            assert family["targets"] == [family["published"][1]]
+        else:
+            assert family["targets"][0] == pytest.approx(1.001 * one["cost"][0])
+        assert one["target"]["iterations"][0] > 0
+        assert f"| {name} | lqrsim | 1 | 1 | 1 |" in said["report"]
+
+
+def test_an_untouched_plan_is_verified(solved: tuple[ls.Problem, ls.Solution]) -> None:
+    problem, solution = solved
+    found = verification.verify(problem, solution.trajectory, solution.cost)
+    assert found.faults == ()
+    assert found.cost == pytest.approx(solution.cost, rel=1e-9)
+
+
+def moved(which: str, row: int, entry: int, to: float) -> Callable[[ls.Trajectory], ls.Trajectory]:
+    """A plan with one number changed."""
+
+    def change(plan: ls.Trajectory) -> ls.Trajectory:
+        numbers = np.array(getattr(plan, which))
+        numbers[row, entry] = to
+        return dataclasses.replace(plan, **{which: numbers})
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (moved("states", 5, 0, 0.3), "the dynamics"),
+        (moved("states", 0, 0, 1e-3), "the start"),
+        (moved("states", 7, 1, 0.7), "a constraint"),
+        (moved("states", -1, 0, 0.99), "a constraint"),
+        (moved("controls", 0, 0, 3.1), "a limit of the controls"),
+        (moved("controls", 3, 0, 0.0), "it costs"),
+        (moved("controls", 3, 0, np.nan), "not finite"),
+        (lambda plan: ls.Trajectory(plan.states[:-1], plan.controls[:-1], plan.dt), "another size"),
+    ],
+)
+def test_a_tampered_plan_is_refused(
+    solved: tuple[ls.Problem, ls.Solution], change: Callable[[ls.Trajectory], ls.Trajectory], fault: str
+) -> None:
+    problem, solution = solved
+    faults = verification.verify(problem, change(solution.trajectory), solution.cost).faults
+    assert any(fault in one for one in faults)
+
+
+def test_a_cost_that_is_claimed_too_low_is_refused(solved: tuple[ls.Problem, ls.Solution]) -> None:
+    problem, solution = solved
+    assert verification.verify(problem, solution.trajectory, 0.9999 * solution.cost).faults
+
+
+def test_a_solver_that_claims_what_is_not_so_has_solved_nothing(
+    solved: tuple[ls.Problem, ls.Solution], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, solution = solved
+    moment = Moment(1, 0.0, 0.1, 0.0)
+
+    def make(problem: ls.Problem, *, compile: bool) -> contestants.Solve:
+        plan = moved("states", 5, 0, 0.3)(solution.trajectory)
+        claim = contestants.Run(plan, 0.1, "solved", solved=True, exact=moment, first=lambda enough: moment)
+        return lambda problem, start: claim
+
+    monkeypatch.setitem(solver_league.CONTESTANTS, "liar", make)
+    config = solver_league.Config(problems=("double_integrator",), solvers=("liar",), quick=True)
+    result = solver_league.main(config)
+    found = result["problems"]["double_integrator"]["solvers"]["liar"]
+    assert found["solved"] == [False]
+    assert found["target"]["iterations"] == found["exact"]["iterations"] == [None]
+    assert "double_integrator, liar, instance 0: claimed, but the dynamics: missed by" in solver_league.report(result)
+
+
+def test_what_is_not_taken_or_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def make(problem: ls.Problem, *, compile: bool) -> contestants.Solve:
+        raise peers.Unavailable("it is not installed")
+
+    monkeypatch.setitem(solver_league.CONTESTANTS, "absent", make)
+    config = solver_league.Config(problems=("double_integrator",), solvers=("ilqr", "absent"), quick=True)
+    text = solver_league.report(solver_league.main(config))
+    assert "double_integrator: without ilqr, which does not take constraints." in text
+    assert "double_integrator: without absent, for it is not installed." in text
+    with pytest.raises(ls.InputError, match="--solvers"):
+        solver_league.main(dataclasses.replace(config, solvers=("nobody",)))
+
+
+def test_concar_is_drawn_within_its_bounds() -> None:
+    for seed in range(100):
+        problem, _ = problems.concar(seed)
+        force, turn = problem.control_coordinates.high
+        assert 1.5 <= force <= 2.5
+        assert 3 <= turn <= 5
+        (circles,) = problem.constraints
+        assert isinstance(circles, ls.SymbolicConstraint)
+        for i, (x, y) in enumerate(((0.25, 0.25), (0.75, 0.75), (0.25, 0.75), (0.75, 0.25))):
+            p = circles.parameters
+            assert max(abs(p[f"x{i}"] - x), abs(p[f"y{i}"] - y)) <= 0.1
+            assert 0.07 <= p[f"r{i}"] <= 0.22
+            # A start or an end inside one could not be helped.
+            assert min(np.hypot(p[f"x{i}"] - a, p[f"y{i}"] - a) for a in (0, 1)) > p[f"r{i}"] - 0.02
+    assert problems.concar(3)[0].digest == problems.concar(3)[0].digest != problems.concar(4)[0].digest
+
+
+@pytest.mark.parametrize("name", ["parallel_park", "zigzag", "escape", "concar", "planar", "quadrotor"])
+def test_others_are_told_the_same_problem(name: str) -> None:
+    """The cost and the constraints that IPOPT and FATROP are told, at a plan that keeps to nothing but the dynamics."""
+    problem, _ = problems.FAMILIES[name].make(0)
+    try:
+        solver = Shooting(problem, "ipopt", compile=False)
+    except peers.Unavailable as error:
+        pytest.skip(str(error))
+    low, high = (np.clip(side, -1, 1) for side in (problem.control_coordinates.low, problem.control_coordinates.high))
+    controls = np.random.default_rng(0).uniform(low, high, (problem.steps, len(low)))
+    states = verification.rolled_out(problem, controls)
+    found = verification.verify(problem, ls.Trajectory(states, controls, problem.dt), 0.0)
+    cost, violation = solver.worth(problem, states, controls)
+    assert cost == pytest.approx(found.cost, rel=1e-9)
+    assert violation == pytest.approx(found.violation, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("plugin", ["ipopt", "fatrop"])
+def test_when_others_had_come_far_enough(plugin: str) -> None:
+    problem, start = problems.FAMILIES["double_integrator"].make(0)
+    try:
+        solver = Shooting(problem, plugin, compile=False)  # pyright: ignore[reportArgumentType]
+    except peers.Unavailable as error:
+        pytest.skip(str(error))
+    assert not isinstance(start, ls.Trajectory)
+    guess = verification.rolled_out(problem, start), start
+    answer = solver.solve(problem, *guess)
+    assert answer.converged
+    found = {}
+    for closer in (1e-2, 1e-3, 1e-6):
+        most = (1 + closer) * answer.cost
+        moment = solver.first(
+            problem, *guess, answer.iterations, lambda one, most=most: one.violation + one.cost < most
+        )
+        assert moment is not None
+        found[closer] = moment.iterations
+    assert 1 <= found[1e-2] <= found[1e-3] <= found[1e-6] <= answer.iterations
+    assert found[1e-2] < found[1e-6]
+    assert solver.first(problem, *guess, answer.iterations, lambda one: one.cost < 0) is None
+
+
+@pytest.mark.parametrize("plugin", ["ipopt", "fatrop"])
+def test_ctrl_c_ends_what_is_solved(plugin: str) -> None:
+    problem, start = problems.concar(0)
+    try:
+        solver = Shooting(problem, plugin, compile=False)  # pyright: ignore[reportArgumentType]
+    except peers.Unavailable as error:
+        pytest.skip(str(error))
+    guess = verification.rolled_out(problem, start), start
+    timer = threading.Timer(0.03, signal.raise_signal, [signal.SIGINT])
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        [solver.solve(problem, *guess) for _ in range(1000)]
+    assert solver.solve(problem, *guess).converged
