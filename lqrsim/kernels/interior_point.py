@@ -219,3 +219,21 @@ def definite(stage, least):
             block[i, j] = stage[N + i, N + j]
         block[i, i] -= least[i]
     return cholesky(block, M)
+
+
+def follow(steps, part, plan, policy, limits, model, out):
+    """The motion that a part of a step leads to, its gains closing the loop; writes states and controls.
+
+    Args:
+      plan: a motion. policy: gains, and changes of controls where states do not change; `direction` has written them.
+      limits: what the controls are held between, at each step, (T, M) each. out: gets the motion.
+    """
+    for i in range(N):
+        out.states[0, i] = plan.states[0, i]
+    for t in range(steps):
+        for i in range(M):
+            total = plan.controls[t, i] + part * policy.offset[t, i]
+            for j in range(N):
+                total += policy.gain[t, i, j] * (out.states[t, j] - plan.states[t, j])
+            out.controls[t, i] = min(max(total, limits.low[t, i]), limits.high[t, i])
+        advance(out.states[t], out.controls[t], model, model.dt, out.states[t + 1])

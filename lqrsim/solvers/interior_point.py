@@ -22,7 +22,7 @@ from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
 from lqrsim.kernels import interior_point as kernel
-from lqrsim.kernels.records import ConstraintRows, CostToGo, Plan, Policy, StageModels
+from lqrsim.kernels.records import ConstraintRows, CostToGo, Limits, Plan, Policy, StageModels
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
 from lqrsim.solvers.common import INSIDE
@@ -85,6 +85,15 @@ class Found:
     shares: list[Array]
 
 
+class Sizes(NamedTuple):
+    """By how much things change: states (n,), controls (m,), the rows where these do (R,); and what that costs."""
+
+    states: Array
+    controls: Array
+    rows: Array
+    cost: float
+
+
 class Stages:
     """A problem as the iterations see it: models of its stages, and all constraints and limits as rows.
 
@@ -132,7 +141,7 @@ class Stages:
         )  # fmt: skip
         first = np.cumsum([0, *counts])[:-1].astype(np.float64)
         self._rows = ConstraintRows(rows, np.inf, first, np.zeros((rows, n + m)), np.zeros((steps + 1) * rows))
-        self.gain, self._offset = np.zeros((steps, m, n)), np.zeros((steps, m))
+        self.gain, self.offset = np.zeros((steps, m, n)), np.zeros((steps, m))
         self.to_go = CostToGo(np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1))
         self.changes = Plan(np.zeros((steps + 1, n)), np.zeros((steps, m)))
 
@@ -168,6 +177,47 @@ class Stages:
             beside = Plan(plan.states + far * wiggle[: self.n], plan.controls + far * wiggle[self.n :])
             self.linearize(beside, nowhere, none, np.inf)
 
+    def sizes(self, plan: Plan) -> Sizes:
+        """By how much things change, as far as a plan and the problem tell.
+
+        A control without limits has the size with which it moves states by theirs.
+        """
+        problem = self.problem
+        reach = np.ptp(plan.states, axis=0)
+        if problem.goal is not None and problem.start is not None:
+            reach = np.maximum(reach, np.abs(np.nan_to_num(problem.goal - problem.start)))
+        states = np.where(reach > 1e-6, reach, 1.0)
+        self.look_about(plan)
+        moved = np.abs(self.models.jacobian[:, :, self.n :]).sum(axis=0) / states[:, None]
+        enough = np.maximum(1 / np.maximum(moved.max(axis=0), 1e-6), np.abs(plan.controls).max(axis=0))
+        controls = np.where(np.isfinite(self.high - self.low), self.high - self.low, enough)
+        both = np.concatenate([states, controls])
+        counts = np.maximum(self.live.sum(axis=0), 1)
+        rows = np.sqrt(((self.slopes * both) ** 2).sum(axis=2).sum(axis=0) / counts)
+        cost = 0.5 * float(np.abs(np.einsum("tww->w", self.models.convex)) @ both**2)
+        return Sizes(states, controls, np.where(rows > 0, rows, 1.0), cost or 1.0)
+
+    def spread(self, rows: Array) -> Array:
+        """Numbers of the live rows (K,) where they belong, (T+1, R); others are zero."""
+        spread = np.zeros(self.live.shape)
+        spread[self.live] = rows
+        return spread
+
+    def pull(self, rows: Array) -> Array:
+        """The sum of the slopes (T+1, n+m) of the live rows times these numbers."""
+        return np.matmul(self.spread(rows)[:, None, :], self.slopes)[:, 0, :]
+
+    def curvature(self, rows: Array) -> Array:
+        """The sum of slope times slope' (T+1, n+m, n+m) of the live rows times these numbers."""
+        weighed = self.slopes * self.spread(rows)[:, :, None]
+        return np.matmul(weighed.transpose(0, 2, 1), self.slopes)
+
+    def follow(self, plan: Plan, part: float, policy: tuple[Array, Array], limits: Limits) -> Plan:
+        """The motion that a part of a step leads to; see the kernel's."""
+        out = Plan(np.empty((self.steps + 1, self.n)), np.empty((self.steps, self.m)))
+        self._module.follow(self.steps, float(part), plan, Policy(*policy), limits, self._model, out)
+        return out
+
     def adjoint(self, gradient: Array) -> tuple[Array, Array]:
         """Costates (T+1, n) of stages with these gradients (T+1, n+m), and their slopes in the controls (T, m)."""
         costates, slopes = np.zeros((self.steps + 1, self.n)), np.zeros((self.steps, self.m))
@@ -178,7 +228,7 @@ class Stages:
         """Write the step to the minimum of models, and the costates there; whether there is one."""
         failed = self._module.direction(
             self.steps, self.free, in_c_order(hessian), in_c_order(gradient), self.models.jacobian, in_c_order(gaps),
-            Policy(self.gain, self._offset), self.to_go, self.changes,
+            Policy(self.gain, self.offset), self.to_go, self.changes,
         )  # fmt: skip
         return failed == -1
 
@@ -241,36 +291,15 @@ class InteriorPoint:
             fixed = stages.free == 0
             states[0, fixed] = np.asarray(problem.start)[fixed]
         plan = Plan(in_c_order(states), in_c_order(np.clip(controls, stages.low + edge, stages.high - edge)))
-        self._sizes(problem, plan, finite)
+        self.sizes = stages.sizes(plan)
+        self._state_size, self._range, self._row_size, self._typical = self.sizes
         self._rows_of(plan, barrier, room, price, weight, multipliers)
         self.iterations, self.gain = 0, stages.gain
         self._filter: list[tuple[float, float]] = []
         self._mixed, self._part, self._forced = False, 1.0, 0
-        stages.linearize(plan, self._costates, self._spread(self._force), np.inf)
+        stages.linearize(plan, self._costates, self.stages.spread(self._force), np.inf)
         self._costates, self._slopes = self._adjoint()
         self._measure()
-
-    def _sizes(self, problem: Problem, plan: Plan, finite: Array) -> None:
-        """The sizes of states, of controls, of rows (R,), by how much they change where these do, and of the cost.
-
-        A control without limits has the size with which it moves states by theirs.
-        """
-        stages = self.stages
-        reach = np.ptp(plan.states, axis=0)
-        if problem.goal is not None and problem.start is not None:
-            reach = np.maximum(reach, np.abs(np.nan_to_num(problem.goal - problem.start)))
-        self._state_size = np.where(reach > 1e-6, reach, 1.0)
-        stages.look_about(plan)
-        moved = np.abs(stages.models.jacobian[:, :, stages.n :]).sum(axis=0) / self._state_size[:, None]
-        enough = 1 / np.maximum(moved.max(axis=0), 1e-6)
-        enough = np.maximum(enough, np.abs(plan.controls).max(axis=0))
-        self._range = np.where(finite, stages.high - stages.low, enough)
-        both = np.concatenate([self._state_size, self._range])
-        counts = np.maximum(stages.live.sum(axis=0), 1)
-        size = np.sqrt(((stages.slopes * both) ** 2).sum(axis=2).sum(axis=0) / counts)
-        self._row_size = np.where(size > 0, size, 1.0)
-        curvature = np.abs(np.einsum("tww->w", stages.models.convex)) @ both**2
-        self._typical = 0.5 * float(curvature) or 1.0
 
     def _rows_of(
         self, plan: Plan, barrier: float, room: float, price: float, weight: float, multipliers: tuple[Array, ...]
@@ -349,13 +378,13 @@ class InteriorPoint:
         return self._found(solved)
 
     def _found(self, solved: bool) -> Found:
-        stages, spread = self.stages, self._spread(self._force)
+        stages, spread = self.stages, self.stages.spread(self._force)
         known = tuple(spread[:, stages.owners == k].copy() for k in range(len(stages.problem.constraint_terms)))
         pressing = np.zeros((stages.steps, stages.m))
         for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             pressing[:, i] -= sign * spread[:-1, row]
         held = np.where(np.isfinite(self._highest), self._force / self._highest, 0.0)
-        spread = self._spread(held)
+        spread = self.stages.spread(held)
         shares = [spread[:, stages.owners == k] for k in range(len(known))]
         return Found(
             plan=self.point.plan, gain=stages.gain, measures=self.measures, multipliers=known, pressing=pressing,
@@ -383,11 +412,10 @@ class InteriorPoint:
             numbers = self.point.numbers - aim
             sigma = np.where(presses, self._scale / (REGULARISATION * size**2), 0.0)
             self._force = np.where(presses, self._force, np.where(paid, np.sign(self._force) * highest, 0.0))
-            stages.linearize(self.point.plan, self._costates, self._spread(self._force), 0.0)
+            stages.linearize(self.point.plan, self._costates, self.stages.spread(self._force), 0.0)
             gaps = stages.models.arrived - self.point.plan.states[1:]
-            spread = self._spread(sigma)
-            barrier = np.matmul((stages.slopes * spread[:, :, None]).transpose(0, 2, 1), stages.slopes)
-            gradient = stages.models.gradient - self._pull(self._force - sigma * numbers)
+            barrier = stages.curvature(sigma)
+            gradient = stages.models.gradient - self.stages.pull(self._force - sigma * numbers)
             if not stages.direction(stages.models.hessian + barrier, gradient, gaps):
                 break
             moved = np.matmul(stages.slopes, stages.joined()[:, :, None])[:, :, 0][stages.live]
@@ -397,7 +425,7 @@ class InteriorPoint:
             if there is None:
                 break
             self.point = there._replace(slack=self.point.slack)
-            stages.linearize(there.plan, self._costates, self._spread(self._force), 0.0)
+            stages.linearize(there.plan, self._costates, self.stages.spread(self._force), 0.0)
             self._measure()
             beyond = presses & (np.abs(self._force) > highest)
             lifted = presses & ~equality & (self._force < 0)
@@ -425,18 +453,8 @@ class InteriorPoint:
         least = 1e-6 * self._typical
         return max(abs(cost), least) if np.isfinite(cost) else least
 
-    def _spread(self, rows: Array) -> Array:
-        """Numbers of the live rows (K,) where they belong, (T+1, R); others are zero."""
-        spread = np.zeros(self.stages.live.shape)
-        spread[self.stages.live] = rows
-        return spread
-
-    def _pull(self, rows: Array) -> Array:
-        """The sum of the slopes (T+1, n+m) of the live rows times these numbers."""
-        return np.matmul(self._spread(rows)[:, None, :], self.stages.slopes)[:, 0, :]
-
     def _adjoint(self) -> tuple[Array, Array]:
-        return self.stages.adjoint(in_c_order(self.stages.models.gradient - self._pull(self._force)))
+        return self.stages.adjoint(in_c_order(self.stages.models.gradient - self.stages.pull(self._force)))
 
     def _missed(self, point: Point) -> Array:
         """By how much rows are not their slacks, (K,)."""
@@ -476,8 +494,7 @@ class InteriorPoint:
         duals = self._duals(self._force)
         ratio = point.slack / duals
         sigma = 1 / (self._regularised + np.bincount(self._row, ratio, len(point.numbers)))
-        spread = self._spread(sigma)
-        barrier = np.matmul((stages.slopes * spread[:, :, None]).transpose(0, 2, 1), stages.slopes)
+        barrier = stages.curvature(sigma)
         mix = self._mix(barrier, sigma, duals)
         if mix is None:
             return False
@@ -516,7 +533,7 @@ class InteriorPoint:
         self._costates = self._costates + part * (step.costates - self._costates)
         self._tidy(new.slack)
         self.point = new
-        stages.linearize(new.plan, self._costates, self._spread(self._force), 1e-10 * scale)
+        stages.linearize(new.plan, self._costates, self.stages.spread(self._force), 1e-10 * scale)
         self._measure()
         return True
 
@@ -557,7 +574,7 @@ class InteriorPoint:
     def _solve(self, hessian: Array, sigma: Array, duals: Array, corrections: Array, beyond: Array) -> bool:
         """Find the step, of plan and costates; `beyond` is added to what the rows miss."""
         pull = self._force - sigma * (self._target(duals, corrections) + beyond)
-        gradient = self.stages.models.gradient - self._pull(pull)
+        gradient = self.stages.models.gradient - self.stages.pull(pull)
         return self.stages.direction(hessian, gradient, self._gaps + self._more)
 
     _more: Array | float = 0.0  # gaps that a correction adds

@@ -86,7 +86,7 @@ class AugmentedLagrangian:
                 self._first[which] = PENALTY * self._curvature(which) if len(values) else 1.0
             array[0] = self._first[which]
 
-    def update(self) -> None:
+    def update(self, growth: float = GROWTH) -> None:
         """Take the forces for the multipliers; let the penalty grow where that helps too little."""
         for term, array, values in self._constraints():
             array[declarations.HEADER :] = _forces(term, array, values)
@@ -99,11 +99,11 @@ class AugmentedLagrangian:
         near = {kind: kind and short <= self._near for kind, short in missed.items()}
         self.stuck = self.stuck + 1 if missed[worst] > 0.9 * self._last[worst] and not near[worst] else 0
         for kind, tolerance in self._tolerance.items():
-            more = GROWTH * self._grown[kind] <= LARGEST or not near[kind]
+            more = growth * self._grown[kind] <= LARGEST or not near[kind]
             if more and missed[kind] > max(0.5 * self._last[kind], tolerance):
-                self._grown[kind] *= GROWTH
+                self._grown[kind] *= growth
                 for term, array, _ in self._constraints():
-                    array[0] *= GROWTH if term.equality == kind else 1.0
+                    array[0] *= growth if term.equality == kind else 1.0
         self._last = missed
 
     def added(self) -> float:
@@ -126,7 +126,7 @@ class AugmentedLagrangian:
 
     def worst(self) -> str:
         """Which constraint is missed most, by how much and when."""
-        if self.kept:
+        if self.kept and not self._work.priced:
             return "the plan keeps the constraints, but there are better ones"
         missed = [
             (np.abs(values) if term.equality else -(values + array[3])).max(initial=-np.inf)

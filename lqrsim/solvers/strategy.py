@@ -31,19 +31,21 @@ from lqrsim.solvers import compiled, constrained
 from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import Callback, check_outcome
 from lqrsim.solvers.infeasibility import Evidence, evidence
-from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures, Stages
+from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures, Sizes, Stages
 from lqrsim.solvers.multipliers import AugmentedLagrangian
+from lqrsim.solvers.restoration import Restored, restore
 
 FAR = 100.0  # times what may be missed: then the price is too low, or there is no way to keep all
 AUGMENTED = 160  # iterations of the augmented Lagrangian
 STARTS = 2  # from which what is missed has to be stationary, before that is called infeasible
 OPENING = 10  # iterations of smoothing at most, before constraints come in
 MOST = 150  # of the interior point from one plan
-INTERIOR = "interior point"  # what an iteration of it is called
+INTERIOR, RESTORATION = "interior point", "restoration"  # what iterations are called
 ROUGHLY = 1e-4  # how closely constraints at a price are solved for
 MUCH, LITTLE = (1.0, 0.02), (0.01, 0.01)  # barrier and room of a first plan, and of one that is near to the answer
 PRICES = (1e2, 1e4)  # of missing a constraint by its size, relative to the cost
 PENALTY = 8.0  # of the augmented Lagrangian that holds the policy to the constraints, in the same unit
+UPDATES = 5  # of multipliers, where Newton's steps at the end come to miss constraints
 AT_LIMIT = 1e-9  # of its range, within which a control that presses against its limit is put there
 
 
@@ -109,8 +111,9 @@ class Ladder:
             near = LITTLE if self._given is not None else MUCH
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
-            rungs += [self._from_valley, self._augmented, lambda: self._at_a_price(self._valley)]
-        rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._at_a_price(_plan(start))]
+            rungs += [self._from_valley, self._augmented]
+        rungs.append(lambda: self._interior(_plan(start), MUCH))
+        rungs += [lambda: self._at_a_price(self._valley), lambda: self._at_a_price(_plan(start))]
         for rung in rungs:
             found = rung()
             if found is not None and found.success and not self._worse(found):
@@ -169,27 +172,58 @@ class Ladder:
 
     def _at_a_price(self, plan: Plan | None) -> AttemptResult | None:
         """With constraints that may be missed; and from where that leads, without."""
-        for price in PRICES if self._attempt.settings.elastic is None else ():
-            priced = None if plan is None else self._run(plan, MUCH, price=price, tolerance=ROUGHLY)
-            if priced is None or self._attempt.stop.due or not np.isfinite(priced.measures.cost):
+        if plan is None or self._attempt.settings.elastic is not None:
+            return None
+        for price in PRICES:
+            priced, sizes = self._restore(plan, price)
+            if priced is None:
                 return None
-            missed = priced.solved and priced.measures.violation > FAR * self._allowed
-            if missed and price == PRICES[-1] and self._look_for_evidence(priced):
+            plan = priced.plan
+            values = self._attempt.work.constraint_values(plan.states, plan.controls)
+            missed = self._attempt.work.violation(values) > FAR * self._allowed
+            if missed and price == PRICES[-1] and priced.settled and self._look_for_evidence(priced, sizes):
                 return None
             if not missed or price == PRICES[-1]:
-                found = self._interior(priced.plan, LITTLE, multipliers=priced.multipliers)
+                found = self._interior(plan, LITTLE)
                 if found is not None and found.success:
                     return found
-            plan = priced.plan
         return None
 
-    def _look_for_evidence(self, priced: Found) -> bool:
+    def _restore(self, plan: Plan, price: float) -> tuple[Restored | None, Sizes]:
+        """Descent at a price, with a line of the log each."""
+        stop, left = self._attempt.stop, self._attempt.iterations_left(self._iterations) - 1
+        before, clock = np.inf, time.perf_counter()
+
+        def watch(cost: float, violation: float, promised: float) -> bool:
+            nonlocal before, clock
+            now = time.perf_counter()
+            improvement = (before - cost) / max(abs(cost), 1e-300)
+            self._iterations += (
+                Iteration(cost, improvement, 0.0, promised, 0.0, violation, now - clock, RESTORATION),
+            )
+            before, clock = cost, now
+            if self._callback is not None:
+                self._callback(self._iterations[-1])
+            return stop.due
+
+        try:
+            with np.errstate(all="ignore"):
+                sizes = self._stages.sizes(plan)
+                return restore(
+                    self._stages, plan, sizes, price=price, most=min(MOST, left), watch=watch
+                ) if left > 0 and not stop.due else None, sizes
+        except BaseException as error:
+            stop.error = error
+            return None, self._stages.sizes(plan)
+
+    def _look_for_evidence(self, priced: Restored, sizes: Sizes) -> bool:
         """Whether what is missed there is stationary; if so it is kept."""
-        there = self._rolled_out(priced.plan, priced.gain)
-        sizes = [priced.row_size[self._stages.owners == k] for k in range(len(priced.shares))]
+        plan = priced.plan
+        there = self._rolled_out(plan, np.zeros((len(plan.controls), plan.controls.shape[1], plan.states.shape[1])))
+        rows = [sizes.rows[self._stages.owners == k] for k in range(len(priced.shares))]
         found = evidence(
-            self._problem, self._attempt.work, there.states, there.controls, priced.shares, sizes, self._allowed,
-            priced.control_size, priced.state_size,
+            self._problem, self._attempt.work, there.states, there.controls, priced.shares, rows, self._allowed,
+            sizes.controls, sizes.states,
         )  # fmt: skip
         if found is not None:
             self._evidence.append((found, self._note(there)))
@@ -212,6 +246,8 @@ class Ladder:
     ) -> Found | None:  # fmt: skip
         """Iterations of the interior point, with a line of the log each; None where they were interrupted."""
         stop, left = self._attempt.stop, self._attempt.iterations_left(self._iterations) - 1
+        if left < 1 or stop.due:
+            return None
         before, clock = np.inf, time.perf_counter()
 
         def watch(measures: Measures) -> bool:
@@ -295,16 +331,22 @@ class Ladder:
             array[declarations.HEADER :] = np.where(acts & np.isfinite(numbers), force, 0.0).ravel()
         work.plan.states[...], work.plan.controls[...] = states, controls
         work.memory["plan_cost"] = self._stages.trial(Plan(in_c_order(states), in_c_order(controls)))[0]
-        lagrangian = AugmentedLagrangian(attempt)
-        lagrangian.evaluate(states, controls)
-        before = self._iterations
-        result = attempt.descend(before, each=self._each, callback=None, added=lagrangian.added())
-        self._iterations = result.iterations
-        if len(result.iterations) == len(before) + 1 and before:  # no step: a look at the plan
-            last = result.iterations[-1]
+        lagrangian, before = AugmentedLagrangian(attempt), self._iterations
+        for _ in range(UPDATES):
+            lagrangian.evaluate(*work.plan)
+            result = attempt.descend(self._iterations, each=self._each, callback=None, added=lagrangian.added())
+            self._iterations = result.iterations
+            lagrangian.evaluate(result.states, result.controls)
+            if lagrangian.kept or not result.success:
+                break
+            lagrangian.update(growth=1.0)
+        if len(self._iterations) == len(before) + 1 and before:  # no step: a look at the plan
+            last = self._iterations[-1]
             self._iterations = (*before[:-1], replace(last, method=INTERIOR, seconds=last.seconds + before[-1].seconds))
-        lagrangian.evaluate(result.states, result.controls)
-        result = replace(result, multipliers=lagrangian.multipliers())
+        detail = ""
+        if attempt.settings.elastic is not None and result.violation > 0:
+            detail = f"elastic: {lagrangian.worst()}"
+        result = replace(result, detail=detail, multipliers=lagrangian.multipliers())
         return result if lagrangian.kept else replace(result, status=Status.MAX_ITERATIONS)
 
     def _note(self, found: AttemptResult) -> AttemptResult:

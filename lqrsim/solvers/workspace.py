@@ -67,7 +67,7 @@ class Workspace:
     def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
         """Begin a solve; after another one, of a problem of the same size with as many steps."""
         self._problem, self._tolerance, steps = problem, settings.missed(problem), problem.steps
-        self._exact, self._priced = settings.newton(problem), np.isfinite(settings.price)
+        self._exact, self.priced = settings.newton(problem), np.isfinite(settings.price)
         self.fixed = isinstance(problem.initial, FixedState)
         self.prior, self.prior_iterations = self.no_prior, 0
         if initial_guess.prior is not None:
@@ -168,4 +168,4 @@ class Workspace:
         """
         pairs = zip(self._problem.constraint_terms, values, strict=True)
         allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)
-        return self._priced or all(violation_of(term, one) <= allowed(term) for term, one in pairs)
+        return self.priced or all(violation_of(term, one) <= allowed(term) for term, one in pairs)
