@@ -11,7 +11,8 @@ and for equalities d = 0, with multipliers of either sign, the same without the 
 At the optimum the multipliers are the forces `max(0, lambda - mu d)` and `lambda - mu d`. For inequalities d is what a
 constraint has to spare beyond the tolerance to which it is solved, so that what is within the tolerance keeps the
 constraint itself. A constraint may have a price, in cost a unit, for which it may be missed: no force is larger, and
-beyond what one of that size keeps the Lagrangian goes on as a straight line. Of the curvature only `mu n n'` is taken, n the slope of d: the rest can be negative.
+beyond what one of that size keeps the Lagrangian goes on as a straight line. Of the curvature only `mu n n'` is taken,
+n the slope of d: the rest can be negative.
 These functions are compiled with each constraint.
 
 `multipliers` is one array a constraint: mu, how many numbers there are at a step, the first step at which they act, the

@@ -65,11 +65,11 @@ def constraint_models(x, u, t, steps, constraints, rows, out):
     """Write the slopes of all constraints at a step, and subtract their Hessians times the multipliers."""
     slope = stack(W)
     for k in range(constraints.size):
-        own, begin, acts = int(constraints.multipliers[k][1]), constraints.multipliers[k][2], t >= 0
+        own, begin = int(constraints.multipliers[k][1]), constraints.multipliers[k][2]
         acts = t >= begin and not (t == steps and constraints.functions[k, USES_CONTROL] != 0)
         for row in range(own):
             place = int(rows.first[k]) + row
-            at = rows.count * t + place
+            at = rows.size * t + place
             for i in range(W):
                 slope[i] = 0.0
             if acts:
@@ -77,7 +77,9 @@ def constraint_models(x, u, t, steps, constraints, rows, out):
             for i in range(W):
                 out.slopes[at, i] = slope[i]
             if acts and abs(rows.multipliers[at]) > rows.least:
-                subtract_curvature(k, row, x, u, t, constraints, rows.support[place], rows.multipliers[at], out.hessian[t])
+                subtract_curvature(
+                    k, row, x, u, t, constraints, rows.support[place], rows.multipliers[at], out.hessian[t]
+                )
 
 
 def subtract_curvature(k, row, x, u, t, constraints, support, weight, hessian):

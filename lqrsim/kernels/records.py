@@ -188,14 +188,14 @@ class Stage(NamedTuple):
 
 
 class ConstraintRows(NamedTuple):
-    """The numbers of all constraints, row by row, of which there are `count` at each step.
+    """The numbers of all constraints, row by row, of which there are `size` at each step.
 
     Attributes:
-      first: (C,) the row with which each constraint begins. support: (count, W) 0 where a row does not depend on that
-        state or control. multipliers: ((T+1) count,); those of up to `least` are as good as none.
+      first: (C,) the row with which each constraint begins. support: (size, W) 0 where a row does not depend on that
+        state or control. multipliers: ((T+1) size,); those of up to `least` are as good as none.
     """
 
-    count: int
+    size: int
     least: float
     first: Arrays
     support: Arrays
@@ -208,7 +208,7 @@ class StageModels(NamedTuple):
     Attributes:
       hessian: (T+1, W, W) of the cost and of steps and constraints times costates and multipliers. convex: (T+1, W, W)
         of the cost alone, projected. gradient: (T+1, W) of the cost. jacobian: (T, N, W) of the steps.
-      arrived: (T, N) where these lead. slopes: ((T+1) count, W) of the constraints, row by row.
+      arrived: (T, N) where these lead. slopes: ((T+1) size, W) of the constraints, row by row.
     """
 
     hessian: Arrays

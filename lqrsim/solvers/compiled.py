@@ -232,9 +232,7 @@ def rollout(
     return states, controls
 
 
-def no_multipliers(
-    problem: Problem, term: ConstraintTerm, tolerance: float = 0.0, price: float = np.inf
-) -> Array:
+def no_multipliers(problem: Problem, term: ConstraintTerm, tolerance: float = 0.0, price: float = np.inf) -> Array:
     """Those of a constraint that does not act yet; see `kernels/augmented_lagrangian.py`."""
     # A fixed start cannot change; its control can.
     first = 1 if isinstance(problem.initial, FixedState) and not term.uses_control else 0

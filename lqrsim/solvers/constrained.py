@@ -24,12 +24,11 @@ STUCK = 3  # how often the penalty grows to no avail at all before that is given
 ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
 ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to update the multipliers, and when anyway
 ROUGHEST_GAP = 3e-2  # and of damped iterations, which come to their minimum slowly
-NEAR = 0.05  # what is little, in the constraints' units
 STALE, CLOSER = 40, 0.9  # undamped iterations that come no closer, before these are given up; what counts as closer
 
 
 def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
-    """Run an attempt to its end, the method, its safeguard where that fails, and then the constraints; certified."""
+    """Run an attempt at a problem with constraints to its end, the method, its safeguard, and these; certified."""
     tried: tuple[Iteration, ...] = ()
     if attempt.initial_guess.multipliers and attempt.run_opening_pass():
         found = satisfy(attempt, None, each=each, callback=callback)
@@ -64,12 +63,9 @@ def _with_constraints(
 
 
 def satisfy(
-    attempt: Attempt, found: AttemptResult | None, *, each: bool, callback: Callback | None = None, near: bool = False
+    attempt: Attempt, found: AttemptResult | None, *, each: bool, callback: Callback | None = None
 ) -> AttemptResult:
-    """Go on from what was found without the constraints, or, without it, from the multipliers of another solution.
-
-    With `near`, only until little is missed.
-    """
+    """Go on from what was found without the constraints, or, without it, from the multipliers of another solution."""
     lagrangian = AugmentedLagrangian(attempt)
     if found is None:
         attempt.roll_out()
@@ -82,16 +78,15 @@ def satisfy(
         # These will be overwritten.
         found = dataclasses.replace(found, states=found.states.copy(), controls=found.controls.copy())
     before = found.iterations if found is not None else ()
-    undamped = _undamped(attempt, lagrangian, before, each=each, callback=callback, near=near)
+    undamped = _undamped(attempt, lagrangian, before, each=each, callback=callback)
     if (
         undamped.success
-        or (near and undamped.violation < NEAR)
         or not attempt.settings.safeguard
         or attempt.stop.due
         or not attempt.iterations_left(undamped.iterations)
     ):
         return undamped
-    return _damped(attempt, lagrangian, found, undamped, each=each, callback=callback, near=near)
+    return _damped(attempt, lagrangian, found, undamped, each=each, callback=callback)
 
 
 def _first_feasible(
@@ -143,7 +138,6 @@ def _undamped(
     *,
     each: bool,
     callback: Callback | None,
-    near: bool = False,
 ) -> AttemptResult:
     work = attempt.work
     work.memory["plan_cost"] = -np.inf  # of lower cost is not better now
@@ -158,7 +152,7 @@ def _undamped(
             break
         lagrangian.evaluate(work.states, work.controls)
         settled = termination.outcome in (declarations.CONVERGED, declarations.COST_CONVERGED)
-        if len(done) == len(log) or (settled and lagrangian.solved) or (near and done[-1].violation < NEAR):
+        if len(done) == len(log) or (settled and lagrangian.solved):
             break
         # From the optimum without constraints they soon settle, or cycle: then damped ones are far quicker.
         last, limits = done[-1], attempt.settings
@@ -187,7 +181,6 @@ def _damped(
     *,
     each: bool,
     callback: Callback | None,
-    near: bool,
 ) -> AttemptResult:
     """The safeguard: from the plan without constraints or the last one with them, whichever is the better beginning."""
     work = attempt.work
@@ -206,7 +199,7 @@ def _damped(
     work.plan[0][:], work.plan[1][:] = states, controls
     work.memory["plan_cost"] = cost
     why = "the undamped method failed with the constraints"
-    return _rounds(attempt, lagrangian, undamped.iterations, why, each=each, callback=callback, near=near)
+    return _rounds(attempt, lagrangian, undamped.iterations, why, each=each, callback=callback)
 
 
 def refine(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
@@ -238,7 +231,6 @@ def _rounds(
     *,
     each: bool,
     callback: Callback | None,
-    near: bool = False,
 ) -> AttemptResult:
     """Damped iterations from the plan in the memory, and updated multipliers, until the constraints are met or cannot
     be.
@@ -261,8 +253,6 @@ def _rounds(
             if attempt.iterations_left(iterations) and not attempt.stop.due:
                 rough = False
                 continue
-        if near and termination.iterations[-1].violation < NEAR:
-            break
         if rounds == ROUNDS or lagrangian.grown > LARGEST or lagrangian.stuck == STUCK:
             break
         if attempt.stop.due or not attempt.iterations_left(iterations):

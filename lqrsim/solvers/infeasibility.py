@@ -47,7 +47,9 @@ def evidence(
     steps, (n, m) = len(controls), (states.shape[1], controls.shape[1])
     slopes, alone, missed = np.zeros((steps + 1, n + m)), np.zeros((steps + 1, n + m)), 0.0
     holding: list[tuple[float, str]] = []
-    for k, (term, numbers) in enumerate(zip(problem.constraint_terms, work.constraint_values(states, controls), strict=True)):
+    for k, (term, numbers) in enumerate(
+        zip(problem.constraint_terms, work.constraint_values(states, controls), strict=True)
+    ):
         short = np.where(np.isfinite(numbers), np.abs(numbers) if term.equality else -numbers, 0.0)
         weights = np.where(short > allowed, 1.0, np.abs(shares[k])) * (np.sign(shares[k]) if term.equality else 1.0)
         weights[np.where(np.isfinite(numbers), numbers, np.inf) > 1e-2 * sizes[k]] *= term.equality
@@ -57,7 +59,7 @@ def evidence(
             slopes[t] -= slope
             if short[t, row] > allowed:
                 alone[t] -= slope
-                missed += short[t, row] / sizes[k][row]
+                missed += float(short[t, row] / sizes[k][row])
         shown = np.where(short > allowed, 0.0, np.abs(weights))
         if shown.size and shown.max() > 1e-2:
             t, row = np.unravel_index(shown.argmax(), shown.shape)
@@ -77,13 +79,19 @@ def evidence(
         pressed = np.maximum(pressed, np.abs(slope) * control_size * ~free)
         reach = np.linalg.norm(B / state_size[:, None], axis=0) * control_size
         size = max(size, float((np.linalg.norm(ahead * state_size) * reach).max()))
-        size = max(size, float((np.linalg.norm(own * state_size) * reach).max()), float((np.abs(of_missed) * control_size).max()))
+        size = max(
+            size,
+            float((np.linalg.norm(own * state_size) * reach).max()),
+            float((np.abs(of_missed) * control_size).max()),
+        )
         ahead, own = slopes[t, :n] + A.T @ ahead, alone[t, :n] + A.T @ own
     left = total / size if size > 0 else 0.0
     if not left <= STATIONARY:
         return None
     names = problem.dynamics.control_coordinates.names
     if size > 0:
-        holding += [(float(pressed[i]) / size, f"the limits of {names[i]}") for i in range(m) if pressed[i] > 1e-2 * size]
+        holding += [
+            (float(pressed[i]) / size, f"the limits of {names[i]}") for i in range(m) if pressed[i] > 1e-2 * size
+        ]
     against = [name for _, name in sorted(holding, reverse=True)[:NAMED]]
     return Evidence(states, controls, left, missed, ", ".join(against))

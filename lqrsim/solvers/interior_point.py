@@ -20,7 +20,6 @@ import numpy as np
 from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
-from lqrsim.kernels import declarations
 from lqrsim.kernels import interior_point as kernel
 from lqrsim.kernels.records import ConstraintRows, CostToGo, Limits, Plan, Policy, StageModels
 from lqrsim.problem.problem import FixedState, Problem
@@ -67,8 +66,7 @@ class Found:
       plan: states and controls, a motion but for gaps. gain: (T, m, n) about it. measures: of it.
       multipliers: of each constraint (T+1, rows); of the limits (T, m), positive where a control presses against the
         upper one. solved: whether all measures are within tolerance. iterations: how many there were.
-      control_size, row_size, state_size: by how much controls (m,), rows (R,) and states (n,) change. scale: the cost
-        that is relative to. shares: of each constraint (T+1, rows), the multipliers relative to what missing it costs.
+      control_size, row_size: by how much controls (m,) and rows (R,) change. scale: the cost that is relative to.
     """
 
     plan: Plan
@@ -81,8 +79,6 @@ class Found:
     control_size: Array
     row_size: Array
     scale: float
-    state_size: Array
-    shares: list[Array]
 
 
 class Sizes(NamedTuple):
@@ -264,8 +260,7 @@ class InteriorPoint:
       plan: states (T+1, n) and controls (T, m) to begin with, which need not be a motion or keep anything.
       barrier: its first parameter for each row, as a share of the cost divided by the number of rows.
       room: what slacks are at first, at least: relative to a row's size, or to a control's range.
-      price: of missing a constraint by its size, relative to the cost: then it is elastic. Infinite: it is not.
-      weight: the same, in cost a unit of each constraint.
+      price: of missing a constraint, in cost a unit: then it is elastic. Infinite: it is not to be missed.
       multipliers: known ones of the constraints, (T+1, rows) each, or none.
       stages: to use again, of the same problem.
     """
@@ -278,7 +273,6 @@ class InteriorPoint:
         barrier: float = 1.0,
         room: float = 0.02,
         price: float = np.inf,
-        weight: float = np.inf,
         multipliers: tuple[Array, ...] = (),
         stages: Stages | None = None,
     ) -> None:
@@ -293,7 +287,7 @@ class InteriorPoint:
         plan = Plan(in_c_order(states), in_c_order(np.clip(controls, stages.low + edge, stages.high - edge)))
         self.sizes = stages.sizes(plan)
         self._state_size, self._range, self._row_size, self._typical = self.sizes
-        self._rows_of(plan, barrier, room, price, weight, multipliers)
+        self._rows_of(plan, barrier, room, price, multipliers)
         self.iterations, self.gain = 0, stages.gain
         self._filter: list[tuple[float, float]] = []
         self._mixed, self._part, self._forced = False, 1.0, 0
@@ -301,9 +295,7 @@ class InteriorPoint:
         self._costates, self._slopes = self._adjoint()
         self._measure()
 
-    def _rows_of(
-        self, plan: Plan, barrier: float, room: float, price: float, weight: float, multipliers: tuple[Array, ...]
-    ) -> None:
+    def _rows_of(self, plan: Plan, barrier: float, room: float, price: float, multipliers: tuple[Array, ...]) -> None:
         """Set up slacks and multipliers."""
         stages, live = self.stages, self.stages.live
         cost, arrived = stages.trial(plan)
@@ -315,7 +307,7 @@ class InteriorPoint:
         equality = np.broadcast_to(stages.equality, shape)[live]
         limit = np.broadcast_to(stages.owners == -1, shape)[live]
         self._size = size
-        highest = np.where(limit, np.inf, np.minimum(price * self._scale / size, weight))
+        highest = np.where(limit, np.inf, price)
         self._highest, self._elastic = highest, bool(np.isfinite(highest).any())
         lowest = np.where(equality, -highest, 0.0)
         below, above = np.flatnonzero(np.isfinite(lowest)), np.flatnonzero(np.isfinite(highest))
@@ -383,13 +375,10 @@ class InteriorPoint:
         pressing = np.zeros((stages.steps, stages.m))
         for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             pressing[:, i] -= sign * spread[:-1, row]
-        held = np.where(np.isfinite(self._highest), self._force / self._highest, 0.0)
-        spread = self.stages.spread(held)
-        shares = [spread[:, stages.owners == k] for k in range(len(known))]
         return Found(
             plan=self.point.plan, gain=stages.gain, measures=self.measures, multipliers=known, pressing=pressing,
             solved=solved, iterations=self.iterations, control_size=self._range, row_size=self._row_size,
-            scale=self._scale, state_size=self._state_size, shares=shares,
+            scale=self._scale,
         )  # fmt: skip
 
     def _cross(self, tolerance: float, violation: float) -> None:

@@ -17,7 +17,7 @@ from lqrsim.kernels.records import Limits, Plan
 from lqrsim.solvers.interior_point import MIXES, Sizes, Stages
 
 FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # of the barrier's parameter, relative to the price; and what it falls by
-SETTLED = 1e-3  # of the parameter, a promised decrease for each row below which it falls
+SETTLED = 0.1  # of the parameter, a promised decrease for each row below which it falls
 ARMIJO, SHORTEST = 1e-4, 1e-6
 INSIDE = 0.01  # of the way to a limit, what is left by a step
 EDGE = 0.01  # of the range, how far inside of the limits controls begin
@@ -75,17 +75,14 @@ def restore(
         numbers = stages.values(plan)[live]
         if not np.isfinite(cost) or not np.isfinite(numbers).all():
             return None
+        stages.linearize(plan, costates, stages.spread(force), 0.0)
         while True:
             slack, excess = _slacks(numbers, highest, equality, parameter)
             room = np.where(limit, numbers, slack)
             lowest = np.where(equality, -highest, 0.0)
             force = lowest + parameter / room
             curvature = np.where(limit, parameter / room**2, 1 / (slack**2 / parameter + excess**2 / parameter))
-            spread = stages.spread(force)
-            stages.linearize(plan, costates, spread, 0.0)
             gradient = stages.models.gradient - stages.pull(force)
-            costates, _slopes = stages.adjoint(in_c_order(gradient))
-            stages.linearize(plan, costates, spread, 0.0)
             barrier = stages.curvature(curvature)
             if not _direction(stages, barrier, gradient, sizes, price):
                 return None
@@ -94,6 +91,7 @@ def restore(
             if -slope > SETTLED * parameter * len(size) or parameter <= least:
                 break
             parameter = max(FALL * parameter, least)
+        costates = stages.to_go.gradient.copy()
         now = merit(numbers, cost)
         part, taken = 1.0, None
         policy = stages.gain, stages.offset

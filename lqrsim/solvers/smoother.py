@@ -229,7 +229,11 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
     if settings.elastic is not None and not (problem.constraints and settings.newton(problem)):
         if problem.constraints:
             why = 'finish="newton" and stop="optimal"'
-            why = "without noise, and dynamics that are not of an MJCF" if settings.finish and settings.stop == "optimal" else why
+            why = (
+                "without noise, and dynamics that are not of an MJCF"
+                if settings.finish and settings.stop == "optimal"
+                else why
+            )
             raise InputError(f"elastic: got {settings.elastic:g}, want {why} beside it")
         raise InputError(f"elastic: got {settings.elastic:g} for a problem without constraints, want None")
     several = settings.start is None and len(problem.obstacle_costs) > 0

@@ -6,9 +6,9 @@ With constraints, whatever comes first is followed by the interior point, which 
     the plan of another solution, with its multipliers;
     a trajectory or a policy that the caller gave;
     the valley that smoothing finds without the constraints;
-    the same with constraints that may be missed at a price, and from there without;
-    what the augmented Lagrangian comes to;
-    the start itself, with a large barrier.
+    the same, after a descent in which constraints may be missed at a price;
+    the start itself;
+    the same, after such a descent.
 
 Where none of these converges, the plan that misses the constraints least is the answer. It is INFEASIBLE if two starts
 came to plans about which no change lessens what is missed.
@@ -36,12 +36,10 @@ from lqrsim.solvers.multipliers import AugmentedLagrangian
 from lqrsim.solvers.restoration import Restored, restore
 
 FAR = 100.0  # times what may be missed: then the price is too low, or there is no way to keep all
-AUGMENTED = 160  # iterations of the augmented Lagrangian
 STARTS = 2  # from which what is missed has to be stationary, before that is called infeasible
 OPENING = 10  # iterations of smoothing at most, before constraints come in
 MOST = 150  # of the interior point from one plan
 INTERIOR, RESTORATION = "interior point", "restoration"  # what iterations are called
-ROUGHLY = 1e-4  # how closely constraints at a price are solved for
 MUCH, LITTLE = (1.0, 0.02), (0.01, 0.01)  # barrier and room of a first plan, and of one that is near to the answer
 PRICES = (1e2, 1e4)  # of missing a constraint by its size, relative to the cost
 PENALTY = 8.0  # of the augmented Lagrangian that holds the policy to the constraints, in the same unit
@@ -111,9 +109,9 @@ class Ladder:
             near = LITTLE if self._given is not None else MUCH
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
-            rungs += [self._from_valley, self._augmented]
+            rungs += [self._from_valley, lambda: self._at_a_price(self._valley)]
         rungs.append(lambda: self._interior(_plan(start), MUCH))
-        rungs += [lambda: self._at_a_price(self._valley), lambda: self._at_a_price(_plan(start))]
+        rungs += [lambda: self._at_a_price(_plan(start))]
         for rung in rungs:
             found = rung()
             if found is not None and found.success and not self._worse(found):
@@ -153,23 +151,6 @@ class Ladder:
                 return self._note(found)
         return self._interior(self._valley, MUCH)
 
-    def _augmented(self) -> AttemptResult | None:
-        attempt, settings = self._attempt, self._attempt.settings
-        if self._valley is None or settings.elastic is not None:
-            return None
-        begun = len(self._iterations)
-        attempt.settings = replace(settings, max_iterations=min(begun + AUGMENTED, settings.max_iterations))
-        before = replace(attempt.result(attempt.termination), iterations=self._iterations)
-        found = constrained.satisfy(attempt, before, each=self._each, callback=self._callback, near=True)
-        attempt.settings, self._iterations = settings, found.iterations
-        if attempt.stop.due or not np.isfinite(found.cost):
-            return None
-        plan = Plan(found.states.copy(), found.controls.copy())
-        result = self._interior(plan, LITTLE)
-        if attempt.stop.due or (result is not None and result.success):
-            return result
-        return self._interior(plan, MUCH)
-
     def _at_a_price(self, plan: Plan | None) -> AttemptResult | None:
         """With constraints that may be missed; and from where that leads, without."""
         if plan is None or self._attempt.settings.elastic is not None:
@@ -198,9 +179,7 @@ class Ladder:
             nonlocal before, clock
             now = time.perf_counter()
             improvement = (before - cost) / max(abs(cost), 1e-300)
-            self._iterations += (
-                Iteration(cost, improvement, 0.0, promised, 0.0, violation, now - clock, RESTORATION),
-            )
+            self._iterations += (Iteration(cost, improvement, 0.0, promised, 0.0, violation, now - clock, RESTORATION),)
             before, clock = cost, now
             if self._callback is not None:
                 self._callback(self._iterations[-1])
@@ -240,10 +219,7 @@ class Ladder:
             return self._note(result)
         return self._note(self._rolled_out(found.plan, found.gain))
 
-    def _run(
-        self, plan: Plan, barrier: tuple[float, float], *, price: float = np.inf,
-        multipliers: tuple[Array, ...] = (), tolerance: float | None = None,
-    ) -> Found | None:  # fmt: skip
+    def _run(self, plan: Plan, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()) -> Found | None:
         """Iterations of the interior point, with a line of the log each; None where they were interrupted."""
         stop, left = self._attempt.stop, self._attempt.iterations_left(self._iterations) - 1
         if left < 1 or stop.due:
@@ -267,12 +243,11 @@ class Ladder:
         try:
             with np.errstate(all="ignore"):
                 point = InteriorPoint(
-                    self._problem, plan, barrier=barrier[0], room=barrier[1], price=price,
-                    weight=self._attempt.settings.price, multipliers=multipliers, stages=self._stages,
+                    self._problem, plan, barrier=barrier[0], room=barrier[1], price=self._attempt.settings.price,
+                    multipliers=multipliers, stages=self._stages,
                 )  # fmt: skip
                 return point.run(
-                    tolerance=self._attempt.final if tolerance is None else tolerance, violation=self._allowed,
-                    most=min(MOST, left), watch=watch,
+                    tolerance=self._attempt.final, violation=self._allowed, most=min(MOST, left), watch=watch
                 )  # fmt: skip
         except BaseException as error:  # the callback's, or Ctrl-C: raised again when there is a solution
             stop.error = error
@@ -332,14 +307,13 @@ class Ladder:
         work.plan.states[...], work.plan.controls[...] = states, controls
         work.memory["plan_cost"] = self._stages.trial(Plan(in_c_order(states), in_c_order(controls)))[0]
         lagrangian, before = AugmentedLagrangian(attempt), self._iterations
+        lagrangian.evaluate(*work.plan)
+        result = self._descend(lagrangian)
         for _ in range(UPDATES):
-            lagrangian.evaluate(*work.plan)
-            result = attempt.descend(self._iterations, each=self._each, callback=None, added=lagrangian.added())
-            self._iterations = result.iterations
-            lagrangian.evaluate(result.states, result.controls)
             if lagrangian.kept or not result.success:
                 break
             lagrangian.update(growth=1.0)
+            result = self._descend(lagrangian)
         if len(self._iterations) == len(before) + 1 and before:  # no step: a look at the plan
             last = self._iterations[-1]
             self._iterations = (*before[:-1], replace(last, method=INTERIOR, seconds=last.seconds + before[-1].seconds))
@@ -348,6 +322,13 @@ class Ladder:
             detail = f"elastic: {lagrangian.worst()}"
         result = replace(result, detail=detail, multipliers=lagrangian.multipliers())
         return result if lagrangian.kept else replace(result, status=Status.MAX_ITERATIONS)
+
+    def _descend(self, lagrangian: AugmentedLagrangian) -> AttemptResult:
+        """Newton's method from the plan in the memory, with these multipliers."""
+        result = self._attempt.descend(self._iterations, each=self._each, callback=None, added=lagrangian.added())
+        self._iterations = result.iterations
+        lagrangian.evaluate(result.states, result.controls)
+        return result
 
     def _note(self, found: AttemptResult) -> AttemptResult:
         """Keep it, if it is the best so far, in memory of its own."""
