@@ -70,37 +70,31 @@ def is_optimal(of: ls.Problem, solution: ls.Solution, tolerance: float = 1e-5) -
     found = Shooting(of).conditions(solution)
     assert found.violation <= solution.options["constraint_tolerance"], found  # pyright: ignore[reportOperatorIssue]
     assert found.sign == 0, found
-    assert max(found.slope, found.pressing, found.spare) < (tolerance if of.constraints else 1e-3), found
+    # Without a constraint that acts it is Newton's method that ends, by the decrease that is left: a square of slopes.
+    acts = any(one.values.any() for one in solution.multipliers)
+    assert max(found.slope, found.pressing, found.spare) < (tolerance if acts else 1e-3), found
 
 
 # Whole problems that can be solved: what is asked for is kept by a motion that was drawn first.
 
-decades = st.floats(0, 4).map(lambda power: 10.0**power)
-
-
-@st.composite
-def solvable(draw: st.DrawFn) -> ls.Problem:
-    limit = draw(st.sampled_from([np.inf, 2.0, 5.0]))
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    dynamics = system(
-        pull=draw(st.sampled_from([0.0, 4.0])), push=draw(st.floats(0.5, 2)), drag=draw(st.sampled_from([0.0, 0.5]))
-    )
-    steps, start = draw(st.integers(8, 20)), rng.uniform(-1, 1, 2)
-    times = np.arange(steps) * DT
-    most = min(limit, 4.0) * 0.9
-    controls = most * np.sin(rng.uniform(0.5, 4) * times + rng.uniform(0, 6))[:, None]
-    bare = problem(dynamics=dynamics, start=start, steps=steps)
-    z = Shooting(bare).points(controls.ravel())
+def drawn(number: int) -> ls.Problem:
+    """One with bounds, goals, limits of any kind, or none, and weights over four decades."""
+    rng = np.random.default_rng(number)
+    limit, steps, start = rng.choice([np.inf, 2.0, 5.0]), int(rng.integers(8, 20)), rng.uniform(-1, 1, 2)
+    dynamics = system(pull=rng.choice([0.0, 4.0]), push=rng.uniform(0.5, 2), drag=rng.choice([0.0, 0.5]))
+    most, times = 0.9 * min(limit, 4.0), np.arange(steps) * DT
+    controls = most * np.sin(rng.uniform(0.5, 4) * times + rng.uniform(0, 6))
+    z = Shooting(problem(dynamics=dynamics, start=start, steps=steps)).points(controls)
+    (x, v), u, room = z[:, :2].T, controls, rng.choice([0.02, 0.3])
     kept: list[ls.Constraint] = []
-    (x, v), u, room = z[:, :2].T, controls[:, 0], draw(st.sampled_from([0.02, 0.3]))
-    if draw(st.booleans()):
+    if rng.random() < 0.5:
         kept.append(ls.StateBounds(low={"x": x.min() - room}, high={"v": v.max() + room}))
-    if draw(st.booleans()):
+    if rng.random() < 0.5:
         strongest, beside = float((u * v[:-1]).max()) + room, 0.5
         most = float((u**2 + beside * v[:-1] ** 2).max()) + room
         numbers = {"power": strongest, "most": most, "beside": beside, "force": 1.0, "speed": 1.0}
         kept.append(ls.SymbolicConstraint(power, parameters=numbers))
-    end = draw(st.sampled_from(["none", "all", "place", "met"]))
+    end = rng.choice(["none", "all", "place", "met"])
     if end == "all":
         kept.append(ls.GoalState(z[-1, :2]))
     elif end == "place":
@@ -111,25 +105,27 @@ def solvable(draw: st.DrawFn) -> ls.Problem:
         kept.append(ls.SymbolicConstraint(meeting, parameters=numbers | {"there": there}, equality=True, at="final"))
     return problem(
         *kept, dynamics=dynamics, start=start, goal=rng.uniform(-3, 3, 2), steps=steps, limit=limit,
-        effort=draw(decades) * 1e-2, final=[draw(decades), draw(decades)],
-        on_the_way=[draw(st.sampled_from([0.0, 1.0])), 0.0], soft=draw(st.sampled_from([None, 100.0])),
+        effort=10 ** rng.uniform(-2, 2), final=10 ** rng.uniform(0, 4, 2),
+        on_the_way=[rng.choice([0.0, 1.0]), 0.0], soft=rng.choice([None, 100.0]),
     )  # fmt: skip
 
 
-drawn = settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+numbers = st.integers(0, 2**32 - 1)
+enough = settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 
 
-@drawn
-@given(of=solvable())
-def test_what_can_be_solved_is(of: ls.Problem) -> None:
+@enough
+@given(number=numbers)
+def test_what_can_be_solved_is(number: int) -> None:
+    of = drawn(number)
     solution = solved(of)
     is_optimal(of, solution)
 
 
-@settings(drawn, max_examples=15)
-@given(of=solvable(), seed=st.integers(0, 2**32 - 1), size=st.sampled_from([1.0, 10.0]))
-def test_what_can_be_solved_is_not_called_infeasible_from_any_start(of: ls.Problem, seed: int, size: float) -> None:
-    rng = np.random.default_rng(seed)
+@settings(enough, max_examples=15)
+@given(number=numbers, size=st.sampled_from([1.0, 10.0]))
+def test_what_can_be_solved_is_not_called_infeasible_from_any_start(number: int, size: float) -> None:
+    of, rng = drawn(number), np.random.default_rng(number + 1)
     solution = ls.smooth(of, start=size * rng.normal(size=(of.steps, 1)))
     assert solution.status is not Status.INFEASIBLE, solution.summary()
     if solution.success:
