@@ -26,6 +26,7 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.solvers import compiled
 from lqrsim.solvers.common import INSIDE
 
+INTERIOR = "interior point"  # what its iterations are called
 MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # shares of the projected Hessian, tried in turn
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)  # on changes of controls, where not even that has a minimum; relative to the cost
 REGULARISATION = 1e-8  # of equalities, relative
