@@ -352,7 +352,7 @@ class Problem:
         stated = self.steps * self.dt
         if not 0 < low < high or not low <= stated <= high:
             raise InputError(
-                f"duration: got {low:g} to {high:g} s, want two times above 0 between which steps * dt, {stated:g} s, is"
+                f"duration: got {low:g} to {high:g} s, want two times above 0, and steps * dt, {stated:g} s, between them"
             )
         object.__setattr__(self, "duration", (low, high))
         why = ""

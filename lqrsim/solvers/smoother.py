@@ -27,9 +27,12 @@ from lqrsim.solvers.common import (
 )
 from lqrsim.solvers.free_duration import find_duration, settled
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
-from lqrsim.solvers.interior_point import INTERIOR, Measures
+from lqrsim.solvers.interior_point import Measures, iteration_of
 from lqrsim.solvers.multistart import STARTS, Search, check_starts, guides
 from lqrsim.solvers.risk import name_risk
+
+# Of a free duration: how often shorter ones are tried, by how much, and with how many iterations.
+SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 
 
 def smooth(
@@ -233,43 +236,53 @@ def _solve(
 def _solve_for_duration(
     problem: Problem, settings: SmootherSettings, *, each: bool, threads: int, callback: Callback | None
 ) -> Solution:
-    """Solve for the stated duration, then for the best one near that, and then to the end with it."""
-    stop = settings.stop_early()
-    stated = problem.steps * problem.dt
-    first = _solve(settled(problem, stated), settings, each=each, threads=threads, callback=callback)
-    log: list[Iteration] = []
+    """Solve for the stated duration, then for the best one near that, and then to the end with it.
+
+    Where time costs, shorter durations are tried, too, for they may lead another way round.
+    """
+    stop, log = settings.stop_early(), list[Iteration]()
     clock = time.perf_counter()
 
     def watch(measures: Measures) -> bool:
         nonlocal clock
-        now = time.perf_counter()
-        cost = log[-1].cost if log else np.inf
-        log.append(
-            Iteration(
-                measures.cost, (cost - measures.cost) / max(abs(measures.cost), 1e-300), measures.gap,
-                max(measures.stationarity, measures.complementarity), measures.gap, measures.violation, now - clock,
-                INTERIOR,
-            )
-        )  # fmt: skip
+        now, before = time.perf_counter(), log[-1].cost if log else np.inf
+        log.append(iteration_of(measures, before, now - clock))
         clock = now
         if callback is not None:
             callback(log[-1])
         return stop.due
 
-    ended = find_duration(
-        problem, first.trajectory, tolerance=settings.final(problem), violation=settings.missed(problem), watch=watch
-    )
-    if ended is None:
+    assert problem.duration is not None
+    stated, first, best = problem.steps * problem.dt, None, None
+    for attempt in range(SHORTENED + 1 if problem.time_weight > 0 else 1):
+        tries = settings if first is None else replace(settings, max_iterations=min(TRIES, settings.max_iterations))
+        begin = _solve(settled(problem, stated), tries, each=each, threads=threads, callback=callback)
+        first = begin if first is None else first
+        if attempt and not begin.success:
+            break
+        ended = find_duration(
+            problem,
+            begin.trajectory,
+            tolerance=settings.final(problem),
+            violation=settings.missed(problem),
+            watch=watch,
+        )
+        if stop.due or ended is None or (best is not None and not ended[1].measures.cost < best[1].measures.cost):
+            break
+        best = ended
+        stated = max(SHORTER * best[0].steps * best[0].dt, problem.duration[0])
+    assert first is not None
+    if best is None:
         status = Status.TIME_LIMIT if stop.due else Status.MAX_ITERATIONS
         detail = f"no better duration than {stated:g} s was found; {first.detail}".removesuffix("; ")
         return replace(first, status=status, detail=detail, iterations=(*first.iterations, *log))
-    best, found = ended
-    n, m = first.trajectory.states.shape[1], first.trajectory.controls.shape[1]
+    ordinary, found = best
+    m, n = first.trajectory.controls.shape[1], first.trajectory.states.shape[1]
     guess = InitialGuess(
-        np.zeros((best.steps, m, n)), found.plan.controls, None, None, f"a plan of {best.steps * best.dt:.6g} s",
-        found=found, log=tuple(log),
+        np.zeros((ordinary.steps, m, n)), found.plan.controls, None, None,
+        f"a plan of {ordinary.steps * ordinary.dt:.6g} s", found=found, log=tuple(log),
     )  # fmt: skip
-    return _solve(best, replace(settings, start=guess, starts=None), each=each, callback=callback)
+    return _solve(ordinary, replace(settings, start=guess, starts=None), each=each, callback=callback)
 
 
 def _check(problem: Problem, settings: SmootherSettings) -> None:

@@ -31,7 +31,7 @@ from lqrsim.solvers import compiled, constrained
 from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import Callback, check_outcome
 from lqrsim.solvers.infeasibility import Evidence, evidence
-from lqrsim.solvers.interior_point import INTERIOR, Found, InteriorPoint, Measures, Sizes, Stages
+from lqrsim.solvers.interior_point import INTERIOR, Found, InteriorPoint, Measures, Sizes, Stages, iteration_of
 from lqrsim.solvers.multipliers import AugmentedLagrangian
 from lqrsim.solvers.restoration import Restored, restore
 
@@ -235,16 +235,11 @@ class Ladder:
 
         def watch(measures: Measures) -> bool:
             nonlocal before, clock
-            improvement = (before - measures.cost) / max(abs(measures.cost), 1e-300)
             now = time.perf_counter()
-            iteration = Iteration(
-                measures.cost, improvement, measures.gap, max(measures.stationarity, measures.complementarity),
-                measures.gap, measures.violation, now - clock, INTERIOR,
-            )  # fmt: skip
+            self._iterations += (iteration_of(measures, before, now - clock),)
             before, clock = measures.cost, now
-            self._iterations += (iteration,)
             if self._callback is not None:
-                self._callback(iteration)
+                self._callback(self._iterations[-1])
             return stop.due
 
         try:
