@@ -136,7 +136,8 @@ class Ladder:
 
     def _from_valley(self) -> AttemptResult | None:
         attempt = self._attempt
-        attempt.run(min(OPENING, attempt.settings.max_iterations), each=self._each, callback=self._callback)
+        most = min(OPENING, attempt.iterations_left(self._iterations))
+        attempt.run(most, each=self._each, callback=self._callback)
         termination = check_outcome(
             self._problem, attempt.termination, attempt.work.start, attempt.initial_guess.offset[0], refuse=self._each
         )
