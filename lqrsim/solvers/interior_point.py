@@ -40,6 +40,7 @@ ARMIJO = 1e-4  # of what a step promises, what there has to be of it
 FORCED = 6  # steps that are taken though no part of them is better
 WIDE = 1e10  # how far a product of slack and multiplier may be from the barrier's parameter
 CROSSINGS = 8  # steps without a barrier, at the end
+FINER, FINEST = 1e-2, 1e-13  # by what the tolerance falls where these are not right, and how far
 EDGE = 0.05  # how far inside of their limits controls begin, relative to their range
 
 
@@ -368,15 +369,25 @@ class InteriorPoint:
           tolerance: of stationarity, gaps and complementarity. violation: of the constraints, in their units.
           most: iterations. watch: called with the measures after each; True ends it.
         """
-        solved = self._within(tolerance, violation)
-        while not solved and self.iterations < most and np.isfinite(self.measures.cost):
+        solved, ended = self._within(tolerance, violation), False
+        while not solved and not ended and self.iterations < most and np.isfinite(self.measures.cost):
             if not self._iterate(tolerance):
                 break
             solved = self._within(tolerance, violation)
-            if watch(self.measures):
+            ended = watch(self.measures)
+        finer, found = tolerance, (self.point, self._force, self._costates, self.measures)
+        while solved and not self._cross(tolerance, violation) and not ended and finer > FINEST:
+            # Which rows press is told by a lower barrier: of a cost that is mostly constant, all else is little.
+            finer *= FINER
+            for _ in range(min(CROSSINGS, most - self.iterations)):
+                ended = not self._iterate(finer) or watch(self.measures)
+                if ended or max(self.measures.complementarity, self.measures.stationarity) < finer:
+                    break
+            ended = ended or self.iterations >= most
+            if not self._within(tolerance, violation):
+                self.point, self._force, self._costates, self.measures = found
                 break
-        if solved:
-            self._cross(tolerance, violation)
+            found = self.point, self._force, self._costates, self.measures
         return self._found(solved)
 
     def _found(self, solved: bool) -> Found:
@@ -391,8 +402,8 @@ class InteriorPoint:
             scale=self._scale,
         )  # fmt: skip
 
-    def _cross(self, tolerance: float, violation: float) -> None:
-        """Leave the barrier: rows that press are zero from now on, others do not matter; where that is right.
+    def _cross(self, tolerance: float, violation: float) -> bool:
+        """Leave the barrier: rows that press are zero from now on, others do not matter; whether that is right.
 
         So controls come to stand at their limits, and multipliers lose what the barrier added. Constraints are kept
         with as much to spare as rounding takes.
@@ -437,8 +448,12 @@ class InteriorPoint:
                 break
         found = self.measures
         right = right and found.stationarity < tolerance and found.gap < tolerance
-        if not right or not (self._elastic or found.violation <= violation):
-            self.point, self._force, self._costates, self.measures = kept
+        if right and (self._elastic or found.violation <= violation):
+            return True
+        self.point, self._force, self._costates, self.measures = kept
+        stages.linearize(self.point.plan, self._costates, self.stages.spread(self._force), 1e-10 * self._scale)
+        self._measure()
+        return False
 
     def _within(self, tolerance: float, violation: float) -> bool:
         found = self.measures
