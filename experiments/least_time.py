@@ -47,7 +47,7 @@ CASES = (
         effort=1e-3,
         share=0.9,
         longest=60.0,
-        margin=0.05,
+        margin=0.12,
         axes=((0, "x (m)"), (1, "y (m)")),
     ),
     Case(scenario="quadrotor", effort=1e-3, share=0.9, longest=20.0, margin=0.05, axes=((0, "x (m)"), (2, "z (m)"))),
