@@ -76,6 +76,8 @@ def newton_iterations(first, last, settings, model, work, memory, log):
         log[done].cost, log[done].optimality = memory.plan_cost, memory.promised
         if memory.promised < settings.tolerance and come_to_plan(settings, model, work, memory, log[done]):
             return done + 1, CONVERGED, False, -1
+        if outcome == STALLED and memory.promised < settings.tolerance:  # the rest is rounding
+            outcome = CONVERGED
         if outcome == RUNNING and done + 1 == settings.max_iterations:
             outcome = MAX_ITERATIONS
         if outcome != RUNNING:

@@ -352,7 +352,7 @@ class Problem:
         stated = self.steps * self.dt
         if not 0 < low < high or not low <= stated <= high:
             raise InputError(
-                f"duration: got {low:g} to {high:g} s, want two times above 0, and steps * dt, {stated:g} s, between them"
+                f"duration: got {low:g} to {high:g} s, want two times above 0 with steps * dt, {stated:g} s, between"
             )
         object.__setattr__(self, "duration", (low, high))
         why = ""

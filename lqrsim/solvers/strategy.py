@@ -304,9 +304,10 @@ class Ladder:
         for k, (term, numbers) in enumerate(zip(self._problem.constraint_terms, values, strict=True)):
             array, size = work.multipliers[k], found.row_size[stages.owners == k]
             array[0] = PENALTY * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
-            force = found.multipliers[k]
-            acts = term.equality | (force > array[0] * (numbers - array[3]))
-            array[declarations.HEADER :] = np.where(acts & np.isfinite(numbers), force, 0.0).ravel()
+            # Such that the augmented Lagrangian's forces, about this plan, are those that were found.
+            force = found.multipliers[k] + array[0] * np.where(np.isfinite(numbers), numbers - array[3], 0.0)
+            acts = np.isfinite(numbers) & (term.equality | (found.multipliers[k] > 0))
+            array[declarations.HEADER :] = np.where(acts, force, 0.0).ravel()
         work.plan.states[...], work.plan.controls[...] = states, controls
         work.memory["plan_cost"] = self._stages.trial(Plan(in_c_order(states), in_c_order(controls)))[0]
         lagrangian, before = AugmentedLagrangian(attempt), self._iterations
