@@ -219,6 +219,15 @@ class StageModels(NamedTuple):
     slopes: Arrays
 
 
+class StepModels(NamedTuple):
+    """What a step about a plan minimises: hessian (T+1, W, W), gradient (T+1, W), jacobian (T, N, W), gaps (T, N)."""
+
+    hessian: Arrays
+    gradient: Arrays
+    jacobian: Arrays
+    gaps: Arrays
+
+
 class Reduced(NamedTuple):
     """A step and its stage with the control eliminated by u = w - F x - h, for the dual form.
 

@@ -21,7 +21,7 @@ from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import interior_point as kernel
-from lqrsim.kernels.records import ConstraintRows, CostToGo, Limits, Plan, Policy, StageModels
+from lqrsim.kernels.records import ConstraintRows, CostToGo, Limits, Plan, Policy, StageModels, StepModels
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Iteration
 from lqrsim.solvers import compiled
@@ -234,7 +234,8 @@ class Stages:
     def direction(self, hessian: Array, gradient: Array, gaps: Array) -> bool:
         """Write the step to the minimum of models, and the costates there; whether there is one."""
         failed = self._module.direction(
-            self.steps, self.free, in_c_order(hessian), in_c_order(gradient), self.models.jacobian, in_c_order(gaps),
+            self.steps, self.free,
+            StepModels(in_c_order(hessian), in_c_order(gradient), self.models.jacobian, in_c_order(gaps)),
             Policy(self.gain, self.offset), self.to_go, self.changes,
         )  # fmt: skip
         return failed == -1

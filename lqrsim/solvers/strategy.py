@@ -206,8 +206,8 @@ class Ladder:
         there = self._rolled_out(plan, np.zeros((len(plan.controls), plan.controls.shape[1], plan.states.shape[1])))
         rows = [sizes.rows[self._stages.owners == k] for k in range(len(priced.shares))]
         found = evidence(
-            self._problem, self._attempt.work, there.states, there.controls, priced.shares, rows, self._allowed,
-            sizes.controls, sizes.states,
+            self._problem, self._attempt.work, there.states, there.controls, shares=priced.shares, sizes=rows,
+            allowed=self._allowed, control_size=sizes.controls, state_size=sizes.states,
         )  # fmt: skip
         if found is not None:
             self._evidence.append((found, self._note(there)))
