@@ -31,14 +31,19 @@ def swing(x, u, p):
 
 def power(x, u, p):
     """No more power than that, nor more effort and speed together."""
-    return [p.power - u[0] * x[1] / (p.force * p.speed), p.most - (u[0] / p.force) ** 2 - p.beside * (x[1] / p.speed) ** 2]
+    return [
+        p.power - u[0] * x[1] / (p.force * p.speed),
+        p.most - (u[0] / p.force) ** 2 - p.beside * (x[1] / p.speed) ** 2,
+    ]
 
 
 def meeting(x, u, p):
     return x[0] / p.place + p.share * x[1] / p.speed + p.bent * (x[0] / p.place) ** 2 - p.there
 
 
-def system(*, pull: float = 0.0, push: float = 1.0, drag: float = 0.0, units: Mapping[str, float] = UNITS) -> ls.Dynamics:
+def system(
+    *, pull: float = 0.0, push: float = 1.0, drag: float = 0.0, units: Mapping[str, float] = UNITS
+) -> ls.Dynamics:
     numbers = {name: units[name] for name in ("place", "speed", "force")}
     return ls.Dynamics(
         swing, states={"x": "m", "v": "m/s"}, controls={"u": "N"},
