@@ -95,6 +95,12 @@ class Ladder:
         self._given: AttemptResult | None = None
         self._valley: Plan | None = None
         self._evidence: list[tuple[Evidence, AttemptResult]] = []
+        self._without_multipliers()
+
+    def _without_multipliers(self) -> None:
+        """Have the augmented Lagrangian add nothing to the cost."""
+        for array in self._attempt.work.multipliers:
+            array[0], array[declarations.HEADER :] = 0.0, 0.0
 
     def climb(self, *, stay: bool = False) -> AttemptResult:
         """Try one after the other; with `stay`, only what begins where the first policy leads."""
@@ -114,12 +120,13 @@ class Ladder:
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
             rungs += [self._from_valley, lambda: self._at_a_price(self._valley)]
-        rungs.append(lambda: self._interior(_plan(start), MUCH))
-        rungs += [lambda: self._at_a_price(_plan(start))]
+        rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._at_a_price(_plan(start))]
         for rung in rungs:
             found = rung()
-            if found is not None and found.success and not self._worse(found):
-                break
+            if found is not None and found.success:
+                if not self._worse(found):
+                    break
+                self._best = None  # what was given is better
             if self._attempt.stop.due or not self._attempt.iterations_left(self._iterations):
                 break
         return self._answer(start)
@@ -190,15 +197,15 @@ class Ladder:
                 self._callback(self._iterations[-1])
             return stop.due
 
+        sizes = self._stages.sizes(plan)
+        if left < 1 or stop.due:
+            return None, sizes
         try:
             with np.errstate(all="ignore"):
-                sizes = self._stages.sizes(plan)
-                return restore(
-                    self._stages, plan, sizes, price=price, most=min(MOST, left), watch=watch
-                ) if left > 0 and not stop.due else None, sizes
-        except BaseException as error:
+                return restore(self._stages, plan, sizes, price=price, most=min(MOST, left), watch=watch), sizes
+        except BaseException as error:  # as above
             stop.error = error
-            return None, self._stages.sizes(plan)
+            return None, sizes
 
     def _look_for_evidence(self, priced: Restored, sizes: Sizes) -> bool:
         """Whether what is missed there is stationary; if so it is kept."""
@@ -325,7 +332,10 @@ class Ladder:
         if attempt.settings.elastic is not None and result.violation > 0:
             detail = f"elastic: {lagrangian.worst()}"
         result = replace(result, detail=detail, multipliers=lagrangian.multipliers())
-        return result if lagrangian.kept else replace(result, status=Status.MAX_ITERATIONS)
+        if result.success and lagrangian.kept:
+            return result
+        self._without_multipliers()
+        return replace(result, status=Status.MAX_ITERATIONS)
 
     def _descend(self, lagrangian: AugmentedLagrangian) -> AttemptResult:
         """Newton's method from the plan in the memory, with these multipliers."""
@@ -339,8 +349,6 @@ class Ladder:
         if self._best is None or found.rank < self._best.rank:
             law = found.law[0].copy(), found.law[1].copy()
             self._best = replace(found, states=found.states.copy(), controls=found.controls.copy(), law=law)
-            if found.success and self._attempt.work.arrays.policy.gain is not found.law[0]:
-                self._best = replace(self._best, values={})
         return found
 
     def _worse(self, found: AttemptResult) -> bool:
