@@ -41,6 +41,7 @@ FORCED = 6  # steps that are taken though no part of them is better
 WIDE = 1e10  # how far a product of slack and multiplier may be from the barrier's parameter
 CROSSINGS = 8  # steps without a barrier, at the end
 FINER, FINEST = 1e-2, 1e-13  # by what the tolerance falls where these are not right, and how far
+AT_LIMIT = 1e-9  # of its range, how far a control may be from a limit and count as at it
 EDGE = 0.05  # how far inside of their limits controls begin, relative to their range
 
 
@@ -296,6 +297,9 @@ class InteriorPoint:
         if isinstance(problem.initial, FixedState):
             fixed = stages.free == 0
             states[0, fixed] = np.asarray(problem.start)[fixed]
+        # With multipliers: the plan as it is, and what presses on it.
+        within = in_c_order(np.clip(controls, stages.low, stages.high))
+        self._warm = (Plan(in_c_order(states), within), multipliers) if multipliers else None
         plan = Plan(in_c_order(states), in_c_order(np.clip(controls, stages.low + edge, stages.high - edge)))
         self.sizes = stages.sizes(plan)
         self._state_size, self._range, self._row_size, self._typical = self.sizes
@@ -370,6 +374,9 @@ class InteriorPoint:
           tolerance: of stationarity, gaps and complementarity. violation: of the constraints, in their units.
           most: iterations. watch: called with the measures after each; True ends it.
         """
+        if self._warm is not None and self._settle(*self._warm, tolerance, violation):
+            watch(self.measures)
+            return self._found(True)
         solved, ended = self._within(tolerance, violation), False
         while not solved and not ended and self.iterations < most and np.isfinite(self.measures.cost):
             if not self._iterate(tolerance):
@@ -390,6 +397,28 @@ class InteriorPoint:
                 break
             found = self.point, self._force, self._costates, self.measures
         return self._found(solved)
+
+    def _settle(self, plan: Plan, multipliers: tuple[Array, ...], tolerance: float, violation: float) -> bool:
+        """Go on from a plan near the answer with about its multipliers, without a barrier; whether that leads there."""
+        stages, kept = self.stages, (self.point, self._force, self._costates, self.measures)
+        cost, arrived = stages.trial(plan)
+        numbers = stages.values(plan)
+        force = np.zeros(stages.live.shape)
+        for k, one in enumerate(multipliers):
+            force[:, stages.owners == k] = one
+        at_limit = (stages.owners == -1) & (numbers <= AT_LIMIT * self._row_size)
+        force[at_limit] = np.broadcast_to(AT_LIMIT * self._scale / self._row_size, force.shape)[at_limit]
+        self.point = Point(plan, cost, arrived, numbers[stages.live], kept[0].slack)
+        self._force = np.clip(force[stages.live], -self._highest, self._highest)
+        stages.linearize(plan, self._costates, stages.spread(self._force), np.inf)
+        self._costates, _ = self._adjoint()
+        if np.isfinite(cost) and self._cross(tolerance, violation):
+            self.iterations = 1
+            return True
+        self.point, self._force, self._costates, self.measures = kept
+        stages.linearize(self.point.plan, self._costates, stages.spread(self._force), 1e-10 * self._scale)
+        self._measure()
+        return False
 
     def _found(self, solved: bool) -> Found:
         stages, spread = self.stages, self.stages.spread(self._force)
