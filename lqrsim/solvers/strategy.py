@@ -265,7 +265,8 @@ class Ladder:
                     multipliers=multipliers, stages=self._stages,
                 )  # fmt: skip
                 return point.run(
-                    tolerance=self._attempt.final, violation=self._allowed, most=min(MOST, left), watch=watch
+                    tolerance=self._attempt.final, violation=self._allowed, most=min(MOST, left),
+                    near=barrier is LITTLE, watch=watch,
                 )  # fmt: skip
         except BaseException as error:  # the callback's, or Ctrl-C: raised again when there is a solution
             stop.error = error
