@@ -10,8 +10,9 @@ get over and a clearance; the paper's quadrotor, whose obstacles are a cost; and
 solvers begin with the same: controls and the states that they lead to, or for `escape` states that do not belong
 together.
 
-lqrsim            ls.smooth, its settings the default ones but for constraint_tolerance=1e-6.
-lqrsim, no finish the same with finish=None and tolerance=1e-8.
+lqrsim            ls.smooth with its default settings.
+lqrsim, no finish the same with finish=None and tolerance=1e-8: no Newton steps, and the augmented Lagrangian, with 1e-6
+                  to spare, in place of the interior point.
 ilqr              ls.ilqr with tolerance=1e-8; it keeps no constraints but the limits of the controls.
 box-FDDP          Crocoddyl's, which keeps as much.
 FATROP, IPOPT     through CasADi, with exact Hessians and a tolerance of 1e-8.
@@ -38,7 +39,7 @@ import numpy as np
 from league.contestants import CONTESTANTS, Run, Solve
 from league.problems import FAMILIES, Instance, instances
 from league.verification import VIOLATION, Verified, verify
-from paper.common import Result, Settings, opening, run, table
+from paper.common import Result, Settings, Statement, opening, run, table
 from peers import Unavailable
 from peers import versions as versions_of_peers
 from peers.shooting import Moment
@@ -172,6 +173,11 @@ def _progress(items: Sequence[Any], name: str) -> Any:
     return tqdm(items, name, leave=False, delay=2.0, position=1, disable=None)
 
 
+def statements(result: Result) -> list[Statement]:
+    """None: the paper says nothing of other solvers and constraints."""
+    return []
+
+
 def report(result: Result) -> str:
     head = (
         "problem", "solver", "instances", "solved", "at the target", "iterations", "ms", "at 1e-8", "iterations", "ms",
@@ -223,4 +229,4 @@ def _median(values: Sequence[float | None], spec: str) -> str:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, lambda result: [], __doc__)  # of the paper's statements, for it has none of this
+    run(Config, main, report, statements, __doc__)
