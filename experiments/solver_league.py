@@ -19,9 +19,10 @@ FATROP, IPOPT     through CasADi, with exact Hessians and a tolerance of 1e-8.
 
 The target is Altro.jl's published cost where a verified plan of the league costs no more, and otherwise 1.001 times the
 least cost of all verified plans, whether or not they are said to be optimal. It is reached at the first iteration with
-no higher cost and every constraint kept to 1e-6; of FATROP and IPOPT the dynamics, too. A solver whose final plan costs
-more is not asked when it was there. "To 1e-8" is by each solver's own measure of optimality, which are not the same:
-the decrease of the cost that is still promised, relative to the cost, or the residuals of the optimality conditions.
+no higher cost and every constraint kept to 1e-6; of the interior point, FATROP and IPOPT the dynamics, too. A solver
+whose final plan costs more is not asked when it was there. "To 1e-8" is by each solver's own measure of optimality,
+which are not the same: the decrease of the cost that is still promised, relative to the cost, or the residuals of the
+optimality conditions.
 
 Each plan that is returned is recomputed in NumPy, apart from all solvers: dynamics and constraints are to be kept to
 1e-6, and the cost is to be the claimed one. What is claimed but not so counts as not solved, and reaches nothing. Of
