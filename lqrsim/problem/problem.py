@@ -69,6 +69,10 @@ class Problem:
         worked out to second order about the plan. None for none.
       risk: theta, in 1/cost: with noise, minimise (1/theta) log E exp(theta cost) in place of E cost. Above 0 it shuns
         runs that cost much, below 0 it hopes for those that cost little; 0 is the expectation.
+      duration: (shortest, longest) in s: the final time is free. `dt` and `steps` say what a solve begins with, and the
+        solution has a dt of its own, with as many steps. The stage cost is still that of each step, whatever dt is.
+        None for the duration that dt and steps say.
+      time_weight: what a second of a free duration costs. It is not in the solution's cost, whose duration is settled.
 
     Raises:
       InputError: dt or steps not positive, a cost or a constraint that does not fit the dynamics, an initial or final
@@ -87,6 +91,8 @@ class Problem:
     begin: float = 0.0
     noise: Noise | None = None
     risk: float = 0.0
+    duration: tuple[float, float] | None = None
+    time_weight: float = 0.0
     _terms: dict[str, tuple[Term, ...]] = field(init=False, repr=False, compare=False)
     _constraint_terms: tuple[ConstraintTerm, ...] = field(init=False, repr=False, compare=False)
     _noise_term: NoiseTerm | None = field(init=False, repr=False, compare=False)
@@ -121,6 +127,7 @@ class Problem:
         object.__setattr__(self, "risk", check_number("risk", self.risk))
         if self.risk and self.noise is None:
             raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
+        self._check_duration()
         controls = self.dynamics.control_coordinates
         if self.control_limits is not None:
             try:
@@ -330,7 +337,33 @@ class Problem:
         if self._noise_term is not None:
             parts += [self._noise_term.source.digest, self._noise_term.data, repr((self._noise_term.filled, self.risk))]
             functions += self._noise_term.functions
+        if self.duration is not None:
+            parts.append(repr((self.duration, self.time_weight)))
         return sha256(*parts, "\n".join(function.identity for function in functions))[:16]
+
+    def _check_duration(self) -> None:
+        """Raises InputError if the duration is not as described, or a problem of its kind cannot have one."""
+        object.__setattr__(self, "time_weight", check_number("time_weight", self.time_weight, at_least=0.0))
+        if self.duration is None:
+            if self.time_weight:
+                raise InputError(f"time_weight: got {self.time_weight:g} without a duration, want duration=(low, high)")
+            return
+        low, high = check_array("duration", self.duration, (2,)).tolist()
+        stated = self.steps * self.dt
+        if not 0 < low < high or not low <= stated <= high:
+            raise InputError(
+                f"duration: got {low:g} to {high:g} s, want two times above 0 with steps * dt, {stated:g} s, between"
+            )
+        object.__setattr__(self, "duration", (low, high))
+        why = ""
+        if self.dynamics.discrete or self.dynamics.level != "symbolic":
+            why = "dynamics that are not a formula"
+        elif self.noise is not None:
+            why = "noise"
+        elif self.moving:
+            why = "obstacles that move"
+        if why:
+            raise InputError(f"duration: got {low:g} to {high:g} s beside {why}, want None, or a problem without")
 
     def _check_start_clear(self) -> None:
         """Raises InputError if the robot is in an obstacle where it starts."""

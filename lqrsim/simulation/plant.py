@@ -1,5 +1,7 @@
 """A robot in a scene: the MuJoCo model that is run, and where the robot is in it."""
 
+import copy
+import math
 from collections.abc import Iterable
 from functools import cached_property
 
@@ -51,6 +53,7 @@ class Plant:
         plant_validation.check_names(robot, scene)
         space = robot.dynamics.state_coordinates
         self.robot, self.scene = robot, scene
+        self._step: float | None = None  # s, in place of the MJCF's
         self.balls, self.places = robot.balls, None if robot.balls is None else robot.balls.bind(robot.dynamics)
         self.world = World()
         if self.places is not None and not self.places.in_plane:
@@ -76,6 +79,27 @@ class Plant:
     def timestep(self) -> float:
         return float(self.model.opt.timestep)
 
+    def for_period(self, period: float) -> "Plant":
+        """The same plant with a physics step of which a control period is a multiple: the longest up to its own.
+
+        A plan whose duration was free has a period that no MJCF foresees.
+
+        Args:
+          period: seconds, such as `solution.trajectory.dt`.
+
+        Returns:
+          A Plant.
+
+        Raises:
+          InputError: the period is no time above 0.
+        """
+        period = check_number("control period", period, above=0.0)
+        other = copy.copy(self)
+        vars(other).pop("without_contacts", None)
+        other._step = period / max(1, math.ceil(period / self.timestep - 1e-6))
+        other.model = other._compile()
+        return other
+
     def substeps(self, period: float) -> int:
         """The number of physics steps in a control period.
 
@@ -99,7 +123,8 @@ class Plant:
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise InputError(
                 f"control period: got {period:g} s, want a multiple of the physics step of scene {self.scene.name},"
-                f' {self.timestep:g} s; or set <option timestep="{period / max(round(steps), 1):.17g}"/> there'
+                f" {self.timestep:g} s: plant.for_period({period:g}); or set <option"
+                f' timestep="{period / max(round(steps), 1):.17g}"/> there'
             )
         return round(steps)
 
@@ -259,6 +284,8 @@ class Plant:
         had, has = self.scene.model, again
         if (had.ngeom, had.nbody, had.nq, had.nv, had.nu) != (has.ngeom, has.nbody, has.nq, has.nv, has.nu):
             raise InputError(f"scene {self.scene.name}: got a model that is not of its xml, want one of load_scene")
+        if self._step is not None:
+            spec.option.timestep = self._step
         geoms = {geom.id: geom for geom in spec.geoms}
         for geom, obstacle in zip(obstacle_geoms(self.scene.model), self.scene.world.obstacles, strict=True):
             geoms[geom].name = obstacle.name

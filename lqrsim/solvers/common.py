@@ -76,7 +76,7 @@ class Settings:
     tolerance: float | None
     max_iterations: int
     time_limit: float | None
-    start: StartLike
+    start: StartLike | InitialGuess
 
     def __post_init__(self) -> None:
         check_name("stop", self.stop, ("optimal", "cost"))

@@ -126,6 +126,8 @@ def _check(problem: Problem, settings: Settings) -> None:
     check_number("tolerance", settings.tolerance, above=0.0)
     if isinstance(settings.start, InitialPrior):
         raise InputError(_NO_PRIOR)
+    if problem.duration is not None:
+        raise InputError("duration: got one, want None for ilqr; smooth solves for it")
     if problem.constraints:
         raise InputError(
             "constraints: got some, want none for ilqr, which keeps the control limits only; smooth keeps them"

@@ -15,6 +15,7 @@ from lqrsim.problem.problem import Problem
 from lqrsim.solvers.workspace import Workspace
 
 STATIONARY = 5e-3  # slope that may be left, relative to what cancels
+AT_LIMIT = 1e-4  # of a control's range, which a barrier may have left, and which could lessen nothing that matters
 NAMED = 3  # constraints at most that a message names
 
 
@@ -67,8 +68,8 @@ def evidence(
     if not missed > 0:
         return None
     space = problem.control_coordinates
-    low = controls <= space.low + 1e-6 * control_size
-    high = controls >= space.high - 1e-6 * control_size
+    low = controls <= space.low + AT_LIMIT * control_size
+    high = controls >= space.high - AT_LIMIT * control_size
     total, size, pressed = 0.0, 0.0, np.zeros(m)
     ahead, own = slopes[steps, :n], alone[steps, :n]
     for t in range(steps - 1, -1, -1):

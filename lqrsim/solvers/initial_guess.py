@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -11,8 +12,11 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.hashing import sha256
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Multipliers, Trajectory
+from lqrsim.results.solution_parts import Iteration, Multipliers, Trajectory
 from lqrsim.results.value_functions import Quadratic
+
+if TYPE_CHECKING:
+    from lqrsim.solvers.interior_point import Found
 
 
 class InitialPrior:
@@ -114,6 +118,7 @@ class InitialGuess:
       summary: what a solution's options say of it.
       prior: what acts in the first iterations besides the cost.
       multipliers: of the constraints, where they are known.
+      found: what the interior point came to already, in the iterations of `log`; what is left is to look at it.
     """
 
     gain: Array
@@ -123,6 +128,8 @@ class InitialGuess:
     summary: object
     prior: InitialPrior | None = None
     multipliers: tuple[Multipliers, ...] = ()
+    found: "Found | None" = None
+    log: tuple[Iteration, ...] = ()
 
     def rolled_out(self, problem: Problem, x: Array) -> "InitialGuess":
         """With the trajectory of the policy from a state (n,): what a backward pass that comes first is about.
@@ -158,13 +165,15 @@ class InitialGuess:
         return replace(self, multipliers=tuple(Multipliers(one, penalty) for one in values))
 
 
-def resolve(start: StartLike, problem: Problem) -> InitialGuess:
+def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess:
     """The beginning that a caller asked for; by default the problem's nominal control, held.
 
     Raises:
       InputError: it does not fit the problem.
     """
     n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
+    if isinstance(start, InitialGuess):
+        return start
     if callable(start) and not isinstance(start, AffinePolicy):
         start = start(problem)
     if isinstance(start, InitialPrior):

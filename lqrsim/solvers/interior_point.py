@@ -23,9 +23,11 @@ from lqrsim.errors import Array
 from lqrsim.kernels import interior_point as kernel
 from lqrsim.kernels.records import ConstraintRows, CostToGo, Limits, Plan, Policy, StageModels
 from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.results.solution_parts import Iteration
 from lqrsim.solvers import compiled
 from lqrsim.solvers.common import INSIDE
 
+INTERIOR = "interior point"  # what its iterations are called
 MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # shares of the projected Hessian, tried in turn
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)  # on changes of controls, where not even that has a minimum; relative to the cost
 REGULARISATION = 1e-8  # of equalities, relative
@@ -56,6 +58,14 @@ class Measures(NamedTuple):
     violation: float
     gap: float
     complementarity: float
+
+
+def iteration_of(measures: Measures, before: float, seconds: float) -> Iteration:
+    """A line of the log, after one whose cost was `before`."""
+    return Iteration(
+        measures.cost, (before - measures.cost) / max(abs(measures.cost), 1e-300), measures.gap,
+        max(measures.stationarity, measures.complementarity), measures.gap, measures.violation, seconds, INTERIOR,
+    )  # fmt: skip
 
 
 @dataclass(kw_only=True)

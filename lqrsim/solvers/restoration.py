@@ -18,6 +18,7 @@ from lqrsim.solvers.interior_point import MIXES, Sizes, Stages
 
 FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # of the barrier's parameter, relative to the price; and what it falls by
 SETTLED = 0.1  # of the parameter, a promised decrease for each row below which it falls
+LAST = 1e-6  # the same of all rows at the end: shares are right to its root
 ARMIJO, SHORTEST = 1e-4, 1e-6
 INSIDE = 0.01  # of the way to a limit, what is left by a step
 EDGE = 0.01  # of the range, how far inside of the limits controls begin
@@ -108,7 +109,7 @@ def restore(
         promised = -0.5 * slope / max(abs(now), 1e-300)
         if watch(cost, missed, promised):
             break
-        if parameter <= least and (taken is None or -slope < SETTLED * parameter * len(size)):
+        if parameter <= least and (taken is None or -slope < LAST * parameter):
             settled = -slope < len(size) * parameter
             break
         if taken is None:

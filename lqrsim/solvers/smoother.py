@@ -1,6 +1,8 @@
 """Iterated LQR smoothing: Sec. V of the paper, with a safeguard for where it would fail."""
 
+import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,7 +11,7 @@ from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Status
+from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.solvers.assembly import assemble
 from lqrsim.solvers.attempt import Attempt
 from lqrsim.solvers.common import (
@@ -23,9 +25,14 @@ from lqrsim.solvers.common import (
     check_threads,
     solve_all,
 )
-from lqrsim.solvers.initial_guess import StartLike, resolve
+from lqrsim.solvers.free_duration import find_duration, settled
+from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
+from lqrsim.solvers.interior_point import Measures, iteration_of
 from lqrsim.solvers.multistart import STARTS, Search, check_starts, guides
 from lqrsim.solvers.risk import name_risk
+
+# Of a free duration: how often shorter ones are tried, by how much, and with how many iterations.
+SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 
 
 def smooth(
@@ -196,6 +203,8 @@ def _solve(
     callback: Callback | None = None,
 ) -> Solution:
     """Solve; with `each`, a look after each iteration (see `iterate`)."""
+    if problem.duration is not None:
+        return _solve_for_duration(problem, settings, each=each, threads=threads, callback=callback)
     given = [("", settings.start)] if settings.start is not None else guides(problem, settings.starts)
     start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
     first = resolve(given[0][1], problem).penalised(problem, settings.penalty)
@@ -231,6 +240,58 @@ def _solve(
     return stop.finish(solution)
 
 
+def _solve_for_duration(
+    problem: Problem, settings: SmootherSettings, *, each: bool, threads: int, callback: Callback | None
+) -> Solution:
+    """Solve for the stated duration, then for the best one near that, and then to the end with it.
+
+    Where time costs, shorter durations are tried, too, for they may lead another way round.
+    """
+    stop, log = settings.stop_early(), list[Iteration]()
+    clock = time.perf_counter()
+
+    def watch(measures: Measures) -> bool:
+        nonlocal clock
+        now, before = time.perf_counter(), log[-1].cost if log else np.inf
+        log.append(iteration_of(measures, before, now - clock))
+        clock = now
+        if callback is not None:
+            callback(log[-1])
+        return stop.due
+
+    assert problem.duration is not None
+    stated, first, best = problem.steps * problem.dt, None, None
+    for attempt in range(SHORTENED + 1 if problem.time_weight > 0 else 1):
+        tries = settings if first is None else replace(settings, max_iterations=min(TRIES, settings.max_iterations))
+        begin = _solve(settled(problem, stated), tries, each=each, threads=threads, callback=callback)
+        first = begin if first is None else first
+        if attempt and not begin.success:
+            break
+        ended = find_duration(
+            problem,
+            begin.trajectory,
+            tolerance=settings.final(problem),
+            violation=settings.missed(problem),
+            watch=watch,
+        )
+        if stop.due or ended is None or (best is not None and not ended[1].measures.cost < best[1].measures.cost):
+            break
+        best = ended
+        stated = max(SHORTER * best[0].steps * best[0].dt, problem.duration[0])
+    assert first is not None
+    if best is None:
+        status = Status.TIME_LIMIT if stop.due else Status.MAX_ITERATIONS
+        detail = f"no better duration than {stated:g} s was found; {first.detail}".removesuffix("; ")
+        return replace(first, status=status, detail=detail, iterations=(*first.iterations, *log))
+    ordinary, found = best
+    m, n = first.trajectory.controls.shape[1], first.trajectory.states.shape[1]
+    guess = InitialGuess(
+        np.zeros((ordinary.steps, m, n)), found.plan.controls, None, None,
+        f"a plan of {ordinary.steps * ordinary.dt:.6g} s", found=found, log=tuple(log),
+    )  # fmt: skip
+    return _solve(ordinary, replace(settings, start=guess, starts=None), each=each, callback=callback)
+
+
 def _check(problem: Problem, settings: SmootherSettings) -> None:
     check_problem(problem)
     if settings.elastic is not None and not (problem.constraints and settings.newton(problem)):
@@ -243,6 +304,8 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
             )
             raise InputError(f"elastic: got {settings.elastic:g}, want {why} beside it")
         raise InputError(f"elastic: got {settings.elastic:g} for a problem without constraints, want None")
+    if problem.duration is not None and not settings.newton(problem):
+        raise InputError('duration: got one without the interior point, want finish="newton" and stop="optimal"')
     several = settings.start is None and len(problem.obstacle_costs) > 0
     check_attempts(problem, settings.starts or (STARTS if several else 1))
     if settings.form == "primal" and problem.dynamics.discrete:

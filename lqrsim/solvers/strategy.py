@@ -31,7 +31,7 @@ from lqrsim.solvers import compiled, constrained
 from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import Callback, check_outcome
 from lqrsim.solvers.infeasibility import Evidence, evidence
-from lqrsim.solvers.interior_point import Found, InteriorPoint, Measures, Sizes, Stages
+from lqrsim.solvers.interior_point import INTERIOR, Found, InteriorPoint, Measures, Sizes, Stages, iteration_of
 from lqrsim.solvers.multipliers import AugmentedLagrangian
 from lqrsim.solvers.restoration import Restored, restore
 
@@ -39,7 +39,7 @@ FAR = 100.0  # times what may be missed: then the price is too low, or there is 
 STARTS = 2  # from which what is missed has to be stationary, before that is called infeasible
 OPENING = 10  # iterations of smoothing at most, before constraints come in
 MOST = 150  # of the interior point from one plan
-INTERIOR, RESTORATION = "interior point", "restoration"  # what iterations are called
+RESTORATION = "restoration"  # what its iterations are called
 MUCH, LITTLE = (1.0, 0.02), (0.01, 0.01)  # barrier and room of a first plan, and of one that is near to the answer
 PRICES = (1e2, 1e4)  # of missing a constraint by its size, relative to the cost
 PENALTY = 8.0  # of the augmented Lagrangian that holds the policy to the constraints, in the same unit
@@ -49,6 +49,8 @@ AT_LIMIT = 1e-9  # of its range, within which a control that presses against its
 
 def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
     """Run an attempt to its end, certified."""
+    if attempt.initial_guess.found is not None:
+        return Ladder(attempt, each=each, callback=callback).climb()
     if not attempt.problem.constraints:
         return attempt.certified(_without_constraints(attempt, each=each, callback=callback))
     if not attempt.newton:
@@ -88,7 +90,7 @@ class Ladder:
         clock = time.perf_counter()
         self._stages = Stages(attempt.problem)
         attempt.stop.deadline += time.perf_counter() - clock  # compiling does not count
-        self._iterations: tuple[Iteration, ...] = ()
+        self._iterations: tuple[Iteration, ...] = attempt.initial_guess.log
         self._best: AttemptResult | None = None
         self._given: AttemptResult | None = None
         self._valley: Plan | None = None
@@ -102,6 +104,8 @@ class Ladder:
         if given and start.violation <= self._allowed:
             self._given = start  # never left behind
         rungs: list[Callable[[], AttemptResult | None]] = []
+        if guess.found is not None:
+            rungs.append(lambda: self._answered(guess.found))
         if guess.multipliers and any(one.values.any() for one in guess.multipliers):
             known = tuple(one.values for one in guess.multipliers)
             rungs.append(lambda: self._interior(_plan(start), LITTLE, multipliers=known))
@@ -132,7 +136,8 @@ class Ladder:
 
     def _from_valley(self) -> AttemptResult | None:
         attempt = self._attempt
-        attempt.run(min(OPENING, attempt.settings.max_iterations), each=self._each, callback=self._callback)
+        most = min(OPENING, attempt.iterations_left(self._iterations))
+        attempt.run(most, each=self._each, callback=self._callback)
         termination = check_outcome(
             self._problem, attempt.termination, attempt.work.start, attempt.initial_guess.offset[0], refuse=self._each
         )
@@ -212,7 +217,10 @@ class Ladder:
         self, plan: Plan, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()
     ) -> AttemptResult | None:
         """The interior point from a plan, and what becomes of it."""
-        found = self._run(plan, barrier, multipliers=multipliers)
+        return self._answered(self._run(plan, barrier, multipliers=multipliers))
+
+    def _answered(self, found: Found | None) -> AttemptResult | None:
+        """What becomes of what the interior point came to."""
         if found is None or not np.isfinite(found.plan.states).all():
             return None
         if found.solved and (result := self._kept(found)) is not None and result.success:
@@ -228,16 +236,11 @@ class Ladder:
 
         def watch(measures: Measures) -> bool:
             nonlocal before, clock
-            improvement = (before - measures.cost) / max(abs(measures.cost), 1e-300)
             now = time.perf_counter()
-            iteration = Iteration(
-                measures.cost, improvement, measures.gap, max(measures.stationarity, measures.complementarity),
-                measures.gap, measures.violation, now - clock, INTERIOR,
-            )  # fmt: skip
+            self._iterations += (iteration_of(measures, before, now - clock),)
             before, clock = measures.cost, now
-            self._iterations += (iteration,)
             if self._callback is not None:
-                self._callback(iteration)
+                self._callback(self._iterations[-1])
             return stop.due
 
         try:
@@ -301,9 +304,10 @@ class Ladder:
         for k, (term, numbers) in enumerate(zip(self._problem.constraint_terms, values, strict=True)):
             array, size = work.multipliers[k], found.row_size[stages.owners == k]
             array[0] = PENALTY * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
-            force = found.multipliers[k]
-            acts = term.equality | (force > array[0] * (numbers - array[3]))
-            array[declarations.HEADER :] = np.where(acts & np.isfinite(numbers), force, 0.0).ravel()
+            # Such that the augmented Lagrangian's forces, about this plan, are those that were found.
+            force = found.multipliers[k] + array[0] * np.where(np.isfinite(numbers), numbers - array[3], 0.0)
+            acts = np.isfinite(numbers) & (term.equality | (found.multipliers[k] > 0))
+            array[declarations.HEADER :] = np.where(acts, force, 0.0).ravel()
         work.plan.states[...], work.plan.controls[...] = states, controls
         work.memory["plan_cost"] = self._stages.trial(Plan(in_c_order(states), in_c_order(controls)))[0]
         lagrangian, before = AugmentedLagrangian(attempt), self._iterations
@@ -349,7 +353,7 @@ class Ladder:
         best = start if self._best is None else self._best
         if self._given is not None and self._worse(best):
             best = self._given
-        if not best.success:
+        if not best.success and self._problem.constraints:
             lagrangian = AugmentedLagrangian(attempt)
             lagrangian.evaluate(best.states, best.controls)
             status, detail = Status.MAX_ITERATIONS, lagrangian.worst()
