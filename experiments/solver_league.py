@@ -32,9 +32,13 @@ those of calls through CasADi, their functions compiled from C, which takes a wh
 evaluated in CasADi. What is not installed is left out, and named.
 """
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+if __name__ == "__main__":  # before NumPy looks: times are on one thread
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
 
 import numpy as np
 from league.contestants import CONTESTANTS, Run, Solve
