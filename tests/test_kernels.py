@@ -41,6 +41,7 @@ from lqrsim.kernels import (
     declarations,
     estimation,
     exponential,
+    interior_point,
     iterations,
     linear_algebra,
     mjcf_dynamics,
@@ -71,6 +72,7 @@ from lqrsim.kernels.records import (
     Smoothing,
     Stage,
     Step,
+    StepModels,
 )
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.kernels.records import Settings as KernelSettings
@@ -82,6 +84,7 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.attempt import Attempt
 from lqrsim.solvers.common import SmootherSettings, Stop
 from lqrsim.solvers.initial_guess import resolve
+from lqrsim.solvers.interior_point import Stages
 
 MEMORY = 1 << 20  # numbers from which an array is memory at an address, which has no end
 MADE: dict[Any, tuple[Loaded, Entry]] = {}  # what was compiled, by all that it depends on
@@ -1008,6 +1011,46 @@ class TestControl:
         replay(source, SIZES, "slopes_along", *given, np.zeros((k, 3)), np.zeros((k, 3, 5)))
         which, changes = np.array([0.0]), np.array([1e-5])
         replay(source, SIZES, "parameter_slopes", *given, which, changes, np.zeros((k, 3, 1)))
+
+
+class TestInteriorPoint:
+    """What an iteration takes of a problem, and the step that it makes."""
+
+    def test_models_steps_and_where_they_lead(self) -> None:
+        """From a soft start, with constraints that bend; the plan is no motion."""
+        rng = np.random.default_rng(0)
+        kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState([1.4], states=("x",))]
+        one = problem(steps=3, constraints=kept)
+        stages, source = Stages(one), source_of(interior_point)
+        plan = Plan(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
+        multipliers = rng.uniform(0.1, 1.0, size=stages.live.size)
+        rows = stages._rows._replace(least=0.0, support=np.ones((len(stages.owners), 5)), multipliers=multipliers)
+        begun = 3, 1, plan
+        replay(source, SIZES, "models", *begun, rng.normal(size=(4, 3)), stages._model, rows, stages.models)
+        replay(source, SIZES, "trial", *begun, stages._model, np.zeros((3, 3)))
+        gradient, jacobian = stages.models.gradient, stages.models.jacobian
+        replay(source, SIZES, "adjoint", 3, gradient, jacobian, np.zeros((4, 3)), np.zeros((3, 2)))
+        policy = Policy(np.zeros((3, 2, 3)), np.zeros((3, 2)))
+        to_go = CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4))
+        changes = Plan(np.zeros((4, 3)), np.zeros((3, 2)))
+        gaps = 0.1 * rng.normal(size=(3, 3))
+
+        def direction(hessian: Array, free: float = 1.0) -> int:
+            models = StepModels(hessian, gradient, jacobian, gaps)
+            return replay(source, SIZES, "direction", 3, np.full(3, free), models, policy, to_go, changes)
+
+        convex = stages.models.convex + np.eye(5)
+        assert direction(convex) == direction(convex, 0.0) == -1
+        assert changes.states.any()
+        limits = Limits(plan.controls - 0.1, plan.controls + 0.1)
+        out = Plan(np.zeros((4, 3)), np.zeros((3, 2)))
+        replay(source, SIZES, "follow", 3, 0.5, plan, policy, limits, stages._model, out)
+        bent = convex.copy()
+        bent[2, 3:, 3:] -= 1e4 * np.eye(2)
+        assert direction(bent) == 2  # the controls of that step have no least
+        bent = convex.copy()
+        bent[0, :3, :3] -= 1e6 * np.eye(3)
+        assert direction(bent) == 4  # nor has the start
 
 
 def test_no_kernel_is_left_out() -> None:

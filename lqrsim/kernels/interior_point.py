@@ -77,23 +77,20 @@ def constraint_models(x, u, t, steps, constraints, rows, out):
             for i in range(W):
                 out.slopes[at, i] = slope[i]
             if acts and abs(rows.multipliers[at]) > rows.least:
-                subtract_curvature(
-                    k, row, x, u, t, constraints, rows.support[place], rows.multipliers[at], out.hessian[t]
-                )
+                subtract_curvature(k, row, x, u, t, constraints, rows, out.hessian[t])
 
 
-def subtract_curvature(k, row, x, u, t, constraints, support, weight, hessian):
-    """Subtract the Hessian of one of a constraint's numbers times a weight: differences of its slope.
-
-    `support` (W,) is 0 for entries that it does not depend on.
-    """
+def subtract_curvature(k, row, x, u, t, constraints, rows, hessian):
+    """Subtract the Hessian of one of a constraint's numbers times its multiplier: differences of its slope."""
+    place = int(rows.first[k]) + row
+    weight = rows.multipliers[rows.size * t + place]
     y, v, ahead, behind = stack(N), stack(M), stack(W), stack(W)
     for i in range(N):
         y[i] = x[i]
     for i in range(M):
         v[i] = u[i]
     for j in range(W):
-        if support[j] == 0:
+        if rows.support[place, j] == 0:
             continue
         z = x[j] if j < N else u[j - N]
         far = STEP * max(1.0, abs(z))
@@ -145,34 +142,34 @@ def adjoint(steps, gradient, jacobian, costates, slopes):
                 slopes[t, j - N] = total
 
 
-def direction(steps, free, hessian, gradient, jacobian, gaps, policy, to_go, changes):
+def direction(steps, free, models, policy, to_go, changes):
     """The step to the minimum of the stages' models, the gaps closed: a Riccati recursion, and where it leads.
 
     Args:
-      free: (N,) 0 for the states that the start fixes. hessian, gradient, jacobian: (T+1, W, W), (T+1, W), (T, N, W).
-      gaps: (T, N). policy: gets the gains, and the changes of controls where states do not change. to_go: gets the
-        cost-to-go of changes; its gradients are the costates where the step leads. changes: gets those of the plan.
+      free: (N,) 0 for the states that the start fixes. models: `records.StepModels`.
+      policy: gets the gains, and the changes of controls where states do not change. to_go: gets the cost-to-go of
+        changes; its gradients are the costates where the step leads. changes: gets those of the plan.
 
     Returns:
       The step whose control block is not positive definite, steps + 1 where it is the start's, or else -1.
     """
     stage, slope, ahead, least = stack(W, W), stack(W), stack(N), stack(M)
     for i in range(N):
-        to_go.gradient[steps, i] = gradient[steps, i]
+        to_go.gradient[steps, i] = models.gradient[steps, i]
         for j in range(N):
-            to_go.hessian[steps, i, j] = hessian[steps, i, j]
+            to_go.hessian[steps, i, j] = models.hessian[steps, i, j]
     for t in range(steps - 1, -1, -1):
         for i in range(W):
-            slope[i] = gradient[t, i]
+            slope[i] = models.gradient[t, i]
             for j in range(W):
-                stage[i, j] = hessian[t, i, j]
+                stage[i, j] = models.hessian[t, i, j]
         for i in range(M):
             least[i] = TINY * abs(stage[N + i, N + i])
         for i in range(N):
             ahead[i] = to_go.gradient[t + 1, i]
             for j in range(N):
-                ahead[i] += to_go.hessian[t + 1, i, j] * gaps[t, j]
-        congruence(jacobian[t], to_go.hessian[t + 1], ahead, stage, slope)
+                ahead[i] += to_go.hessian[t + 1, i, j] * models.gaps[t, j]
+        congruence(models.jacobian[t], to_go.hessian[t + 1], ahead, stage, slope)
         if not definite(stage, least):
             return t
         if minimize_control(stage, slope, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]) < 0:
@@ -186,11 +183,11 @@ def direction(steps, free, hessian, gradient, jacobian, gaps, policy, to_go, cha
                 total += policy.gain[t, i, j] * changes.states[t, j]
             changes.controls[t, i] = total
         for i in range(N):
-            total = gaps[t, i]
+            total = models.gaps[t, i]
             for j in range(N):
-                total += jacobian[t, i, j] * changes.states[t, j]
+                total += models.jacobian[t, i, j] * changes.states[t, j]
             for j in range(M):
-                total += jacobian[t, i, N + j] * changes.controls[t, j]
+                total += models.jacobian[t, i, N + j] * changes.controls[t, j]
             changes.states[t + 1, i] = total
     for t in range(steps + 1):
         for i in range(N):

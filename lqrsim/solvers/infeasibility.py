@@ -36,7 +36,7 @@ class Evidence:
 
 
 def evidence(
-    problem: Problem, work: Workspace, states: Array, controls: Array, shares: list[Array], sizes: list[Array],
+    problem: Problem, work: Workspace, states: Array, controls: Array, *, shares: list[Array], sizes: list[Array],
     allowed: float, control_size: Array, state_size: Array,
 ) -> Evidence | None:  # fmt: skip
     """The evidence that a plan is, or None.

@@ -21,7 +21,7 @@ from lqrsim.codegen.compiled_module import in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import interior_point as kernel
-from lqrsim.kernels.records import ConstraintRows, CostToGo, Limits, Plan, Policy, StageModels
+from lqrsim.kernels.records import ConstraintRows, CostToGo, Limits, Plan, Policy, StageModels, StepModels
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Iteration
 from lqrsim.solvers import compiled
@@ -40,6 +40,8 @@ ARMIJO = 1e-4  # of what a step promises, what there has to be of it
 FORCED = 6  # steps that are taken though no part of them is better
 WIDE = 1e10  # how far a product of slack and multiplier may be from the barrier's parameter
 CROSSINGS = 8  # steps without a barrier, at the end
+FINER, FINEST = 1e-2, 1e-13  # by what the tolerance falls where these are not right, and how far
+AT_LIMIT = 1e-9  # of its range, how far a control may be from a limit and count as at it
 EDGE = 0.05  # how far inside of their limits controls begin, relative to their range
 
 
@@ -233,7 +235,8 @@ class Stages:
     def direction(self, hessian: Array, gradient: Array, gaps: Array) -> bool:
         """Write the step to the minimum of models, and the costates there; whether there is one."""
         failed = self._module.direction(
-            self.steps, self.free, in_c_order(hessian), in_c_order(gradient), self.models.jacobian, in_c_order(gaps),
+            self.steps, self.free,
+            StepModels(in_c_order(hessian), in_c_order(gradient), self.models.jacobian, in_c_order(gaps)),
             Policy(self.gain, self.offset), self.to_go, self.changes,
         )  # fmt: skip
         return failed == -1
@@ -294,6 +297,9 @@ class InteriorPoint:
         if isinstance(problem.initial, FixedState):
             fixed = stages.free == 0
             states[0, fixed] = np.asarray(problem.start)[fixed]
+        # With multipliers: the plan as it is, and what presses on it.
+        within = in_c_order(np.clip(controls, stages.low, stages.high))
+        self._warm = (Plan(in_c_order(states), within), multipliers) if multipliers else None
         plan = Plan(in_c_order(states), in_c_order(np.clip(controls, stages.low + edge, stages.high - edge)))
         self.sizes = stages.sizes(plan)
         self._state_size, self._range, self._row_size, self._typical = self.sizes
@@ -368,16 +374,51 @@ class InteriorPoint:
           tolerance: of stationarity, gaps and complementarity. violation: of the constraints, in their units.
           most: iterations. watch: called with the measures after each; True ends it.
         """
-        solved = self._within(tolerance, violation)
-        while not solved and self.iterations < most and np.isfinite(self.measures.cost):
+        if self._warm is not None and self._settle(*self._warm, tolerance, violation):
+            watch(self.measures)
+            return self._found(True)
+        solved, ended = self._within(tolerance, violation), False
+        while not solved and not ended and self.iterations < most and np.isfinite(self.measures.cost):
             if not self._iterate(tolerance):
                 break
             solved = self._within(tolerance, violation)
-            if watch(self.measures):
+            ended = watch(self.measures)
+        finer, found = tolerance, (self.point, self._force, self._costates, self.measures)
+        while solved and not self._cross(tolerance, violation) and not ended and finer > FINEST:
+            # Which rows press is told by a lower barrier: of a cost that is mostly constant, all else is little.
+            finer *= FINER
+            for _ in range(min(CROSSINGS, most - self.iterations)):
+                ended = not self._iterate(finer) or watch(self.measures)
+                if ended or max(self.measures.complementarity, self.measures.stationarity) < finer:
+                    break
+            ended = ended or self.iterations >= most
+            if not self._within(tolerance, violation):
+                self.point, self._force, self._costates, self.measures = found
                 break
-        if solved:
-            self._cross(tolerance, violation)
+            found = self.point, self._force, self._costates, self.measures
         return self._found(solved)
+
+    def _settle(self, plan: Plan, multipliers: tuple[Array, ...], tolerance: float, violation: float) -> bool:
+        """Go on from a plan near the answer with about its multipliers, without a barrier; whether that leads there."""
+        stages, kept = self.stages, (self.point, self._force, self._costates, self.measures)
+        cost, arrived = stages.trial(plan)
+        numbers = stages.values(plan)
+        force = np.zeros(stages.live.shape)
+        for k, one in enumerate(multipliers):
+            force[:, stages.owners == k] = one
+        at_limit = (stages.owners == -1) & (numbers <= AT_LIMIT * self._row_size)
+        force[at_limit] = np.broadcast_to(AT_LIMIT * self._scale / self._row_size, force.shape)[at_limit]
+        self.point = Point(plan, cost, arrived, numbers[stages.live], kept[0].slack)
+        self._force = np.clip(force[stages.live], -self._highest, self._highest)
+        stages.linearize(plan, self._costates, stages.spread(self._force), np.inf)
+        self._costates, _ = self._adjoint()
+        if np.isfinite(cost) and self._cross(tolerance, violation):
+            self.iterations = 1
+            return True
+        self.point, self._force, self._costates, self.measures = kept
+        stages.linearize(self.point.plan, self._costates, stages.spread(self._force), 1e-10 * self._scale)
+        self._measure()
+        return False
 
     def _found(self, solved: bool) -> Found:
         stages, spread = self.stages, self.stages.spread(self._force)
@@ -391,8 +432,8 @@ class InteriorPoint:
             scale=self._scale,
         )  # fmt: skip
 
-    def _cross(self, tolerance: float, violation: float) -> None:
-        """Leave the barrier: rows that press are zero from now on, others do not matter; where that is right.
+    def _cross(self, tolerance: float, violation: float) -> bool:
+        """Leave the barrier: rows that press are zero from now on, others do not matter; whether that is right.
 
         So controls come to stand at their limits, and multipliers lose what the barrier added. Constraints are kept
         with as much to spare as rounding takes.
@@ -437,8 +478,12 @@ class InteriorPoint:
                 break
         found = self.measures
         right = right and found.stationarity < tolerance and found.gap < tolerance
-        if not right or not (self._elastic or found.violation <= violation):
-            self.point, self._force, self._costates, self.measures = kept
+        if right and (self._elastic or found.violation <= violation):
+            return True
+        self.point, self._force, self._costates, self.measures = kept
+        stages.linearize(self.point.plan, self._costates, self.stages.spread(self._force), 1e-10 * self._scale)
+        self._measure()
+        return False
 
     def _within(self, tolerance: float, violation: float) -> bool:
         found = self.measures

@@ -1,0 +1,135 @@
+"""A final time that is free: closed forms, differences in the duration, and other solves of the settled problem."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lqrsim as ls
+from lqrsim.results.solution_parts import Status
+from lqrsim.solvers.free_duration import settled
+
+
+def cart(x: Any, u: Any, p: Any) -> list[Any]:
+    return [x[1], p.push * u[0]]
+
+
+def problem(
+    *, way: float = 1.0, push: float = 1.0, steps: int = 20, weight: float = 1e-6, **options: Any
+) -> ls.Problem:
+    dynamics = ls.Dynamics(
+        cart, states={"x": "m", "v": "m/s"}, controls={"push": ""}, parameters={"push": push}, control_limits=(-1, 1)
+    )
+    told: dict[str, Any] = {"duration": (0.1, 20.0), "time_weight": 1.0} | options
+    return ls.Problem(
+        dynamics=dynamics, dt=4.0 / steps, steps=steps, initial=ls.FixedState([0.0, 0.0]),
+        stage_cost=ls.ControlCost([weight]), final_cost=ls.QuadraticCost([0.0, 0.0], about=[way, 0.0]),
+        constraints=[ls.GoalState([way, 0.0])], **told,
+    )  # fmt: skip
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(0.1, 5.0), st.floats(0.3, 3.0), st.integers(5, 20))
+def test_a_cart_pushes_and_brakes_for_half_of_the_way_each(way: float, push: float, half: int) -> None:
+    """The least time is 2 sqrt(way / push); an even number of steps can have the switch where it belongs.
+
+    Next to nothing for the control changes it by less than a part in a million.
+    """
+    solution = ls.smooth(problem(way=way, push=push, steps=2 * half))
+    assert solution.status is Status.CONVERGED
+    assert solution.trajectory.horizon == pytest.approx(2 * np.sqrt(way / push), rel=1e-6)
+    expected = np.repeat([1.0, -1.0], half)
+    np.testing.assert_allclose(solution.trajectory.controls[:, 0], expected, atol=1e-6)
+
+
+def test_a_control_that_costs_nothing_stands_at_its_limits() -> None:
+    free = dataclasses.replace(problem(), stage_cost=ls.SymbolicCost(lambda x, u, p: 1e-12 * x[0] ** 2, convex=True))
+    solution = ls.smooth(free)
+    assert solution.status is Status.CONVERGED
+    assert solution.trajectory.horizon == pytest.approx(2.0, rel=1e-9)
+    np.testing.assert_array_equal(np.abs(solution.trajectory.controls), 1.0)
+
+
+@pytest.mark.parametrize("price", [5.0, 20.0])
+def test_no_other_duration_costs_less(price: float) -> None:
+    """A pendulum, swung up: costs of neighbouring durations, each solved on its own, are higher, and rise as a square."""
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [x[1], -9.81 * _sine(x[0]) + u[0]], states={"angle": "rad", "rate": "rad/s"},
+        controls={"torque": "N m"}, control_limits=(-12, 12),
+    )  # fmt: skip
+    free = ls.Problem(
+        dynamics=dynamics, dt=0.05, steps=40, initial=ls.FixedState([0.0, 0.0]), stage_cost=ls.ControlCost([0.05]),
+        final_cost=ls.QuadraticCost([0.0, 0.0], about=[np.pi, 0.0]), constraints=[ls.GoalState([np.pi, 0.0])],
+        duration=(0.3, 8.0), time_weight=price,
+    )  # fmt: skip
+    solution = ls.smooth(free)
+    assert solution.status is Status.CONVERGED
+    best, plan = solution.trajectory.horizon, solution.trajectory
+    costs = []
+    for share in (0.998, 1.0, 1.002):
+        other = settled(free, share * best)
+        found = ls.smooth(other, start=ls.Trajectory(plan.states, plan.controls, other.dt))
+        assert found.status is Status.CONVERGED
+        costs.append(found.cost + price * share * best)
+    low, here, high = costs
+    assert min(low, high) > here
+    # Its slope is next to nothing beside its curvature over such a step.
+    assert abs(high - low) < 0.2 * (high + low - 2 * here)
+    assert here == pytest.approx(solution.cost + price * best, rel=1e-9)
+
+
+def _sine(angle: Any) -> Any:
+    from sympy import sin
+
+    return sin(angle)
+
+
+def test_a_duration_ends_at_its_bound() -> None:
+    solution = ls.smooth(problem(duration=(3.0, 5.0)))
+    assert solution.trajectory.horizon == pytest.approx(3.0, abs=1e-7)
+    solution = ls.smooth(problem(weight=1.0, duration=(1.0, 5.0), time_weight=0.0))
+    assert solution.trajectory.horizon == pytest.approx(5.0, abs=1e-6)
+
+
+def test_the_policy_runs_with_the_period_of_the_plan(differential_drive: ls.Scenario) -> None:
+    stated = differential_drive.problem
+    free = dataclasses.replace(stated, duration=(5.0, 60.0), time_weight=1.0, constraints=[ls.GoalState(stated.goal)])
+    solution = ls.smooth(free)
+    assert solution.status is Status.CONVERGED
+    plan = solution.trajectory
+    assert solution.policy.dt == plan.dt
+    plant = differential_drive.plant()
+    with pytest.raises(ls.InputError, match=r"plant\.for_period"):
+        ls.simulate(plant, solution)
+    fitting = plant.for_period(plan.dt)
+    assert fitting.timestep <= plant.timestep
+    assert plan.dt / fitting.timestep == pytest.approx(fitting.substeps(plan.dt), rel=1e-12)
+    assert ls.simulate(fitting, solution, seed=0).outcome[0] == "reached"
+    assert plant.for_period(4 * plant.timestep).timestep == pytest.approx(plant.timestep, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"duration": (5.0, 6.0)}, "between"),
+        ({"duration": (0.0, 6.0)}, "above 0"),
+        ({"duration": None}, "time_weight: got 1 without a duration"),
+        ({"time_weight": -1.0}, "time_weight"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ls.InputError, match=said):
+        problem(**changes)
+
+
+def test_solvers_that_cannot_free_it_say_so() -> None:
+    free = problem()
+    with pytest.raises(ls.InputError, match="duration"):
+        ls.ilqr(dataclasses.replace(free, constraints=()))
+    with pytest.raises(ls.InputError, match="duration"):
+        ls.prepare(free)
+    with pytest.raises(ls.InputError, match="duration"):
+        ls.smooth(free, finish=None)
