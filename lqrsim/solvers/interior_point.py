@@ -300,6 +300,7 @@ class InteriorPoint:
         self.sizes = stages.sizes(plan)
         self._state_size, self._range, self._row_size, self._typical = self.sizes
         self._rows_of(plan, barrier, room, price, multipliers)
+        self._known = len(multipliers) > 0  # then which rows press may be known, too
         self.iterations, self.gain = 0, stages.gain
         self._filter: list[tuple[float, float]] = []
         self._mixed, self._part, self._forced = False, 1.0, 0
@@ -370,6 +371,8 @@ class InteriorPoint:
           tolerance: of stationarity, gaps and complementarity. violation: of the constraints, in their units.
           most: iterations. watch: called with the measures after each; True ends it.
         """
+        if self._known and self._cross(tolerance, violation):
+            return self._found(True)
         solved, ended = self._within(tolerance, violation), False
         while not solved and not ended and self.iterations < most and np.isfinite(self.measures.cost):
             if not self._iterate(tolerance):

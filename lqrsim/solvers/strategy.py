@@ -107,7 +107,7 @@ class Ladder:
         guess = self._attempt.initial_guess
         start = self._start()
         given = guess.trajectory is not None or guess.gain.any() or stay
-        if given and start.violation <= self._allowed:
+        if (given or self._attempt.settings.start is not None) and start.violation <= self._allowed:
             self._given = start  # never left behind
         rungs: list[Callable[[], AttemptResult | None]] = []
         if guess.found is not None:
@@ -353,19 +353,19 @@ class Ladder:
 
     def _worse(self, found: AttemptResult) -> bool:
         """Whether a plan costs more than one that was given and keeps the constraints."""
-        return self._given is not None and found.cost > self._given.cost * (1 + 1e-9) + 1e-12
+        return self._given is not None and found.cost > self._given.cost + 1e-9 * abs(self._given.cost) + 1e-12
 
     def _answer(self, start: AttemptResult) -> AttemptResult:
         """The best of all, certified."""
         attempt = self._attempt
         best = start if self._best is None else self._best
-        if self._given is not None and self._worse(best):
+        if self._given is not None and (best.violation > self._allowed or self._worse(best)):
             best = self._given
         if not best.success and self._problem.constraints:
             lagrangian = AugmentedLagrangian(attempt)
             lagrangian.evaluate(best.states, best.controls)
             status, detail = Status.MAX_ITERATIONS, lagrangian.worst()
-            if len(self._evidence) >= STARTS:
+            if len(self._evidence) >= STARTS and best.violation > self._allowed:
                 least, best = min(self._evidence, key=lambda pair: pair[0].missed)
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()
