@@ -95,7 +95,8 @@ class Ladder:
         self._given: AttemptResult | None = None
         self._valley: Plan | None = None
         self._evidence: list[tuple[Evidence, AttemptResult]] = []
-        self._without_multipliers()
+        if attempt.settings.penalty is None:
+            self._without_multipliers()
 
     def _without_multipliers(self) -> None:
         """Have the augmented Lagrangian add nothing to the cost."""
