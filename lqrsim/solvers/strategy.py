@@ -386,7 +386,7 @@ class Ladder:
             lagrangian = AugmentedLagrangian(attempt)
             lagrangian.evaluate(best.states, best.controls)
             status, detail = Status.MAX_ITERATIONS, lagrangian.worst()
-            if len(self._evidence) >= STARTS:
+            if len(self._evidence) >= STARTS and best.violation > self._allowed:
                 least, best = min(self._evidence, key=lambda pair: pair[0].missed)
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()
