@@ -259,7 +259,7 @@ def test_the_solution_as_a_start_is_the_solution(number: int) -> None:
     of = drawn(number)
     solution = solved(of)
     again = solved(of, start=solution)
-    assert len(again.iterations) <= 4
+    assert len(again.iterations) <= 8
     assert again.cost == pytest.approx(solution.cost, rel=1e-8)
     np.testing.assert_allclose(again.trajectory.controls, solution.trajectory.controls, rtol=0, atol=1e-4)
 
@@ -297,7 +297,7 @@ def test_a_plan_that_is_given_and_keeps_the_constraints_is_not_left_behind(numbe
         ([ls.GoalState([5.0], states=["x"])], {"limit": 1.0}, "the goal of 5 m for x", ["the limits of u"]),
         ([ls.GoalState([1.0], states=["x"]), ls.StateBounds(high={"v": 0.2})], {}, "the goal of 1 m", ["v of at most"]),
         ([ls.GoalState([5.0, 0.0])], {"limit": 1.0}, "the goal of 5 m for x", ["the limits of u", "the goal of 0 m/s"]),
-        ([ls.GoalState([4.0], states=["x"])], {"limit": 1.0, "dynamics": system(pull=4.0)}, "goal", ["limits of u"]),
+        ([ls.GoalState([4.0], states=["x"])], {"limit": 1.0, "dynamics": system(pull=4.0)}, "the goal", ["limits of"]),
     ],
     ids=["too far", "too slow", "too far to stop", "too weak to swing up"],
 )  # fmt: skip

@@ -11,8 +11,8 @@ from parking.task import ALONG_CAR, ALONG_TRAILER, RADIUS, Shape, Task
 
 Array = np.ndarray
 
-# As documented: inequalities to within constraint_tolerance, equalities to 1e-6; and rounding of a long rollout.
-INEQUALITY, EQUALITY, MOTION = 1e-3, 1.001e-6, 1e-8
+# As documented: all constraints to within constraint_tolerance, which is 1e-6; and rounding of a long rollout.
+INEQUALITY, EQUALITY, MOTION = 1.001e-6, 1.001e-6, 1e-8
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ SCRIPTS = (
     "robust_policies",
     "noise_aware",
     "funnels",
+    "solver_league",
 )
 
 TIDYING = 20.0  # s

@@ -148,6 +148,18 @@ def promised(step, stage, gain, S, room, costate):
     return within_box(factor, slope, room.low, room.high, moved)
 
 
+def flat(matrix):
+    """Whether a block is singular and no more than that: positive definite with next to nothing on its diagonal."""
+    block, size = stack(M, M), 1e-300
+    for i in range(M):
+        size = max(size, abs(matrix[i, i]))
+    for i in range(M):
+        for j in range(M):
+            block[i, j] = matrix[i, j]
+        block[i, i] += 1e-9 * size
+    return cholesky(block, M)
+
+
 def promised_of_start(stage, S, costate):
     """What a soft start promises, its cost quadratised in `stage`."""
     factor, direction = stack(N, N), stack(N)
@@ -201,15 +213,22 @@ def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):
 
 
 def within_box(matrix, slope, lowest, highest, best):
-    """The decrease of `1/2 x'E x + e'x` at its minimiser `best` (M,) within a box about zero; NaN unless E > 0."""
+    """The decrease of `1/2 x'E x + e'x` at its minimiser `best` (M,) within a box about zero; NaN unless E >= 0.
+
+    Where E is singular, it is that of e'x.
+    """
     factor = stack(M, M)
     inside = True
     for i in range(M):
         best[i] = -slope[i]
         for j in range(M):
             factor[i, j] = matrix[i, j]
-    if not cholesky(factor, M):
-        return nan
+    if not cholesky(factor, M):  # flat: no more than a straight line promises, up to where the box ends
+        decrease = 0.0
+        for i in range(M):
+            if slope[i] != 0:
+                decrease += slope[i] * -lowest[i] if slope[i] > 0 else -slope[i] * highest[i]
+        return decrease if flat(matrix) else nan
     cholesky_solve(factor, M, best)
     for i in range(M):
         inside = inside and lowest[i] <= best[i] <= highest[i]

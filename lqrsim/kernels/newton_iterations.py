@@ -31,6 +31,7 @@ SHARES = (1.0, 0.97, 0.9, 0.75, 0.5, 0.0)
 ARMIJO = 1e-4  # of the decrease that a step promises, what there has to be of it
 SMALLEST = 1e-3  # part of a step
 ROUNDING = 1e-12  # of a merit
+SMALL, WEIGHTS = 1e-10, 8  # of the merit, a weight on changes of controls; how many are tried, in thousands
 MORE = 3  # steps at most, while the states of least total cost are not at the plan
 
 
@@ -114,9 +115,11 @@ def newton_pass(settings, model, work, memory):
                     work.x_hat[i] += shift[i]
                 if isnan(left):
                     failed = 0
-            memory.failed, memory.share = failed, share
+            memory.failed, memory.share, memory.damping = failed, share, 0.0
             if failed < 0 or not good:
                 break
+    if failed >= 0 and good:
+        failed, left = damped_pass(settings, model, work, memory, second)
     size = 0.0
     for t in range(steps + 1):
         size = max(size, abs(second.constant[t]))
@@ -124,6 +127,28 @@ def newton_pass(settings, model, work, memory):
     memory.decrease = 2 * left
     memory.promised = relative_optimality(failed, left, memory.merit, memory.nothing)
     return good
+
+
+def damped_pass(settings, model, work, memory, second):
+    """A pass where not even convex models have a minimum, as where a control costs nothing: with the least weight on
+    changes of the controls, of some, with which they have. Returns as a pass does, without whether numbers are finite.
+    """
+    steps, plan, shift, damping, failed, left = settings.steps, work.plan, stack(N), 0.0, 0, nan
+    for k in range(WEIGHTS):
+        damping = SMALL * max(abs(memory.merit), SMALL) * 1e3**k
+        order = Order(damping, 0.0, work.to_go)
+        failed, good, left = differential_pass(steps, plan, model, order, 1, work.policy, second)
+        copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
+        if failed < 0 and not settings.fixed:
+            left += initial_step(plan.states[0], model, 0.0, second, shift)
+            for i in range(N):
+                work.x_hat[i] += shift[i]
+            if isnan(left):
+                failed = 0
+        if failed < 0 or not good:
+            break
+    memory.failed, memory.damping = failed, damping
+    return failed, left
 
 
 def come_to_plan(settings, model, work, memory, row):
@@ -143,7 +168,7 @@ def value_functions(settings, model, work, memory, row):
     """
     policy, controls = work.policy, work.plan.controls
     if not NOISY:
-        order = Order(0.0, 0.0, work.to_go)
+        order = Order(memory.damping, 0.0, work.to_go)
         differential_pass(settings.steps, work.plan, model, order, 1, work.kept, work.to_go)
     model_come_to(settings, model, work, memory, row)
     for t in range(settings.steps):

@@ -367,11 +367,11 @@ def _row(*names: str) -> np.dtype[np.void]:
 # time, and how many others there were since. At the end, how far the states of least total cost are from the plan; at
 # the beginning, whether that was made. `watched` is 1 where undamped iterations are to end when they make no progress,
 # because there is a safeguard to go on. Of Newton's method: the share of the second order that the next pass may have;
-# the step at which the last one failed; what it promised, as the slope of the merit and as a share of it; and a cost
-# that is as good as none.
+# the step at which the last one failed; what it promised, as the slope of the merit and as a share of it; a cost that
+# is as good as none; and the weight on changes of controls without which it has no minimum.
 MEMORY = _row(
     "plan_cost", "merit", "reach", "weight", "small_changes", "ilqr_left", "ilqr_next", "since_ilqr", "final_gap",
-    "started", "watched", "share", "failed", "decrease", "promised", "nothing",
+    "started", "watched", "share", "failed", "decrease", "promised", "nothing", "damping",
 )  # fmt: skip
 
 # A line of the log: NaN where something was not worked out.

@@ -152,17 +152,22 @@ class Iteration:
         constraints it is of the cost with the augmented Lagrangian, and so is the optimality.
       gap: largest difference between the minimal-total-cost states and that rollout, each state relative to its
         range along the rollout (at least 1 unit). Where the safeguard went part of the way, they are taken there; 0 for
-        steps of iLQR and Newton's method, which have none.
+        steps of iLQR, Newton's method and restoration, which have none. Of the interior point it is the largest between
+        two steps of its plan, which need not obey the dynamics until the end.
       optimality: the decrease that a linear-quadratic model about the rollout still predicts, relative to the cost; NaN
-        where it was not evaluated (it is once the other tests pass, and after the last iteration).
+        where it was not evaluated (it is once the other tests pass, and after the last iteration). Of the interior
+        point it is what is left of the optimality conditions: the slope of the Lagrangian in a control, times the
+        control's range, or the product of a multiplier and its slack, the larger one, relative to the cost.
       dynamics_residual: how far one step of the true dynamics takes a minimal-total-cost state from the next one, at
         most; relative as the gap is, and evaluated where the optimality is. The plan itself is a rollout, and has none.
+        Of the interior point it is the gap.
       violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all inequalities are
         kept and there are no equalities, which are off by rounding at least; NaN where it was not evaluated.
       seconds: time this iteration took.
-      method: "smooth", the paper's; "newton", at the end; of the safeguard's "damped", or "ilqr" where its step is that
-        of iLQR; of the last three "rejected" (it would have cost more, or a pass failed; cost is that of the plan that
-        was kept).
+      method: "smooth", the paper's; "newton", at the end; with constraints or limits "interior point", and
+        "restoration", a descent in which constraints may be missed at a price; of the safeguard's "damped", or "ilqr"
+        where its step is that of iLQR; of Newton's method and the safeguard "rejected" (it would have cost more, or a
+        pass failed; cost is that of the plan that was kept).
     """
 
     cost: float
@@ -209,7 +214,7 @@ class Iteration:
 class Certificate:
     """What the plan is, recomputed from the problem after the solve, on a path that the solvers do not use.
 
-    A solution that says CONVERGED has passed: each of these is within rounding, and the optimality within tolerance.
+    A solution that says CONVERGED has passed: optimality and violation are within tolerance, the rest within rounding.
 
     Attributes:
       cost: of the plan; see `Solution.cost`.
@@ -219,7 +224,8 @@ class Certificate:
       law: largest difference of a control from the policy's at that state, relative to the terms of `L x + l`.
       limits: by how much a control is beyond its limits, in its unit.
       violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all inequalities are
-        kept and there are no equalities, which are kept to 1e-6.
+        kept and there are no equalities. Of a converged plan it is at most `constraint_tolerance`, of equalities at
+        most 1e-6, unless constraints are elastic.
       optimality: the decrease of cost that the slopes of the cost in the policy's offsets (and in a start that is not
         fixed) still promise, relative to the cost; infinite where there is no cost-to-go to weigh them with.
     """

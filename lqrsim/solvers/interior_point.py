@@ -41,6 +41,7 @@ FORCED = 6  # steps that are taken though no part of them is better
 WIDE = 1e10  # how far a product of slack and multiplier may be from the barrier's parameter
 CROSSINGS = 8  # steps without a barrier, at the end
 FINER, FINEST = 1e-2, 1e-13  # by what the tolerance falls where these are not right, and how far
+AT_LIMIT = 1e-9  # of its range, how far a control may be from a limit and count as at it
 EDGE = 0.05  # how far inside of their limits controls begin, relative to their range
 
 
@@ -296,11 +297,12 @@ class InteriorPoint:
         if isinstance(problem.initial, FixedState):
             fixed = stages.free == 0
             states[0, fixed] = np.asarray(problem.start)[fixed]
+        within = in_c_order(np.clip(controls, stages.low, stages.high))
+        self._begun, self._known = Plan(in_c_order(states), within), multipliers
         plan = Plan(in_c_order(states), in_c_order(np.clip(controls, stages.low + edge, stages.high - edge)))
         self.sizes = stages.sizes(plan)
         self._state_size, self._range, self._row_size, self._typical = self.sizes
         self._rows_of(plan, barrier, room, price, multipliers)
-        self._known = len(multipliers) > 0  # then which rows press may be known, too
         self.iterations, self.gain = 0, stages.gain
         self._filter: list[tuple[float, float]] = []
         self._mixed, self._part, self._forced = False, 1.0, 0
@@ -363,15 +365,17 @@ class InteriorPoint:
         tolerance: float,
         violation: float,
         most: int,
+        near: bool = False,
         watch: Callable[[Measures], bool] = lambda measures: False,
     ) -> Found:
         """Go on until the measures are within tolerance, or no step helps, or `watch` says so.
 
         Args:
           tolerance: of stationarity, gaps and complementarity. violation: of the constraints, in their units.
-          most: iterations. watch: called with the measures after each; True ends it.
+          most: iterations. near: whether the plan may be next to the answer. watch: called with the measures after each; True ends it.
         """
-        if self._known and self._cross(tolerance, violation):
+        if near and self._settle(tolerance, violation):
+            watch(self.measures)
             return self._found(True)
         solved, ended = self._within(tolerance, violation), False
         while not solved and not ended and self.iterations < most and np.isfinite(self.measures.cost):
@@ -393,6 +397,29 @@ class InteriorPoint:
                 break
             found = self.point, self._force, self._costates, self.measures
         return self._found(solved)
+
+    def _settle(self, tolerance: float, violation: float) -> bool:
+        """Go on from the plan as it was given, with its multipliers, without a barrier; whether that leads anywhere."""
+        stages, kept = self.stages, (self.point, self._force, self._costates, self.measures)
+        plan = self._begun
+        cost, arrived = stages.trial(plan)
+        numbers = stages.values(plan)
+        force = np.zeros(stages.live.shape)
+        for k, one in enumerate(self._known):
+            force[:, stages.owners == k] = one
+        at_limit = (stages.owners == -1) & (numbers <= AT_LIMIT * self._row_size)
+        force[at_limit] = np.broadcast_to(AT_LIMIT * self._scale / self._row_size, force.shape)[at_limit]
+        self.point = Point(plan, cost, arrived, numbers[stages.live], kept[0].slack)
+        self._force = np.clip(force[stages.live], -self._highest, self._highest)
+        stages.linearize(plan, self._costates, stages.spread(self._force), np.inf)
+        self._costates, _ = self._adjoint()
+        if np.isfinite(cost) and self._cross(tolerance, violation):
+            self.iterations = 1
+            return True
+        self.point, self._force, self._costates, self.measures = kept
+        stages.linearize(self.point.plan, self._costates, stages.spread(self._force), 1e-10 * self._scale)
+        self._measure()
+        return False
 
     def _found(self, solved: bool) -> Found:
         stages, spread = self.stages, self.stages.spread(self._force)

@@ -37,9 +37,10 @@ def prepare(
       problem: what is to be solved again and again, with other states, goals, obstacles and parameters.
       tolerance: as in `smooth`.
       gap_tolerance: as in `smooth`.
-      constraint_tolerance: as in `smooth`.
+      constraint_tolerance: as in `smooth` with the augmented Lagrangian: what inequalities are to have to spare, by
+        default 1e-3.
       max_iterations: as in `smooth`.
-      finish: as in `smooth`.
+      finish: as in `smooth`; with constraints it is None.
 
     Returns:
       A PreparedSolver.

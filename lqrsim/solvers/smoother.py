@@ -61,7 +61,8 @@ def smooth(
 
     Each iteration is a forward pass (cost-to-come), a backward pass (cost-to-go) and a rollout of the new policy; both
     passes linearise about the states of least total cost. No trajectory is needed to start from. Paper: Sec. V.
-    Once these states are near the rollout, Newton's method takes over.
+    Once these states are near the rollout, Newton's method takes over; problems with constraints are finished by an
+    interior point.
 
     Which local optimum it ends in depends on the start. With an ObstacleCost, unless a start is given, several are
     tried for a few iterations each, and the most promising goes on; see `solvers/multistart.py`.
@@ -79,24 +80,30 @@ def smooth(
       tolerance: of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8, and 1e-4
         without Newton's method.
       gap_tolerance: of the gap (see `Iteration`).
-      max_iterations: the most iterations that lead to the answer, the safeguard's and those with constraints included.
-        Of a search, each start has as many.
+      max_iterations: the most iterations that lead to the answer, by whatever method. Of a search, each start has as
+        many.
       time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
         comes first, does not count. It is looked at between iterations.
       start: what to begin with, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
         problem's nominal control, which the paper begins with; an InitialPrior, which adds to that what draws the first
         iterations; an AffinePolicy; a Trajectory, feasible or not, about which the first pass linearises; or a Solution
-        of a similar problem, whose policy and cost-to-go it takes up. Or a function of the problem that returns one.
-        Controls are cut off at their limits wherever they are applied.
+        of a similar problem, whose policy, cost-to-go and multipliers it takes up. Or a function of the problem that
+        returns one. Controls are cut off at their limits wherever they are applied. With constraints, the interior
+        point begins at a given trajectory, policy or solution; the answer costs no more than a feasible one.
       starts: how many starts to try, by default 7 where there is an ObstacleCost; 1 is the straight way to the goal.
         The candidates are in the solution.
-      constraint_tolerance: how closely the problem's constraints are solved for, in their unit: for a clearance it is
-        metres. So much to spare is aimed at; a plan that has converged keeps the constraints themselves, and equalities
-        to 1e-6, or to this where it is smaller.
-      penalty: the initial penalty of all constraints, in cost per square of their unit; they then act from the first
-        iteration. It needs a start. By default they come in after a solve without them, with penalties from curvature.
-      finish: "newton" leaves the last iterations to Newton's method; see `kernels/newton_iterations.py`. None is the
-        paper's method to the end; so are `stop="cost"`, problems with constraints and the steps of an MJCF.
+      constraint_tolerance: the most by which constraints may be missed, each in its unit, for a clearance metres; by
+        default 1e-6. Equalities are kept to 1e-6 even if this is larger. With `finish=None`, `stop="cost"`, noise or
+        the steps of an MJCF the augmented Lagrangian keeps constraints: then inequalities are solved for with so much
+        to spare, by default 1e-3, and may not be missed.
+      penalty: the initial penalty of all constraints in the augmented Lagrangian, in cost per square of their unit;
+        they then act from the first iteration. It needs a start. By default they come in after a solve without them,
+        with penalties from curvature.
+      finish: "newton" leaves the last iterations to Newton's method, and those with constraints to the interior point;
+        see `kernels/newton_iterations.py` and `solvers/interior_point.py`. None is the paper's method to the end; so
+        are `stop="cost"`, noise with constraints and the steps of an MJCF.
+      elastic: the price of missing a constraint, in cost per unit, summed over rows and steps. Constraints whose
+        multipliers would exceed it are missed, and the detail says by how much. None: they are to be kept.
       noise: replaces the problem's own; see `Noise`. The cost is then an expectation, in the log, line searches and
         the choice among starts.
       risk: replaces the problem's own; see `Problem`.

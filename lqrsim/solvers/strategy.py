@@ -26,7 +26,7 @@ from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import Plan
-from lqrsim.results.solution_parts import Iteration, Status, Trajectory
+from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers import compiled, constrained
 from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import Callback, check_outcome
@@ -44,6 +44,7 @@ MUCH, LITTLE = (1.0, 0.02), (0.01, 0.01)  # barrier and room of a first plan, an
 PRICES = (1e2, 1e4)  # of missing a constraint by its size, relative to the cost
 PENALTY = 8.0  # of the augmented Lagrangian that holds the policy to the constraints, in the same unit
 UPDATES = 5  # of multipliers, where Newton's steps at the end come to miss constraints
+ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
 AT_LIMIT = 1e-9  # of its range, within which a control that presses against its limit is put there
 
 
@@ -66,7 +67,7 @@ def refine(attempt: Attempt, *, each: bool, callback: Callback | None = None) ->
 
 
 def _without_constraints(attempt: Attempt, *, each: bool, callback: Callback | None) -> AttemptResult:
-    """The method; where controls stand at limits and it does not settle soon, the interior point first."""
+    """The method; where controls stand at limits and it does not settle soon, or it fails, the interior point."""
     problem = attempt.problem
     space = problem.control_coordinates
     if not attempt.newton or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
@@ -75,10 +76,16 @@ def _without_constraints(attempt: Attempt, *, each: bool, callback: Callback | N
     controls = attempt.work.plan.controls
     pressed = ((controls <= space.low) | (controls >= space.high)).any()
     if attempt.termination.outcome == declarations.RUNNING and pressed and np.isfinite(attempt.cost):
-        found = Ladder(attempt, each=each, callback=callback).from_plan(attempt.termination.iterations)
+        ladder = Ladder(attempt, each=each, callback=callback)
+        found = ladder.from_plan(attempt.termination.iterations, attempt.work.plan)
         if found is not None:
             return found
-    return attempt.finish(each=each, callback=callback)
+    found = attempt.finish(each=each, callback=callback)
+    if found.success or attempt.stop.due or attempt.iterations_left(found.iterations) < 2:
+        return found
+    ladder = Ladder(attempt, each=each, callback=callback)
+    plan = attempt.work.plan if np.isfinite(found.cost) else ladder.start()
+    return ladder.from_plan(found.iterations, plan) or found
 
 
 class Ladder:
@@ -106,7 +113,7 @@ class Ladder:
     def climb(self, *, stay: bool = False) -> AttemptResult:
         """Try one after the other; with `stay`, only what begins where the first policy leads."""
         guess = self._attempt.initial_guess
-        start = self._start()
+        start = self.start()
         given = guess.trajectory is not None or guess.gain.any() or stay
         if (given or self._attempt.settings.start is not None) and start.violation <= self._allowed:
             self._given = start  # never left behind
@@ -117,7 +124,7 @@ class Ladder:
             known = tuple(one.values for one in guess.multipliers)
             rungs.append(lambda: self._interior(_plan(start), LITTLE, multipliers=known))
         if given:
-            near = LITTLE if self._given is not None else MUCH
+            near = LITTLE if start.violation <= self._allowed else MUCH
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
             rungs += [self._from_valley, lambda: self._at_a_price(self._valley)]
@@ -132,11 +139,11 @@ class Ladder:
                 break
         return self._answer(start)
 
-    def from_plan(self, iterations: tuple[Iteration, ...]) -> AttemptResult | None:
-        """From the best plan so far, which took these iterations; None where that leads nowhere."""
+    def from_plan(self, iterations: tuple[Iteration, ...], plan: Plan | AttemptResult) -> AttemptResult | None:
+        """From a plan, which took these iterations; None where that leads nowhere."""
         kept = self._attempt.kept()
         self._iterations = iterations
-        found = self._interior(_plan(self._attempt.work.plan), MUCH)
+        found = self._interior(_plan(plan), MUCH)
         if found is not None and found.success:
             return replace(found, iterations=self._iterations)
         self._attempt.go_on(kept, self._iterations)
@@ -258,13 +265,14 @@ class Ladder:
                     multipliers=multipliers, stages=self._stages,
                 )  # fmt: skip
                 return point.run(
-                    tolerance=self._attempt.final, violation=self._allowed, most=min(MOST, left), watch=watch
+                    tolerance=self._attempt.final, violation=self._allowed, most=min(MOST, left),
+                    near=barrier is LITTLE, watch=watch,
                 )  # fmt: skip
         except BaseException as error:  # the callback's, or Ctrl-C: raised again when there is a solution
             stop.error = error
             return None
 
-    def _start(self) -> AttemptResult:
+    def start(self) -> AttemptResult:
         """Where the policy leads that it all begins with."""
         work = self._attempt.work
         guess = self._attempt.initial_guess
@@ -333,11 +341,23 @@ class Ladder:
         detail = ""
         if attempt.settings.elastic is not None and result.violation > 0:
             detail = f"elastic: {lagrangian.worst()}"
-        result = replace(result, detail=detail, multipliers=lagrangian.multipliers())
+        result = replace(result, detail=detail, multipliers=self._pressing(lagrangian, found, result))
         if result.success and lagrangian.kept:
             return result
         self._without_multipliers()
         return replace(result, status=Status.MAX_ITERATIONS)
+
+    def _pressing(
+        self, lagrangian: AugmentedLagrangian, found: Found, result: AttemptResult
+    ) -> tuple[Multipliers, ...]:
+        """The multipliers, without what is left of the barrier on rows that have more to spare than they press."""
+        values = self._attempt.work.constraint_values(result.states, result.controls)
+        multipliers = []
+        for k, one in enumerate(lagrangian.multipliers()):
+            size = found.row_size[self._stages.owners == k]
+            idle = (one.values * size / found.scale < values[k] / size) & ~self._problem.constraint_terms[k].equality
+            multipliers.append(replace(one, values=np.where(idle, 0.0, one.values)))
+        return tuple(multipliers)
 
     def _descend(self, lagrangian: AugmentedLagrangian) -> AttemptResult:
         """Newton's method from the plan in the memory, with these multipliers."""
@@ -355,7 +375,7 @@ class Ladder:
 
     def _worse(self, found: AttemptResult) -> bool:
         """Whether a plan costs more than one that was given and keeps the constraints."""
-        return self._given is not None and found.cost > self._given.cost + 1e-9 * abs(self._given.cost) + 1e-12
+        return self._given is not None and found.cost > self._given.cost + ROUNDING * abs(self._given.cost)
 
     def _answer(self, start: AttemptResult) -> AttemptResult:
         """The best of all, certified."""
