@@ -372,7 +372,8 @@ class InteriorPoint:
 
         Args:
           tolerance: of stationarity, gaps and complementarity. violation: of the constraints, in their units.
-          most: iterations. near: whether the plan may be next to the answer. watch: called with the measures after each; True ends it.
+          most: iterations. near: whether the plan may be next to the answer. watch: called with the measures after
+            each; True ends it.
         """
         if near and self._settle(tolerance, violation):
             watch(self.measures)
