@@ -254,7 +254,7 @@ def test_a_price_below_it_is_paid(which: int, share: float) -> None:
 # Warm starts.
 
 
-@pytest.mark.parametrize("number", [8, 15, 20, 33, 93])
+@pytest.mark.parametrize("number", [3, 8, 15, 20, 33, 49, 93])
 def test_the_solution_as_a_start_is_the_solution(number: int) -> None:
     of = drawn(number)
     solution = solved(of)
@@ -407,14 +407,16 @@ def racing(*constraints: ls.Constraint, limit: float = 1.0) -> ls.Problem:
     return replace(of, stage_cost=nothing, final_cost=final)
 
 
-def test_without_a_cost_of_the_control_nothing_false_is_said() -> None:
-    """Full speed ahead is the best there is, at a cost of minus half of the time squared."""
-    of = racing()
-    solution = ls.smooth(of)
-    ends(of, solution)
-    assert solution.cost >= -(1.5**2) / 2 - 1e-9
-    if solution.success:
-        np.testing.assert_array_equal(solution.trajectory.controls, 1.0)
+def test_without_a_cost_of_the_control_it_is_at_its_limits() -> None:
+    solution = solved(racing())
+    np.testing.assert_array_equal(solution.trajectory.controls, 1.0)
+    # To end at rest: full speed ahead for one half, and back for the other, of which the middle step is zero.
+    stopped = solved(racing(ls.GoalState([0.0], states=["v"])))
+    switch = np.sign(7.0 - np.arange(15))
+    np.testing.assert_allclose(stopped.trajectory.controls[:, 0], switch, rtol=0, atol=1e-6)
+    again = solved(racing(ls.GoalState([0.0], states=["v"])), start=stopped)
+    assert len(again.iterations) <= 4
+    assert again.cost == pytest.approx(stopped.cost, rel=1e-8)
 
 
 def test_a_cost_without_end_is_not_called_a_solution() -> None:

@@ -322,7 +322,8 @@ class Ladder:
             array[0] = PENALTY * found.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
             # Such that the augmented Lagrangian's forces, about this plan, are those that were found.
             force = found.multipliers[k] + array[0] * np.where(np.isfinite(numbers), numbers - array[3], 0.0)
-            acts = np.isfinite(numbers) & (term.equality | (found.multipliers[k] > 0))
+            presses = found.multipliers[k] > array[0] * (numbers - array[3])  # others have what a barrier leaves
+            acts = np.isfinite(numbers) & (term.equality | presses)
             array[declarations.HEADER :] = np.where(acts, force, 0.0).ravel()
         work.plan.states[...], work.plan.controls[...] = states, controls
         work.memory["plan_cost"] = self._stages.trial(Plan(in_c_order(states), in_c_order(controls)))[0]
