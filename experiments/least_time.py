@@ -4,8 +4,8 @@
     python experiments/least_time.py --quick    # the drive alone
 
 The controls cost next to nothing, and time does: motors stand at their limits most of the way. The paths keep clear of
-all obstacles by a margin and end at the goal exactly. They take nine tenths of what the motors can do; the rest is for a
-tracking law, which then runs in MuJoCo, with a physics step of which the period of the plan is a multiple.
+all obstacles by a margin and end at the goal exactly. They take nine tenths of what the motors can do. The rest is for
+a tracking law, which then runs in MuJoCo, with a physics step of which the period of the plan is a multiple.
 """
 
 import dataclasses
@@ -28,9 +28,10 @@ class Case:
     """What is asked of a robot.
 
     Attributes:
-      scenario: its name. effort: weight of the controls, next to nothing. share: of
-        what the motors can do, what the plan may take: the rest is for feedback. longest: the longest duration in s.
-      margin: to obstacles, in m. tolerate: how far the tracking law lets states be off, in their units. axes: the states that are drawn, and what the axes are called.
+      scenario: its name. effort: weight of the controls, next to nothing.
+      share: of what the motors can do, what the plan may take. longest: the longest duration in s.
+      margin: to obstacles, in m. tolerate: how far the tracking law lets states be off, in their units.
+      axes: the states that are drawn, and what the axes are called.
     """
 
     scenario: str

@@ -90,7 +90,7 @@ class TestPlanarQuadrotor:
         assert contradictions(problem, solution) == []
 
     def test_where_the_search_ends_before_the_wall_another_way_is_found(self) -> None:
-        """The seven starts end 2.3 m short of the goal, at a cost of 1,362; over the wall it costs a twentieth."""
+        """The seven starts end 2.3 m short of the goal, or at a cost of thousands; over the wall it costs 60.9."""
         problem = planar_quadrotor.problem(
             (-1.02, 0.62), (1.92, 0.63), steps=247, effort=10.0, weight=500.0, sharpness=5.0
         )
@@ -100,7 +100,7 @@ class TestPlanarQuadrotor:
             assert one.status is Status.CONVERGED
             assert contradictions(problem, one) == []
         assert short.cost > 1000
-        assert solution.cost < short.cost / 10
+        assert solution.cost < 61.1
         assert np.linalg.norm(solution.trajectory.states[-1][:2] - (1.92, 0.63)) < planar_quadrotor.RADIUS
         assert "times the weight of obstacles and goal" in solution.summary()
 
@@ -194,7 +194,7 @@ class TestExceptionsOnTheWay:
         assert solution.cost <= min(iteration.cost for iteration in seen) * (1 + 1e-12)
         assert contradictions(drive, solution) == []
 
-    @pytest.mark.parametrize("when", [1, 5, 20, 40])
+    @pytest.mark.parametrize("when", [1, 5, 8, 15])  # of smoothing, and of the interior point
     def test_with_constraints_too(self, when: int) -> None:
         problem = planar_quadrotor.problem((-1.42, 0.16), (1.94, 0.04), steps=257, effort=10.0, weight=1000.0)
         seen: list[Iteration] = []
@@ -212,11 +212,13 @@ class TestExceptionsOnTheWay:
 
 
 def test_nothing_is_compiled_in_mid_solve() -> None:
-    """The damped iterations once were, where the first solve came to need them."""
+    """The damped iterations once were, where the first solve came to need them; and so might the interior point be."""
     easy = planar_quadrotor.problem((-1.2, 0.1), (1.6, 0.3), steps=150)
     ls.smooth(easy)
     before = len(compiled_module.compilations)
     hard = planar_quadrotor.problem((-1.42, 0.16), (1.94, 0.04), steps=257, effort=10.0, weight=1000.0)
     solution = ls.smooth(hard)
-    assert "damped" in {iteration.method for iteration in solution.iterations}
+    bare = ls.smooth(hard, finish=None)
+    assert "interior point" in {iteration.method for iteration in solution.iterations}
+    assert "damped" in {iteration.method for iteration in bare.iterations}
     assert compiled_module.compilations[before:] == []

@@ -55,7 +55,7 @@ def test_a_control_that_costs_nothing_stands_at_its_limits() -> None:
 
 @pytest.mark.parametrize("price", [5.0, 20.0])
 def test_no_other_duration_costs_less(price: float) -> None:
-    """A pendulum, swung up: costs of neighbouring durations, each solved on its own, are higher, and rise as a square."""
+    """A pendulum, swung up: of neighbouring durations, each solved on its own, the costs are higher, as a square."""
     dynamics = ls.Dynamics(
         lambda x, u, p: [x[1], -9.81 * _sine(x[0]) + u[0]], states={"angle": "rad", "rate": "rad/s"},
         controls={"torque": "N m"}, control_limits=(-12, 12),

@@ -297,9 +297,8 @@ class InteriorPoint:
         if isinstance(problem.initial, FixedState):
             fixed = stages.free == 0
             states[0, fixed] = np.asarray(problem.start)[fixed]
-        # With multipliers: the plan as it is, and what presses on it.
         within = in_c_order(np.clip(controls, stages.low, stages.high))
-        self._warm = (Plan(in_c_order(states), within), multipliers) if multipliers else None
+        self._begun, self._known = Plan(in_c_order(states), within), multipliers
         plan = Plan(in_c_order(states), in_c_order(np.clip(controls, stages.low + edge, stages.high - edge)))
         self.sizes = stages.sizes(plan)
         self._state_size, self._range, self._row_size, self._typical = self.sizes
@@ -366,15 +365,17 @@ class InteriorPoint:
         tolerance: float,
         violation: float,
         most: int,
+        near: bool = False,
         watch: Callable[[Measures], bool] = lambda measures: False,
     ) -> Found:
         """Go on until the measures are within tolerance, or no step helps, or `watch` says so.
 
         Args:
           tolerance: of stationarity, gaps and complementarity. violation: of the constraints, in their units.
-          most: iterations. watch: called with the measures after each; True ends it.
+          most: iterations. near: whether the plan may be next to the answer. watch: called with the measures after
+            each; True ends it.
         """
-        if self._warm is not None and self._settle(*self._warm, tolerance, violation):
+        if near and self._settle(tolerance, violation):
             watch(self.measures)
             return self._found(True)
         solved, ended = self._within(tolerance, violation), False
@@ -398,13 +399,14 @@ class InteriorPoint:
             found = self.point, self._force, self._costates, self.measures
         return self._found(solved)
 
-    def _settle(self, plan: Plan, multipliers: tuple[Array, ...], tolerance: float, violation: float) -> bool:
-        """Go on from a plan near the answer with about its multipliers, without a barrier; whether that leads there."""
+    def _settle(self, tolerance: float, violation: float) -> bool:
+        """Go on from the plan as it was given, with its multipliers, without a barrier; whether that leads anywhere."""
         stages, kept = self.stages, (self.point, self._force, self._costates, self.measures)
+        plan = self._begun
         cost, arrived = stages.trial(plan)
         numbers = stages.values(plan)
         force = np.zeros(stages.live.shape)
-        for k, one in enumerate(multipliers):
+        for k, one in enumerate(self._known):
             force[:, stages.owners == k] = one
         at_limit = (stages.owners == -1) & (numbers <= AT_LIMIT * self._row_size)
         force[at_limit] = np.broadcast_to(AT_LIMIT * self._scale / self._row_size, force.shape)[at_limit]

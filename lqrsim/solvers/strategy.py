@@ -265,7 +265,8 @@ class Ladder:
                     multipliers=multipliers, stages=self._stages,
                 )  # fmt: skip
                 return point.run(
-                    tolerance=self._attempt.final, violation=self._allowed, most=min(MOST, left), watch=watch
+                    tolerance=self._attempt.final, violation=self._allowed, most=min(MOST, left),
+                    near=barrier is LITTLE, watch=watch,
                 )  # fmt: skip
         except BaseException as error:  # the callback's, or Ctrl-C: raised again when there is a solution
             stop.error = error
@@ -385,7 +386,7 @@ class Ladder:
             lagrangian = AugmentedLagrangian(attempt)
             lagrangian.evaluate(best.states, best.controls)
             status, detail = Status.MAX_ITERATIONS, lagrangian.worst()
-            if len(self._evidence) >= STARTS:
+            if len(self._evidence) >= STARTS and best.violation > self._allowed:
                 least, best = min(self._evidence, key=lambda pair: pair[0].missed)
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()

@@ -116,8 +116,9 @@ class Shooting:
             violation = max(violation, float((np.abs(values) if one.equality else -values).max(initial=0.0)))
             if not solution.multipliers:
                 continue
-            force = solution.multipliers[k].values[one.acts]
-            assert not solution.multipliers[k].values[~one.acts].any()  # none where nothing acts
+            acts: Any = one.acts
+            force = solution.multipliers[k].values[acts]
+            assert not solution.multipliers[k].values[~acts].any()  # none where nothing acts
             slopes = self.slope(lambda z, one=one: one.function(self.points(z))[..., one.acts], z)
             left = left - force @ slopes
             size = size + np.abs(force) @ np.abs(slopes)
