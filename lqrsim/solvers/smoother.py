@@ -97,8 +97,8 @@ def smooth(
         the steps of an MJCF the augmented Lagrangian keeps constraints: then inequalities are solved for with so much
         to spare, by default 1e-3, and may not be missed.
       penalty: the initial penalty of all constraints in the augmented Lagrangian, in cost per square of their unit;
-        they then act from the first iteration. It needs a start. By default they come in after a solve without them,
-        with penalties from curvature.
+        they then act from the first iteration, also of the smoothing before the interior point. It needs a start. By
+        default they come in after a solve without them, with penalties from curvature.
       finish: "newton" leaves the last iterations to Newton's method, and those with constraints to the interior point;
         see `kernels/newton_iterations.py` and `solvers/interior_point.py`. None is the paper's method to the end; so
         are `stop="cost"`, noise with constraints and the steps of an MJCF.
