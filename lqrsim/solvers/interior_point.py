@@ -42,6 +42,7 @@ WIDE = 1e10  # how far a product of slack and multiplier may be from the barrier
 CROSSINGS = 8  # steps without a barrier, at the end
 FINER, FINEST = 1e-2, 1e-13  # by what the tolerance falls where these are not right, and how far
 AT_LIMIT = 1e-9  # of its range, how far a control may be from a limit and count as at it
+CREEP, CREEPING = 0.1, 20  # the part of a step that is short; and how many of them in a row lead nowhere
 EDGE = 0.05  # how far inside of their limits controls begin, relative to their range
 
 
@@ -194,7 +195,7 @@ class Stages:
         reach = np.ptp(plan.states, axis=0)
         if problem.goal is not None and problem.start is not None:
             reach = np.maximum(reach, np.abs(np.nan_to_num(problem.goal - problem.start)))
-        states = np.where(reach > 1e-6, reach, 1.0)
+        states = np.where(reach > 1e-3, reach, 1.0)
         self.look_about(plan)
         moved = np.abs(self.models.jacobian[:, :, self.n :]).sum(axis=0) / states[:, None]
         enough = np.maximum(1 / np.maximum(moved.max(axis=0), 1e-6), np.abs(plan.controls).max(axis=0))
@@ -378,12 +379,13 @@ class InteriorPoint:
         if near and self._settle(tolerance, violation):
             watch(self.measures)
             return self._found(True)
-        solved, ended = self._within(tolerance, violation), False
+        solved, ended, creeping = self._within(tolerance, violation), False, 0
         while not solved and not ended and self.iterations < most and np.isfinite(self.measures.cost):
             if not self._iterate(tolerance):
                 break
             solved = self._within(tolerance, violation)
-            ended = watch(self.measures)
+            creeping = creeping + 1 if self._part < CREEP else 0
+            ended = watch(self.measures) or creeping == CREEPING
         finer, found = tolerance, (self.point, self._force, self._costates, self.measures)
         while solved and not self._cross(tolerance, violation) and not ended and finer > FINEST:
             # Which rows press is told by a lower barrier: of a cost that is mostly constant, all else is little.

@@ -5,7 +5,8 @@ With constraints, whatever comes first is followed by the interior point, which 
 
     the plan of another solution, with its multipliers;
     a trajectory or a policy that the caller gave;
-    the valley that smoothing finds without the constraints;
+    the plan of smoothing without the constraints, after a few iterations;
+    what the augmented Lagrangian comes to from there, with an ObstacleCost;
     the same, after a descent in which constraints may be missed at a price;
     the start itself;
     the same, after such a descent.
@@ -37,7 +38,8 @@ from lqrsim.solvers.restoration import Restored, restore
 
 FAR = 100.0  # times what may be missed: then the price is too low, or there is no way to keep all
 STARTS = 2  # from which what is missed has to be stationary, before that is called infeasible
-OPENING = 10  # iterations of smoothing at most, before constraints come in
+AUGMENTED = 100  # iterations of the augmented Lagrangian
+OPENING, GUIDED = 10, 60  # iterations of smoothing at most before constraints come in; and with an ObstacleCost
 MOST = 150  # of the interior point from one plan
 RESTORATION = "restoration"  # what its iterations are called
 MUCH, LITTLE = (1.0, 0.02), (0.01, 0.01)  # barrier and room of a first plan, and of one that is near to the answer
@@ -101,6 +103,8 @@ class Ladder:
         self._best: AttemptResult | None = None
         self._given: AttemptResult | None = None
         self._valley: Plan | None = None
+        # Whether smoothing and its search have gone round obstacles, which are then to be passed on that side.
+        self._guided = any(cost.weight for cost in attempt.problem.obstacle_costs)
         self._evidence: list[tuple[Evidence, AttemptResult]] = []
         if attempt.settings.penalty is None:
             self._without_multipliers()
@@ -127,7 +131,7 @@ class Ladder:
             near = LITTLE if start.violation <= self._allowed else MUCH
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
-            rungs += [self._from_valley, lambda: self._at_a_price(self._valley)]
+            rungs += [self._from_valley, self._augmented, lambda: self._at_a_price(self._valley)]
         rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._at_a_price(_plan(start))]
         for rung in rungs:
             found = rung()
@@ -151,7 +155,7 @@ class Ladder:
 
     def _from_valley(self) -> AttemptResult | None:
         attempt = self._attempt
-        most = min(OPENING, attempt.iterations_left(self._iterations))
+        most = min(GUIDED if self._guided else OPENING, attempt.iterations_left(self._iterations))
         attempt.run(most, each=self._each, callback=self._callback)
         termination = check_outcome(
             self._problem, attempt.termination, attempt.work.start, attempt.initial_guess.offset[0], refuse=self._each
@@ -164,12 +168,34 @@ class Ladder:
         self._valley = Plan(plan.states.copy(), plan.controls.copy())
         if attempt.stop.due:
             return None
-        if termination.outcome == declarations.IN_VALLEY and termination.iterations[-1].violation == 0:
-            found = attempt.descend(self._iterations, each=self._each, callback=self._callback)
-            self._iterations = found.iterations
-            if found.success and found.violation == 0:
-                return self._note(found)
-        return self._interior(self._valley, MUCH)
+        chosen = self._guided or termination.iterations[-1].violation == 0
+        if not (termination.outcome == declarations.IN_VALLEY and chosen):
+            return self._interior(self._valley, MUCH)
+        # Its bottom: the answer, if that keeps the constraints; or, with what keeps clear of obstacles, next to it.
+        kept = attempt.kept()
+        found = attempt.descend(self._iterations, each=self._each, callback=self._callback)
+        self._iterations = found.iterations
+        if found.success and found.violation == 0:
+            return self._note(found)
+        bottom = Plan(found.states.copy(), found.controls.copy()) if found.success else self._valley
+        attempt.go_on(kept, termination.iterations)
+        return None if attempt.stop.due else self._interior(bottom, LITTLE if self._guided else MUCH)
+
+    def _augmented(self) -> AttemptResult | None:
+        """From what the augmented Lagrangian comes to, which stays in the valley that smoothing has chosen."""
+        attempt, settings = self._attempt, self._attempt.settings
+        if self._valley is None or settings.elastic is not None or not self._guided:
+            return None
+        most = min(len(self._iterations) + AUGMENTED, settings.max_iterations)
+        attempt.settings = replace(settings, max_iterations=most)
+        before = replace(attempt.result(attempt.termination), iterations=self._iterations)
+        found = constrained.satisfy(attempt, before, each=self._each, callback=self._callback)
+        attempt.settings, self._iterations = settings, found.iterations
+        plan = Plan(found.states.copy(), found.controls.copy())
+        self._without_multipliers()
+        if attempt.stop.due or not np.isfinite(found.cost) or not np.isfinite(plan.states).all():
+            return None
+        return self._interior(plan, LITTLE)
 
     def _at_a_price(self, plan: Plan | None) -> AttemptResult | None:
         """With constraints that may be missed; and from where that leads, without."""
@@ -381,7 +407,8 @@ class Ladder:
         """The best of all, certified."""
         attempt = self._attempt
         best = start if self._best is None else self._best
-        if self._given is not None and (best.violation > self._allowed or self._worse(best)):
+        priced = self._attempt.settings.elastic is not None and best.success
+        if self._given is not None and not priced and (best.violation > self._allowed or self._worse(best)):
             best = self._given
         if not best.success and self._problem.constraints:
             lagrangian = AugmentedLagrangian(attempt)
