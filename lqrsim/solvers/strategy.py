@@ -127,6 +127,8 @@ class Ladder:
         if guess.multipliers and any(one.values.any() for one in guess.multipliers):
             known = tuple(one.values for one in guess.multipliers)
             rungs.append(lambda: self._interior(_plan(start), LITTLE, multipliers=known))
+        if stay and self._guided:
+            rungs.append(self._refined)
         if given:
             near = LITTLE if start.violation <= self._allowed else MUCH
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
@@ -180,6 +182,18 @@ class Ladder:
         bottom = Plan(found.states.copy(), found.controls.copy()) if found.success else self._valley
         attempt.go_on(kept, termination.iterations)
         return None if attempt.stop.due else self._interior(bottom, LITTLE if self._guided else MUCH)
+
+    def _refined(self) -> AttemptResult | None:
+        """From where steps lead that lower the augmented Lagrangian alone."""
+        attempt, settings = self._attempt, self._attempt.settings
+        attempt.settings = replace(settings, max_iterations=min(AUGMENTED, settings.max_iterations))
+        found = constrained.refine(attempt, each=self._each, callback=self._callback)
+        attempt.settings, self._iterations = settings, (*self._iterations, *found.iterations)
+        plan = Plan(found.states.copy(), found.controls.copy())
+        self._without_multipliers()
+        if attempt.stop.due or not np.isfinite(found.cost) or not np.isfinite(plan.states).all():
+            return None
+        return self._interior(plan, LITTLE)
 
     def _augmented(self) -> AttemptResult | None:
         """From what the augmented Lagrangian comes to, which stays in the valley that smoothing has chosen."""
