@@ -315,7 +315,9 @@ def test_a_robot_that_lacks_a_part_is_told_which(tmp_path, part, name):
 
 def test_a_control_period_that_is_no_multiple_of_the_physics_step_is_told_both(cage):
     solution = track(Quadrotor(), np.zeros(12), np.full((5, 4), 1.225), 0.05)
-    with pytest.raises(InputError, match=r"^control period: got 0.05 s, want a multiple of .* cage, 0.0333333 s; or"):
+    with pytest.raises(
+        InputError, match=r"^control period: got 0.05 s, want a multiple of .* cage, 0.0333333 s: plant.for_period"
+    ):
         simulate(cage, solution)
     with pytest.raises(InputError, match=r"^control period: got 0.01 s, .*timestep=\"0.01"):
         cage.substeps(0.01)

@@ -400,6 +400,13 @@ class TestSolvers:
         assert descended(problem(steps=3), tolerance=1e9, small_changes=9.0) == declarations.CONVERGED
         assert descended(problem(steps=3), merit=-1e9) == declarations.STALLED
 
+    def test_controls_without_a_minimum_get_a_weight_on_their_changes(self) -> None:
+        for initial in (None, ls.FixedState([0.0, 0.0, 0.3])):
+            of = problem(steps=3) if initial is None else problem(steps=3, initial=initial)
+            assert descended(of, factor=-10.0) in (
+                declarations.CONVERGED, declarations.STALLED, declarations.MAX_ITERATIONS,
+            )  # fmt: skip
+
     def test_ilqr(self) -> None:
         one = problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=5)
         states, controls = np.zeros((6, 3)), np.zeros((5, 2))
@@ -468,8 +475,13 @@ class Begun:
         return replay(self.source, self.sizes, "smoother", *with_rows(given))
 
 
-def descended(one: ls.Problem, form: str = "dual", count: int = 3, tolerance: float = 1e-12, **memory: float) -> int:
-    """Newton iterations, in plain Python, from where a first iteration of smoothing leads; how they end."""
+def descended(
+    one: ls.Problem, form: str = "dual", count: int = 3, tolerance: float = 1e-12, factor: float = 1.0, **memory: float
+) -> int:
+    """Newton iterations, in plain Python, from where a first iteration of smoothing leads; how they end.
+
+    They have that many times the weight of the controls.
+    """
     settings = settings_of(form=form, finish="newton", tolerance=tolerance)
     begin = np.zeros(3) if one.start is None else one.start
     attempt = Attempt(one, settings, resolve(None, one), begin, Stop())
@@ -478,6 +490,9 @@ def descended(one: ls.Problem, form: str = "dual", count: int = 3, tolerance: fl
     work.memory["merit"], work.memory["share"] = work.memory["plan_cost"], -1.0
     for name, number in memory.items():
         work.memory[name] = number
+    stage = work.model.stage
+    if factor != 1:
+        work.model = work.model._replace(stage=with_numbers(stage, 1, 2, lambda weight: factor * weight))
     trial = Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
     source, sizes = compiled._with_form(form, "entry_points"), sizes_of(one)
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()

@@ -124,6 +124,7 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
         "Plant.state": (
             {"self": plant, "qpos": np.eye(9)[3], "qvel": np.zeros(8), "act": np.zeros(0), "near": np.zeros(3)},
         ),
+        "Plant.for_period": ({"self": plant, "period": 1 / 7},),
         "Plant.substeps": ({"self": plant, "period": 1 / 6},),
         "Plant.clearance": ({"self": plant, "states": np.zeros((1, 5, 3)),
                              "displaced": np.zeros((1, len(plant.world), 3))},),

@@ -85,23 +85,20 @@ def smooth(
       time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
         comes first, does not count. It is looked at between iterations.
       start: what to begin with, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
-        problem's nominal control, which the paper begins with; an InitialPrior, which adds to that what draws the first
-        iterations; an AffinePolicy; a Trajectory, feasible or not, about which the first pass linearises; or a Solution
-        of a similar problem, whose policy, cost-to-go and multipliers it takes up. Or a function of the problem that
-        returns one. Controls are cut off at their limits wherever they are applied. With constraints, the interior
-        point begins at a given trajectory, policy or solution; the answer costs no more than a feasible one.
+        problem's nominal control; an InitialPrior, which adds what draws the first iterations; an AffinePolicy; a
+        Trajectory, feasible or not; or a Solution of a similar problem, whose policy, cost-to-go and multipliers it
+        takes up. Or a function of the problem that returns one. Controls are cut off at their limits. With constraints
+        the answer costs no more than a feasible plan that is given.
       starts: how many starts to try, by default 7 where there is an ObstacleCost; 1 is the straight way to the goal.
         The candidates are in the solution.
-      constraint_tolerance: the most by which constraints may be missed, each in its unit, for a clearance metres; by
-        default 1e-6. Equalities are kept to 1e-6 even if this is larger. With `finish=None`, `stop="cost"`, noise or
-        the steps of an MJCF the augmented Lagrangian keeps constraints: then inequalities are solved for with so much
-        to spare, by default 1e-3, and may not be missed.
+      constraint_tolerance: the most by which constraints may be missed, each in its unit; by default 1e-6, and of
+        equalities no more than that. Where the augmented Lagrangian keeps them (see `finish`), inequalities are solved
+        for with so much to spare, by default 1e-3.
       penalty: the initial penalty of all constraints in the augmented Lagrangian, in cost per square of their unit;
-        they then act from the first iteration, also of the smoothing before the interior point. It needs a start. By
-        default they come in after a solve without them, with penalties from curvature.
+        they then act from the first iteration. It needs a start.
       finish: "newton" leaves the last iterations to Newton's method, and those with constraints to the interior point;
-        see `kernels/newton_iterations.py` and `solvers/interior_point.py`. None is the paper's method to the end; so
-        are `stop="cost"`, noise with constraints and the steps of an MJCF.
+        see `solvers/strategy.py`. None is the paper's method to the end, with constraints by an augmented Lagrangian;
+        so are `stop="cost"`, noise with constraints and the steps of an MJCF.
       elastic: the price of missing a constraint, in cost per unit, summed over rows and steps. Constraints whose
         multipliers would exceed it are missed, and the detail says by how much. None: they are to be kept.
       noise: replaces the problem's own; see `Noise`. The cost is then an expectation, in the log, line searches and

@@ -170,8 +170,7 @@ class Ladder:
         self._valley = Plan(plan.states.copy(), plan.controls.copy())
         if attempt.stop.due:
             return None
-        chosen = self._guided or termination.iterations[-1].violation == 0
-        if not (termination.outcome == declarations.IN_VALLEY and chosen):
+        if termination.outcome != declarations.IN_VALLEY or (not self._guided and termination.iterations[-1].violation):
             return self._interior(self._valley, MUCH)
         # Its bottom: the answer, if that keeps the constraints; or, with what keeps clear of obstacles, next to it.
         kept = attempt.kept()
