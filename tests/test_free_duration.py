@@ -96,6 +96,7 @@ def test_a_duration_ends_at_its_bound() -> None:
 
 def test_the_policy_runs_with_the_period_of_the_plan(differential_drive: ls.Scenario) -> None:
     stated = differential_drive.problem
+    assert stated.goal is not None
     free = dataclasses.replace(stated, duration=(5.0, 60.0), time_weight=1.0, constraints=[ls.GoalState(stated.goal)])
     solution = ls.smooth(free)
     assert solution.status is Status.CONVERGED
