@@ -26,7 +26,7 @@ from solver_benchmark.common import median, take_turns
 
 import lqrsim as ls
 from lqrsim.machine import description, processors
-from lqrsim.simulation.outcome_table import outcomes
+from lqrsim.stress.outcome_table import outcomes
 from lqrsim.versions import versions
 
 LEAST = 0.85  # of raw, one thread
@@ -146,7 +146,7 @@ def throughput(contest: Contest, count: int, threads: tuple[int, ...], rounds: i
 def making(contest: Contest, rounds: int) -> dict[str, float]:
     """Milliseconds, medians."""
     problem, solution = contest.scenario.problem, contest.solution
-    stated = ls.uncertainty_of(contest.plant, ls.preset("light", contest.plant))
+    stated = ls.uncertainty_of(contest.plant, ls.disturbances.preset("light", contest.plant))
     tolerate = {"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}
     contestants = {
         "track": timed(lambda: ls.track(problem, solution, tolerate=tolerate)),

@@ -106,7 +106,7 @@ def all_faults(video: Path, digest: str) -> dict[str, tuple[faults.Fault, bool]]
     return made | {"another seed's run, its digest forged": (faults.forged(digest), True)}
 
 
-def verdict(found: ls.Verification) -> dict[str, Any]:
+def verdict(found: ls.types.Verification) -> dict[str, Any]:
     return {
         "rms": 1e3 * found.rms, "worst": 1e3 * found.worst, "shift": found.shift, "scale": found.scale,
         "frames": len(found.times), "passed": found.passed, "likely": found.likely,

@@ -136,10 +136,12 @@ def compute(queries: int, trials: int, place: str) -> dict[str, list[Any]]:
         for i, solution in enumerate(solutions):
             lines[name].append(_line(solution, f"{name}/{i}", arrays))
     for name in ("differential_drive", "quadrotor"):
-        sweeps = {kind: tuple(ls.preset(kind, ls.scenarios.get(name).plant())) for kind in ("light", "severe")}
+        sweeps = {
+            kind: tuple(ls.disturbances.preset(kind, ls.scenarios.get(name).plant())) for kind in ("light", "severe")
+        }
         with tempfile.TemporaryDirectory() as folder:
-            results = ls.run_campaign(
-                ls.Campaign(scenario=name, sweeps=sweeps, strengths=(0.5, 1.0), trials=trials), folder, workers=0
+            results = ls.stress.run_campaign(
+                ls.stress.Campaign(scenario=name, sweeps=sweeps, strengths=(0.5, 1.0), trials=trials), folder, workers=0
             )
             cells = [vars(results.outcomes(cell)) for cell in results.campaign.cells]
         lines[f"campaign {name}"] = [_table(cell, f"campaign {name}/{i}", arrays) for i, cell in enumerate(cells)]

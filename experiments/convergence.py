@@ -148,7 +148,7 @@ def explained(factors: Sequence[float], measured: Sequence[float | None]) -> dic
     return {"factor": numbers(factors), "median": middle(factors), "worth": middle(worth)}
 
 
-def gaps(logs: Sequence[Sequence[ls.Iteration]]) -> dict[str, Any]:
+def gaps(logs: Sequence[Sequence[ls.types.Iteration]]) -> dict[str, Any]:
     """Of smoothing: the gap at some iterations (the last one of those that ended before), and how it goes with cost."""
     at = [[log[min(number, len(log)) - 1].gap for log in logs] for number in SHOWN]
     slopes, stopped = [], []

@@ -29,9 +29,9 @@ from paper.common import (
     numbers,
     opening,
     picture,
+    render_still,
     run,
     shown,
-    still,
     table,
 )
 from paper.plans import described, sensitive, solved
@@ -124,7 +124,7 @@ def planned(scenario: ls.Scenario, result: Result, rounds: int) -> dict[str, ls.
 def executed(config: Config, scenario: ls.Scenario, result: Result, plan: ls.Solution, trials: int) -> None:
     """The policy in MuJoCo, on wheels: without disturbances, with them, and with them but without feedback."""
 
-    def runs(of: ls.Solution, disturbances: Iterable[ls.Disturbance], count: int) -> ls.Rollout:
+    def runs(of: ls.Solution, disturbances: Iterable[ls.disturbances.Disturbance], count: int) -> ls.Rollout:
         with counting("simulating") as told:
             return ls.simulate(
                 scenario.plant(), of, disturbances=tuple(disturbances), seed=config.seed, trials=count, progress=told
@@ -150,7 +150,7 @@ def executed(config: Config, scenario: ls.Scenario, result: Result, plan: ls.Sol
         }  # fmt: skip
     with figure(config, result, "figure_2_executed", (10, 5.6)) as drawn:
         arena.draw_runs(drawn, scenario, rollouts[UNDISTURBED], rollouts[DISTURBED])
-    still(config, result, "figure_2_rendered", rollouts[DISTURBED], every=2.0)
+    render_still(config, result, "figure_2_rendered", rollouts[DISTURBED], every=2.0)
 
 
 def draw(

@@ -23,8 +23,8 @@ from paper.common import (
     numbers,
     opening,
     picture,
+    render_still,
     run,
-    still,
     table,
 )
 from scipy.spatial.transform import Rotation
@@ -84,7 +84,7 @@ def main(config: Config) -> Result:
         "clearance": float(runs.least_clearance().min()),
     }
     draw(config, result, scenario, solution, runs)
-    still(config, result, "figure_3_rendered", calm, every=EVERY)
+    render_still(config, result, "figure_3_rendered", calm, every=EVERY)
     return result
 
 

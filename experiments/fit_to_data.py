@@ -158,7 +158,7 @@ def fit(robot: ls.MjcfRobot, run: ls.Rollout, names: list[str]) -> dict[str, tup
 def of_case(case: Case, trials: int, seed: int) -> dict[str, Any]:
     """Record, fit, solve with each of the models, and run all in the plant."""
     true = case.robot.with_parameters(**case.truth)
-    plant, noise = ls.Plant(true, true.scene), [ls.MeasurementNoise(case.noise)]
+    plant, noise = ls.Plant(true, true.scene), [ls.disturbances.MeasurementNoise(case.noise)]
     on_paper = ls.smooth(case.problem(case.robot.dynamics))
     recorded = ls.simulate(plant, on_paper, disturbances=noise, seed=seed)
     fitted = fit(case.robot, recorded, list(case.truth))
@@ -184,7 +184,7 @@ def of_case(case: Case, trials: int, seed: int) -> dict[str, Any]:
 def outcome(plant: ls.Plant, plan: ls.Solution, noise: list[Any], trials: int, seed: int) -> dict[str, Any]:
     """How a plan's policy does in the plant."""
     runs = ls.simulate(plant, plan, disturbances=noise, frames=False, trials=trials, seed=seed)
-    counted = ls.outcomes(runs)
+    counted = ls.stress.outcomes(runs)
     return {
         "status": plan.status.name, "cost": plan.cost, "trials": trials, "unit": runs.tracking_unit,
         "reached": int(runs.reached.sum()), "collided": int(np.isfinite(runs.collided_at).sum()),

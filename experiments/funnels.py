@@ -122,7 +122,7 @@ def robots(config: Config) -> dict[str, Any]:
     for robot in ROBOTS:
         scenario = ls.scenarios.get(robot)
         solution, plant = ls.smooth(scenario.problem), scenario.plant()
-        how: dict[str, Any] = {"disturbances": [ls.ControlNoise(NOISE)]}
+        how: dict[str, Any] = {"disturbances": [ls.disturbances.ControlNoise(NOISE)]}
         begun, used = time.perf_counter(), time.process_time()
         with counting(f"funnel of the {robot}") as progress:
             funnel = ls.funnel(
@@ -131,7 +131,7 @@ def robots(config: Config) -> dict[str, Any]:
             )  # fmt: skip
         took, busy = time.perf_counter() - begun, time.process_time() - used
         checks = [
-            ls.check_funnel(
+            ls.stress.check_funnel(
                 funnel, plant, solution, trials=config.trials, between=shell, seed=config.seed + 1 + i, **how
             )
             for i, shell in enumerate(SHELLS)
@@ -156,7 +156,7 @@ def in_gusts(config: Config, gusts: float, rates: tuple[float, ...]) -> dict[str
     scenario = scenario_of("quadrotor", 0)
     problem = firm(scenario)
     solution, plant = ls.smooth(problem), scenario.plant()
-    wrong = [ls.Gusts(gusts)]
+    wrong = [ls.disturbances.Gusts(gusts)]
     laws: dict[str, ls.Replanning | None] = {
         EACH: ls.Replanning(problem, solution, every=EVERY), "never, the policy alone": None,
     }  # fmt: skip

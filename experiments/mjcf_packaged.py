@@ -84,7 +84,7 @@ def of_drive(most: int) -> dict[str, Any]:
         runs = ls.simulate(ls.Plant(robot, robot.scene), solution)
         found[name] = _of(solution) | {
             "apart": float(np.linalg.norm(path - other, axis=1).max()), "same way": ways[0] == ways[1],
-            "off": float(ls.outcomes(runs).worst[0]), "outcome": runs.outcome[0],
+            "off": float(ls.stress.outcomes(runs).worst[0]), "outcome": runs.outcome[0],
         }  # fmt: skip
     return found
 

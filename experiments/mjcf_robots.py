@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from mjcf.tasks import TASKS, Task
-from paper.common import FIGURES, Result, Settings, opening, run, still, table
+from paper.common import FIGURES, Result, Settings, opening, render_still, run, table
 from PIL import Image
 from solver_benchmark.common import progress
 
@@ -74,7 +74,7 @@ def of_task(config: Config, task: Task, most: int, result: Result) -> dict[str, 
         seconds[name] = time.perf_counter() - clock
     solution, other = found["smooth"], found["ilqr"]
     rollout = ls.simulate(plant, solution)
-    outcome = ls.outcomes(rollout)
+    outcome = ls.stress.outcomes(rollout)
     row = {
         "name": task.name, "states": len(robot.dynamics.state_coordinates), "file": f"{task.package}/{task.file}",
         "controls": len(robot.dynamics.control_coordinates), "status": solution.status.name, "cost": solution.cost,
@@ -91,7 +91,9 @@ def of_task(config: Config, task: Task, most: int, result: Result) -> dict[str, 
         (config.out / FIGURES).mkdir(parents=True, exist_ok=True)
         name = task.name.replace(" ", "_")
         camera = camera_of(robot)
-        still(config, result, name, rollout, every=rollout.times[-1] / 8, camera=camera, overlays=("trace", "caption"))
+        render_still(
+            config, result, name, rollout, every=rollout.times[-1] / 8, camera=camera, overlays=("trace", "caption")
+        )
     return row
 
 

@@ -21,7 +21,7 @@ from peers.rotorpy import BEST_AT_LIGHT, BEST_AT_MODERATE, DEFAULT, Gains, Rotor
 
 import lqrsim as ls
 from lqrsim.simulation.disturbances import preset
-from lqrsim.simulation.outcome_table import Outcomes, outcomes
+from lqrsim.stress.outcome_table import Outcomes, outcomes
 
 # Position gain and damping: horizontally, of the attitude, and vertically.
 HORIZONTAL = (6.5, 10.0, 15.0, 22.0), (0.6, 0.8, 1.1)

@@ -30,6 +30,7 @@ from paper.common import (
 from paper.stress_figures import NAMES, WORDS, draw_alone, draw_together
 
 import lqrsim as ls
+from lqrsim.disturbances import Disturbance
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress import analysis
 
@@ -64,18 +65,18 @@ def main(config: Config) -> Result:
     return result
 
 
-def finished(config: Config, asked: ls.Campaign, folder: Path) -> ls.Results:
+def finished(config: Config, asked: ls.stress.Campaign, folder: Path) -> ls.stress.Results:
     """The campaign, run to its end."""
     with counting(f"{NAMES[asked.scenario]}, {folder.name}") as told:
         workers = 0 if config.quick else config.workers
-        return ls.run_campaign(asked, folder, workers=workers, progress=told)
+        return ls.stress.run_campaign(asked, folder, workers=workers, progress=told)
 
 
 def together(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, Any]:
     """All disturbances of the presets at once, from the weakest preset up: each policy, and all against the first."""
-    light = ls.preset("light", scenario.plant())
+    light = ls.disturbances.preset("light", scenario.plant())
     strengths = [strength for strength in STRENGTHS if all(possible(one, [strength]) for one in light)]
-    asked = ls.Campaign(
+    asked = ls.stress.Campaign(
         scenario=scenario.name, sweeps={"light": tuple(light)}, seed=config.seed, shard=100,
         strengths=(0.25, 1.0) if config.quick else tuple(strengths),
         trials=min(config.trials, 3) if config.quick else config.trials,
@@ -116,23 +117,23 @@ def alone(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, Any]
     stride = len(GRID) if config.quick else 4
     trials = min(config.alone, 3) if config.quick else config.alone
     plant = scenario.plant()
-    kinds = {in_words(one): one for one in ls.preset("light", plant)}
+    kinds = {in_words(one): one for one in ls.disturbances.preset("light", plant)}
     grids = {name: possible(one, GRID) for name, one in kinds.items()}
-    found: dict[str, dict[float, ls.Outcomes]] = {name: {} for name in kinds}
+    found: dict[str, dict[float, ls.stress.Outcomes]] = {name: {} for name in kinds}
     asked = {name: {*grid[::stride], grid[-1]} for name, grid in grids.items()}
     for part in ("alone, coarse",) if config.quick else ("alone, coarse", "alone, fine"):
         cells = {(name, strength): f"{name} {strength:.3g}" for name in kinds for strength in sorted(asked[name])}
         sweeps = {cell: (kinds[name].scaled(strength),) for (name, strength), cell in cells.items()}
         results = finished(
             config,
-            ls.Campaign(
+            ls.stress.Campaign(
                 scenario=scenario.name, sweeps=sweeps, strengths=(1.0,), policies=("smooth",), trials=trials,
                 seed=config.seed, shard=50,
             ),
             folder / part,
         )  # fmt: skip
         for (name, strength), cell in cells.items():
-            found[name][strength] = results.outcomes(ls.Cell("smooth", cell, 1.0))
+            found[name][strength] = results.outcomes(ls.stress.Cell("smooth", cell, 1.0))
         for name, grid in grids.items():
             half = half_fail(success(found[name]))
             low, high = half["above"] or 0.0, half["below"] or np.inf
@@ -143,7 +144,7 @@ def alone(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, Any]
     return {"alone": rows, "trials_alone": trials}
 
 
-def told(name: str, one: ls.Disturbance, plant: ls.Plant, found: dict[float, ls.Outcomes]) -> dict[str, Any]:
+def told(name: str, one: Disturbance, plant: ls.Plant, found: dict[float, ls.stress.Outcomes]) -> dict[str, Any]:
     """What the result says of a kind."""
     points = success(found)
     strengths, half = [strength for strength, _ in points], half_fail(points)
@@ -157,17 +158,17 @@ def told(name: str, one: ls.Disturbance, plant: ls.Plant, found: dict[float, ls.
     }  # fmt: skip
 
 
-def success(found: dict[float, ls.Outcomes]) -> list[tuple[float, list[float]]]:
+def success(found: dict[float, ls.stress.Outcomes]) -> list[tuple[float, list[float]]]:
     """Strength and exact interval of success, the weakest first."""
     return [
-        (strength, interval(analysis.success(ls.Cell("smooth", "alone", strength), outcomes).exact))
+        (strength, interval(analysis.success(ls.stress.Cell("smooth", "alone", strength), outcomes).exact))
         for strength, outcomes in sorted(found.items())
     ]
 
 
-def possible(one: ls.Disturbance, strengths: Sequence[float]) -> list[float]:
+def possible(one: Disturbance, strengths: Sequence[float]) -> list[float]:
     """The strengths that the disturbance can have and that differ: not more losses than of everything."""
-    kept: dict[ls.Disturbance, float] = {}
+    kept: dict[Disturbance, float] = {}
     for strength in strengths:
         try:
             kept.setdefault(one.scaled(strength), strength)
@@ -198,7 +199,7 @@ def half_fail(points: Sequence[tuple[float, Sequence[float]]]) -> dict[str, floa
     }
 
 
-def in_words(one: ls.Disturbance) -> str:
+def in_words(one: Disturbance) -> str:
     """The name of its class: MotorLag is motor lag."""
     words = re.sub(r"(?<!^)(?=[A-Z])", " ", type(one).__name__).lower()
     return {"dryden": "Dryden turbulence"}.get(words, words)

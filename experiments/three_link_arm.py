@@ -5,8 +5,9 @@
 
 The links are 0.4 m long, move in a level plane, and are driven by torques against damping; their dynamics are those of
 three rigid bodies. Stretched out, the arm would sweep through all the posts: it has to fold up between them. The plan
-knows of it by balls along each link (`Capsule`, `Balls`), costs and constraints are of all of them, and the search
-begins with paths of the joints. MuJoCo's distance between geoms, of capsules and posts, says whether it was right.
+knows of it by spheres along each link (`Capsule`, `CollisionSpheres`), costs and constraints are of all of them, and
+the search begins with paths of the joints. MuJoCo's distance between geoms, of capsules and posts, says whether it was
+right.
 """
 
 import sys
@@ -98,10 +99,10 @@ class ThreeLinkArm(ls.Robot):
         )
 
     @cached_property
-    def balls(self) -> ls.Balls:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def balls(self) -> ls.CollisionSpheres:  # pyright: ignore[reportIncompatibleVariableOverride]
         between = [None] * (LINK.count - 1)
         sites = [site for number in range(3) for site in (*between, f"end {number}")]
-        return ls.Balls(places, 3 * LINK.radii, sites=sites)
+        return ls.CollisionSpheres(places, 3 * LINK.radii, sites=sites)
 
     def state(self, qpos: Any, qvel: Any, near: Any = None) -> Array:
         state = np.concatenate([qpos, qvel], axis=-1)
@@ -217,7 +218,7 @@ def main(config: Config) -> dict[str, Any]:
     print(solution.summary())
     calm = ls.simulate(plant, solution)
     trials = 10 if config.quick else config.trials
-    noisy = ls.simulate(plant, solution, disturbances=[ls.ControlNoise(config.noise)], trials=trials)
+    noisy = ls.simulate(plant, solution, disturbances=[ls.disturbances.ControlNoise(config.noise)], trials=trials)
     clear = [distances(plant, frames).min() for frames in (calm.frames[0], *noisy.frames)]
     assert solution.clearance is not None
     found = {
@@ -234,7 +235,7 @@ def main(config: Config) -> dict[str, Any]:
         "trials": trials,
     }
     if not config.quick:
-        ls.plot_run(
+        ls.view.plot_run(
             solution, {"undisturbed": calm, "disturbed": noisy}, config.out / "arm.png", world=plant.scene.world
         )
         ls.render(calm, config.out / "arm.mp4", insets=("top", "side"))

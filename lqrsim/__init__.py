@@ -4,7 +4,7 @@
 
     scenario = ls.scenarios.differential_drive()
     solution = ls.smooth(scenario.problem)
-    rollout = ls.simulate(scenario.plant(), solution, disturbances=[ls.ControlNoise(0.05)], seed=0)
+    rollout = ls.simulate(scenario.plant(), solution, disturbances=[ls.disturbances.ControlNoise(0.05)], seed=0)
     ls.render(rollout, "arena.mp4")
 
 Names are imported when they are first used, so that importing lqrsim costs nothing; `__init__.pyi` lists them.

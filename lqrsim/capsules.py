@@ -20,7 +20,7 @@ MOST = 10_000  # balls in a chain
 
 # A named tuple, for formulas that refer to one can be kept: see `codegen/fingerprint.py`.
 class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
-    """A capsule that is covered by a chain of balls, for `Balls`.
+    """A capsule that is covered by a chain of balls, for `CollisionSpheres`.
 
         link = ls.Capsule(length=0.4, radius=0.03, tolerance=0.002)
 
@@ -28,7 +28,7 @@ class Capsule(namedtuple("Capsule", ("length", "radius", "tolerance"))):
             from sympy import cos, sin
             return link.between((0, 0, 0.1), (0.4 * cos(x[0]), 0.4 * sin(x[0]), 0.1))
 
-        balls = ls.Balls(arm, link.radii)
+        balls = ls.CollisionSpheres(arm, link.radii)
 
     A `Clearance` with a margin of `missed` keeps the capsule itself clear.
 

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import ArrayLike
 
 import lqrsim as ls
-from lqrsim.simulation.outcome_table import Outcomes
 from lqrsim.stress.analysis import breaks, comparisons, degradation, modes, quantiles, success, worst
+from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.specification import Cell
 
 

@@ -11,6 +11,7 @@ from planar_arm import LINK, PlanarArm
 
 import lqrsim as ls
 from lqrsim.control.collision_chance import Surroundings
+from lqrsim.disturbances import ControlNoise, DisplacedObstacles
 from lqrsim.errors import Array
 from lqrsim.results.goal import OF_RANGE
 from lqrsim.simulation.tube_under import tube_under
@@ -108,7 +109,7 @@ def test_without_mujocos_contacts_the_balls_collide_alone(plant: ls.Plant, blind
 
 
 def test_obstacles_elsewhere(plant: ls.Plant, plan: ls.Solution) -> None:
-    rollout = ls.simulate(plant, plan, disturbances=[ls.DisplacedObstacles(0.03)], trials=3, frames=False)
+    rollout = ls.simulate(plant, plan, disturbances=[DisplacedObstacles(0.03)], trials=3, frames=False)
     for k in range(3):
         moved = ls.World(
             [
@@ -145,7 +146,7 @@ def test_clearances_that_chances_of_collision_are_of(plant: ls.Plant, plan: ls.S
 
 def test_the_chance_of_collision_is_about_how_often_it_collides(plant: ls.Plant, plan: ls.Solution) -> None:
     """Of obstacles that are elsewhere by so much that some runs collide."""
-    noise = [ls.DisplacedObstacles(0.06)]
+    noise = [DisplacedObstacles(0.06)]
     stated = problem(plant, plant.world)
     tube = ls.predict_tube(stated, plan, ls.uncertainty_of(plant, noise))
     run = ls.simulate(plant, plan, disturbances=noise, trials=200, frames=False, contacts=False)
@@ -156,7 +157,7 @@ def test_the_chance_of_collision_is_about_how_often_it_collides(plant: ls.Plant,
 
 
 def test_no_tube_of_a_robot_without_a_position(plant: ls.Plant, plan: ls.Solution) -> None:
-    tube, why = tube_under(problem(plant, plant.world), plan, plant, [ls.ControlNoise(0.1)])
+    tube, why = tube_under(problem(plant, plant.world), plan, plant, [ControlNoise(0.1)])
     assert tube is None
     assert why == "no predicted tube: the robot has no position"
 
@@ -181,10 +182,13 @@ def mirrored(x, p):
 @pytest.mark.parametrize(
     ("balls", "said"),
     [
-        (ls.Balls(mirrored, [0.03], sites=["end 0"], names=["elbow"]), "got 'elbow' at .* has 'end 0' at"),
-        (ls.Balls(mirrored, [0.03], sites=["link 0"]), "has 'link 0' at"),
-        (ls.Balls(mirrored, [0.03], sites=["end 9"]), "got 'end 9', want a site or a geom of the MJCF; it has: end 0"),
-        ([0.03], "balls: got .*, want Balls"),
+        (ls.CollisionSpheres(mirrored, [0.03], sites=["end 0"], names=["elbow"]), "got 'elbow' at .* has 'end 0' at"),
+        (ls.CollisionSpheres(mirrored, [0.03], sites=["link 0"]), "has 'link 0' at"),
+        (
+            ls.CollisionSpheres(mirrored, [0.03], sites=["end 9"]),
+            "got 'end 9', want a site or a geom of the MJCF; it has: end 0",
+        ),
+        ([0.03], "balls: got .*, want CollisionSpheres"),
     ],
 )
 def test_balls_that_are_elsewhere_in_mujoco_are_refused(plant: ls.Plant, balls: object, said: str) -> None:
@@ -202,7 +206,9 @@ def test_what_it_sees_of_a_floor(tmp_path: Path) -> None:
 class Long(ls.DifferentialDrive):
     """A drive that pushes a bumper before it: two balls in the plane, turned by its heading."""
 
-    balls = ls.Balls(lambda x, p: [[x[0], x[1]], [x[0] + 0.25 * _cos(x[2]), x[1] + 0.25 * _sin(x[2])]], [0.17, 0.05])
+    balls = ls.CollisionSpheres(
+        lambda x, p: [[x[0], x[1]], [x[0] + 0.25 * _cos(x[2]), x[1] + 0.25 * _sin(x[2])]], [0.17, 0.05]
+    )
 
 
 def _cos(angle):
@@ -222,7 +228,7 @@ def test_balls_in_the_plane_of_a_position(differential_drive: ls.Scenario, drive
     plant = ls.Plant(Long(), differential_drive.scene)
     around = ls.Plant(ls.DifferentialDrive(), differential_drive.scene)
     assert plant.world.names == around.world.names
-    rollout = ls.simulate(plant, drive_solution, trials=2, disturbances=[ls.ControlNoise(0.05)], contacts=False)
+    rollout = ls.simulate(plant, drive_solution, trials=2, disturbances=[ControlNoise(0.05)], contacts=False)
     x, y, heading = rollout.states[0].T
     front = np.stack([x + 0.25 * np.cos(heading), y + 0.25 * np.sin(heading)], axis=1)
     flat = plant.world
@@ -244,7 +250,7 @@ def rotors(x, p):
 
 def test_balls_in_space_that_turn_with_a_position(quadrotor: ls.Scenario) -> None:
     """The derivatives of places by rotation vectors, and costs of them, against differences."""
-    balls = ls.Balls(rotors, [0.1] * 4)
+    balls = ls.CollisionSpheres(rotors, [0.1] * 4)
     problem = dataclasses.replace(
         quadrotor.problem,
         stage_cost=ls.ControlCost(np.ones(4)) + ls.ObstacleCost(quadrotor.scene.world, balls=balls),

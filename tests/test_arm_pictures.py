@@ -41,7 +41,7 @@ def plan(plant: ls.Plant) -> ls.Solution:
 
 @pytest.fixture(scope="module")
 def run(plant: ls.Plant, plan: ls.Solution) -> ls.Rollout:
-    return ls.simulate(plant, plan, disturbances=[ls.ControlNoise(0.1)], trials=2)
+    return ls.simulate(plant, plan, disturbances=[ls.disturbances.ControlNoise(0.1)], trials=2)
 
 
 def test_a_run_records_where_its_balls_were(plant: ls.Plant, plan: ls.Solution, run: ls.Rollout) -> None:
@@ -58,13 +58,13 @@ def test_a_run_records_where_its_balls_were(plant: ls.Plant, plan: ls.Solution, 
 
 
 def test_its_file_is_the_same_run(run: ls.Rollout, tmp_path: Path) -> None:
-    read = ls.load_rollout(ls.save(run, tmp_path / "rollout.npz"))
+    read = ls.load(ls.save(run, tmp_path / "rollout.npz"), ls.Rollout)
     assert run.balls is not None
     assert read.balls is not None
     for field in dataclasses.fields(BallRecord):
         np.testing.assert_array_equal(getattr(read.balls, field.name), getattr(run.balls, field.name))
     bare = dataclasses.replace(run, balls=None)
-    assert ls.load_rollout(ls.save(bare, tmp_path / "bare.npz")).balls is None
+    assert ls.load(ls.save(bare, tmp_path / "bare.npz"), ls.Rollout).balls is None
 
 
 def test_the_silhouette_is_where_the_last_ball_is(plan: ls.Solution, run: ls.Rollout) -> None:
@@ -98,8 +98,8 @@ def test_the_figure_has_the_balls_at_several_times(
     assert len(circles) == MOMENTS * 3 * LINK.count
     seen = np.array([circle.center for circle in circles[-3 * LINK.count :]])
     np.testing.assert_allclose(seen, run.balls.driven[0, -1, :, :2], rtol=0, atol=1e-12)
-    assert ls.plot_run(plan, {"run": run}, tmp_path / "run.png", world=plant.scene.world).stat().st_size > 10_000
-    assert ls.plot_policy(plan, tmp_path / "p.png", world=plant.scene.world, radius=0.1).stat().st_size > 10_000
+    assert ls.view.plot_run(plan, {"run": run}, tmp_path / "run.png", world=plant.scene.world).stat().st_size > 10_000
+    assert ls.view.plot_policy(plan, tmp_path / "p.png", world=plant.scene.world, radius=0.1).stat().st_size > 10_000
 
 
 class Closing(Viewer):
@@ -146,10 +146,10 @@ def test_what_is_missing_is_said(run: ls.Rollout, plan: ls.Solution, plant: ls.P
     with pytest.raises(ls.InputError, match="or a run of a robot with balls that has frames"):
         ls.render(bare, tmp_path / "arm.mp4", **FLAT)
     with pytest.raises(ls.InputError, match="or runs of a robot with balls that have frames"):
-        ls.plot_run(plan, {"run": bare}, tmp_path / "run.png", world=plant.scene.world)
+        ls.view.plot_run(plan, {"run": bare}, tmp_path / "run.png", world=plant.scene.world)
     assert run.balls is not None
     nameless = dataclasses.replace(run.balls, anchors=np.full_like(run.balls.anchors, np.nan))
-    with pytest.raises(ls.InputError, match="want sites= in Balls"):
+    with pytest.raises(ls.InputError, match="want sites= in CollisionSpheres"):
         ls.verify_run(dataclasses.replace(run, balls=nameless))
     with pytest.raises(ls.InputError, match="got bodies beyond the model's"):
         ls.verify_run(dataclasses.replace(run, balls=dataclasses.replace(run.balls, anchors=1e3 + run.balls.anchors)))

@@ -14,7 +14,7 @@ from planar_arm import LENGTH, LINK, PlanarArm, places
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.problem.balls import clearances
+from lqrsim.problem.collision_spheres import clearances
 from lqrsim.problem.derivative_check import evaluate
 from lqrsim.solvers import compiled
 
@@ -48,9 +48,9 @@ def three_numbers(x, p):
     return out
 
 
-balls_of: Any = ls.Balls  # whose types nobody checks
+balls_of: Any = ls.CollisionSpheres  # whose types nobody checks
 RADII = (0.02, 0.05, 0.08)
-THREE = ls.Balls(three, RADII)
+THREE = ls.CollisionSpheres(three, RADII)
 
 
 def draw(seed: int) -> Array:
@@ -143,7 +143,7 @@ def test_clearance(margin: Any) -> None:
 @pytest.fixture(scope="module")
 def pair() -> tuple[ls.Problem, ls.Problem]:
     """A point mass with a radius, and the same with one ball."""
-    ball = ls.Balls(lambda x, p: [[x[0], x[1]]], [point_mass.RADIUS])
+    ball = ls.CollisionSpheres(lambda x, p: [[x[0], x[1]]], [point_mass.RADIUS])
     world, effort = point_mass.balls((0.0, 0.1, 0.5), (0.9, -0.3, 0.2)), ls.ControlCost([0.1, 0.1])
     stage = effort + ls.ObstacleCost(world, radius=point_mass.RADIUS, weight=2.0)
     first = dataclasses.replace(point_mass.problem(world), stage_cost=stage)
@@ -200,7 +200,7 @@ class TestLevels:
         jacobian = self.jacobian if with_jacobian else None
         options = {"level": level, "jacobian": jacobian, "depends_on": STATES[:3]}
         function = numba.njit(three_numbers) if level == "compiled" and not with_jacobian else three_numbers
-        balls = ls.Balls(function, RADII, **options)
+        balls = ls.CollisionSpheres(function, RADII, **options)
         ours, theirs = (
             ls.ObstacleCost(WORLD, balls=one, sharpness=SHARPNESS).bind(ARM.dynamics) for one in (balls, THREE)
         )
@@ -220,7 +220,7 @@ class TestLevels:
             [ls.Obstacle("rock", "sphere", np.array([1.34, 0.35, 0.1]), np.eye(3), np.array([0.1, 0.0, 0.0]))]
         )
 
-        def solved(balls: ls.Balls) -> ls.Solution:
+        def solved(balls: ls.CollisionSpheres) -> ls.Solution:
             start, goal = (-0.2, 0.1, 0.1, 0.0, 0.0, 0.0), (0.55, 0.1, 0.1, 0.0, 0.0, 0.0)
             problem = ls.Problem(
                 dynamics=ARM.dynamics, dt=0.1, steps=20, initial=ls.FixedState(start), control_limits=(-2.0, 2.0),
@@ -234,7 +234,9 @@ class TestLevels:
         assert theirs.success
         assert theirs.multipliers  # it presses
         # Both with a Jacobian: so they are compiled once, and `test_numbers` has them without.
-        ours = solved(ls.Balls(three_numbers, RADII, level=level, depends_on=STATES[:3], jacobian=self.jacobian))
+        ours = solved(
+            ls.CollisionSpheres(three_numbers, RADII, level=level, depends_on=STATES[:3], jacobian=self.jacobian)
+        )
         assert ours.status is theirs.status
         assert ours.cost == pytest.approx(theirs.cost, rel=1e-6)
         np.testing.assert_allclose(ours.trajectory.states, theirs.trajectory.states, rtol=0, atol=1e-4)
@@ -245,7 +247,7 @@ class TestLevels:
                 raise ValueError("too far")
             return np.zeros((1, 3))
 
-        balls = ls.Balls(failing, [0.1], level="plain")
+        balls = ls.CollisionSpheres(failing, [0.1], level="plain")
         with pytest.raises(ValueError, match="too far"):
             balls.centres(ARM.dynamics, np.full(6, 2.0))
 
@@ -316,25 +318,39 @@ def with_u(x, u, p):
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: ls.Balls(nobody, [0.1, 0.1]).bind(ARM.dynamics), "got 1 points, want 2: one for each of radii"),
-        (lambda: ls.Balls(nobody, [-0.1]), "radii: got -0.1 for ball 0, want at least 0"),
-        (lambda: ls.Balls(nobody, []), "radii: got none"),
-        (lambda: ls.Balls(nobody, 0.1), "radii: got shape"),
-        (lambda: ls.Balls(nobody, [np.nan]), "radii"),
-        (lambda: ls.Balls(of_another_size, [0.1, 0.1]).bind(ARM.dynamics), "points of 2 and 3 coordinates"),
-        (lambda: ls.Balls(in_the_plane, [0.1]).bind(ARM.dynamics), "2 coordinates for dynamics with no position"),
-        (lambda: ls.Balls(of_the_unknown, [0.1]).bind(ARM.dynamics), "parameter: got 'height', want one of: length"),
-        (lambda: balls_of(with_u, [0.1]), "want a function of \\(x, p\\)"),
-        (lambda: ls.Balls(nobody, [0.1], names=("a", "b")), "names: got"),
-        (lambda: ls.Balls(nobody, [0.1], sites=("a", "b")), "sites: got 2"),
-        (lambda: balls_of(nobody, [0.1], jacobian=nobody), "jacobian: got one for nobody, which is symbolic"),
-        (lambda: ls.Balls(nobody, [0.1], depends_on=("a",)), "depends_on: got names for a symbolic function"),
         (
-            lambda: ls.Balls(three_numbers, RADII, level="plain", depends_on=("shoulder", "knee")).bind(ARM.dynamics),
+            lambda: ls.CollisionSpheres(nobody, [0.1, 0.1]).bind(ARM.dynamics),
+            "got 1 points, want 2: one for each of radii",
+        ),
+        (lambda: ls.CollisionSpheres(nobody, [-0.1]), "radii: got -0.1 for ball 0, want at least 0"),
+        (lambda: ls.CollisionSpheres(nobody, []), "radii: got none"),
+        (lambda: ls.CollisionSpheres(nobody, 0.1), "radii: got shape"),
+        (lambda: ls.CollisionSpheres(nobody, [np.nan]), "radii"),
+        (lambda: ls.CollisionSpheres(of_another_size, [0.1, 0.1]).bind(ARM.dynamics), "points of 2 and 3 coordinates"),
+        (
+            lambda: ls.CollisionSpheres(in_the_plane, [0.1]).bind(ARM.dynamics),
+            "2 coordinates for dynamics with no position",
+        ),
+        (
+            lambda: ls.CollisionSpheres(of_the_unknown, [0.1]).bind(ARM.dynamics),
+            "parameter: got 'height', want one of: length",
+        ),
+        (lambda: balls_of(with_u, [0.1]), "want a function of \\(x, p\\)"),
+        (lambda: ls.CollisionSpheres(nobody, [0.1], names=("a", "b")), "names: got"),
+        (lambda: ls.CollisionSpheres(nobody, [0.1], sites=("a", "b")), "sites: got 2"),
+        (lambda: balls_of(nobody, [0.1], jacobian=nobody), "jacobian: got one for nobody, which is symbolic"),
+        (
+            lambda: ls.CollisionSpheres(nobody, [0.1], depends_on=("a",)),
+            "depends_on: got names for a symbolic function",
+        ),
+        (
+            lambda: ls.CollisionSpheres(three_numbers, RADII, level="plain", depends_on=("shoulder", "knee")).bind(
+                ARM.dynamics
+            ),
             "depends_on: got 'knee', want one of",
         ),
         (
-            lambda: ls.Balls(lambda x, p: np.zeros((3, 1)), [0.1], level="plain").bind(ARM.dynamics),
+            lambda: ls.CollisionSpheres(lambda x, p: np.zeros((3, 1)), [0.1], level="plain").bind(ARM.dynamics),
             "got 3 points, want 1",
         ),
         (lambda: ls.ObstacleCost(WORLD, radius=0.1, balls=THREE), "ObstacleCost: got radius and balls, want one"),

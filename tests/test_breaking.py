@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 import lqrsim as ls
+from lqrsim.disturbances import ControlNoise, ForceNoise, Push
 from lqrsim.stress.design_point import largest_effects, smallest_failure
 from lqrsim.stress.trial_score import TrialScore
 
@@ -86,7 +87,7 @@ def test_a_quadrotor_is_broken_by_less_than_what_broke_it(
     quadrotor: ls.Scenario, quadrotor_solution: ls.Solution
 ) -> None:
     """Gusts that break it need an eighth of a random failure's size, if they all push in the right direction."""
-    trials = TrialScore(quadrotor.plant(), quadrotor_solution, [ls.ForceNoise(0.2)])
+    trials = TrialScore(quadrotor.plant(), quadrotor_solution, [ForceNoise(0.2)])
     drawn = 1.5 * np.random.default_rng(1).standard_normal((200, trials.size))
     failures = drawn[trials(drawn) > 0]
     assert len(failures) > 5
@@ -104,9 +105,9 @@ def test_a_quadrotor_is_broken_by_less_than_what_broke_it(
 
 
 def test_disturbances_in_physical_units(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
-    push = ls.Push((0.0, 0.3, 0.4), at=2.0)
+    push = Push((0.0, 0.3, 0.4), at=2.0)
     force, *rest = largest_effects(
-        ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[push, ls.ControlNoise(0.01)], frames=False)
+        ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[push, ControlNoise(0.01)], frames=False)
     )
     assert (force.size, force.time) == (pytest.approx(0.5 * 30), pytest.approx(2.0))
     assert [one.what for one in rest] == [f"error of rotor_{i} as applied" for i in (1, 2, 3, 4)]

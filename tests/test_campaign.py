@@ -66,7 +66,7 @@ class Trouble(Disturbance):
 
 def troubled(kind: str = "raise", share: float = 0.17) -> ls.Scenario:
     given = ls.scenarios.quadrotor()
-    return dataclasses.replace(given, disturbances=(ls.ControlNoise(0.05), Trouble(kind, share)))
+    return dataclasses.replace(given, disturbances=(ls.disturbances.ControlNoise(0.05), Trouble(kind, share)))
 
 
 def malformed() -> ls.Scenario:
@@ -379,8 +379,9 @@ import sys
 if {dies} and __name__ == "__mp_main__":
     sys.exit(3)
 import lqrsim as ls
-campaign = ls.Campaign(scenario="quadrotor", sweeps={{"force": (ls.ForceNoise(0.1),)}}, policies=("smooth",), trials=1)
-ls.run_campaign(campaign, sys.argv[1], workers=1)
+force = {{"force": (ls.disturbances.ForceNoise(0.1),)}}
+campaign = ls.stress.Campaign(scenario="quadrotor", sweeps=force, policies=("smooth",), trials=1)
+ls.stress.run_campaign(campaign, sys.argv[1], workers=1)
 """
 
 
@@ -569,7 +570,7 @@ def test_stress_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     for name in ("1", str(cell)):
         assert main(["replay", str(folder), "--cell", name, "--trial", str(collided), "--out", str(rollout)]) == 0
         assert "identical to the table" in capsys.readouterr().out
-    again = ls.load_rollout(rollout)
+    again = ls.load(rollout, ls.Rollout)
     assert (again.first_trial, again.outcome) == (collided, ("collided",))
     assert again.frames.shape[1] > 100
     assert main(["stress", "quadrotor", "--resume", "--workers", "0", "--out", str(folder)]) == 0

@@ -36,7 +36,7 @@ def tracked(problem: ls.Problem, solution: ls.Solution) -> ls.AffinePolicy:
     return ls.track(problem, solution, tolerate=TOLERATE)
 
 
-def collisions(plan: ls.SafePlan, trials: int) -> float:
+def collisions(plan: ls.types.SafePlan, trials: int) -> float:
     """The share of collisions at the knots, by Monte Carlo with the exact discrete double integrator."""
     assert isinstance(plan.controller, ls.Feedback)
     rng, policy = np.random.default_rng(1), plan.controller.policy

@@ -58,7 +58,7 @@ def own(tmp_path: Path) -> Path:
 
 def simulate(solved: Path, out: Path, *options: str) -> ls.Rollout:
     assert main(["simulate", str(solved), "--out", str(out), *options]) == 0
-    return ls.load_rollout(out / "rollout.npz")
+    return ls.load(out / "rollout.npz", ls.Rollout)
 
 
 def one_line(capsys: pytest.CaptureFixture[str]) -> str:
@@ -82,7 +82,7 @@ def test_solve_prints_the_log_and_writes_the_solution(tmp_path: Path, capsys: py
     assert main(["solve", "quadrotor,query=2,seed=0", "--out", str(tmp_path), "--stop", "cost",
                  "--figure", str(tmp_path / "policy.pdf")]) == 0  # fmt: skip
     assert (tmp_path / "policy.pdf").read_bytes().startswith(b"%PDF")
-    solution = ls.load_solution(tmp_path / "solution.npz")
+    solution = ls.load(tmp_path / "solution.npz", ls.Solution)
     printed = capsys.readouterr().out
     assert solution.iteration_table() in printed
     assert solution.summary() in printed
@@ -96,7 +96,7 @@ def test_solve_says_that_it_did_not_converge(tmp_path: Path, capsys: pytest.Capt
     command = ["solve", "quadrotor", "--solver", "ilqr", "--max-iterations", "1", "--out", str(tmp_path)]
     assert main(command) == 1
     assert "remedy:" in capsys.readouterr().out
-    solution = ls.load_solution(tmp_path / "solution.npz")
+    solution = ls.load(tmp_path / "solution.npz", ls.Solution)
     assert (solution.status, solution.solver, len(solution.iterations)) == (ls.Status.MAX_ITERATIONS, "ilqr", 1)
 
 
@@ -105,23 +105,23 @@ def test_simulate_is_the_library_call_that_its_options_say(solved: Path, tmp_pat
     rest = "--push 1 0 0 2.5 --seed 4 --trials 2 --first-trial 3"
     rollout = simulate(solved, tmp_path, *f"{noise} {rest}".split())
     disturbances = [
-        ls.ControlNoise(0.05),
-        ls.ForceNoise(2.0),
-        ls.MeasurementNoise((0.01, 0.01, 0.02)),
-        ls.Push((1.0, 0.0, 0.0), at=2.5),
+        ls.disturbances.ControlNoise(0.05),
+        ls.disturbances.ForceNoise(2.0),
+        ls.disturbances.MeasurementNoise((0.01, 0.01, 0.02)),
+        ls.disturbances.Push((1.0, 0.0, 0.0), at=2.5),
     ]
-    plant, solution = ls.scenarios.differential_drive().plant(), ls.load_solution(solved)
+    plant, solution = ls.scenarios.differential_drive().plant(), ls.load(solved, ls.Solution)
     again = ls.simulate(plant, solution, disturbances=disturbances, seed=4, trials=2, first_trial=3)
     np.testing.assert_array_equal(rollout.states, again.states)  # the same seed: the same bits
     assert rollout.disturbances == again.disturbances
 
 
 def test_simulate_with_disturbances_by_name_and_without_feedback(solved: Path, tmp_path: Path) -> None:
-    scenario, solution = ls.scenarios.differential_drive(), ls.load_solution(solved)
+    scenario, solution = ls.scenarios.differential_drive(), ls.load(solved, ls.Solution)
     options = "--disturbances light scenario:ControlNoise --strength 2 --push 1 0 0 2.5 --open-loop --seed 4"
     rollout = simulate(solved, tmp_path, *options.split())
-    noise, push = ls.ControlNoise(0.1), ls.Push((1.0, 0.0, 0.0), at=2.5)
-    disturbances = [*ls.preset("moderate", scenario.plant()), noise, push]
+    noise, push = ls.disturbances.ControlNoise(0.1), ls.disturbances.Push((1.0, 0.0, 0.0), at=2.5)
+    disturbances = [*ls.disturbances.preset("moderate", scenario.plant()), noise, push]
     again = ls.simulate(scenario.plant(), solution.open_loop(), disturbances=disturbances, seed=4)
     np.testing.assert_array_equal(rollout.states, again.states)
     assert rollout.disturbances == again.disturbances
@@ -133,8 +133,8 @@ def test_simulate_with_disturbances_by_name_and_without_feedback(solved: Path, t
 def test_simulate_predicts_where_the_run_will_be_or_says_why_not(
     solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scenario, solution = ls.scenarios.differential_drive(), ls.load_solution(solved)
-    plant, noise = scenario.plant(), [ls.ControlNoise(0.05), ls.MeasurementNoise(0.01)]
+    scenario, solution = ls.scenarios.differential_drive(), ls.load(solved, ls.Solution)
+    plant, noise = scenario.plant(), [ls.disturbances.ControlNoise(0.05), ls.disturbances.MeasurementNoise(0.01)]
     rollout = simulate(solved, tmp_path, "--control-noise", "0.05", "--measurement-noise", "0.01", "--open-loop")
     assert "tube" not in capsys.readouterr().out
     tube = ls.predict_tube(scenario.problem, solution.open_loop(), ls.uncertainty_of(plant, noise))
@@ -175,7 +175,7 @@ def test_own_scenario_in_a_file(own: Path, tmp_path: Path, capsys: pytest.Captur
     reference = f"{own}:shorter,steps=100"
     assert main(["solve", reference, "--out", str(tmp_path)]) == 0
     solution = tmp_path / "solution.npz"
-    assert ls.load_solution(solution).trajectory.steps == 100
+    assert ls.load(solution, ls.Solution).trajectory.steps == 100
     capsys.readouterr()
     # A file of someone else's must not decide what code runs here.
     assert main(["simulate", str(solution)]) == 2
@@ -204,7 +204,7 @@ def test_own_scenario_in_a_module(own: Path, tmp_path: Path, monkeypatch: pytest
     monkeypatch.chdir(own.parent)
     monkeypatch.setattr(sys, "path", [*sys.path])
     assert main(["solve", "own:shorter"]) == 0
-    assert ls.load_solution("runs/shorter/solution.npz").scenario == "own:shorter"
+    assert ls.load("runs/shorter/solution.npz", ls.Solution).scenario == "own:shorter"
 
 
 @pytest.mark.parametrize(

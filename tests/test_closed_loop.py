@@ -425,6 +425,6 @@ def test_a_saved_policy_runs_as_the_one_that_was_saved(
     differential_drive: Scenario, drive_solution: Solution, tmp_path: Path
 ) -> None:
     """What is loaded is read-only."""
-    loaded = save_load.load_solution(save_load.save(drive_solution, tmp_path / "solution.npz"))
+    loaded = save_load.load(save_load.save(drive_solution, tmp_path / "solution.npz"), Solution)
     runs = [simulate(differential_drive.plant(), solution) for solution in (drive_solution, loaded)]
     np.testing.assert_array_equal(runs[0].states, runs[1].states)

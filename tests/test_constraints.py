@@ -134,7 +134,7 @@ class TestTolerance:
 def test_a_file_keeps_multipliers_and_candidates(tmp_path: Path) -> None:
     case = problem(weight=0.5)
     solution = ls.smooth(case)
-    loaded = ls.load_solution(ls.save(solution, tmp_path / "solution.npz"))
+    loaded = ls.load(ls.save(solution, tmp_path / "solution.npz"), ls.Solution)
     np.testing.assert_array_equal(loaded.multipliers[0].values, solution.multipliers[0].values)
     assert loaded.multipliers[0].penalty == solution.multipliers[0].penalty
     for one, other in zip(loaded.candidates, solution.candidates, strict=True):
@@ -176,12 +176,12 @@ def test_check_derivatives_finds_a_wrong_slope(differential_drive: ls.Scenario) 
     """Of a speed limit whose slope has one sign wrong; those of a clearance are right."""
 
     class Slow(ls.Constraint):
-        def bind(self, dynamics: ls.Dynamics) -> ls.ConstraintTerm:
+        def bind(self, dynamics: ls.Dynamics) -> ls.types.ConstraintTerm:
             source = (
                 "def value(x, u, t, row, data):\n    return data[0] - u[0] * u[1]\n\n\n"
                 "def slope(x, u, t, row, data, gradient):\n    gradient[3] -= u[1]\n    gradient[4] += u[0]\n"
             )
-            return ls.ConstraintTerm(source, np.array([0.1]), 1, lambda row: "slowness", uses_control=True)
+            return ls.types.ConstraintTerm(source, np.array([0.1]), 1, lambda row: "slowness", uses_control=True)
 
     clear = ls.Clearance(differential_drive.scene.world, radius=differential_drive.robot.radius)
     stated = replace(differential_drive.problem, constraints=[Slow(), clear])

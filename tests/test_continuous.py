@@ -216,7 +216,7 @@ def test_costs_that_are_not_quadratic_at_the_ends() -> None:
 
 def test_converged_means_what_it_says(differential_drive: ls.Scenario) -> None:
     """Sec. V-C: at convergence to 1e-9, Eq. (22) holds to 1e-5, and the total cost is the true cost at all times."""
-    seen: list[ls.Iteration] = []
+    seen: list[ls.types.Iteration] = []
     found = smooth_continuous(differential_drive.problem, tolerance=1e-9, gap_tolerance=1e-6, callback=seen.append)
     assert tuple(seen) == found.iterations
     assert found.success
@@ -227,7 +227,7 @@ def test_converged_means_what_it_says(differential_drive: ls.Scenario) -> None:
     np.testing.assert_allclose(found.policy(x, times), found.inverse_policy(x, times), rtol=0, atol=1e-5)
     np.testing.assert_allclose(found.total_cost(times).minimum(), found.cost, rtol=1e-6)
     text = str(found)
-    assert text.splitlines()[0] == ls.Iteration.HEADER
+    assert text.splitlines()[0] == ls.types.Iteration.HEADER
     assert f"CONVERGED after {len(seen)} iterations" in text
 
 
@@ -309,7 +309,7 @@ class TestEndings:
         assert found.detail.endswith("the integration is not done after 20 evaluations")
 
     def test_an_interrupt_is_not_swallowed(self) -> None:
-        def interrupt(iteration: ls.Iteration) -> None:
+        def interrupt(iteration: ls.types.Iteration) -> None:
             raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):

@@ -20,10 +20,10 @@ def test_demo_leaves_everything_it_promises(tmp_path: Path, capsys: pytest.Captu
     printed = capsys.readouterr().out
     for name in ("differential_drive", "quadrotor"):
         folder = tmp_path / name
-        solution, scenario = ls.load_solution(folder / "solution.npz"), ls.scenarios.get(name)
+        solution, scenario = ls.load(folder / "solution.npz", ls.Solution), ls.scenarios.get(name)
         assert solution.status is ls.Status.CONVERGED
         assert solution.iteration_table() in printed
-        undisturbed, disturbed = (ls.load_rollout(folder / f"{run}.npz") for run in ("undisturbed", "disturbed"))
+        undisturbed, disturbed = (ls.load(folder / f"{run}.npz", ls.Rollout) for run in ("undisturbed", "disturbed"))
         assert undisturbed.disturbances == ()
         assert undisturbed.outcome == ("reached",)
         assert undisturbed.tracking_error.max() <= scenario.tracking_bound

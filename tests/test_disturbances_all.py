@@ -8,6 +8,32 @@ import pytest
 from tracking import hover, weave
 
 import lqrsim as ls
+from lqrsim.disturbances import (
+    ActuatorLoss,
+    AxleMismatch,
+    CommandDropouts,
+    ControlDelay,
+    ControlNoise,
+    DisplacedObstacles,
+    Dryden,
+    ForceNoise,
+    FrictionMismatch,
+    Gusts,
+    InertiaMismatch,
+    InitialStateError,
+    MassMismatch,
+    MeanWind,
+    MeasurementBias,
+    MeasurementDropouts,
+    MeasurementLatency,
+    MeasurementNoise,
+    MotorLag,
+    Push,
+    Saturation,
+    ThrustMismatch,
+    TorqueNoise,
+    WheelRadiusMismatch,
+)
 from lqrsim.errors import InputError
 from lqrsim.robots.differential_drive import DifferentialDrive
 from lqrsim.robots.quadrotor import Quadrotor
@@ -23,15 +49,24 @@ RECORDS = (
 
 # One of each that both robots can have, and those of the one and the other.
 BOTH = [
-    ls.InitialStateError(0.01), ls.DisplacedObstacles(0.05), ls.MassMismatch(0.1), ls.InertiaMismatch(0.1),
-    ls.MeasurementNoise(0.005), ls.MeasurementBias(0.005), ls.MeasurementLatency(1),
-    ls.MeasurementDropouts(GilbertElliott(0.2, 0.5)), ls.ControlNoise(0.02), ls.CommandDropouts(0.2),
-    ls.ControlDelay(1), ls.MotorLag(0.05), ls.Saturation(share=0.9), ls.ActuatorLoss(at=0.2, remaining=0.7),
-    ls.ForceNoise(0.1), ls.TorqueNoise(0.002), ls.Push((0.1, 0.0, 0.0), at=0.1),
+    InitialStateError(0.01), DisplacedObstacles(0.05), MassMismatch(0.1), InertiaMismatch(0.1),
+    MeasurementNoise(0.005), MeasurementBias(0.005), MeasurementLatency(1),
+    MeasurementDropouts(GilbertElliott(0.2, 0.5)), ControlNoise(0.02), CommandDropouts(0.2),
+    ControlDelay(1), MotorLag(0.05), Saturation(share=0.9), ActuatorLoss(at=0.2, remaining=0.7),
+    ForceNoise(0.1), TorqueNoise(0.002), Push((0.1, 0.0, 0.0), at=0.1),
 ]  # fmt: skip
 OWN = {
-    "cage": [ls.ThrustMismatch(0.05), ls.MeanWind((0.5, 0.2, 0.0)), ls.Gusts(0.5, 0.5), ls.Dryden("light")],
-    "arena": [ls.WheelRadiusMismatch(0.01), ls.AxleMismatch(0.02), ls.FrictionMismatch(0.1)],
+    "cage": [
+        ThrustMismatch(0.05),
+        MeanWind((0.5, 0.2, 0.0)),
+        Gusts(0.5, 0.5),
+        Dryden("light"),
+    ],
+    "arena": [
+        WheelRadiusMismatch(0.01),
+        AxleMismatch(0.02),
+        FrictionMismatch(0.1),
+    ],
 }
 EXAMPLES = {type(one).__name__: one for one in (*BOTH, *OWN["cage"], *OWN["arena"])}
 FITTING = [(name, one) for name, own in OWN.items() for one in (*BOTH, *own)]
@@ -80,7 +115,7 @@ def test_a_trial_is_the_same_alone_and_among_nine_and_each_trial_is_its_own(plan
     # It does something.
     calm = simulate(plant, solution)
     changed = any((getattr(together, name) != getattr(calm, name)).any() for name in RECORDS)
-    assert changed or isinstance(one, ls.Saturation)  # whose limits these plans keep
+    assert changed or isinstance(one, Saturation)  # whose limits these plans keep
 
 
 @pytest.mark.parametrize("fixture", ["arena", pytest.param("cage", marks=pytest.mark.long)])
@@ -102,15 +137,28 @@ def test_all_compose(plants, solutions, fixture):
 
 def test_what_changes_the_same_thing_multiplies_and_adds(plants):
     cage, solution = plants["cage"], hover(6)
-    twice = simulate(cage, solution, disturbances=[ls.MassMismatch(factor=1.1), ls.MassMismatch(factor=1.2)])
-    once = simulate(cage, solution, disturbances=[ls.MassMismatch(factor=1.32)])
+    twice = simulate(
+        cage,
+        solution,
+        disturbances=[MassMismatch(factor=1.1), MassMismatch(factor=1.2)],
+    )
+    once = simulate(cage, solution, disturbances=[MassMismatch(factor=1.32)])
     np.testing.assert_allclose(twice.states, once.states, atol=1e-12)
-    lost = [ls.ActuatorLoss("quadrotor_rotor_2", remaining=0.5), ls.ThrustMismatch(factor=0.8)]
+    lost = [
+        ActuatorLoss("quadrotor_rotor_2", remaining=0.5),
+        ThrustMismatch(factor=0.8),
+    ]
     both = simulate(cage, solution, disturbances=lost)
-    same = simulate(cage, solution, disturbances=[ls.ThrustMismatch(factor=(0.8, 0.4, 0.8, 0.8))])
+    same = simulate(cage, solution, disturbances=[ThrustMismatch(factor=(0.8, 0.4, 0.8, 0.8))])
     np.testing.assert_allclose(both.states, same.states, atol=1e-12)
     winds = simulate(
-        cage, solution, disturbances=[ls.MeanWind((1, 0, 0)), ls.MeanWind((0, 2, 0)), ls.Push((0, 0, 1), 0)]
+        cage,
+        solution,
+        disturbances=[
+            MeanWind((1, 0, 0)),
+            MeanWind((0, 2, 0)),
+            Push((0, 0, 1), 0),
+        ],
     )
     np.testing.assert_allclose(winds.forces[0, :2], [[0.15, 0.3, 30], [0.15, 0.3, 0]])
 
@@ -134,16 +182,16 @@ def test_strength_0_is_no_effect_and_strength_1_itself(plants, solutions, fixtur
 
 
 def test_strengths_in_between():
-    assert ls.MeasurementNoise((0.1, 0.2)).scaled(0.5) == ls.MeasurementNoise((0.05, 0.1))
-    assert ls.MassMismatch(factor=1.21).scaled(0.5).factor == pytest.approx(1.1)
-    assert ls.MassMismatch(0.1).scaled(2) == ls.MassMismatch(0.2)
-    assert ls.ControlDelay(1).scaled(2.5) == ls.ControlDelay(3)
-    assert ls.MeasurementDropouts(0.4).scaled(3) == ls.MeasurementDropouts(1.0)
-    assert ls.ActuatorLoss(remaining=0.6).scaled(0.5).remaining == pytest.approx(0.8)
-    assert ls.ActuatorLoss(remaining=0.6).scaled(4).remaining == 0.0
-    assert ls.Dryden("light").scaled(3).std == pytest.approx(ls.Dryden("severe").std)  # pyright: ignore[reportAttributeAccessIssue]
+    assert MeasurementNoise((0.1, 0.2)).scaled(0.5) == MeasurementNoise((0.05, 0.1))
+    assert MassMismatch(factor=1.21).scaled(0.5).factor == pytest.approx(1.1)
+    assert MassMismatch(0.1).scaled(2) == MassMismatch(0.2)
+    assert ControlDelay(1).scaled(2.5) == ControlDelay(3)
+    assert MeasurementDropouts(0.4).scaled(3) == MeasurementDropouts(1.0)
+    assert ActuatorLoss(remaining=0.6).scaled(0.5).remaining == pytest.approx(0.8)
+    assert ActuatorLoss(remaining=0.6).scaled(4).remaining == 0.0
+    assert Dryden("light").scaled(3).std == pytest.approx(Dryden("severe").std)  # pyright: ignore[reportAttributeAccessIssue]
     with pytest.raises(InputError, match=r"^MassMismatch: std: got 0.4, want a finite number >= 0 < 0.333333$"):
-        ls.MassMismatch(0.1).scaled(4)
+        MassMismatch(0.1).scaled(4)
 
     class Silent(Disturbance):
         def start(self, plant, plan, generators):
@@ -178,24 +226,39 @@ def test_a_bad_number_is_refused_in_one_line_that_names_class_and_field(name, fi
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ls.MeasurementLatency(-1), "^MeasurementLatency: periods: got -1, want a whole number >= 0$"),
-        (lambda: ls.ControlDelay(True), "^ControlDelay: periods: got True, want a whole number >= 0$"),
-        (lambda: ls.MeasurementDropouts(1.01), "^MeasurementDropouts: loss: got 1.01, want a finite number >= 0 <= 1$"),
-        (lambda: ls.CommandDropouts(2), "^CommandDropouts: loss: got 2, want a finite number >= 0 <= 1$"),
+        (
+            lambda: MeasurementLatency(-1),
+            "^MeasurementLatency: periods: got -1, want a whole number >= 0$",
+        ),
+        (lambda: ControlDelay(True), "^ControlDelay: periods: got True, want a whole number >= 0$"),
+        (
+            lambda: MeasurementDropouts(1.01),
+            "^MeasurementDropouts: loss: got 1.01, want a finite number >= 0 <= 1$",
+        ),
+        (lambda: CommandDropouts(2), "^CommandDropouts: loss: got 2, want a finite number >= 0 <= 1$"),
         (lambda: GilbertElliott(0.1, 0.0), "^GilbertElliott: to_good: got 0.0, want a finite number > 0 <= 1$"),
         (lambda: GilbertElliott(1.1, 0.1), "^GilbertElliott: to_bad: got 1.1, want"),
         (lambda: GilbertElliott(0.1, 0.1, np.nan), "^GilbertElliott: lost_when_good: got nan, want"),
         (lambda: GilbertElliott(0.1, 0.1, 0, -1), "^GilbertElliott: lost_when_bad: got -1, want"),
-        (lambda: ls.Gusts(1.0, 0.0), "^Gusts: time_constant: got 0.0, want a finite number > 0$"),
-        (lambda: ls.Dryden("sever"), r"^Dryden: wind: got 'sever', want one of: light, .* \(did you mean severe\?\)$"),
-        (lambda: ls.Dryden(altitude=400.0), "^Dryden: altitude: got 400.0, want a finite number >= 0 <= 304.8$"),
-        (lambda: ls.Saturation(), "^Saturation: share: got neither it and limits, want"),
-        (lambda: ls.Saturation(share=1.1), "^Saturation: share: got 1.1, want"),
-        (lambda: ls.ActuatorLoss(remaining=1.1), "^ActuatorLoss: remaining: got 1.1, want"),
-        (lambda: ls.MassMismatch(), "^MassMismatch: got neither of std and factor, want one of them$"),
-        (lambda: ls.AxleMismatch(0.1, 1.1), "^AxleMismatch: got both std and factor, want one of them$"),
-        (lambda: ls.ThrustMismatch(0.34), "^ThrustMismatch: std: got 0.34, want a finite number >= 0 < 0.333333$"),
-        (lambda: ls.MassMismatch(factor=0.0), "^MassMismatch: factor: got 0, want numbers > 0$"),
+        (lambda: Gusts(1.0, 0.0), "^Gusts: time_constant: got 0.0, want a finite number > 0$"),
+        (
+            lambda: Dryden("sever"),
+            r"^Dryden: wind: got 'sever', want one of: light, .* \(did you mean severe\?\)$",
+        ),
+        (
+            lambda: Dryden(altitude=400.0),
+            "^Dryden: altitude: got 400.0, want a finite number >= 0 <= 304.8$",
+        ),
+        (lambda: Saturation(), "^Saturation: share: got neither it and limits, want"),
+        (lambda: Saturation(share=1.1), "^Saturation: share: got 1.1, want"),
+        (lambda: ActuatorLoss(remaining=1.1), "^ActuatorLoss: remaining: got 1.1, want"),
+        (lambda: MassMismatch(), "^MassMismatch: got neither of std and factor, want one of them$"),
+        (lambda: AxleMismatch(0.1, 1.1), "^AxleMismatch: got both std and factor, want one of them$"),
+        (
+            lambda: ThrustMismatch(0.34),
+            "^ThrustMismatch: std: got 0.34, want a finite number >= 0 < 0.333333$",
+        ),
+        (lambda: MassMismatch(factor=0.0), "^MassMismatch: factor: got 0, want numbers > 0$"),
     ],
 )
 def test_numbers_beyond_their_bounds_are_refused(make, message):
@@ -233,8 +296,8 @@ def test_descriptions_are_in_words_and_units(plants):
         "axle length off by 2 % (std, cut at 3 std)",
         "friction of the wheels off by 10 % (std, cut at 3 std)",
     ]
-    assert ls.Saturation(lowest=0.5, highest=2.0).describe(plants["cage"]) == "controls limited from 0.5 N to 2 N"
-    assert ls.AxleMismatch(factor=1.1).describe(plants["arena"]) == "axle length times 1.1"
+    assert Saturation(lowest=0.5, highest=2.0).describe(plants["cage"]) == "controls limited from 0.5 N to 2 N"
+    assert AxleMismatch(factor=1.1).describe(plants["arena"]) == "axle length times 1.1"
 
 
 @pytest.mark.parametrize("fixture", ["arena", "cage"])

@@ -159,13 +159,13 @@ def test_robust_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     # The recursion of the file gives what the filter gave in the simulation, shown the same.
     np.testing.assert_allclose(names["control"], run.commanded[0, 0], rtol=0, atol=1e-9)
     with pytest.raises(ls.InputError, match=r"wind_z.*wind_x"):
-        ls.Uncertainty(unknowns=[ls.Unknown("wind_z", std=1.0)]).check(names["mass"])
+        ls.Uncertainty(unknowns=[ls.disturbances.Unknown("wind_z", std=1.0)]).check(names["mass"])
 
 
 def presets() -> str:
     """The table of docs/stress_testing.md."""
     plants = {name: ls.scenarios.get(name).plant() for name in ls.scenarios.names()}
-    words = {name: {type(one).__name__: one.describe(plant) for one in ls.preset("light", plant)}
+    words = {name: {type(one).__name__: one.describe(plant) for one in ls.disturbances.preset("light", plant)}
              for name, plant in plants.items()}  # fmt: skip
     kinds = dict.fromkeys(kind for of_plant in words.values() for kind in of_plant)
     lines = [
@@ -188,7 +188,7 @@ def test_stress_testing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert set(KINDS) <= set(re.findall(r"`(\w+)`", page.split("## Presets")[0]))
     small = ["--trials", "4", "--strengths", "1", "--policies", "smooth", "--workers", "0"]
     assert main(["stress", "draught.py:draughty", "--sweep", "scenario", *small]) == 0
-    assert ls.Results("runs/stress/draughty").cells == [ls.Cell("smooth", "scenario", 1.0)]
+    assert ls.stress.Results("runs/stress/draughty").cells == [ls.stress.Cell("smooth", "scenario", 1.0)]
 
 
 def test_commands_of_pages_exist() -> None:

@@ -13,7 +13,7 @@ import lqrsim as ls
 from lqrsim.errors import InputError
 
 SECTION = re.compile(r"^(Args|Attributes|Returns|Yields|Raises):$")
-MODULES = (ls.robots, ls.rotations, ls.scenarios)
+MODULES = (ls.disturbances, ls.lq, ls.robots, ls.rotations, ls.scenarios, ls.stress, ls.types, ls.view)
 
 
 def sections(doc: str) -> dict[str, list[str]]:

@@ -16,17 +16,27 @@ from tracking import hover, track
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.control.controllers import Control, Controller, Feedback
+from lqrsim.disturbances import (
+    ControlNoise,
+    DisplacedObstacles,
+    ForceNoise,
+    InitialStateError,
+    MassMismatch,
+    MeasurementNoise,
+    Push,
+    Unknown,
+)
 from lqrsim.errors import InputError
 from lqrsim.reports.page import report
 from lqrsim.results.goal import OF_RANGE, Target
 from lqrsim.results.trial_outcome import endings
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import scene_from_xml
-from lqrsim.simulation.outcome_table import OUTCOMES, Outcomes, outcomes
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.tube_under import tube_under
 from lqrsim.stress import trials
 from lqrsim.stress.campaign import Campaign, run_campaign
+from lqrsim.stress.outcome_table import OUTCOMES, Outcomes, outcomes
 from lqrsim.stress.results import Results, differences, replay
 
 ARM = """<mujoco>
@@ -152,7 +162,7 @@ def test_no_tube_is_predicted_of_where_a_robot_without_a_position_is(arm: Plant,
         dynamics=arm.robot.dynamics, dt=0.05, steps=40, initial=ls.FixedState((0.0, 0.0)),
         stage_cost=ls.ControlCost((1.0,)), final_cost=ls.QuadraticCost((1.0, 1.0), about=(1.0, 0.0)),
     )  # fmt: skip
-    assert tube_under(problem, swing, arm, [ls.ControlNoise(0.1)]) == (
+    assert tube_under(problem, swing, arm, [ControlNoise(0.1)]) == (
         None,
         "no predicted tube: the robot has no position",
     )
@@ -203,9 +213,9 @@ def test_a_cart_pole_that_has_fallen_has_not_reached_its_goal() -> None:
     plant = Plant(CartPole(), scene_from_xml(CART_POLE.replace("0 0 -0.2", "0 0 -0.7"), "rail"))  # out of reach
     plan = track(plant.robot, np.zeros(4), np.zeros((25, 1)), 0.05)
     plan = replace(plan, goal=np.zeros(4))
-    held = ls.simulate(plant, plan, disturbances=[ls.InitialStateError((0, 0.02, 0, 0))])
+    held = ls.simulate(plant, plan, disturbances=[InitialStateError((0, 0.02, 0, 0))])
     assert held.outcome == ("reached",)
-    fallen = ls.simulate(plant, plan.open_loop(), disturbances=[ls.InitialStateError((0, 0.02, 0, 0))])
+    fallen = ls.simulate(plant, plan.open_loop(), disturbances=[InitialStateError((0, 0.02, 0, 0))])
     assert abs(fallen.states[0, -1, 1]) > 1
     assert fallen.outcome == ("timed out",)
     assert fallen.tracking_error.max() > 1
@@ -217,9 +227,7 @@ def test_the_floor_is_an_obstacle_of_what_cannot_stand_on_it(contacts: bool) -> 
     plant = Plant(CartPole(), scene_from_xml(CART_POLE, "rail"))
     assert plant.obstacles == ("floor",)
     plan = track(plant.robot, np.zeros(4), np.zeros((60, 1)), 0.05)
-    fallen = ls.simulate(
-        plant, plan.open_loop(), disturbances=[ls.InitialStateError((0, 0.02, 0, 0))], contacts=contacts
-    )
+    fallen = ls.simulate(plant, plan.open_loop(), disturbances=[InitialStateError((0, 0.02, 0, 0))], contacts=contacts)
     assert (fallen.outcome, fallen.obstacles) == (("collided",), ("floor",))
     # The pole's tip, 0.6 m from the hinge and 2 cm thick, is then on the floor, 0.2 m below the hinge.
     touch, at = np.arccos(-0.18 / 0.6), round(fallen.collided_at[0] / 0.05 - 0.5)
@@ -302,12 +310,12 @@ def test_a_solution_and_its_files_keep_the_goal(quadrotor_solution: ls.Solution,
     assert solution.goal is not None
     away = np.linalg.norm(solution.trajectory.states[-1, :3] - solution.goal[:3])
     assert f"the plan ends {away:.3g} m from the goal" in solution.summary()
-    again = ls.load_solution(ls.save(solution, tmp_path / "solution.npz"))
+    again = ls.load(ls.save(solution, tmp_path / "solution.npz"), ls.Solution)
     np.testing.assert_array_equal(again.goal, solution.goal)
     assert again.goal_radius == solution.goal_radius == 0.3
     half = replace(short(1.9), goal=np.array([1.0, *[np.nan] * 11]))
-    rollout = ls.simulate(cage, half, disturbances=[ls.ForceNoise(2.0)], trials=4)
-    loaded = ls.load_rollout(ls.save(rollout, tmp_path / "rollout.npz"))
+    rollout = ls.simulate(cage, half, disturbances=[ForceNoise(2.0)], trials=4)
+    loaded = ls.load(ls.save(rollout, tmp_path / "rollout.npz"), ls.Rollout)
     assert loaded.outcome == rollout.outcome
     assert loaded.obstacles == rollout.obstacles
     np.testing.assert_array_equal(loaded.goal, half.goal)
@@ -319,7 +327,7 @@ def test_a_solution_and_its_files_keep_the_goal(quadrotor_solution: ls.Solution,
 
 def test_what_hits_something_and_then_blows_up_has_collided_everywhere(cage: Plant) -> None:
     """Thrown at a wall, and out of the world two seconds later."""
-    push = [ls.Push((3.0, 0.0, 0.0), at=0.0), ls.Push((1e12, 0.0, 0.0), at=1.5)]
+    push = [Push((3.0, 0.0, 0.0), at=0.0), Push((1e12, 0.0, 0.0), at=1.5)]
     for contacts in (True, False):
         rollout = ls.simulate(cage, hover(), disturbances=push, contacts=contacts)
         assert np.isfinite(rollout.diverged_at[0])
@@ -328,7 +336,7 @@ def test_what_hits_something_and_then_blows_up_has_collided_everywhere(cage: Pla
         assert outcomes(rollout).outcome.tolist() == ["collided"]
         assert outcomes(rollout).ended[0] == rollout.collided_at[0] < rollout.diverged_at[0]
         assert "collided with" in rollout.summary()
-    lost = ls.simulate(cage, hover(), disturbances=[ls.ForceNoise(1e300)], trials=2)
+    lost = ls.simulate(cage, hover(), disturbances=[ForceNoise(1e300)], trials=2)
     assert set(lost.outcome) <= {"diverged", "collided"}
     assert lost.summary()  # whatever the strength
 
@@ -395,7 +403,7 @@ def by_hand(rollout: ls.Rollout, table: Outcomes, k: int) -> None:
 )  # fmt: skip
 def test_table_and_rollout_agree(force: float, by: float, seed: int, contacts: bool, trials: int) -> None:
     plant = Plant(ls.Quadrotor(), ls.load_scene("cage"))
-    noise = [ls.ForceNoise(force)]
+    noise = [ForceNoise(force)]
     rollout = ls.simulate(plant, short(by), disturbances=noise, seed=seed, trials=trials, contacts=contacts)
     other = ls.simulate(
         plant, short(by), disturbances=noise, seed=seed, trials=trials, contacts=not contacts, frames=False
@@ -467,13 +475,13 @@ def test_a_campaign_says_whose_filter_diverged(tmp_path: Path, monkeypatch: pyte
     scenario = ls.scenarios.quadrotor()
     tolerate = {"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}
     # Estimates of drag that are negative make its predictions explode.
-    wrong = ls.Uncertainty(unknowns=[ls.Unknown("drag", 60.0)], measurement=0.02, start=0.01)
+    wrong = ls.Uncertainty(unknowns=[Unknown("drag", 60.0)], measurement=0.02, start=0.01)
 
     def controller(own: trials.Trials, policy: str) -> Controller:
         return ls.OffsetFree(scenario.problem, own.solutions[policy], wrong, tolerate=tolerate)
 
     monkeypatch.setattr(trials.Trials, "_controller", controller)
-    noise = (ls.MeasurementNoise(0.02), ls.ForceNoise(1.0))
+    noise = (MeasurementNoise(0.02), ForceNoise(1.0))
     campaign = replace(ROUGH, sweeps={"noise": noise}, strengths=(1.0,), trials=12)
     files = []
     for batch in (12, 5):
@@ -540,7 +548,7 @@ def one_nan(shown: np.ndarray, command: np.ndarray) -> np.ndarray:
     ],
 )
 def test_a_controller_that_fails_ends_its_trials_and_says_why(cage: Plant, how, failed: int, why: str) -> None:
-    noise, plan = [ls.ForceNoise(0.1)], hover()
+    noise, plan = [ForceNoise(0.1)], hover()
     calm = ls.simulate(cage, plan, disturbances=noise, trials=3)
     rollout = ls.simulate(cage, plan, controller=Failing(plan, how), disturbances=noise, trials=3)
     assert rollout.outcome.count("error") == failed
@@ -606,7 +614,11 @@ def test_parts_that_stick_out_of_the_radius_collide_too(cage: Plant) -> None:
     assert cage.enclosed
     plant = Plant(ls.Quadrotor(radius=0.2), cage.scene)
     assert not plant.enclosed
-    noise = [ls.ForceNoise(10.0), ls.DisplacedObstacles(0.05), ls.MassMismatch(0.05)]
+    noise = [
+        ForceNoise(10.0),
+        DisplacedObstacles(0.05),
+        MassMismatch(0.05),
+    ]
     runs = {c: ls.simulate(plant, hover(), disturbances=noise, trials=8, contacts=c) for c in (True, False)}
     free, solid = runs[False], runs[True]
     assert free.collided.sum() >= 4

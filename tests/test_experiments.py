@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
+from lqrsim.disturbances import MassMismatch, MeasurementDropouts, MeasurementLatency
 
 FOLDER = Path(__file__).parent.parent / "experiments"
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if "__main__" in path.read_text(encoding="utf-8"))
@@ -290,9 +291,9 @@ class TestStressTest:
         }  # fmt: skip
 
     def test_only_strengths_that_can_be_and_differ_are_tried(self, stress: ModuleType) -> None:
-        assert stress.possible(ls.MassMismatch(0.1), (1.0, 2.0, 3.0, 4.0)) == [1.0, 2.0, 3.0]
-        assert stress.possible(ls.MeasurementDropouts(0.5), (1.0, 2.0, 3.0)) == [1.0, 2.0]
-        assert stress.possible(ls.MeasurementLatency(1), (1.0, 1.1, 2.0)) == [1.0, 2.0]
+        assert stress.possible(MassMismatch(0.1), (1.0, 2.0, 3.0, 4.0)) == [1.0, 2.0, 3.0]
+        assert stress.possible(MeasurementDropouts(0.5), (1.0, 2.0, 3.0)) == [1.0, 2.0]
+        assert stress.possible(MeasurementLatency(1), (1.0, 1.1, 2.0)) == [1.0, 2.0]
 
 
 @pytest.mark.long

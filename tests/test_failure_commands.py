@@ -27,7 +27,7 @@ from lqrsim.simulation.disturbances import Effect
 
 
 @dataclasses.dataclass(frozen=True)
-class Shift(ls.Disturbance):
+class Shift(Disturbance):
     std: float
     most: float
 
@@ -51,12 +51,12 @@ def shifted(std: float = 0.1, most: float = 9.0, steps: int = 3) -> ls.Scenario:
 
 
 def pushed() -> ls.Scenario:
-    return dataclasses.replace(shifted(), disturbances=(ls.Push((0.1, 0.0, 0.0), at=0.1),))
+    return dataclasses.replace(shifted(), disturbances=(Push((0.1, 0.0, 0.0), at=0.1),))
 
 
 def blocked() -> ls.Scenario:
     given = ls.scenarios.quadrotor(query=3)
-    return dataclasses.replace(given, disturbances=(ls.ForceNoise(0.01),))
+    return dataclasses.replace(given, disturbances=(ForceNoise(0.01),))
 """
 OPEN = ["--policy", "open_loop"]  # it stays where it was shifted to
 SMALL = ["--particles", "60", "--repetitions", "5"]
@@ -104,7 +104,7 @@ def test_rare_measures_a_probability_that_is_known(
     assert (asked["scenario"], asked["policy"], asked["particles"]) == (reference, "open_loop", 60)
     assert rare["disturbances"] == [{"kind": "Shift", "settings": {"std": 0.1, "most": 9.0}}]
     # What is written fails, the worst first.
-    rollout = ls.load_rollout(tmp_path / "one" / "rollout.npz")
+    rollout = ls.load(tmp_path / "one" / "rollout.npz", ls.Rollout)
     assert rollout.outcome == ("collided",) * 3
     assert rollout.frames.shape[1] > 1
     begun = rollout.states[:, 0, 1]
@@ -113,7 +113,7 @@ def test_rare_measures_a_probability_that_is_known(
     same = [sorted((path.name, path.read_bytes()) for path in (tmp_path / name).iterdir()) for name in ("one", "again")]
     assert [name for name, _ in same[0]] == ["rare.json", "rollout.npz"]
     assert dict(same[0])["rare.json"] == dict(same[1])["rare.json"]
-    again = ls.load_rollout(tmp_path / "again" / "rollout.npz")
+    again = ls.load(tmp_path / "again" / "rollout.npz", ls.Rollout)
     np.testing.assert_array_equal(again.states, rollout.states)
 
 
@@ -130,14 +130,14 @@ def test_break_finds_a_distance_that_is_known(own: str, tmp_path: Path, capsys: 
     assert numbers["numbers"] == pytest.approx([numbers["distance"]])
     assert f"{numbers['distance']:.3g} standard deviations from the undisturbed trial" in printed
     assert "100.0 % of its square: shifted to the south, std 0.08 m (1 of the numbers)" in printed
-    rollout = ls.load_rollout(tmp_path / "rollout.npz")
+    rollout = ls.load(tmp_path / "rollout.npz", ls.Rollout)
     assert rollout.outcome == ("collided",)
     assert -0.001 < rollout.clearance[0].min() < 0
 
 
 def same_files(one: Path, other: Path, name: str) -> None:
     assert (one / name).read_bytes() == (other / name).read_bytes()
-    runs = [ls.load_rollout(folder / "rollout.npz") for folder in (one, other)]
+    runs = [ls.load(folder / "rollout.npz", ls.Rollout) for folder in (one, other)]
     np.testing.assert_array_equal(runs[0].states, runs[1].states)
 
 
@@ -148,7 +148,7 @@ def test_python_and_the_commands_give_the_same(own: str, tmp_path: Path, capsys:
     more = [*OPEN, "--strength", "2", "--out", str(command)]
     assert main(["rare", reference, "--particles", "20", "--repetitions", "2", "--shown", "2", *more]) == 0
     rare_says = capsys.readouterr().out
-    problem = ls.ReliabilityProblem(reference, strength=2, policy="open_loop")
+    problem = ls.stress.ReliabilityProblem(reference, strength=2, policy="open_loop")
     told: list[str] = []
     rare = problem.rare_failures(particles=20, repetitions=2, report=told.append)
     shown = rare.save(python, shown=2)
@@ -183,7 +183,7 @@ def test_python_and_the_commands_give_the_same(own: str, tmp_path: Path, capsys:
 )
 def test_a_problem_that_is_not_one_is_refused(asked: dict[str, Any], says: str) -> None:
     with pytest.raises(ls.InputError, match=says):
-        ls.ReliabilityProblem(**{"scenario": "quadrotor", **asked})
+        ls.stress.ReliabilityProblem(**{"scenario": "quadrotor", **asked})
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_a_problem_that_is_not_one_is_refused(asked: dict[str, Any], says: str) 
     [({"particles": 19}, "particles: got 19"), ({"repetitions": 1}, "repetitions: got 1"), ({"seed": -1}, "seed")],
 )
 def test_options_are_refused_before_anything_is_solved(options: dict[str, Any], says: str) -> None:
-    problem = ls.ReliabilityProblem("quadrotor")
+    problem = ls.stress.ReliabilityProblem("quadrotor")
     with pytest.raises(ls.InputError, match=says):
         problem.rare_failures(**options)
     assert "score" not in vars(problem)

@@ -5,6 +5,7 @@ import dataclasses
 import importlib
 import io
 import json
+import os
 import pickle
 import tracemalloc
 import warnings
@@ -32,13 +33,55 @@ def saved(tmp_path: Path, drive_solution: ls.Solution) -> Path:
 
 
 def test_a_solution_survives(saved: Path, drive_solution: ls.Solution) -> None:
-    assert same(ls.load_solution(saved), drive_solution)
+    assert same(ls.load(saved, ls.Solution), drive_solution)
+
+
+def test_a_file_says_what_it_holds(saved: Path, drive_solution: ls.Solution, tmp_path: Path) -> None:
+    """Without a kind it is whatever it is; with one, another is refused by name."""
+    policy = ls.save(drive_solution.policy, tmp_path / "policy.npz")
+    assert same(ls.load(saved), drive_solution)
+    assert same(ls.load(policy), drive_solution.policy)
+    with pytest.raises(ls.InputError, match="holds a 'lqrsim solution', want a 'lqrsim rollout'"):
+        ls.load(saved, ls.Rollout)
+    with pytest.raises(ls.InputError, match="holds an AffinePolicy, want an OutputFeedbackPolicy"):
+        ls.load(policy, ls.OutputFeedbackPolicy)
+    with pytest.raises(ls.InputError, match=r"kind: got .*, want one of ls.Solution, ls.Rollout"):
+        ls.load(saved, ls.Trajectory)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    with pytest.raises(ls.InputError, match="a folder, want a file; the folder of a campaign is opened"):
+        ls.load(tmp_path)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a privilege on Windows")
+def test_a_link_is_written_through(drive_solution: ls.Solution, tmp_path: Path) -> None:
+    """Also one whose target is not there yet, and one that leads to another link."""
+    (tmp_path / "elsewhere").mkdir()
+    target, link, second = tmp_path / "elsewhere" / "plan.npz", tmp_path / "link.npz", tmp_path / "second.npz"
+    link.symlink_to(target)
+    second.symlink_to(link)
+    for name in (link, second):
+        ls.save(drive_solution, name)
+        assert name.is_symlink()
+        assert same(ls.load(target), drive_solution)
+        target.unlink()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no pipes in folders")
+def test_only_regular_files_are_written_to(drive_solution: ls.Solution, tmp_path: Path) -> None:
+    """A pipe would be replaced by a file, and whoever reads from it would wait for ever."""
+    pipe, folder = tmp_path / "pipe.npz", tmp_path / "folder.npz"
+    os.mkfifo(pipe)
+    folder.mkdir()
+    for path, what in ((pipe, "neither a file nor a folder"), (folder, "a folder")):
+        with pytest.raises(ls.InputError, match=f"output: got .*, which is {what}, want the name of a file"):
+            ls.save(drive_solution, path)
+    assert pipe.is_fifo()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder.npz", "pipe.npz"]
 
 
 def test_so_do_the_solutions_of_ilqr_and_failed_ones(tmp_path: Path, differential_drive: ls.Scenario) -> None:
     for max_iterations in (500, 1):
         solution = ls.ilqr(differential_drive.problem, max_iterations=max_iterations)
-        assert same(ls.load_solution(ls.save(solution, tmp_path / "it.npz")), solution)
+        assert same(ls.load(ls.save(solution, tmp_path / "it.npz"), ls.Solution), solution)
 
 
 def test_the_same_solution_gives_the_same_bytes(tmp_path: Path, saved: Path, drive_solution: ls.Solution) -> None:
@@ -86,13 +129,16 @@ def _save_bare_array(path: Path) -> None:
 def test_a_spoilt_file_gets_one_line(saved: Path, spoil, message: str) -> None:
     spoil(saved)
     with pytest.raises(ls.InputError, match=message) as caught:
-        ls.load_solution(saved)
+        ls.load(saved, ls.Solution)
     assert "\n" not in str(caught.value)
 
 
 @pytest.fixture(scope="module")
 def rollout(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> ls.Rollout:
-    plant, disturbances = differential_drive.plant(), [ls.ControlNoise(0.01), ls.ForceNoise(0.1)]
+    plant, disturbances = (
+        differential_drive.plant(),
+        [ls.disturbances.ControlNoise(0.01), ls.disturbances.ForceNoise(0.1)],
+    )
     return ls.simulate(plant, drive_solution, disturbances=disturbances, trials=2, seed=2**40)
 
 
@@ -102,9 +148,9 @@ def run(tmp_path: Path, rollout: ls.Rollout) -> Path:
 
 
 def test_a_rollout_survives_and_is_saved_again_as_it_was(saved: Path, run: Path, rollout: ls.Rollout) -> None:
-    loaded = ls.load_rollout(run)
+    loaded = ls.load(run, ls.Rollout)
     assert same(loaded, rollout)
-    for path, one in ((run, loaded), (saved, ls.load_solution(saved))):
+    for path, one in ((run, loaded), (saved, ls.load(saved, ls.Solution))):
         assert ls.save(one, path.with_name("again.npz")).read_bytes() == path.read_bytes()
 
 
@@ -121,7 +167,7 @@ def test_a_predicted_tube_survives_and_files_without_it_have_none(
     tmp_path: Path, run: Path, predicted: ls.Rollout
 ) -> None:
     path = ls.save(predicted, tmp_path / "tube.npz")
-    loaded = ls.load_rollout(path)
+    loaded = ls.load(path, ls.Rollout)
     assert same(loaded, predicted)
     assert ls.save(loaded, tmp_path / "again.npz").read_bytes() == path.read_bytes()
     arrays, meta = contents(path)
@@ -129,7 +175,7 @@ def test_a_predicted_tube_survives_and_files_without_it_have_none(
     without, of_old = contents(run)
     assert arrays.keys() - without.keys() == {"tube", "collision_chance"}
     assert meta["version"] == of_old["version"] == 4
-    assert (ls.load_rollout(run).tube, ls.load_rollout(run).collision_chance) == (None, None)
+    assert (ls.load(run, ls.Rollout).tube, ls.load(run, ls.Rollout).collision_chance) == (None, None)
 
 
 def skewed(tube: np.ndarray) -> np.ndarray:
@@ -160,11 +206,11 @@ def test_a_damaged_tube_gets_one_line(
     path = ls.save(predicted, tmp_path / "tube.npz")
     rewrite(path, **changes)
     with pytest.raises(ls.InputError, match=message) as caught:
-        ls.load_rollout(path)
+        ls.load(path, ls.Rollout)
     assert "\n" not in str(caught.value)
     rewrite(ls.save(predicted, path), sealed=False, **changes)  # as damage is
     with pytest.raises(ls.InputError, match=r"tube\.npz") as caught:
-        ls.load_rollout(path)
+        ls.load(path, ls.Rollout)
     assert "\n" not in str(caught.value)
 
 
@@ -182,7 +228,7 @@ def test_every_flipped_bit_is_harmless(saved: Path, drive_solution: ls.Solution)
         np.savez(file, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
     rng = np.random.default_rng(0)
     for original in (packed, saved.read_bytes()):
-        assert same(ls.load_solution(saved), drive_solution)
+        assert same(ls.load(saved, ls.Solution), drive_solution)
         # Half of them near the names and sizes at the end, where a bit makes a parser say most.
         for place in [
             *rng.integers(len(original), size=60),
@@ -192,7 +238,7 @@ def test_every_flipped_bit_is_harmless(saved: Path, drive_solution: ls.Solution)
             spoilt[place] ^= 1 << int(rng.integers(8))
             saved.write_bytes(bytes(spoilt))
             with contextlib.suppress(ls.InputError):
-                assert same(ls.load_solution(saved), drive_solution)
+                assert same(ls.load(saved, ls.Solution), drive_solution)
         saved.write_bytes(packed)
 
 
@@ -257,10 +303,10 @@ def test_what_is_in_a_rollout_is_what_it_must_be(run: Path, changes: dict[str, A
     rewrite(run, **changes)
     if message is None:  # without pictures, and so not to be drawn
         with pytest.raises(ls.InputError, match=r"frames|without one finite state"):
-            ls.render(ls.load_rollout(run), run.with_suffix(".mp4"))
+            ls.render(ls.load(run, ls.Rollout), run.with_suffix(".mp4"))
         return
     with pytest.raises(ls.InputError, match=message) as caught:
-        ls.load_rollout(run)
+        ls.load(run, ls.Rollout)
     assert "\n" not in str(caught.value)
 
 
@@ -302,7 +348,7 @@ def test_what_is_in_a_rollout_is_what_it_must_be(run: Path, changes: dict[str, A
 def test_what_is_in_a_solution_is_what_it_must_be(saved: Path, changes: dict[str, Any], message: str) -> None:
     rewrite(saved, **changes)
     with pytest.raises(ls.InputError, match=message) as caught:
-        ls.load_solution(saved)
+        ls.load(saved, ls.Solution)
     assert "\n" not in str(caught.value)
 
 
@@ -321,7 +367,7 @@ def test_another_number_is_not_taken_for_what_was_saved(saved: Path) -> None:
         saved.write_bytes(original)
         rewrite(saved, sealed=False, **change)
         with pytest.raises(ls.InputError, match="sha256: got another than that of the content"):
-            ls.load_solution(saved)
+            ls.load(saved, ls.Solution)
 
 
 def add_member(path: Path, name: str, data: bytes) -> None:
@@ -351,7 +397,7 @@ def npy(array: np.ndarray) -> bytes:
 def test_other_members_are_refused(saved: Path, name: str, data: bytes, message: str) -> None:
     add_member(saved, name, data)
     with pytest.raises(ls.InputError, match=message):
-        ls.load_solution(saved)
+        ls.load(saved, ls.Solution)
 
 
 def test_nothing_is_unpacked_before_it_is_known_to_belong(saved: Path, drive_solution: ls.Solution) -> None:
@@ -373,7 +419,7 @@ def test_nothing_is_unpacked_before_it_is_known_to_belong(saved: Path, drive_sol
         tracemalloc.start()
         try:
             with pytest.raises(ls.InputError, match="which is damaged"):
-                ls.load_solution(saved)
+                ls.load(saved, ls.Solution)
             assert tracemalloc.get_traced_memory()[1] < 20e6  # bytes
         finally:
             tracemalloc.stop()
@@ -385,7 +431,7 @@ def test_any_text_is_one_line(saved: Path, text: str) -> None:
     with saved.open("wb") as file:
         np.savez(file, allow_pickle=False, meta=np.array(text), **arrays)
     with pytest.raises(ls.InputError, match="which is damaged") as caught:
-        ls.load_solution(saved)
+        ls.load(saved, ls.Solution)
     assert "\n" not in str(caught.value)
 
 
@@ -395,7 +441,7 @@ def test_a_name_twice_in_the_text_is_refused(saved: Path) -> None:
         text = json.dumps(meta)[:-1] + f', "dt": {meta["dt"]}}}'
         np.savez(file, allow_pickle=False, meta=np.array(text), **arrays)
     with pytest.raises(ls.InputError, match="a name twice in one object"):
-        ls.load_solution(saved)
+        ls.load(saved, ls.Solution)
 
 
 def test_what_could_not_be_read_again_is_not_written(tmp_path: Path, drive_solution: ls.Solution) -> None:
@@ -427,7 +473,7 @@ def test_what_compresses_too_well_can_be_read_again(
     whole = dataclasses.replace(rollout, **calm, contacts=np.zeros(400, np.int64), **ends)
     path = ls.save(whole, tmp_path / "calm.npz")
     assert path.stat().st_size > 1 << 22
-    assert same(ls.load_rollout(path), whole)
+    assert same(ls.load(path, ls.Rollout), whole)
 
 
 LONG = "x" * 300
@@ -482,7 +528,7 @@ def test_outputs_with_names_that_are_too_long_give_one_line(
 def test_names_that_no_file_can_have(name: str, tmp_path: Path, drive_solution: ls.Solution) -> None:
     with pytest.raises(ls.InputError, match=r"output: got .*want the path of a file, of names of at most 255"):
         ls.save(drive_solution, tmp_path / name)
-    for load in (ls.load_solution, ls.load_rollout):
+    for load in (ls.load, ls.load):
         with pytest.raises(ls.InputError, match="want the path of a file, of names of at most 255 bytes"):
             load(tmp_path / name)
 
@@ -495,7 +541,7 @@ def test_loading_never_runs_code(tmp_path: Path) -> None:
     meta, trap = np.array(json.dumps({})), {"policy.gain": np.array([Trap()], dtype=object)}
     np.savez(tmp_path / "trap.npz", allow_pickle=True, meta=meta, **trap)
     with pytest.raises(ls.InputError, match="which is damaged"):
-        ls.load_solution(tmp_path / "trap.npz")
+        ls.load(tmp_path / "trap.npz", ls.Solution)
     assert not (tmp_path / "sprung").exists()
 
 

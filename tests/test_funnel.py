@@ -15,6 +15,7 @@ from scipy import stats
 
 import lqrsim as ls
 from lqrsim.cli import main
+from lqrsim.disturbances import ControlDelay, ControlNoise, ForceNoise, Gusts, MeasurementNoise
 from lqrsim.errors import InputError
 from lqrsim.simulation.begun_later import simulate_from
 from lqrsim.stress.funnels import points_of
@@ -44,8 +45,8 @@ def test_levels_of_a_linear_system(ice: ls.Plant, states: tuple[str, ...], power
         share = min(1.0, (reach(knot) / level) ** power)
         assert share >= 0.8
         assert 0.8 * reach(knot) * 0.8 ** (-1 / power) < level
-    checks = ls.check_funnel(found, ice, PLAN, trials=2000)
-    outside = ls.check_funnel(found, ice, PLAN, trials=2000, between=(1.0, 1.3))
+    checks = ls.stress.check_funnel(found, ice, PLAN, trials=2000)
+    outside = ls.stress.check_funnel(found, ice, PLAN, trials=2000, between=(1.0, 1.3))
     for knot, level, inside, more in zip((0, 8, 15), found.levels, checks, outside, strict=True):
         share, wider = (min(1.0, (reach(knot) / (much * level)) ** power) for much in (1.0, 1.3))
         assert stats.binomtest(int(inside.successes.sum()), 2000, share).pvalue > 1e-3
@@ -66,7 +67,7 @@ def test_what_is_in_the_way_counts(tmp_path: Path) -> None:
     cap = np.arccos(min(0.05 / level, 1.0))
     share = 1 - (cap - np.sin(cap) * np.cos(cap)) / np.pi
     assert share >= 0.8
-    check = ls.check_funnel(found, walled, PLAN, trials=2000)[0]
+    check = ls.stress.check_funnel(found, walled, PLAN, trials=2000)[0]
     assert stats.binomtest(int(check.successes.sum()), 2000, share).pvalue > 1e-3
     assert share < 0.9  # it was not stopped far too early
 
@@ -95,27 +96,27 @@ def test_from_nowhere(ice: ls.Plant) -> None:
     assert found.trials.tolist() == [0]
     assert "begun on the plan itself" in found.reasons[0]
     assert not found.contains(np.zeros(4), 0.0)
-    assert ls.check_funnel(found, ice, lost) == ()
+    assert ls.stress.check_funnel(found, ice, lost) == ()
     small = ls.funnel(ice, PLAN, knots=(0,), largest=0.01, **COARSE)
     assert small.levels.tolist() == [0.01]
     assert small.reasons == ("levels beyond 0.01 were not tried",)
 
 
 def test_the_same_again_and_in_a_file(ice: ls.Plant, tmp_path: Path) -> None:
-    options: dict[str, Any] = {"disturbances": [ls.ForceNoise(0.02)], "knots": (0, 3), "seed": 4, **COARSE}
+    options: dict[str, Any] = {"disturbances": [ForceNoise(0.02)], "knots": (0, 3), "seed": 4, **COARSE}
     found = ls.funnel(ice, PLAN, **options)
     again = ls.funnel(ice, PLAN, threads=1, **options)
     assert found.digest == again.digest
     options["seed"] = 5
     assert found.digest != ls.funnel(ice, PLAN, **options).digest
-    read = ls.load_funnel(ls.save(found, tmp_path / "funnel.npz"))
+    read = ls.load(ls.save(found, tmp_path / "funnel.npz"), ls.Funnel)
     assert read.digest == found.digest
     for name in ("states", "family", "reasons", "rate", "confidence", "simulated", "seed", "options", "disturbances"):
         assert getattr(read, name) == getattr(found, name), name
     assert read.trials.tolist() == found.trials.tolist()
     assert read.summary() == found.summary()
     with pytest.raises(InputError, match="want a 'lqrsim funnel'"):
-        ls.load_funnel(ls.save(PLAN, tmp_path / "solution.npz"))
+        ls.load(ls.save(PLAN, tmp_path / "solution.npz"), ls.Funnel)
 
 
 @pytest.mark.parametrize(
@@ -251,7 +252,12 @@ class TestBegunLater:
     def test_goes_on_as_the_whole(self, ice: ls.Plant, knot: int) -> None:
         """Forces, controls, measurements, delays and noise on states, each of its own stream; to rounding."""
         noise = ls.Noise(lambda x, u, p: [[0.0], [0.0], [0.01 + 0.01 * x[0]], [0.01]], size=1)
-        wrong = [ls.ControlNoise(0.1), ls.ForceNoise(0.05), ls.MeasurementNoise(0.01), noise]
+        wrong = [
+            ControlNoise(0.1),
+            ForceNoise(0.05),
+            MeasurementNoise(0.01),
+            noise,
+        ]
         whole = ls.simulate(ice, PLAN, disturbances=wrong, trials=4, seed=7)
         rest = simulate_from(ice, PLAN, whole.states[:, knot], knot=knot, disturbances=wrong, seed=7)
         assert rest.plan.steps == STEPS - knot
@@ -261,7 +267,7 @@ class TestBegunLater:
 
     def test_a_delay_has_its_past(self, ice: ls.Plant) -> None:
         """Controls that are on their way at the knot are the plan's, and not those of the deviation."""
-        run = simulate_from(ice, PLAN, np.tile([0.1, 0, 0, 0], (1, 1)), knot=5, disturbances=[ls.ControlDelay(2)])
+        run = simulate_from(ice, PLAN, np.tile([0.1, 0, 0, 0], (1, 1)), knot=5, disturbances=[ControlDelay(2)])
         assert run.applied[0, :2] == pytest.approx(np.zeros((2, 2)))
         assert run.applied[0, 2, 0] == pytest.approx(-0.03)
 
@@ -297,16 +303,16 @@ def test_its_picture(funnel: ls.Funnel, tmp_path: Path) -> None:
         assert 0.85 < reached <= 1 + 1e-12
     scenario = ls.scenarios.quadrotor()
     options: dict[str, Any] = {"world": scenario.scene.world, "radius": scenario.robot.radius}
-    assert ls.plot_funnel(funnel, tmp_path / "funnel.png", **options).stat().st_size > 10_000
+    assert ls.view.plot_funnel(funnel, tmp_path / "funnel.png", **options).stat().st_size > 10_000
     some = replace(funnel, states=("x", "y"), shape=funnel.shape[:, :2, :2])
     with pytest.raises(InputError, match="want the position among them"):
-        ls.plot_funnel(some, tmp_path / "funnel.png", **options)
+        ls.view.plot_funnel(some, tmp_path / "funnel.png", **options)
 
 
 def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--rate", "0.5", "--confidence", "0.6", "--failures", "1", "--knots", "140", "--disturbances", "calm"]
     assert main(["funnel", "quadrotor", *options, "--out", str(tmp_path)]) == 0
-    found = ls.load_funnel(tmp_path / "funnel.npz")
+    found = ls.load(tmp_path / "funnel.npz", ls.Funnel)
     said = capsys.readouterr().out
     assert found.summary() in said
     assert found.knots.tolist() == [140]
@@ -365,8 +371,8 @@ class TestReplanningWhenLeft:
 
 def test_the_safest_way(quadrotor: ls.Scenario) -> None:
     """It is the way that most of the same trials succeed by, counted again here; then new trials are run."""
-    plant, gusts = quadrotor.plant(), [ls.Gusts(0.5)]
-    found = ls.smooth_safest(quadrotor.problem, plant, gusts, trials=20, starts=4, seed=3)
+    plant, gusts = quadrotor.plant(), [Gusts(0.5)]
+    found = ls.stress.smooth_safest(quadrotor.problem, plant, gusts, trials=20, starts=4, seed=3)
 
     def counted(solution: ls.Solution, first: int) -> int:
         run = ls.simulate(plant, solution, disturbances=gusts, seed=3, trials=20, first_trial=first, frames=False)
@@ -382,4 +388,4 @@ def test_the_safest_way(quadrotor: ls.Scenario) -> None:
     for one, other in zip(found.ways, found.ways[1:], strict=False):
         assert np.abs(one.solution.trajectory.states - other.solution.trajectory.states).max() > 0.05
     with pytest.raises(InputError, match="trials: got 0"):
-        ls.smooth_safest(quadrotor.problem, plant, gusts, trials=0)
+        ls.stress.smooth_safest(quadrotor.problem, plant, gusts, trials=0)

@@ -24,7 +24,7 @@ SMALL = (320, 180)
 
 @pytest.fixture(scope="module")
 def drive(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> ls.Rollout:
-    push = ls.Push((4.0, 4.0, 0.0), at=5.0)
+    push = ls.disturbances.Push((4.0, 4.0, 0.0), at=5.0)
     return ls.simulate(differential_drive.plant(), drive_solution, disturbances=[push], seed=3)
 
 
@@ -179,7 +179,7 @@ def test_refused(flight: ls.Rollout, quadrotor_solution: ls.Solution, tmp_path: 
     whole = funnel_by_hand(quadrotor_solution, np.eye(3))
     moved = replace(whole, plan=replace(whole.plan, states=whole.plan.states + 1))
     flat = funnel_by_hand(quadrotor_solution, np.eye(2))
-    unchecked: Any = ls.still
+    unchecked: Any = ls.view.render_still
     assert "funnel" not in OVERLAYS
     for wrong, said in (
         (None, "funnel: got None with the overlay funnel"),

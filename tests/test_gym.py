@@ -52,9 +52,9 @@ def test_an_episode_is_the_trial_of_simulate(case: tuple[str, ls.Scenario, ls.So
     """The policy in its place: the same states, measurements, controls and cost."""
     name, scenario, solution = case
     plant = scenario.plant()
-    disturbances = ls.preset("light", plant)
+    disturbances = ls.disturbances.preset("light", plant)
     rollout = ls.simulate(plant, solution, disturbances=disturbances, seed=3, trials=3, **scenario.near_enough())
-    told = ls.outcomes(rollout, scenario.problem)
+    told = ls.stress.outcomes(rollout, scenario.problem)
     env: Any = gymnasium.make(name, solution=solution, disturbances="light", actions="controls")
     expert = lqrsim.gym.Expert(env)
     for trial in range(3):
@@ -81,7 +81,7 @@ def test_an_episode_is_the_trial_of_simulate(case: tuple[str, ls.Scenario, ls.So
 def test_many_at_once_are_the_same_trials(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """Under severe disturbances, of which some trials collide; who has ended stands still."""
     plant = quadrotor.plant()
-    disturbances = ls.preset("light", plant)
+    disturbances = ls.disturbances.preset("light", plant)
     rollout = ls.simulate(plant, quadrotor_solution, disturbances=disturbances, seed=1, trials=8)
     options: Any = {"solution": quadrotor_solution, "disturbances": "light", "actions": "controls"}
     env = gymnasium.make_vec("lqrsim/Quadrotor-v0", num_envs=4, **options)
@@ -126,7 +126,7 @@ def test_normalized_actions_are_the_controls_between_their_limits(
     # The expert's actions are its controls, to rounding.
     _, rewards, info, _ = run(env, lqrsim.gym.Expert(env), seed=0)
     undisturbed = ls.simulate(differential_drive.plant(), drive_solution)
-    told = ls.outcomes(undisturbed, differential_drive.problem)
+    told = ls.stress.outcomes(undisturbed, differential_drive.problem)
     assert info["is_success"]
     assert -rewards.sum() == pytest.approx(told.cost[0], rel=1e-9)
 
@@ -153,7 +153,9 @@ def test_options_of_reset(quadrotor: ls.Scenario, quadrotor_solution: ls.Solutio
     np.testing.assert_allclose(calm[:-1], quadrotor_solution.trajectory.states[0], rtol=0, atol=1e-14)
     by_name, _ = env.reset(seed=0, options={"preset": "severe"})
     alike, _ = env.reset(seed=0, options={"disturbances": "severe"})
-    listed, info = env.reset(seed=0, options={"disturbances": ls.preset("severe", quadrotor.plant()), "trial": 2})
+    listed, info = env.reset(
+        seed=0, options={"disturbances": ls.disturbances.preset("severe", quadrotor.plant()), "trial": 2}
+    )
     assert info["trial"] == 2
     weak, _ = env.reset(seed=0, options={"preset": "light", "strength": 3.0})
     np.testing.assert_array_equal(by_name, alike)
@@ -247,7 +249,7 @@ def test_pictures_are_those_of_still(quadrotor: ls.Scenario, quadrotor_solution:
     assert env.metadata["render_fps"] == 30
     assert (pictures[0] != pictures[60]).any()
     for step, picture in pictures.items():
-        path = ls.still(
+        path = ls.view.render_still(
             rollout, tmp_path / "still.png", time=step / 30, camera="top", overlays=("plan",), quality="draft",
         )  # fmt: skip
         np.testing.assert_array_equal(picture, np.asarray(Image.open(path)))

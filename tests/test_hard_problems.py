@@ -108,7 +108,7 @@ def test_weights_of_a_soft_start_may_differ_by_any_factor(form: str, weights: tu
     H, g = value.hessian[0] + np.diag(weights), value.gradient[0] - np.diag(weights) @ (-1.0, 5.0)
     np.testing.assert_allclose(solution.trajectory.states[0], -np.linalg.solve(H, g), rtol=1e-6)
     assert solution.cost_to_come is not None
-    if isinstance(solution.cost_to_come, ls.Moments):
+    if isinstance(solution.cost_to_come, ls.types.Moments):
         np.testing.assert_allclose(np.diag(solution.cost_to_come.covariance[0]) * weights, 1.0, rtol=1e-9)
 
 
@@ -127,11 +127,11 @@ class TestLinearQuadratic:
     """smooth_lq() tests its own answer, too."""
 
     def test_a_saddle_is_no_minimum(self) -> None:
-        stage = ls.Stage(A=np.ones((4, 1, 1)), B=[[1e-3]], R=[[1.0]])
+        stage = ls.lq.Stage(A=np.ones((4, 1, 1)), B=[[1e-3]], R=[[1.0]])
         for form in ("dual", "primal"):
-            solution = ls.smooth_lq(
-                stage, initial=ls.Quadratic(np.eye(1), np.zeros(1), 0.0),
-                final=ls.Quadratic(-10 * np.eye(1), np.zeros(1), 0.0), form=form,
+            solution = ls.lq.smooth_lq(
+                stage, initial=ls.types.Quadratic(np.eye(1), np.zeros(1), 0.0),
+                final=ls.types.Quadratic(-10 * np.eye(1), np.zeros(1), 0.0), form=form,
             )  # fmt: skip
             assert solution.status is Status.NOT_POSITIVE_DEFINITE
             assert "minimum of the total cost" in solution.detail
@@ -145,9 +145,9 @@ class TestLinearQuadratic:
         B = np.zeros((n, 1))
         B[-1] = dt
         start = np.array([1.0, 0.0, 0.0, 0.0])
-        final = ls.Quadratic(weight * np.eye(n), np.zeros(n), 0.0)
-        solution = ls.smooth_lq(
-            ls.Stage(A=np.tile(A, (steps, 1, 1)), B=B, R=[[effort]]), initial=ls.FixedState(start), final=final
+        final = ls.types.Quadratic(weight * np.eye(n), np.zeros(n), 0.0)
+        solution = ls.lq.smooth_lq(
+            ls.lq.Stage(A=np.tile(A, (steps, 1, 1)), B=B, R=[[effort]]), initial=ls.FixedState(start), final=final
         )
         assert solution.success or "too ill-conditioned" in solution.detail
         if solution.success:
@@ -158,9 +158,9 @@ class TestLinearQuadratic:
             assert gap < 1e-5
 
     def test_the_cost_to_come_of_an_unstable_motion_is_left_out_when_it_is_lost(self) -> None:
-        stage = ls.Stage(A=np.full((400, 1, 1), 1.2), B=[[1.0]], R=[[1.0]])
-        end = ls.Quadratic(np.eye(1), np.zeros(1), 0.0)
-        solution = ls.smooth_lq(stage, initial=ls.FixedState([1.0]), final=end)
+        stage = ls.lq.Stage(A=np.full((400, 1, 1), 1.2), B=[[1.0]], R=[[1.0]])
+        end = ls.types.Quadratic(np.eye(1), np.zeros(1), 0.0)
+        solution = ls.lq.smooth_lq(stage, initial=ls.FixedState([1.0]), final=end)
         assert solution.success
         # The stationary cost of x' = a x + u with no state cost is (a^2 - 1) x^2 / 2.
         assert solution.cost == pytest.approx((1.2**2 - 1) / 2, rel=1e-9)
@@ -234,7 +234,7 @@ class TestArguments:
     def test_numbers_of_numpy_are_numbers(self, differential_drive: ls.Scenario, tmp_path) -> None:
         options = {"max_iterations": np.int64(20), "tolerance": np.float32(1e-4), "safeguard": np.True_}
         solution = ls.smooth(differential_drive.problem, **options)
-        loaded = ls.load_solution(ls.save(solution, tmp_path / "solution.npz"))
+        loaded = ls.load(ls.save(solution, tmp_path / "solution.npz"), ls.Solution)
         assert loaded.options["max_iterations"] == 20
         assert loaded.options["safeguard"] is True
 
@@ -251,4 +251,4 @@ class TestArguments:
     def test_stages_too(self, fields: dict, message: str) -> None:
         given: dict = {"A": np.eye(2), "B": np.ones((4, 2, 1)), "R": [[1.0]]}
         with pytest.raises(ls.InputError, match=message):
-            ls.Stage(**(given | fields))
+            ls.lq.Stage(**(given | fields))

@@ -32,6 +32,7 @@ FLOORS = (
     ("reports",),
     ("commands",),
     ("cli",),
+    ("disturbances", "lq", "types"),
 )
 
 # Within a room, the same: what is not named here may import whatever is, and its own kind.
@@ -52,7 +53,13 @@ FLOORS_WITHIN = {
         ("numba_functions",),
         ("user_functions",),
     ),
-    "problem": (("dynamics", "linear_quadratic"), ("balls", "noise"), ("costs",), ("constraints",), ("problem",)),
+    "problem": (
+        ("dynamics", "linear_quadratic"),
+        ("collision_spheres", "noise"),
+        ("costs",),
+        ("constraints",),
+        ("problem",),
+    ),
     "solvers": (("compiled", "initial_guess"), ("common", "certify"), ("workspace",), ("attempt",)),
     "simulation": (("plant_validation", "plant"), ("physics",), ("disturbances",)),
 }

@@ -26,14 +26,14 @@ import lqrsim as ls
 def noisy(std: float = 0.05) -> ls.Scenario:
     print("this is not the result")
     given = ls.scenarios.differential_drive()
-    return dataclasses.replace(given, name="noisy", disturbances=(ls.ControlNoise(std),))
+    return dataclasses.replace(given, name="noisy", disturbances=(ls.disturbances.ControlNoise(std),))
 
 
 def shifted(std: float = 0.1) -> ls.Scenario:
     given = ls.scenarios.differential_drive()
     here = ls.QuadraticCost((5000.0, 5000.0, 50.0), about=given.problem.start)
     problem = dataclasses.replace(given.problem, steps=3, final_cost=here)
-    error = ls.InitialStateError((0.0, std, 0.0))
+    error = ls.disturbances.InitialStateError((0.0, std, 0.0))
     return dataclasses.replace(given, name="shifted", problem=problem, disturbances=(error,))
 """
 
@@ -68,7 +68,7 @@ def same(found: object, meant: object) -> None:
 def test_solve_and_simulate(printed: Any, tmp_path: Path) -> None:
     found = printed("solve", "differential_drive", "--out", str(tmp_path))
     assert found["wrote"] == [str(tmp_path / "solution.npz")]
-    solution, shown = ls.load_solution(tmp_path / "solution.npz"), found["solution"]
+    solution, shown = ls.load(tmp_path / "solution.npz", ls.Solution), found["solution"]
     for name in ("cost", "gap", "optimality", "violation", "detail", "solver", "scenario", "problem_digest", "success"):
         same(shown[name], getattr(solution, name))
     assert shown["status"] == "CONVERGED"
@@ -85,8 +85,8 @@ def test_solve_and_simulate(printed: Any, tmp_path: Path) -> None:
 
     noise = ["--control-noise", "0.05", "--trials", "3", "--seed", "2", "--first-trial", "4"]
     found = printed("simulate", found["wrote"][0], *noise)
-    rollout, run = ls.load_rollout(found["wrote"][0]), found["run"]
-    table = ls.outcomes(rollout, ls.scenarios.differential_drive().problem)
+    rollout, run = ls.load(found["wrote"][0], ls.Rollout), found["run"]
+    table = ls.stress.outcomes(rollout, ls.scenarios.differential_drive().problem)
     assert [row["trial"] for row in run["trials"]] == [4, 5, 6]
     for name, column in table.columns().items():
         for row, value in zip(run["trials"], column.tolist(), strict=True):
@@ -113,7 +113,7 @@ def test_in_a_process_of_its_own_stdout_has_nothing_else(tmp_path: Path) -> None
     (tmp_path / "own.py").write_text(OWN, encoding="utf-8")
     command = [sys.executable, "-m", "lqrsim.cli", "solve", f"{tmp_path / 'own.py'}:noisy", "--json"]
     done = subprocess.run([*command, "--out", str(tmp_path)], capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout)["solution"]["cost"] == ls.load_solution(tmp_path / "solution.npz").cost
+    assert json.loads(done.stdout)["solution"]["cost"] == ls.load(tmp_path / "solution.npz", ls.Solution).cost
     assert "this is not the result" in done.stderr
     assert "CONVERGED" in done.stderr
 
@@ -134,7 +134,7 @@ def test_verify(printed: Any, tmp_path: Path) -> None:
     printed("solve", "differential_drive", "--out", str(tmp_path))
     printed("simulate", str(tmp_path / "solution.npz"))
     shown = printed("verify", str(tmp_path / "rollout.npz"))["verification"]
-    solution, rollout = ls.load_solution(tmp_path / "solution.npz"), ls.load_rollout(tmp_path / "rollout.npz")
+    solution, rollout = ls.load(tmp_path / "solution.npz", ls.Solution), ls.load(tmp_path / "rollout.npz", ls.Rollout)
     again = ls.verify_run(rollout, solution=solution)
     assert (shown["passed"], shown["rms"], shown["worst"]) == (True, again.rms, again.worst)
     assert shown["tests"] == [asdict(test) for test in again.tests]
@@ -145,7 +145,7 @@ def test_stress_report_and_replay(printed: Any, tmp_path: Path) -> None:
     folder = tmp_path / "campaign"
     asked = ["--policies", "smooth", "open_loop", "--strengths", "0", "2", "--trials", "6", "--workers", "1"]
     campaign = printed("stress", "differential_drive", *asked, "--out", str(folder))["campaign"]
-    results = ls.Results(folder)
+    results = ls.stress.Results(folder)
     assert campaign["complete"] is True
     assert len(campaign["cells"]) == len(results.cells) == 4
     for row, cell in zip(campaign["cells"], results.cells, strict=True):
@@ -187,9 +187,9 @@ def test_demo(printed: Any, tmp_path: Path) -> None:
     found = printed("demo", "--robots", "differential_drive", "--no-video", "--out", str(tmp_path))
     (one,) = found["scenarios"]
     folder = tmp_path / "differential_drive"
-    assert one["solution"]["cost"] == ls.load_solution(folder / "solution.npz").cost
+    assert one["solution"]["cost"] == ls.load(folder / "solution.npz", ls.Solution).cost
     for name, run in one["runs"].items():
-        rollout = ls.load_rollout(folder / f"{name}.npz")
+        rollout = ls.load(folder / f"{name}.npz", ls.Rollout)
         assert run["trials"][0]["goal"] == rollout.goal_distance[0]
     assert found["failures"] == []
     assert all(Path(path).is_file() for path in found["wrote"])

@@ -14,17 +14,22 @@ from scipy.stats import binom, chi2
 import lqrsim as ls
 from lqrsim.control.kalman import kalman_filter
 from lqrsim.control.plan_model import PlanModel
+from lqrsim.disturbances import Unknown
 from lqrsim.errors import Array
 
 NOISE = {"measurement": 0.1, "start": 0.3, "control": 0.2}
-CONSTANT = ls.Unknown("d0", 0.7)
-PASSING = ls.Unknown("d0", 0.5, time_constant=0.4, order=2)
+CONSTANT = Unknown("d0", 0.7)
+PASSING = Unknown("d0", 0.5, time_constant=0.4, order=2)
 # Unknowns, lag, sensors.
 CASES = (
     ((), 0.0, None),
     ((CONSTANT, PASSING), 0.06, None),
-    ((ls.Unknown("d0", 0.7, time_constant=0.5), ls.Unknown("d0", 0.4, time_constant=0.0)), 0.06, ("s0",)),
-    ((CONSTANT, ls.Unknown("offset of u0", 0.2, time_constant=0.3)), 0.0, [[1.0, 0.5]]),
+    (
+        (Unknown("d0", 0.7, time_constant=0.5), Unknown("d0", 0.4, time_constant=0.0)),
+        0.06,
+        ("s0",),
+    ),
+    ((CONSTANT, Unknown("offset of u0", 0.2, time_constant=0.3)), 0.0, [[1.0, 0.5]]),
 )
 
 
@@ -220,7 +225,7 @@ def test_each_trial_of_a_batch_has_the_bits_that_it_has_alone(case: int) -> None
 
 
 def test_so_has_the_quadrotor(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
-    unknowns = [ls.Unknown(f"wind_{axis}", 1.0) for axis in "xyz"] + [ls.Unknown("mass", 0.02)]
+    unknowns = [Unknown(f"wind_{axis}", 1.0) for axis in "xyz"] + [Unknown("mass", 0.02)]
     uncertainty = ls.Uncertainty(unknowns=unknowns, measurement=0.01, start=0.01, lag=0.02)
     law = ls.OffsetFree(
         quadrotor.problem, quadrotor_solution, uncertainty, tolerate={"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}

@@ -76,7 +76,7 @@ from lqrsim.kernels.records import (
 )
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.kernels.records import Settings as KernelSettings
-from lqrsim.problem.balls import Places
+from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.noise import numbers_of
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes.scene import scene_from_xml
@@ -747,14 +747,14 @@ X, U = np.array([0.45, 0.3, 0.2]), np.array([0.7, -0.2])
 SIZES = {"N": 3, "M": 2, "W": 5}
 
 
-def of_term(term: ls.Term, x: Array = X, u: Array = U) -> None:
+def of_term(term: ls.types.CostTerm, x: Array = X, u: Array = U) -> None:
     n, m = len(x), len(u)
     sizes, data = {"N": n, "M": m, "W": n + m}, compiled.numbers(term)
     replay(term.code, sizes, "value", x, u, 2, data)
     replay(term.code, sizes, "derivatives", x, u, 2, data, np.zeros((n + m, n + m)), np.zeros(n + m))
 
 
-def of_constraint(term: ls.ConstraintTerm, equality: int = 0) -> None:
+def of_constraint(term: ls.types.ConstraintTerm, equality: int = 0) -> None:
     data, source = compiled.numbers(term), source_of(augmented_lagrangian)
     pairs = {"constraint_value": (term.code, "value"), "constraint_slope": (term.code, "slope")}
     if term.balls:
@@ -784,9 +784,9 @@ def turned(x, p, slopes):
 
 
 BALLS = {
-    "formula": ls.Balls(two_balls, [0.1, 0.05]),
-    "plain": ls.Balls(plainly, [0.1, 0.05], level="plain"),
-    "plain with Jacobian": ls.Balls(plainly, [0.1, 0.05], jacobian=turned, level="plain"),
+    "formula": ls.CollisionSpheres(two_balls, [0.1, 0.05]),
+    "plain": ls.CollisionSpheres(plainly, [0.1, 0.05], level="plain"),
+    "plain with Jacobian": ls.CollisionSpheres(plainly, [0.1, 0.05], jacobian=turned, level="plain"),
 }
 
 
@@ -832,7 +832,7 @@ class TestParts:
         self.places(balls.bind(CART), 6, X)
 
     @staticmethod
-    def places(places: Places, coordinates: int, x: Array) -> None:
+    def places(places: SphereCenters, coordinates: int, x: Array) -> None:
         source = source_of(ball_places).filled(places=places.code, places_jacobian=places.code)
         data, n = compiled.numbers(places), len(x)  # pyright: ignore[reportArgumentType]
         states, sizes = np.array([x, 1.1 * x]), {"N": n, "M": 1, "W": n + 1}

@@ -444,7 +444,7 @@ import lqrsim as ls
 
 drive = ls.scenarios.differential_drive()
 print(ls.smooth(drive.problem).status.name)
-ls.simulate(drive.plant(), ls.ilqr(drive.problem), disturbances=[ls.ControlNoise(0.05)], seed=0)
+ls.simulate(drive.plant(), ls.ilqr(drive.problem), disturbances=[ls.disturbances.ControlNoise(0.05)], seed=0)
 dynamics = ls.Dynamics(lambda x, u, p: (u[0] - x[0],), states={"x": ""}, controls={"u": ""}, level="compiled")
 problem = ls.Problem(
     dynamics=dynamics, dt=0.1, steps=5, initial=ls.FixedState([1.0]), stage_cost=ls.ControlCost([1.0]),

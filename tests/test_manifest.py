@@ -21,7 +21,7 @@ from lqrsim.stress.results import Results
 
 CAMPAIGN = Campaign(
     scenario="differential_drive",
-    sweeps={"gusts": (ls.ForceNoise(0.2),), "slips": (ls.ControlNoise(0.02),)},
+    sweeps={"gusts": (ls.disturbances.ForceNoise(0.2),), "slips": (ls.disturbances.ControlNoise(0.02),)},
     strengths=(0.0, 1.0),
     policies=("smooth", "open_loop"),
     trials=4,

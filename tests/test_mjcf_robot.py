@@ -292,7 +292,7 @@ def test_laws_that_track_and_estimate_take_it() -> None:
     robot, _ = robot_of("cart", 4, "implicitfast")
     problem = swing(robot)
     solution, plant = ls.smooth(problem), ls.Plant(robot, robot.scene)
-    noise = [ls.MeasurementNoise(0.002)]
+    noise = [ls.disturbances.MeasurementNoise(0.002)]
     law = ls.track(problem, solution, tolerate={"m": 0.05, "rad": 0.05, "m/s": 0.5, "rad/s": 0.5}, effort=0.5)
     estimating = ls.OffsetFree(
         problem, solution, ls.uncertainty_of(plant, noise), effort=0.5,

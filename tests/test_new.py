@@ -46,8 +46,8 @@ def test_a_new_robot_solves_runs_renders_and_passes_by_the_printed_commands(
             assert "2 passed" in done.stdout
         elif arguments[0] != "render" or gl.available():
             assert main(arguments) == 0
-    assert ls.load_solution("runs/hover_disc/solution.npz").success
-    assert ls.load_rollout("runs/hover_disc/rollout.npz").outcome == ("reached",)
+    assert ls.load("runs/hover_disc/solution.npz", ls.Solution).success
+    assert ls.load("runs/hover_disc/rollout.npz", ls.Rollout).outcome == ("reached",)
     if gl.available():
         (video,) = Path("runs/hover_disc").glob("*.mp4")
         assert video.stat().st_size > 1000

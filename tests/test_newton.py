@@ -255,7 +255,7 @@ class TestOptions:
         problem = random_problems.draw("acrobot", 3)
         found = []
 
-        def stop(iteration: ls.Iteration) -> None:
+        def stop(iteration: ls.types.Iteration) -> None:
             found.append(iteration)
             if sum(one.method == "newton" for one in found) == 2:
                 raise KeyboardInterrupt

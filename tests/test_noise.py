@@ -221,7 +221,7 @@ def test_many_are_solved_as_one_is():
 def test_a_file_says_what_the_noise_was(tmp_path):
     numbers = draw(np.random.default_rng(6))
     solution = ls.smooth(problem_of(numbers, risk=0.002))
-    again = ls.load_solution(ls.save(solution, tmp_path / "solution.npz"))
+    again = ls.load(ls.save(solution, tmp_path / "solution.npz"), ls.Solution)
     assert again.options["noise"] == "Noise(affine(x, u, p), size=2)"
     assert again.options["risk"] == 0.002
     assert again.summary() == solution.summary()
@@ -243,7 +243,7 @@ def test_a_file_says_what_the_noise_was(tmp_path):
         (lambda: of(None, risk=1.0), "^risk: got 1 for a problem without noise, want noise=Noise"),
         (lambda: ls.smooth(of(None), noise="white"), "^noise: got 'white', want a Noise"),  # pyright: ignore[reportArgumentType]
         (
-            lambda: ls.smooth_continuous(problem_of(draw(np.random.default_rng(0)), fixed=False)),
+            lambda: ls.lq.smooth_continuous(problem_of(draw(np.random.default_rng(0)), fixed=False)),
             "^noise: got some, which is per control period, want",
         ),
         (lambda: ls.sample_costs(of(None), None), "^problem: got one without noise, want"),  # pyright: ignore[reportArgumentType]

@@ -39,7 +39,9 @@ def solution() -> ls.Solution:
 @pytest.fixture(scope="module")
 def rollout(solution: ls.Solution) -> ls.Rollout:
     plant = ls.scenarios.differential_drive().plant()
-    return ls.simulate(plant, solution, disturbances=[ls.ControlNoise(0.05)], seed=3, trials=12, first_trial=5)
+    return ls.simulate(
+        plant, solution, disturbances=[ls.disturbances.ControlNoise(0.05)], seed=3, trials=12, first_trial=5
+    )
 
 
 def test_a_solution_shows_status_numbers_and_its_plan(solution: ls.Solution) -> None:
@@ -107,11 +109,11 @@ def test_states_are_drawn_over_time_without_a_position() -> None:
 
 
 def test_results_show_a_row_for_each_cell(tmp_path: Path) -> None:
-    campaign = ls.Campaign(
-        scenario="differential_drive", sweeps={"own": (ls.ControlNoise(0.1),)}, strengths=(0, 2),
+    campaign = ls.stress.Campaign(
+        scenario="differential_drive", sweeps={"own": (ls.disturbances.ControlNoise(0.1),)}, strengths=(0, 2),
         policies=("smooth",), trials=4,
     )  # fmt: skip
-    results = ls.run_campaign(campaign, tmp_path / "there", workers=0)
+    results = ls.stress.run_campaign(campaign, tmp_path / "there", workers=0)
     page = parsed(results._repr_html_())
     head, *rows = texts(page)
     assert len(rows) == len(results.cells)
@@ -124,7 +126,7 @@ def test_results_show_a_row_for_each_cell(tmp_path: Path) -> None:
         assert shown["95 % interval"] == f"{100 * low:.1f} to {100 * high:.1f}"
         assert int(shown["collided"]) == np.sum(ends.outcome == "collided")
     next((tmp_path / "there" / "shards").iterdir()).unlink()
-    unfinished = parsed(ls.Results(tmp_path / "there")._repr_html_())
+    unfinished = parsed(ls.stress.Results(tmp_path / "there")._repr_html_())
     assert "not finished: 4 of 8 trials are missing" in "".join(unfinished.itertext())
 
 
@@ -132,7 +134,7 @@ def test_a_video_and_a_picture_show_themselves(rollout: ls.Rollout, tmp_path: Pa
     options = {"size": (480, 270), "quality": "draft"}
     for path, tag, kind in (
         (ls.render(rollout, tmp_path / "run.mp4", fps=1, **options), "video", "video/mp4"),
-        (ls.still(rollout, tmp_path / "run.png", **options), "img", "image/png"),
+        (ls.view.render_still(rollout, tmp_path / "run.png", **options), "img", "image/png"),
     ):
         shown = parsed(path._repr_html_() or "")
         assert shown.tag == tag

@@ -8,12 +8,24 @@ from linear_plans import DT, Linear, double_integrator
 from tracking import hover, track
 
 import lqrsim as ls
+from lqrsim.disturbances import (
+    ControlDelay,
+    Disturbance,
+    Effect,
+    ForceNoise,
+    MassMismatch,
+    MeanWind,
+    MeasurementDropouts,
+    MeasurementLatency,
+    MeasurementNoise,
+    Unknown,
+)
 from lqrsim.errors import Array
 from lqrsim.simulation.disturbances import GilbertElliott
 from lqrsim.simulation.plant import Plant
 
 TOLERATE = {"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}
-PUSH = ls.Unknown("d0", 0.5)
+PUSH = Unknown("d0", 0.5)
 
 
 def generators(count: int) -> list[np.random.Generator]:
@@ -21,7 +33,7 @@ def generators(count: int) -> list[np.random.Generator]:
 
 
 def run(
-    system: Linear, law: ls.OffsetFree, effects: list[ls.Effect], *, off: Array, push: float = 0.0,
+    system: Linear, law: ls.OffsetFree, effects: list[Effect], *, off: Array, push: float = 0.0,
     limit: float = np.inf,
 ) -> tuple[Array, Array]:  # fmt: skip
     """States (T+1, K, n) and commands (T, K, m) of a linear system in NumPy, with lqrsim's disturbances."""
@@ -53,7 +65,7 @@ def test_what_is_late_is_taken_in_where_it_belongs(latency: int, delay: int) -> 
     system = double_integrator(start=[1.0, 0.0], controls=np.cos(np.arange(steps) / 4)[:, None])
     uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.3, latency=latency, delay=delay)
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0)
-    late = [ls.MeasurementLatency(latency), ls.ControlDelay(delay)]
+    late = [MeasurementLatency(latency), ControlDelay(delay)]
     effects = [one.start(plant_of(), system.plan, generators(2)) for one in late]
     states, commands = run(system, law, effects, off=np.array([[0.3, -0.2], [-0.1, 0.4]]))
     true = np.concatenate([states, np.zeros((steps + 1, 2, 1))], axis=2)
@@ -75,7 +87,7 @@ def test_lost_measurements_are_predicted() -> None:
     system = double_integrator(start=[1.0, 0.0], controls=np.cos(np.arange(steps) / 4)[:, None])
     uncertainty = ls.Uncertainty(start=0.3, loss=0.5)
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
-    dropouts = ls.MeasurementDropouts(GilbertElliott(0.3, 0.3)).start(plant_of(), system.plan, generators(20))
+    dropouts = MeasurementDropouts(GilbertElliott(0.3, 0.3)).start(plant_of(), system.plan, generators(20))
     states, _ = run(system, law, [dropouts], off=0.3 * np.random.default_rng(0).normal(size=(20, 2)))
     assert law.estimates is not None
     assert law.innovations is not None
@@ -123,22 +135,22 @@ def standing(quadrotor: ls.Scenario) -> ls.Solution:
 @pytest.mark.parametrize(
     "disturbance",
     [
-        ls.MeanWind((3.0, 0.0, 0.0)),
-        ls.MeanWind((-1.7, 1.7, 1.7)),
-        ls.MassMismatch(factor=0.8),
-        ls.MassMismatch(factor=1.2),
+        MeanWind((3.0, 0.0, 0.0)),
+        MeanWind((-1.7, 1.7, 1.7)),
+        MassMismatch(factor=0.8),
+        MassMismatch(factor=1.2),
     ],
     ids=str,
 )
 def test_steady_disturbances_leave_no_error(
-    quadrotor: ls.Scenario, standing: ls.Solution, disturbance: ls.Disturbance
+    quadrotor: ls.Scenario, standing: ls.Solution, disturbance: Disturbance
 ) -> None:
     """Hovering for 20 s in MuJoCo without noise: below 1 cm from 10 s on.
 
     In wind it hovers tilted, where the law's linear model is a little wrong: some millimetres stay. The estimates are
     right: it is the law that has the model about the plan alone.
     """
-    unknowns = [ls.Unknown(f"wind_{axis}", 1.0) for axis in "xyz"] + [ls.Unknown("mass", 0.05)]
+    unknowns = [Unknown(f"wind_{axis}", 1.0) for axis in "xyz"] + [Unknown("mass", 0.05)]
     measured = {"m": 5e-3, "m/s": 5e-2, "rad": 5e-3, "rad/s": 5e-3}
     uncertainty = ls.Uncertainty(unknowns=unknowns, start=0.01, measurement=measured)
     law = ls.OffsetFree(quadrotor.problem, standing, uncertainty, tolerate=TOLERATE)
@@ -165,11 +177,14 @@ def test_after_the_horizon_the_last_laws_stay_in_force() -> None:
 # Filters that diverge.
 
 
-def diverging(quadrotor: ls.Scenario) -> tuple[ls.Solution, ls.OffsetFree, list[ls.Disturbance]]:
+def diverging(quadrotor: ls.Scenario) -> tuple[ls.Solution, ls.OffsetFree, list[Disturbance]]:
     """It believes that it knows nothing of its drag: estimates of it that are negative make predictions explode."""
-    plan, uncertainty = hover(), ls.Uncertainty(unknowns=[ls.Unknown("drag", 5.0)], measurement=0.02, start=0.01)
+    plan, uncertainty = (
+        hover(),
+        ls.Uncertainty(unknowns=[Unknown("drag", 5.0)], measurement=0.02, start=0.01),
+    )
     law = ls.OffsetFree(quadrotor.problem, plan, uncertainty, tolerate=TOLERATE)
-    return plan, law, [ls.MeasurementNoise(0.02), ls.ForceNoise(1.0)]
+    return plan, law, [MeasurementNoise(0.02), ForceNoise(1.0)]
 
 
 def test_a_filter_that_diverges_ends_its_trial_and_says_so(quadrotor: ls.Scenario) -> None:
@@ -190,13 +205,13 @@ def test_a_filter_that_diverges_ends_its_trial_and_says_so(quadrotor: ls.Scenari
         assert np.isnan(rollout.states[k, step:]).all()
         assert np.isnan(rollout.applied[k, step:]).all()
         assert f"trial {k}: diverged after {rollout.diverged_at[k]:.2f} s: filter at" in rollout.summary()
-    assert ls.outcomes(rollout).outcome.tolist() == list(rollout.outcome)
+    assert ls.stress.outcomes(rollout).outcome.tolist() == list(rollout.outcome)
 
 
 def test_so_says_its_file(quadrotor: ls.Scenario, tmp_path) -> None:
     plan, law, noise = diverging(quadrotor)
     rollout = ls.simulate(quadrotor.plant(), plan, controller=law, disturbances=noise, trials=8)
-    again = ls.load_rollout(ls.save(rollout, tmp_path / "rollout.npz"))
+    again = ls.load(ls.save(rollout, tmp_path / "rollout.npz"), ls.Rollout)
     assert again.reasons == rollout.reasons
     assert again.outcome == rollout.outcome
     with pytest.raises(ls.InputError, match="Rollout: reasons: got 'it is'"):
@@ -227,15 +242,15 @@ def test_so_says_its_file(quadrotor: ls.Scenario, tmp_path) -> None:
         ({"record": "yes"}, "OffsetFree: record: got 'yes', want"),
         ({"uncertainty": {"start": 0.1}}, "OffsetFree: uncertainty: got {'start': 0.1}, want an Uncertainty"),
         (
-            {"uncertainty": ls.Uncertainty(unknowns=[ls.Unknown("gain of rotor_7", 0.1)])},
+            {"uncertainty": ls.Uncertainty(unknowns=[Unknown("gain of rotor_7", 0.1)])},
             "Uncertainty: unknowns: got 'gain of rotor_7', want one of: mass",
         ),
         (
-            {"uncertainty": ls.Uncertainty(unknowns=[ls.Unknown("force_x", 0.1)]), "sensors": ("rx", "ry", "rz")},
+            {"uncertainty": ls.Uncertainty(unknowns=[Unknown("force_x", 0.1)]), "sensors": ("rx", "ry", "rz")},
             "OffsetFree: unknowns: got force_x, which changes nothing of what is measured (rx, ry, rz), want sensors",
         ),
         (
-            {"uncertainty": ls.Uncertainty(unknowns=[ls.Unknown({"wind_x": 1, "wind_y": 1}, 0.1)]), "sensors": ("z",)},
+            {"uncertainty": ls.Uncertainty(unknowns=[Unknown({"wind_x": 1, "wind_y": 1}, 0.1)]), "sensors": ("z",)},
             "OffsetFree: unknowns: got wind_x and wind_y, which changes nothing of what is measured (z), want sensors",
         ),
     ],
@@ -251,7 +266,7 @@ def test_what_does_not_fit_is_refused_in_a_line(quadrotor: ls.Scenario, options:
 
 def test_what_has_no_spread_is_no_reason_to_refuse(quadrotor: ls.Scenario) -> None:
     """A Dryden wind of strength 0 changes nothing, and nobody wants to see it."""
-    calm = ls.Unknown("wind_x", 0.0, time_constant=1.0, order=2)
+    calm = Unknown("wind_x", 0.0, time_constant=1.0, order=2)
     law = ls.OffsetFree(
         quadrotor.problem, hover(), ls.Uncertainty(unknowns=[calm], measurement=0.01), tolerate=TOLERATE
     )

@@ -5,9 +5,10 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.control.replanning import Replanning
+from lqrsim.disturbances import ForceNoise, MeasurementNoise, Push
 from lqrsim.results.rollout import Rollout
-from lqrsim.simulation.outcome_table import OUTCOMES, outcomes
 from lqrsim.simulation.plant import Plant
+from lqrsim.stress.outcome_table import OUTCOMES, outcomes
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +19,7 @@ def plant(quadrotor: ls.Scenario) -> Plant:
 @pytest.fixture(scope="module")
 def rough(plant: Plant, quadrotor_solution: ls.Solution) -> Rollout:
     """Rough enough for some to collide, and one to be lost."""
-    noise = [ls.ForceNoise(0.5), ls.MeasurementNoise(0.02)]
+    noise = [ForceNoise(0.5), MeasurementNoise(0.02)]
     return ls.simulate(plant, quadrotor_solution, disturbances=noise, trials=20, contacts=False, frames=False)
 
 
@@ -68,7 +69,7 @@ def test_cost_is_that_of_the_plan_where_nothing_disturbs(
 def test_contacts_change_nothing_before_the_first_collision(
     plant: Plant, quadrotor_solution: ls.Solution, rough: Rollout
 ) -> None:
-    noise = [ls.ForceNoise(0.5), ls.MeasurementNoise(0.02)]
+    noise = [ForceNoise(0.5), MeasurementNoise(0.02)]
     solid = ls.simulate(plant, quadrotor_solution, disturbances=noise, trials=20)
     collided = 0
     for k in range(20):
@@ -80,7 +81,7 @@ def test_contacts_change_nothing_before_the_first_collision(
 
 
 def test_a_lost_trial_is_diverged_and_counts_until_then(plant: Plant, quadrotor_solution: ls.Solution) -> None:
-    wild = ls.simulate(plant, quadrotor_solution, disturbances=[ls.ForceNoise(1e12)], trials=3, contacts=False)
+    wild = ls.simulate(plant, quadrotor_solution, disturbances=[ForceNoise(1e12)], trials=3, contacts=False)
     table = outcomes(wild)
     assert set(table.outcome) <= {"diverged", "collided"}
     assert np.isfinite(table.worst).all()
@@ -100,7 +101,7 @@ class TestReplanning:
         assert run.outcome == ("reached",)
 
     def test_each_trial_gets_what_it_gets_alone(self, plant: Plant, again: Replanning, quadrotor_solution) -> None:
-        noise = [ls.ForceNoise(0.2)]
+        noise = [ForceNoise(0.2)]
         together = ls.simulate(plant, quadrotor_solution, controller=again, disturbances=noise, trials=3, frames=False)
         alone = ls.simulate(
             plant, quadrotor_solution, controller=again, disturbances=noise, first_trial=2, frames=False
@@ -109,7 +110,7 @@ class TestReplanning:
 
     def test_it_does_solve_again(self, plant: Plant, again: Replanning, quadrotor_solution) -> None:
         """A push that the first plan only fights; the controls differ from the policy's from the next solve on."""
-        push = [ls.Push((0.3, 0.0, 0.0), at=0.5)]
+        push = [Push((0.3, 0.0, 0.0), at=0.5)]
         policy = ls.simulate(plant, quadrotor_solution, disturbances=push, frames=False)
         solved = ls.simulate(plant, quadrotor_solution, controller=again, disturbances=push, frames=False)
         differ = np.abs(policy.commanded - solved.commanded)[0].max(axis=1) > 1e-6
@@ -139,7 +140,7 @@ class TestReplanning:
     ) -> None:
         """Far outside of the cage costs are beyond numbers."""
         again = Replanning(quadrotor.problem, quadrotor_solution, every=0.1)
-        push = [ls.Push((10.0, 10.0, 0.0), at=0.0)]
+        push = [Push((10.0, 10.0, 0.0), at=0.0)]
         run = ls.simulate(plant, quadrotor_solution, controller=again, disturbances=push, contacts=False, frames=False)
         assert run.collided.all()
         assert np.isfinite(run.commanded).all()

@@ -288,7 +288,7 @@ def test_rotorpy_flies_the_plan(peers: ModuleType, flight: Any) -> None:
     calm = ls.simulate(plant, solution, controller=law, frames=False)
     assert calm.outcome == ("reached",)
     assert calm.tracking_error.max() < 0.15
-    disturbances = ls.preset("light", plant)
+    disturbances = ls.disturbances.preset("light", plant)
     light, policy, last = (
         ls.simulate(
             plant, solution, controller=controller, disturbances=disturbances, frames=False, trials=20 - first,
@@ -322,8 +322,10 @@ def tracking_problem() -> tuple[Array, Array, Array, Array]:
 def gains_of_smooth_lq(A: Array, B: Array, Q: Array, R: Array, Qf: Array) -> Array:
     """The gains (T, m, n) of our backward pass."""
     n = len(Q)
-    solution = ls.smooth_lq(
-        ls.Stage(A=A, B=B, Q=Q, R=R), initial=ls.FixedState(np.zeros(n)), final=ls.Quadratic(Qf, np.zeros(n), 0.0)
+    solution = ls.lq.smooth_lq(
+        ls.lq.Stage(A=A, B=B, Q=Q, R=R),
+        initial=ls.FixedState(np.zeros(n)),
+        final=ls.types.Quadratic(Qf, np.zeros(n), 0.0),
     )
     assert solution.status is ls.Status.CONVERGED
     return solution.policy.gain
@@ -374,13 +376,15 @@ def test_the_backward_pass_tends_to_drakes_in_continuous_time(peers: ModuleType)
 
     A, B = (np.array(each) for each in zip(*(at(t) for t in knots), strict=True))
     K, S = drake(peers).continuous_gains(A, B, Q, R, Qf, knots)
-    end = ls.Quadratic(Qf, np.zeros(n), 0.0)
+    end = ls.types.Quadratic(Qf, np.zeros(n), 0.0)
 
-    def stage(t: float) -> ls.Stage:
+    def stage(t: float) -> ls.lq.Stage:
         A, B = at(t)
-        return ls.Stage(A=A, B=B, Q=Q, R=R)
+        return ls.lq.Stage(A=A, B=B, Q=Q, R=R)
 
-    whole = ls.smooth_lq_continuous(stage, horizon=1.0, initial=ls.Quadratic(np.eye(n), np.zeros(n), 0.0), final=end)
+    whole = ls.lq.smooth_lq_continuous(
+        stage, horizon=1.0, initial=ls.types.Quadratic(np.eye(n), np.zeros(n), 0.0), final=end
+    )
     for t, value in zip(knots, S, strict=True):
         np.testing.assert_allclose(whole.cost_to_go(t).hessian, value, rtol=0, atol=1e-7 * np.abs(S).max())
     errors: list[float] = []

@@ -185,7 +185,7 @@ def test_the_plan_of_a_planar_quadrotor_is_as_clear_as_mujoco_says(flown) -> Non
 
 def test_obstacles_that_are_displaced_are_seen_where_they_are(flown) -> None:
     plant, solution, _ = flown
-    rollout = ls.simulate(plant, solution, disturbances=[ls.DisplacedObstacles(0.05)], seed=3)
+    rollout = ls.simulate(plant, solution, disturbances=[ls.disturbances.DisplacedObstacles(0.05)], seed=3)
     moved = rollout.displaced[0]
     assert np.abs(moved[0]).min() > 0  # across the plane, too
     assert (moved[1] == 0).all()  # a floor stays
@@ -195,7 +195,7 @@ def test_obstacles_that_are_displaced_are_seen_where_they_are(flown) -> None:
     np.testing.assert_allclose(rollout.clearance[0], theirs, rtol=0, atol=1e-4)
 
 
-class Lifted(ls.Disturbance):
+class Lifted(ls.disturbances.Disturbance):
     """Obstacles are so much higher than the plan has them, in metres."""
 
     def __init__(self, *heights: float) -> None:
@@ -236,7 +236,7 @@ def test_a_hit_between_two_knots_is_one_in_a_vertical_plane(names, offset, lift,
 
 def test_the_figures_show_the_cut(flown, tmp_path: Path) -> None:
     plant, solution, rollout = flown
-    ls.plot_run(solution, {"run": rollout}, tmp_path / "run.svg", world=plant.scene.world)
+    ls.view.plot_run(solution, {"run": rollout}, tmp_path / "run.svg", world=plant.scene.world)
     labels = (tmp_path / "run.svg").read_text()
     assert "x (m)" in labels
     assert "z (m)" in labels
@@ -408,6 +408,6 @@ def test_it_is_the_robot_that_is_measured_and_not_what_moves_before_it_in_the_fi
     assert found.passed, found
     video = ls.render(rollout, tmp_path / "run.mp4", camera="side", size=(640, 480), fps=10)
     assert ls.verify_video(video, rollout, solution=solution).passed
-    assert ls.load_rollout(ls.save(rollout, tmp_path / "run.npz")).body == "drone"
+    assert ls.load(ls.save(rollout, tmp_path / "run.npz"), ls.Rollout).body == "drone"
     with pytest.raises(ls.InputError, match=r"rollout.body: got 'ghost', want a body of its model"):
         ls.verify_run(dataclasses.replace(rollout, body="ghost"))

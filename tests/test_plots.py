@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
+from lqrsim.disturbances import ControlNoise, ForceNoise
 from lqrsim.view import style
 from lqrsim.view.obstacle_plots import surface
 from lqrsim.view.plots import plot_run
@@ -18,14 +19,14 @@ from lqrsim.view.plots import plot_run
 @pytest.fixture(scope="module")
 def drive_runs(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> dict[str, ls.Rollout]:
     plant = differential_drive.plant()
-    disturbed = ls.simulate(plant, drive_solution, disturbances=[ls.ControlNoise(0.05)], seed=1)
+    disturbed = ls.simulate(plant, drive_solution, disturbances=[ControlNoise(0.05)], seed=1)
     return {"calm": ls.simulate(plant, drive_solution), "with noise": disturbed}
 
 
 @pytest.fixture(scope="module")
 def flight_runs(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> dict[str, ls.Rollout]:
     plant = quadrotor.plant()
-    disturbed = ls.simulate(plant, quadrotor_solution, disturbances=[ls.ForceNoise(0.1)], seed=1)
+    disturbed = ls.simulate(plant, quadrotor_solution, disturbances=[ForceNoise(0.1)], seed=1)
     return {"calm": ls.simulate(plant, quadrotor_solution), "with noise": disturbed}
 
 
@@ -64,7 +65,7 @@ def test_a_predicted_tube_is_drawn_with_its_chance_of_collision(
     names = {"drive": ("differential_drive", "drive_solution"), "flight": ("quadrotor", "quadrotor_solution")}
     scenario, solution = (request.getfixturevalue(name) for name in names[robot])
     runs = request.getfixturevalue(f"{robot}_runs")
-    noise = [ls.ControlNoise(0.05)] if robot == "drive" else [ls.ForceNoise(0.1)]
+    noise = [ControlNoise(0.05)] if robot == "drive" else [ForceNoise(0.1)]
     tube = ls.predict_tube(scenario.problem, solution, ls.uncertainty_of(scenario.plant(), noise))
     with_tube = runs | {"with noise": tube.added_to(runs["with noise"])}
     without, found = (

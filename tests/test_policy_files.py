@@ -14,13 +14,14 @@ from linear_plans import DT, double_integrator, law_of, linear
 from spoiling import content_hash, contents, rewrite
 
 import lqrsim as ls
+from lqrsim.disturbances import Unknown
 from lqrsim.errors import Array
 
 same = import_module("robustness.files").same
 
 PAGE = Path(__file__).parent.parent / "docs" / "file_format.md"
 SECTION = re.compile(r"^## A policy with its filter.*?^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-PASSING = ls.Unknown("d0", 0.5, time_constant=0.4, order=2)
+PASSING = Unknown("d0", 0.5, time_constant=0.4, order=2)
 
 
 def page() -> dict[str, Any]:
@@ -43,7 +44,10 @@ def law() -> ls.OffsetFree:
     "options",
     [
         {},
-        {"lag": 0.07, "unknowns": (ls.Unknown("d0", 0.3), PASSING, ls.Unknown("offset of u0", 0.2))},
+        {
+            "lag": 0.07,
+            "unknowns": (Unknown("d0", 0.3), PASSING, Unknown("offset of u0", 0.2)),
+        },
         {"sensors": ("s0",)},
         {"sensors": [[1.0, 0.5], [0.0, 2.0], [1.0, 1.0]]},
         {"latency": 2},
@@ -62,7 +66,7 @@ def test_class_page_and_compiled_controller_agree_on_a_linear_system(
         start=[1.0, 0.0], controls=0.5 * np.sin(np.arange(steps) / 4)[:, None], limits=(-1.5, 1.5)
     )
     law = law_of(system, **options)
-    policy = ls.load_policy(ls.save(law.policy, "policy.npz"))
+    policy = ls.load(ls.save(law.policy, "policy.npz"))
     assert isinstance(policy, ls.OutputFeedbackPolicy)
     names, control = page(), law.start(1)
     elsewhere, z, found = names["z"], policy.start(), []
@@ -120,7 +124,7 @@ def test_a_lost_measurement_is_predicted(law: ls.OffsetFree) -> None:
 def flown(quadrotor: ls.Scenario, solution: ls.Solution, law: ls.OffsetFree) -> tuple[ls.Rollout, Array]:
     """A flight in light disturbances with the compiled controller, and what its policy commands of the same."""
     plant = quadrotor.plant()
-    rollout = ls.simulate(plant, solution, controller=law, disturbances=ls.preset("light", plant), seed=1)
+    rollout = ls.simulate(plant, solution, controller=law, disturbances=ls.disturbances.preset("light", plant), seed=1)
     policy, commands = law.policy, []
     z, last = policy.start(), solution.trajectory.states[0]
     for t, shown in enumerate(rollout.measured[0, :-1]):
@@ -132,8 +136,8 @@ def flown(quadrotor: ls.Scenario, solution: ls.Solution, law: ls.OffsetFree) -> 
 
 def test_on_the_quadrotor_they_are_close(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """In the preset light, of the same measurements: 2 % of the rotors' range in the mean; one predicts linearly."""
-    unknowns = [ls.Unknown(f"wind_{axis}", 0.5, time_constant=1.0) for axis in "xyz"]
-    unknowns += [ls.Unknown("mass", 0.01)] + [ls.Unknown(f"gain of rotor_{i}", 0.04) for i in (1, 2, 3, 4)]
+    unknowns = [Unknown(f"wind_{axis}", 0.5, time_constant=1.0) for axis in "xyz"]
+    unknowns += [Unknown("mass", 0.01)] + [Unknown(f"gain of rotor_{i}", 0.04) for i in (1, 2, 3, 4)]
     measured = {"m": 5e-3, "m/s": 5e-2, "rad": 5e-3, "rad/s": 5e-3}
     uncertainty = ls.Uncertainty(unknowns=unknowns, start=0.01, measurement=measured, control=0.037, lag=0.024)
     law = ls.OffsetFree(
@@ -156,9 +160,9 @@ def saved(tmp_path: Path, law: ls.OffsetFree) -> Path:
 
 
 def test_policies_survive(saved: Path, law: ls.OffsetFree, tmp_path: Path, drive_solution: ls.Solution) -> None:
-    assert same(ls.load_policy(saved), law.policy)
+    assert same(ls.load(saved), law.policy)
     assert ls.save(law.policy, tmp_path / "again.npz").read_bytes() == saved.read_bytes()
-    affine = ls.load_policy(ls.save(drive_solution.policy, tmp_path / "affine.npz"))
+    affine = ls.load(ls.save(drive_solution.policy, tmp_path / "affine.npz"), ls.AffinePolicy)
     assert same(affine, drive_solution.policy)
     assert affine.digest == drive_solution.policy.digest
 
@@ -195,7 +199,7 @@ def test_the_hash_is_what_the_page_says(saved: Path) -> None:
 def test_a_spoilt_policy_gets_one_line(saved: Path, changes: dict[str, Any], message: str) -> None:
     rewrite(saved, **changes)
     with pytest.raises(ls.InputError, match=message) as caught:
-        ls.load_policy(saved)
+        ls.load(saved, ls.OutputFeedbackPolicy)
     assert "\n" not in str(caught.value)
 
 
@@ -204,7 +208,7 @@ def test_a_smaller_state_than_the_robots_is_refused(saved: Path) -> None:
     cut |= {"input": lambda a: a[:, :1], "drift": lambda a: a[:, :1], "nominal": lambda a: a[:, :1]}
     rewrite(saved, **{name: (lambda a, part=part: part(a).copy()) for name, part in cut.items()})
     with pytest.raises(ls.InputError, match=r"nominal: got shape \(12, 1\), want at least one row, of 2 states"):
-        ls.load_policy(saved)
+        ls.load(saved, ls.OutputFeedbackPolicy)
 
 
 def test_every_flipped_bit_is_harmless(saved: Path, law: ls.OffsetFree) -> None:
@@ -214,7 +218,7 @@ def test_every_flipped_bit_is_harmless(saved: Path, law: ls.OffsetFree) -> None:
         spoilt[place] ^= 1 << int(rng.integers(8))
         saved.write_bytes(bytes(spoilt))
         with contextlib.suppress(ls.InputError):
-            assert same(ls.load_policy(saved), policy)
+            assert same(ls.load(saved), policy)
 
 
 @pytest.mark.parametrize(
@@ -243,6 +247,6 @@ def test_a_policy_that_was_made_by_hand_is_checked(law: ls.OffsetFree, tmp_path:
         replace(law.policy, drift=np.full((12, 3), np.nan))
     other = linear([[0.0]], [[1.0]], [[1.0]], steps=3).solution.policy
     with pytest.raises(ls.InputError, match=r"policy: got .*, which holds a 'lqrsim solution'"):
-        ls.load_policy(ls.save(double_integrator(steps=3).solution, tmp_path / "solution.npz"))
+        ls.load(ls.save(double_integrator(steps=3).solution, tmp_path / "solution.npz"), ls.AffinePolicy)
     with pytest.raises(ls.InputError, match=r"solution: got .*, which holds a 'lqrsim policy'"):
-        ls.load_solution(ls.save(other, tmp_path / "policy.npz"))
+        ls.load(ls.save(other, tmp_path / "policy.npz"), ls.Solution)

@@ -54,7 +54,7 @@ def test_outlines_lie_where_the_total_cost_is_two_above_its_least(
     """Of all states with that place on the outline, the best has a total cost of two above the least of all."""
     solution = quadrotor_solution
     assert solution.cost_to_go is not None
-    assert isinstance(solution.cost_to_come, ls.Moments)
+    assert isinstance(solution.cost_to_come, ls.types.Moments)
     knots = np.array([20, 75, 130])
     go, come = solution.cost_to_go, solution.cost_to_come
     least = solution.total_cost.minimum()
@@ -87,7 +87,7 @@ def test_the_tube_of_the_cost_that_is_drawn_is_that_of_every_knot(
     tube, _ = [one for one in axes.collections if isinstance(one, PolyCollection)]
     go, come = drive_solution.cost_to_go, drive_solution.cost_to_come
     assert go is not None
-    assert isinstance(come, ls.Moments)
+    assert isinstance(come, ls.types.Moments)
     assert len(tube.get_paths()) == 151
     for knot, path in enumerate(tube.get_paths()):
         precise = np.linalg.inv(come.covariance[knot])
@@ -101,7 +101,7 @@ def test_the_tube_of_the_cost_that_is_drawn_is_that_of_every_knot(
 
 @pytest.fixture(scope="module")
 def drive_tube(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> Tube:
-    uncertainty = ls.uncertainty_of(differential_drive.plant(), [ls.ControlNoise(0.05)])
+    uncertainty = ls.uncertainty_of(differential_drive.plant(), [ls.disturbances.ControlNoise(0.05)])
     return predict_tube(differential_drive.problem, drive_solution, uncertainty)
 
 
@@ -164,9 +164,9 @@ def test_a_tube_of_another_plan_is_refused(
     look: dict = {"world": differential_drive.scene.world, "radius": 0.2}
     moved = replace(drive_tube.plan, states=drive_tube.plan.states + 0.1)
     with pytest.raises(ls.InputError, match="tube: got one of another plan"):
-        ls.plot_policy(drive_solution, tmp_path / "p.png", tube=replace(drive_tube, plan=moved), **look)
+        ls.view.plot_policy(drive_solution, tmp_path / "p.png", tube=replace(drive_tube, plan=moved), **look)
     with pytest.raises(ls.InputError, match="tube: got 3, want a Tube"):
-        ls.plot_policy(drive_solution, tmp_path / "p.png", tube=3, **look)  # pyright: ignore[reportArgumentType]
+        ls.view.plot_policy(drive_solution, tmp_path / "p.png", tube=3, **look)  # pyright: ignore[reportArgumentType]
     assert not list(tmp_path.iterdir())
 
 
@@ -194,7 +194,7 @@ def test_axes_have_units(
 ) -> None:
     def texts(solution: ls.Solution, scenario: ls.Scenario) -> list[str]:
         options = {"world": scenario.scene.world, "radius": scenario.robot.radius}
-        path = ls.plot_policy(solution, tmp_path / "policy.svg", **options)
+        path = ls.view.plot_policy(solution, tmp_path / "policy.svg", **options)
         return [re.sub(r"<[^>]+>", "", text) for text in re.findall(r"<text.*?</text>", path.read_text(), re.DOTALL)]
 
     drive = texts(drive_solution, differential_drive)
@@ -208,7 +208,9 @@ def test_same_policy_gives_the_same_bytes(
     suffix: str, drive_solution: ls.Solution, differential_drive: ls.Scenario, tmp_path: Path
 ) -> None:
     options = {"world": differential_drive.scene.world, "radius": differential_drive.robot.radius}
-    first, second = (ls.plot_policy(drive_solution, tmp_path / f"{n}{suffix}", **options).read_bytes() for n in "ab")
+    first, second = (
+        ls.view.plot_policy(drive_solution, tmp_path / f"{n}{suffix}", **options).read_bytes() for n in "ab"
+    )
     assert first == second
 
 
@@ -217,7 +219,7 @@ def test_solutions_without_a_cost_to_come_have_no_tube(differential_drive: ls.Sc
     axes = drawn(solution, differential_drive).axes[0]
     assert not [one for one in axes.collections if isinstance(one, PolyCollection)]
     with pytest.raises(ls.InputError, match="solution: got one without a cost-to-go"):
-        ls.plot_policy(replace(solution, cost_to_go=None), tmp_path / "policy.png", world=ls.World([]), radius=0.1)
+        ls.view.plot_policy(replace(solution, cost_to_go=None), tmp_path / "policy.png", world=ls.World([]), radius=0.1)
     assert not list(tmp_path.iterdir())
 
 

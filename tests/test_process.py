@@ -77,7 +77,7 @@ def test_a_signal_while_it_starts_is_one_line(module: str, number: int) -> None:
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory, quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> Path:
     folder = tmp_path_factory.mktemp("flown")
-    rollout = ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[ls.ForceNoise(0.1)])
+    rollout = ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[ls.disturbances.ForceNoise(0.1)])
     return ls.save(rollout, folder / "rollout.npz")
 
 

@@ -14,13 +14,14 @@ from funnels_by_hand import funnel_by_hand
 from PIL import Image, ImageSequence
 
 import lqrsim as ls
+from lqrsim.disturbances import ControlNoise, Push
 from lqrsim.view import gl, video_metadata
 from lqrsim.view.captions import Legend
 from lqrsim.view.options import ALL_OVERLAYS, Overlay
 from lqrsim.view.overlays import COST_TUBE, TUBE, Overlays, Scale
 from lqrsim.view.picture import PictureOptions, open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
-from lqrsim.view.render import render, still
+from lqrsim.view.render import render, render_still
 
 draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
 SMALL = (320, 180)
@@ -28,12 +29,12 @@ SMALL = (320, 180)
 
 @pytest.fixture(scope="module")
 def drive(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> ls.Rollout:
-    return ls.simulate(differential_drive.plant(), drive_solution, disturbances=[ls.ControlNoise(0.05)], seed=3)
+    return ls.simulate(differential_drive.plant(), drive_solution, disturbances=[ControlNoise(0.05)], seed=3)
 
 
 @pytest.fixture(scope="module")
 def flight(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> ls.Rollout:
-    push = ls.Push((0.2, 0.0, 0.0), at=2.0)
+    push = Push((0.2, 0.0, 0.0), at=2.0)
     return ls.simulate(quadrotor.plant(), quadrotor_solution, disturbances=[push], seed=3)
 
 
@@ -76,7 +77,7 @@ def test_frames_show_their_moment_at_any_rate(fps: float, drive: ls.Rollout, tmp
     look: dict = {"size": SMALL, "overlays": ("plan", "ghost", "trace")}
     frames = decode(render(drive, tmp_path / "run.mp4", fps=fps, **look))
     for number in (0, len(frames) // 2, len(frames) - 1):
-        path = still(drive, tmp_path / "still.png", time=number / fps, **look)
+        path = render_still(drive, tmp_path / "still.png", time=number / fps, **look)
         # Compared where they differ most, which is where the robot is; the rest is the same at any time. What
         # h264 loses there is a third or less of what one frame of motion changes.
         assert 2 * difference(frames[number], pixels(path)) < difference(frames[number - 1], pixels(path))
@@ -130,7 +131,7 @@ def test_plan_and_trace_are_drawn(drive: ls.Rollout, tmp_path: Path) -> None:
     moved = dataclasses.replace(drive, states=states)
 
     def count(time: float) -> tuple[int, int]:
-        image = pixels(still(moved, tmp_path / "still.png", time=time, size=(640, 360)))[:320]
+        image = pixels(render_still(moved, tmp_path / "still.png", time=time, size=(640, 360)))[:320]
         red, green, blue = np.moveaxis(image, 2, 0)
         plan = (red > 120) & (green < 90) & (blue > 50) & (red > 1.4 * blue)
         trace = (red > 140) & (green > 120) & (blue < 0.75 * green) & (red < 1.5 * green)
@@ -145,7 +146,7 @@ def test_plan_and_trace_are_drawn(drive: ls.Rollout, tmp_path: Path) -> None:
 def test_same_rollout_gives_the_same_bytes(rollout: ls.Rollout, tmp_path: Path) -> None:
     files = [render(rollout, tmp_path / f"{name}.mp4", size=SMALL, fps=1).read_bytes() for name in "ab"]
     assert files[0] == files[1]
-    files = [still(rollout, tmp_path / f"{name}.png", every=1, size=SMALL).read_bytes() for name in "ab"]
+    files = [render_still(rollout, tmp_path / f"{name}.png", every=1, size=SMALL).read_bytes() for name in "ab"]
     assert files[0] == files[1]
 
 
@@ -155,9 +156,9 @@ def test_many_disturbances_do_not_fill_a_small_picture(
 ) -> None:
     """All of a preset, which takes more lines than there is room for: the rest is counted; GIFs can be read."""
     plant = quadrotor.plant()
-    run = ls.simulate(plant, quadrotor_solution, disturbances=ls.preset("light", plant))
+    run = ls.simulate(plant, quadrotor_solution, disturbances=ls.disturbances.preset("light", plant))
     for insets in ((), ("top",)):
-        ls.still(run, tmp_path / "a.png", size=(320, 180), insets=insets)
+        ls.view.render_still(run, tmp_path / "a.png", size=(320, 180), insets=insets)
     path = render(run, tmp_path / "a.gif", quality="draft", fps=1)
     with Image.open(path) as image:
         assert image.size == (480, 270)
@@ -249,7 +250,7 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
 
     def shown(*overlays: Overlay) -> np.ndarray:
         options: dict = {"time": 2.1, "size": (640, 360), "overlays": overlays, "solution": quadrotor_solution}
-        return pixels(still(noisy, tmp_path / "still.png", funnel=funnel, **options))
+        return pixels(render_still(noisy, tmp_path / "still.png", funnel=funnel, **options))
 
     bare = shown()
     for overlay in ALL_OVERLAYS:
@@ -258,9 +259,11 @@ def test_each_overlay_is_seen(flight: ls.Rollout, quadrotor_solution: ls.Solutio
     moved = dataclasses.replace(flight.plan, states=flight.plan.states + 0.1)
     options: dict = {"overlays": ("cost_tube",), "size": SMALL}
     with pytest.raises(ls.InputError, match="solution: got one with another plan"):
-        still(dataclasses.replace(flight, plan=moved), tmp_path / "a.png", solution=quadrotor_solution, **options)
+        render_still(
+            dataclasses.replace(flight, plan=moved), tmp_path / "a.png", solution=quadrotor_solution, **options
+        )
     with pytest.raises(ls.InputError, match="solution: got None with the overlay cost_tube"):
-        still(flight, tmp_path / "a.png", **options)
+        render_still(flight, tmp_path / "a.png", **options)
 
 
 def test_predicted_tube_has_the_half_axes_of_its_covariance(flight: ls.Rollout, drive: ls.Rollout) -> None:
@@ -350,7 +353,7 @@ def test_tube_of_the_cost_is_the_shadow_of_what_the_total_cost_allows(
     assert overlays.legend_entries() == [("2 sigma of the cost: total ≤ least + 2", COST_TUBE)]
     go, come = quadrotor_solution.cost_to_go, quadrotor_solution.cost_to_come
     assert go is not None
-    assert isinstance(come, ls.Moments)
+    assert isinstance(come, ls.types.Moments)
     knots = overlays.cost_tube.knots
     assert (knots[0], knots[-1]) == (0, flight.plan.steps)
     for number in (3, 12, 20):
@@ -365,14 +368,14 @@ def test_tube_of_the_cost_is_the_shadow_of_what_the_total_cost_allows(
             least = 0.5 * (step @ shown @ step + 2 * step @ cross @ rest + rest @ hidden @ rest)
             # Inverting the covariance costs some of the digits.
             assert least == pytest.approx(2.0, rel=1e-4)
-        best = ls.TotalCost(go, come).minimizer()[knot, :3]
+        best = ls.types.TotalCost(go, come).minimizer()[knot, :3]
         assert centre == pytest.approx(best, abs=1e-12)
 
 
 @draws
 def test_robot_is_shown_several_times(flight: ls.Rollout, tmp_path: Path) -> None:
-    once = pixels(still(flight, tmp_path / "once.png", size=(640, 360)))
-    often = pixels(still(flight, tmp_path / "often.png", every=1, size=(640, 360)))
+    once = pixels(render_still(flight, tmp_path / "once.png", size=(640, 360)))
+    often = pixels(render_still(flight, tmp_path / "often.png", every=1, size=(640, 360)))
     assert (np.abs(once - often).max(axis=2) > 20).sum() > 5 * 60
 
 
@@ -380,7 +383,7 @@ def test_robot_is_shown_several_times(flight: ls.Rollout, tmp_path: Path) -> Non
 def test_picture_may_exceed_the_buffer_of_the_model(drive: ls.Rollout, tmp_path: Path) -> None:
     small = drive.model.replace('offwidth="1920" offheight="1080"', 'offwidth="64" offheight="64"')
     assert small != drive.model
-    path = still(dataclasses.replace(drive, model=small), tmp_path / "still.png", size=SMALL)
+    path = render_still(dataclasses.replace(drive, model=small), tmp_path / "still.png", size=SMALL)
     assert pixels(path).shape == (180, 320, 3)
 
 
@@ -389,12 +392,12 @@ def test_diverged_trial_stands_still(flight: ls.Rollout, tmp_path: Path) -> None
     states, frames = flight.states.copy(), flight.frames.copy()
     states[:, 60:], frames[:, flight.frame_times > 2.0] = np.nan, np.nan
     broken = dataclasses.replace(flight, states=states, frames=frames, diverged_at=np.array([2.0]))
-    images = [pixels(still(broken, tmp_path / "still.png", time=time, size=SMALL)) for time in (3.0, 5.0)]
+    images = [pixels(render_still(broken, tmp_path / "still.png", time=time, size=SMALL)) for time in (3.0, 5.0)]
     # The captions, upper left, tell the time; the marks of the plan move on.
     assert (np.abs(images[0] - images[1])[70:].max(axis=2) > 20).mean() < 0.02
     states[:], frames[:] = np.nan, np.nan
     with pytest.raises(ls.InputError, match="without one finite state"):
-        still(broken, tmp_path / "still.png", size=SMALL)
+        render_still(broken, tmp_path / "still.png", size=SMALL)
 
 
 @draws
@@ -439,7 +442,7 @@ def test_bad_input_gets_one_line(options: dict, message: str, drive: ls.Rollout,
 )
 def test_bad_input_for_a_still(options: dict, message: str, drive: ls.Rollout, tmp_path: Path) -> None:
     with pytest.raises(ls.InputError, match=message):
-        still(drive, tmp_path / options.pop("path", "still.png"), **{"size": SMALL, **options})
+        render_still(drive, tmp_path / options.pop("path", "still.png"), **{"size": SMALL, **options})
 
 
 @pytest.mark.parametrize("model", ["<mujoco><worldbody>", "<mujoco/>"])

@@ -8,9 +8,10 @@ import pytest
 from linear_plans import DT, Linear, double_integrator, linear
 
 import lqrsim as ls
+from lqrsim.disturbances import ForceNoise, MeanWind, MeasurementNoise, Unknown
 from lqrsim.errors import Array
 
-PUSH = ls.Unknown("d0", 0.5)
+PUSH = Unknown("d0", 0.5)
 TOLERATE = {"m": 0.05, "m/s": 0.3, "rad": 0.2, "rad/s": 1.0}
 STEPS, AGAIN = 30, 10
 
@@ -20,7 +21,7 @@ def rocking() -> Linear:
     return double_integrator(start=[1.0, 0.0], controls=np.cos(np.arange(STEPS) / 4)[:, None])
 
 
-def stated(*unknowns: ls.Unknown, lag: float = 0.0, latency: int = 0, delay: int = 0) -> ls.Uncertainty:
+def stated(*unknowns: Unknown, lag: float = 0.0, latency: int = 0, delay: int = 0) -> ls.Uncertainty:
     return ls.Uncertainty(
         unknowns=unknowns, start=0.3, measurement=0.1, control=0.2, lag=lag, latency=latency, delay=delay
     )
@@ -81,7 +82,7 @@ def test_new_plans_are_optimal_for_what_is_estimated() -> None:
 def test_so_they_are_for_a_parameter_that_has_a_value() -> None:
     """The control pushes by a third more than it was planned with."""
     system = rocking()
-    law = replanned(system, stated(ls.Unknown("b10", 0.3)))
+    law = replanned(system, stated(Unknown("b10", 0.3)))
     _, commands = run(replace(system, inputs=system.inputs * 4 / 3), law)
     assert (law.solved, law.kept) == (2, {})
     for step, plan in law.plans[0].items():
@@ -97,7 +98,7 @@ def test_so_they_are_for_a_parameter_that_has_a_value() -> None:
 def test_what_is_no_parameter_stays_with_the_law() -> None:
     """An offset of the control: the plan knows nothing of it, and the law takes it off the command, to 1e-5."""
     system = rocking()
-    law = replanned(system, stated(ls.Unknown("offset of u0", 0.5)))
+    law = replanned(system, stated(Unknown("offset of u0", 0.5)))
     _, commands = run(system, law, bias=0.4)
     assert law.solved == 2
     for step, plan in law.plans[0].items():
@@ -130,7 +131,7 @@ def test_estimates_go_on(lag: float) -> None:
 
 # A quadrotor in a steady wind.
 
-WIND = ls.MeanWind((3.0, 0.0, 0.0))
+WIND = MeanWind((3.0, 0.0, 0.0))
 
 
 def flight(steps: int = 150) -> ls.Problem:
@@ -152,7 +153,7 @@ def flown() -> tuple[ls.Solution, ls.OffsetFree]:
     solution = ls.smooth(problem)
     assert solution.success
     measured = {"m": 5e-3, "m/s": 5e-2, "rad": 5e-3, "rad/s": 5e-3}
-    unknowns = [ls.Unknown(f"wind_{axis}", 1.5) for axis in "xyz"]
+    unknowns = [Unknown(f"wind_{axis}", 1.5) for axis in "xyz"]
     uncertainty = ls.Uncertainty(unknowns=unknowns, start=0.01, measurement=measured)
     law = ls.OffsetFree(
         problem, solution, uncertainty, tolerate=TOLERATE, record=True, replan_every=1.0, replan_always=True
@@ -205,7 +206,7 @@ def test_in_a_steady_wind_the_new_plan_leans_into_it(
 
 def test_each_trial_gets_what_it_gets_alone(quadrotor: ls.Scenario, flown: tuple[ls.Solution, ls.OffsetFree]) -> None:
     solution, law = flown
-    noise = [WIND, ls.MeasurementNoise(0.003), ls.ForceNoise(0.05)]
+    noise = [WIND, MeasurementNoise(0.003), ForceNoise(0.05)]
     plant = quadrotor.plant()
     together = ls.simulate(plant, solution, controller=law, disturbances=noise, trials=3, frames=False)
     assert law.solved == 12

@@ -32,7 +32,7 @@ def solution(stated: ls.Problem) -> ls.Solution:
 
 
 @pytest.fixture(scope="module")
-def solver(stated: ls.Problem) -> ls.PreparedSolver:
+def solver(stated: ls.Problem) -> ls.types.PreparedSolver:
     return ls.prepare(stated)
 
 
@@ -64,7 +64,7 @@ class TestPreparedSolver:
         steps=st.integers(0, 5),
     )  # fmt: skip
     def test_no_plan_is_worse_than_to_go_on(
-        self, stated: ls.Problem, solution: ls.Solution, solver: ls.PreparedSolver, away: list[float],
+        self, stated: ls.Problem, solution: ls.Solution, solver: ls.types.PreparedSolver, away: list[float],
         limit: float | None, shift: tuple[float, float], goal: float, steps: int,
     ) -> None:  # fmt: skip
         """Whatever the state, the time, the goal and where the obstacle has gone; and it is what it says it is.
@@ -97,7 +97,7 @@ class TestPreparedSolver:
             assert found.iterations == 0
 
     def test_what_converges_is_an_optimum(
-        self, stated: ls.Problem, solution: ls.Solution, solver: ls.PreparedSolver
+        self, stated: ls.Problem, solution: ls.Solution, solver: ls.types.PreparedSolver
     ) -> None:
         """That of SLSQP from the same plan: to 1e-3 of the cost, for both stop within about 1e-4 of it."""
         state = solution.trajectory.states[3] + np.array([0.02, -0.05, 0.1, 0.1])
@@ -118,7 +118,9 @@ class TestPreparedSolver:
         solver.solve(solution.trajectory.states[4], found.shifted(2), problem=changed)
         assert len(compiled_module.compilations) == before
 
-    def test_another_structure_is_refused(self, stated: ls.Problem, solver: ls.PreparedSolver, solution: Any) -> None:
+    def test_another_structure_is_refused(
+        self, stated: ls.Problem, solver: ls.types.PreparedSolver, solution: Any
+    ) -> None:
         other = replace(stated, stage_cost=ls.ControlCost([0.1, 0.1]))
         with pytest.raises(ls.InputError, match="problem: got one of another structure"):
             solver.solve(np.zeros(4), solution, problem=other)
@@ -156,7 +158,7 @@ def anything(called: Any) -> Any:
     return called
 
 
-NOISE = [ls.ForceNoise(0.1), ls.ControlNoise(0.05)]
+NOISE = [ls.disturbances.ForceNoise(0.1), ls.disturbances.ControlNoise(0.05)]
 
 
 def simulated(plant: ls.Plant, solution: ls.Solution, law: ls.Replanning, **options: Any) -> ls.Rollout:

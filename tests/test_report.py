@@ -13,17 +13,18 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
+from lqrsim.disturbances import ControlNoise, ForceNoise, MeasurementNoise
 from lqrsim.reports.page import report
-from lqrsim.simulation.outcome_table import Outcomes
 from lqrsim.stress.campaign import run_campaign
+from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.results import Results
 from lqrsim.stress.specification import Campaign, Cell
 from lqrsim.view import gl
 
 NASTY = '<script>alert("&")</script>'
 SWEEPS = {
-    NASTY: (ls.ControlNoise(0.2), ls.ForceNoise(5.0)),
-    "measurements": (ls.MeasurementNoise((0.05, 0.05, 0.1)),),
+    NASTY: (ControlNoise(0.2), ForceNoise(5.0)),
+    "measurements": (MeasurementNoise((0.05, 0.05, 0.1)),),
 }
 STRENGTHS = (0.0, 1.0, 4.0)
 TRIALS = 12

@@ -17,6 +17,7 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.commands import reproduce
+from lqrsim.disturbances import InitialStateError, MotorLag
 from lqrsim.reports.paper import results_page
 
 pytestmark = pytest.mark.timeout(900)  # all scripts are run, each in a process of its own
@@ -176,8 +177,8 @@ def test_stress_test_counts_what_simulations_do(quick: tuple[Path, dict[str, Any
         scenario = ls.scenarios.get(name)
         plant, solution = scenario.plant(), ls.smooth(scenario.problem)
         (cell,) = [one for one in robot["together"] if (one["policy"], one["strength"]) == ("smooth", 1.0)]
-        kinds = {"motor lag": ls.MotorLag, "initial state error": ls.InitialStateError}
-        light = ls.preset("light", plant)
+        kinds = {"motor lag": MotorLag, "initial state error": InitialStateError}
+        light = ls.disturbances.preset("light", plant)
         run = ls.simulate(plant, solution, disturbances=light, trials=cell["trials"], contacts=False, frames=False)
         assert run.outcome.count("reached") == cell["reached"]
         assert sum(count for *_, count in cell["modes"]) == cell["trials"] - cell["reached"]
@@ -198,7 +199,9 @@ def test_robust_policies_counts_what_simulations_do(quick: tuple[Path, dict[str,
     result = quick[1]["results"]["robust_policies"]["result"]
     scenario, presets = ls.scenarios.quadrotor(), result["presets"]
     plant, trials = scenario.plant(), presets["trials"]
-    run = ls.simulate(plant, ls.smooth(scenario.problem), disturbances=ls.preset("light", plant), trials=trials)
+    run = ls.simulate(
+        plant, ls.smooth(scenario.problem), disturbances=ls.disturbances.preset("light", plant), trials=trials
+    )
     told = presets["presets"]["light"]["reached"]
     assert told["smoother's policy"][0] == pytest.approx(100 * run.outcome.count("reached") / trials)
     assert told["offset free, safe plan"][0] > 80  # it misses fewer than 1 in 100: docs/robust_policies.md

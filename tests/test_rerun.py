@@ -52,7 +52,7 @@ def test_what_moves_is_where_mujoco_has_it(run: Path, tmp_path: Path, capsys: py
     capsys.readouterr()
     assert main(["render", str(run), "--out", str(path), "--trial", "1"]) == 0
     assert capsys.readouterr().out == f"wrote {path}\n"
-    found, rollout = read(path), ls.load_rollout(run)
+    found, rollout = read(path), ls.load(run, ls.Rollout)
     model = model_from_xml(rollout.model, "model")
     data = mujoco.MjData(model)
     moving = {name: one for name, one in found.items() if name.startswith("/world/model/") and "time" in one}
@@ -74,7 +74,7 @@ def test_what_moves_is_where_mujoco_has_it(run: Path, tmp_path: Path, capsys: py
 
 def test_numbers_plan_and_tube_are_those_of_the_run(run: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs the `rerun` extra")
-    rollout, path = ls.load_rollout(run), tmp_path / "run.rrd"
+    rollout, path = ls.load(run, ls.Rollout), tmp_path / "run.rrd"
     assert rerun_file.write(rollout, path) == []
     found = read(path)
     assert rollout.tube is not None
@@ -102,7 +102,11 @@ def test_numbers_plan_and_tube_are_those_of_the_run(run: Path, tmp_path: Path) -
 def test_a_funnel(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Balls of a quarter of a metre about the plan, of half of it at the second knot, and what is in between."""
     pytest.importorskip("rerun", reason="needs the `rerun` extra")
-    solution, path, kept = ls.load_solution(run.parent / "solution.npz"), tmp_path / "run.rrd", tmp_path / "funnel.npz"
+    solution, path, kept = (
+        ls.load(run.parent / "solution.npz", ls.Solution),
+        tmp_path / "run.rrd",
+        tmp_path / "funnel.npz",
+    )
     ls.save(funnel_by_hand(solution, 0.25**2 * np.eye(3), knots=(0, 100), levels=(1.0, 0.5)), kept)
     assert main(["render", str(run), "--out", str(path), "--funnel", str(kept)]) == 0
     found, plan = read(path), solution.trajectory.states[:, :3]
@@ -129,7 +133,7 @@ def test_every_shape_is_drawn_or_named(run: Path, tmp_path: Path) -> None:
       <geom name="pill" type="capsule" size="0.1 0.3" pos="1 2 3" contype="0" conaffinity="0"/>
       <geom name="egg" type="ellipsoid" size="0.1 0.2 0.3" contype="0" conaffinity="0"/>
       <geom name="hills" type="hfield" hfield="hills" contype="0" conaffinity="0"/></worldbody>"""
-    rollout, path = ls.load_rollout(run), tmp_path / "shapes.rrd"
+    rollout, path = ls.load(run, ls.Rollout), tmp_path / "shapes.rrd"
     xml = rollout.model.replace("<worldbody>", f"{assets}<worldbody>", 1).replace("</worldbody>", geoms, 1)
     assert rerun_file.write(replace(rollout, model=xml), path) == ["hills"]
     model = model_from_xml(xml, "model")

@@ -18,20 +18,20 @@ from lqrsim.errors import Array
 from lqrsim.solvers import compiled
 
 
-def stage_of(problem: LinearQuadratic) -> ls.Stage:
+def stage_of(problem: LinearQuadratic) -> ls.lq.Stage:
     n = problem.A.shape[-1]
-    return ls.Stage(
+    return ls.lq.Stage(
         A=problem.A, B=problem.B, c=problem.c, Q=problem.H[:, :n, :n], P=problem.H[:, n:, :n], R=problem.H[:, n:, n:],
         q=problem.h[:, :n], r=problem.h[:, n:], constant=problem.k,
     )  # fmt: skip
 
 
 def smoothed(problem: LinearQuadratic, form: str) -> ls.Solution:
-    start = ls.Quadratic(problem.Q0, problem.q0, problem.k0)
-    solution = ls.smooth_lq(
+    start = ls.types.Quadratic(problem.Q0, problem.q0, problem.k0)
+    solution = ls.lq.smooth_lq(
         stage_of(problem),
         initial=start if problem.fixed is None else ls.FixedState(problem.fixed),
-        final=ls.Quadratic(problem.QT, problem.qT, problem.kT),
+        final=ls.types.Quadratic(problem.QT, problem.qT, problem.kT),
         form=form,
     )
     assert solution.status is ls.Status.CONVERGED
@@ -76,7 +76,7 @@ def test_both_forms_solve_the_kkt_system_and_agree(n: int, m: int, seed: int, st
     problem = random_problem(seed, n, m, steps)
     primal, dual = (assert_solves(problem, form) for form in ("primal", "dual"))
     for one, other in ((primal.cost_to_go, dual.cost_to_go), (primal.cost_to_come, dual.cost_to_come)):
-        other = other.quadratic() if isinstance(other, ls.Moments) else other
+        other = other.quadratic() if isinstance(other, ls.types.Moments) else other
         assert one is not None
         assert other is not None
         for name in ("hessian", "gradient", "constant"):
@@ -135,21 +135,21 @@ def test_value_functions_are_the_cost_of_the_rest_of_the_way(seed: int, steps: i
 
 @pytest.mark.parametrize("form", ["dual", "primal"])
 def test_a_control_that_costs_nothing_and_does_nothing_is_refused(form: str) -> None:
-    stage = ls.Stage(A=np.eye(3), B=np.zeros((4, 3, 2)), R=np.zeros((2, 2)), Q=np.eye(3))
-    end = ls.Quadratic(np.eye(3), np.zeros(3), np.array(0.0))
-    solution = ls.smooth_lq(stage, initial=end, final=end, form=form)
+    stage = ls.lq.Stage(A=np.eye(3), B=np.zeros((4, 3, 2)), R=np.zeros((2, 2)), Q=np.eye(3))
+    end = ls.types.Quadratic(np.eye(3), np.zeros(3), np.array(0.0))
+    solution = ls.lq.smooth_lq(stage, initial=end, final=end, form=form)
     assert solution.status is ls.Status.NOT_POSITIVE_DEFINITE
     assert solution.detail == "backward pass, step 3 of 4"
     assert not solution.iterations
 
 
-END = ls.Quadratic(np.eye(2), np.zeros(2), np.array(0.0))
-FLAT = ls.Quadratic(np.diag([1.0, 0.0]), np.zeros(2), np.array(0.0))
-STEP = ls.Stage(A=np.eye(2), B=np.ones((4, 2, 1)), R=[[1.0]])
+END = ls.types.Quadratic(np.eye(2), np.zeros(2), np.array(0.0))
+FLAT = ls.types.Quadratic(np.diag([1.0, 0.0]), np.zeros(2), np.array(0.0))
+STEP = ls.lq.Stage(A=np.eye(2), B=np.ones((4, 2, 1)), R=[[1.0]])
 
 
-def lq(stage: ls.Stage = STEP, *, initial: Any = END, final: Any = END, form: str = "dual", dt: float = 1.0) -> Any:
-    return ls.smooth_lq(stage, initial=initial, final=final, form=form, dt=dt)
+def lq(stage: ls.lq.Stage = STEP, *, initial: Any = END, final: Any = END, form: str = "dual", dt: float = 1.0) -> Any:
+    return ls.lq.smooth_lq(stage, initial=initial, final=final, form=form, dt=dt)
 
 
 @pytest.mark.parametrize(
@@ -162,16 +162,16 @@ def lq(stage: ls.Stage = STEP, *, initial: Any = END, final: Any = END, form: st
         (lambda: lq(initial=ls.FixedState([0])), r"initial: state: got shape \(1,\), want \(2,\)"),
         (lambda: lq(final=np.eye(2)), r"final: got array\(.*, want a Quadratic"),
         (
-            lambda: lq(ls.Stage(A=FLAT.hessian, B=np.ones((4, 2, 1)), R=[[1.0]]), form="primal"),
+            lambda: lq(ls.lq.Stage(A=FLAT.hessian, B=np.ones((4, 2, 1)), R=[[1.0]]), form="primal"),
             r'stage: A: got a singular matrix at step 0, want an invertible one, or form="dual"',
         ),
-        (lambda: lq(ls.Stage(A=np.eye(2), B=np.ones((2, 1)), R=[[1.0]])), "stage: got one stage, want one a step"),
+        (lambda: lq(ls.lq.Stage(A=np.eye(2), B=np.ones((2, 1)), R=[[1.0]])), "stage: got one stage, want one a step"),
         (
-            lambda: ls.Stage(A=np.eye(3), B=np.ones((4, 2, 1)), R=[[1.0]]),
+            lambda: ls.lq.Stage(A=np.eye(3), B=np.ones((4, 2, 1)), R=[[1.0]]),
             r"Stage: A: got shape \(4, 3, 3\), want \(4, 2, 2\)",
         ),
         (
-            lambda: ls.Stage(A=np.eye(2), B=np.ones((2, 1)), R=[[1.0]], Q=[[0, 1], [0, 0]]),
+            lambda: ls.lq.Stage(A=np.eye(2), B=np.ones((2, 1)), R=[[1.0]], Q=[[0, 1], [0, 0]]),
             "Stage: Q: got a matrix that is not symmetric",
         ),
     ],

@@ -29,7 +29,7 @@ from lqrsim.errors import (
     excerpt,
 )
 from lqrsim.machine import memory
-from lqrsim.problem.costs import Term
+from lqrsim.problem.costs import CostTerm
 
 api: Any = import_module("robustness.api")  # of experiments/
 of_runs: Any = import_module("robustness.of_runs")
@@ -195,8 +195,10 @@ class TestCounts:
         assert refusal(lambda: lq.split(lambda z: z[:, 0], **options)).startswith(f"{name}: got {count}, ")
 
     def test_of_campaigns(self, tmp_path: Path) -> None:
-        campaign = ls.Campaign(scenario="quadrotor", sweeps={"noise": (ls.ControlNoise(0.1),)}, trials=1)
-        assert "workers" in refusal(lambda: ls.run_campaign(campaign, tmp_path / "a", workers=2**31))
+        campaign = ls.stress.Campaign(
+            scenario="quadrotor", sweeps={"noise": (ls.disturbances.ControlNoise(0.1),)}, trials=1
+        )
+        assert "workers" in refusal(lambda: ls.stress.run_campaign(campaign, tmp_path / "a", workers=2**31))
         assert "trials" in refusal(lambda: dataclasses.replace(campaign, trials=10**20))
 
     def test_a_control_period_that_the_physics_never_ends(
@@ -282,7 +284,7 @@ class TestDataThatUsersBuild:
             effect = {hook: answer if hook == "displaced" else (lambda *_, answer=answer: answer)}
             line = refusal(lambda e=effect: of_runs.simulate_effect(plant, drive_solution, **e))
             assert line.startswith(f"Hooked: {hook}")
-        assert refusal(lambda: ls.Effect(force=3)).startswith("Effect: force: got 3, want a function")  # pyright: ignore
+        assert refusal(lambda: ls.disturbances.Effect(force=3)).startswith("Effect: force: got 3, want a function")  # pyright: ignore
 
     def test_a_list_of_lists_does_for_an_array(
         self, differential_drive: ls.Scenario, drive_solution: ls.Solution
@@ -328,12 +330,12 @@ class TestFunctions:
     def test_functions_of_modules_are_named(self, said: str) -> None:
         value = f"def value(x, u, t, row, data):\n    return {said}\n\n\n"
         slope = "def slope(x, u, t, row, data, gradient):\n    gradient[0] += 1.0\n"
-        line = refusal(lambda: ls.ConstraintTerm(value + slope, np.zeros(0), 1, str))
+        line = refusal(lambda: ls.types.ConstraintTerm(value + slope, np.zeros(0), 1, str))
         assert line == f"ConstraintTerm: source: got {said[:-6]} in line 2, want cos: modules are not at hand"
         term = value.replace("row, ", "") + slope.replace(
             "def slope(x, u, t, row, data, gradient)", "def derivatives(x, u, t, data, hessian, gradient)"
         )
-        assert "want cos" in refusal(lambda: Term(term, np.zeros(0)))
+        assert "want cos" in refusal(lambda: CostTerm(term, np.zeros(0)))
         ast.parse(value)
 
     @pytest.mark.parametrize(
@@ -344,13 +346,13 @@ class TestFunctions:
         ],
     )  # fmt: skip
     def test_sources_that_are_none(self, source: Any, wanted: str) -> None:
-        assert wanted in refusal(lambda: ls.ConstraintTerm(source, np.zeros(0), 1, str))
+        assert wanted in refusal(lambda: ls.types.ConstraintTerm(source, np.zeros(0), 1, str))
 
     def test_what_a_function_of_ones_own_raises_is_its_own(self, differential_drive: ls.Scenario) -> None:
         class Mine(Exception):
             pass
 
-        def callback(iteration: ls.Iteration) -> None:
+        def callback(iteration: ls.types.Iteration) -> None:
             raise Mine
 
         with pytest.raises(Mine):

@@ -43,8 +43,8 @@ class TestForms:
         assert primal.cost == pytest.approx(dual.cost, rel=1e-9)
         np.testing.assert_allclose(primal.trajectory.states, dual.trajectory.states, rtol=0, atol=1e-5)
         np.testing.assert_allclose(primal.policy.gain, dual.policy.gain, rtol=0, atol=1e-4)
-        assert isinstance(dual.cost_to_come, ls.Moments)
-        assert isinstance(primal.cost_to_come, ls.Quadratic)
+        assert isinstance(dual.cost_to_come, ls.types.Moments)
+        assert isinstance(primal.cost_to_come, ls.types.Quadratic)
         converted = dual.cost_to_come.quadratic()
         scale = np.abs(primal.cost_to_come.hessian).max()
         np.testing.assert_allclose(converted.hessian, primal.cost_to_come.hessian, rtol=0, atol=1e-4 * scale)
@@ -254,7 +254,7 @@ class TestSafeguard:
 
     def test_many_and_one_give_the_same_bits(self, stiff: ls.Problem) -> None:
         assert same(ls.smooth(stiff), *ls.smooth_many([stiff], threads=2))
-        seen: list[ls.Iteration] = []
+        seen: list[ls.types.Iteration] = []
         solution = ls.smooth(stiff, callback=seen.append)
         # Of all that were run to their end, one after the other.
         costs, told = [row.cost for row in solution.iterations], [row.cost for row in seen]
@@ -276,10 +276,10 @@ class TestSafeguard:
 
     def test_a_file_keeps_how_each_iteration_came_about(self, stiff: ls.Problem, tmp_path) -> None:
         solution = ls.smooth(stiff)
-        loaded = ls.load_solution(ls.save(solution, tmp_path / "stiff.npz"))
+        loaded = ls.load(ls.save(solution, tmp_path / "stiff.npz"), ls.Solution)
         np.testing.assert_array_equal(
             [row.cost for row in loaded.iterations], [row.cost for row in solution.iterations]
         )
         assert [row.method for row in loaded.iterations] == [row.method for row in solution.iterations]
-        assert isinstance(loaded.cost_to_come, ls.Moments)
+        assert isinstance(loaded.cost_to_come, ls.types.Moments)
         np.testing.assert_array_equal(loaded.total_cost.minimizer(), solution.total_cost.minimizer())

@@ -312,11 +312,11 @@ class TestMany:
 
 
 def test_the_callback_sees_every_iteration_and_may_stop_the_solve(differential_drive: ls.Scenario) -> None:
-    seen: list[ls.Iteration] = []
+    seen: list[ls.types.Iteration] = []
     solution = ls.smooth(differential_drive.problem, callback=seen.append)
     assert tuple(seen) == solution.iterations
 
-    def interrupt(iteration: ls.Iteration) -> None:
+    def interrupt(iteration: ls.types.Iteration) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -351,7 +351,7 @@ def test_the_primal_form_wants_a_soft_start(differential_drive: ls.Scenario) -> 
 
 def test_the_summary_says_what_matters(drive_solution: ls.Solution) -> None:
     text = str(drive_solution)
-    assert text.splitlines()[0] == ls.Iteration.HEADER
+    assert text.splitlines()[0] == ls.types.Iteration.HEADER
     assert "CONVERGED after 6 iterations of smooth" in text
     assert "the plan is from the start 'straight', one of 7; 6 were dropped" in text
     assert "clearance: 0.141 m" in text

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 import lqrsim as ls
+from lqrsim.disturbances import Disturbance, ForceNoise, MeasurementNoise, Push
 from lqrsim.simulation.disturbances import preset
 from lqrsim.stress.multilevel_splitting import NoFailure, split
 from lqrsim.stress.statistics import rate
@@ -68,12 +69,16 @@ def test_what_can_not_be_given_is_named() -> None:
 
 
 @pytest.fixture(scope="module")
-def disturbances() -> list[ls.Disturbance]:
-    return [ls.ForceNoise(0.2), ls.MeasurementNoise(0.005), ls.Push((0.1, 0.0, 0.0), at=1.0)]
+def disturbances() -> list[Disturbance]:
+    return [
+        ForceNoise(0.2),
+        MeasurementNoise(0.005),
+        Push((0.1, 0.0, 0.0), at=1.0),
+    ]
 
 
 def test_the_same_numbers_give_the_trial_that_simulate_gives(
-    quadrotor: ls.Scenario, quadrotor_solution: ls.Solution, disturbances: list[ls.Disturbance]
+    quadrotor: ls.Scenario, quadrotor_solution: ls.Solution, disturbances: list[Disturbance]
 ) -> None:
     trials = TrialScore(quadrotor.plant(), quadrotor_solution, disturbances, contacts=True)
     assert trials.sizes == (150 * 3, 151 * 12, 0)
@@ -109,7 +114,11 @@ def test_any_numbers_give_trials_of_every_preset(
 
 def test_scores_are_positive_where_trials_fail(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     rollout = ls.simulate(
-        quadrotor.plant(), quadrotor_solution.open_loop(), disturbances=[ls.ForceNoise(0.1)], trials=60, frames=False
+        quadrotor.plant(),
+        quadrotor_solution.open_loop(),
+        disturbances=[ForceNoise(0.1)],
+        trials=60,
+        frames=False,
     )
     np.testing.assert_array_equal(collision(rollout) > 0, rollout.collided)
     np.testing.assert_array_equal(miss(rollout) > 0, ~rollout.reached)
@@ -233,7 +242,7 @@ def test_what_is_not_rare_needs_no_levels() -> None:
 @pytest.mark.long
 def test_a_quadrotor_against_plain_monte_carlo(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """Wind in which 1 to 2 % of the trials collide: the two agree within four standard errors of their difference."""
-    trials = TrialScore(quadrotor.plant(), quadrotor_solution, [ls.ForceNoise(0.19)])
+    trials = TrialScore(quadrotor.plant(), quadrotor_solution, [ForceNoise(0.19)])
     rng = np.random.default_rng(8)
     plain = trials(rng.standard_normal((1000, trials.size))) > 0
     expected = rate(int(plain.sum()), len(plain))

@@ -9,6 +9,7 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
+from lqrsim.disturbances import AxleMismatch, ControlNoise, MeasurementNoise, MotorLag
 from lqrsim.errors import InputError
 from lqrsim.reports.curves import COLOURS, LINES, MARKERS
 from lqrsim.stress.campaign import _code
@@ -16,8 +17,13 @@ from lqrsim.stress.manifest import read_manifest
 from lqrsim.stress.specification import POLICIES, TOLD, USUAL
 from lqrsim.stress.trials import CONTROLLERS, controller, controller_of, solve
 
-LIGHT = (ls.ControlNoise(0.02), ls.MeasurementNoise(0.01), ls.AxleMismatch(0.01), ls.MotorLag(0.05))
-CAMPAIGN = ls.Campaign(
+LIGHT = (
+    ControlNoise(0.02),
+    MeasurementNoise(0.01),
+    AxleMismatch(0.01),
+    MotorLag(0.05),
+)
+CAMPAIGN = ls.stress.Campaign(
     scenario="differential_drive",
     sweeps={"own": LIGHT},
     strengths=(2.0,),
@@ -29,13 +35,13 @@ CAMPAIGN = ls.Campaign(
 )
 
 
-def shards(results: ls.Results) -> dict[str, bytes]:
+def shards(results: ls.stress.Results) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((results.folder / "shards").iterdir())}
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> ls.Results:
-    return ls.run_campaign(CAMPAIGN, tmp_path_factory.mktemp("stated") / "here", workers=0)
+def results(tmp_path_factory: pytest.TempPathFactory) -> ls.stress.Results:
+    return ls.stress.run_campaign(CAMPAIGN, tmp_path_factory.mktemp("stated") / "here", workers=0)
 
 
 @pytest.fixture(scope="module")
@@ -50,15 +56,15 @@ def solved(tmp_path_factory: pytest.TempPathFactory, differential_drive: ls.Scen
 @pytest.mark.parametrize(("workers", "batch"), [pytest.param(1, 3, marks=pytest.mark.long), (2, 1)])
 @pytest.mark.long
 def test_all_six_have_the_same_bits_in_other_processes_and_in_any_batch(
-    results: ls.Results, tmp_path: Path, workers: int, batch: int
+    results: ls.stress.Results, tmp_path: Path, workers: int, batch: int
 ) -> None:
-    again = ls.run_campaign(CAMPAIGN, tmp_path, workers=workers, batch=batch)
+    again = ls.stress.run_campaign(CAMPAIGN, tmp_path, workers=workers, batch=batch)
     assert len(shards(again)) == 12
     assert shards(again) == shards(results)
 
 
 def test_trials_are_those_of_the_controllers_as_users_make_them(
-    results: ls.Results, differential_drive: ls.Scenario, drive_solution: ls.Solution
+    results: ls.stress.Results, differential_drive: ls.Scenario, drive_solution: ls.Solution
 ) -> None:
     plant, problem = differential_drive.plant(), differential_drive.problem
     stated, wrong = ls.uncertainty_of(plant, LIGHT), [one.scaled(2.0) for one in LIGHT]
@@ -69,29 +75,29 @@ def test_trials_are_those_of_the_controllers_as_users_make_them(
     }
     for policy, law in made.items():
         rollout = ls.simulate(plant, plan, controller=law, disturbances=wrong, trials=4, contacts=False)
-        rows, own = results.outcomes(ls.Cell(policy, "own", 2.0)), ls.outcomes(rollout, problem)
+        rows, own = results.outcomes(ls.stress.Cell(policy, "own", 2.0)), ls.stress.outcomes(rollout, problem)
         np.testing.assert_array_equal(rows.rms, own.rms)
         np.testing.assert_array_equal(rows.clearance, own.clearance)
         np.testing.assert_array_equal(rows.outcome, own.outcome)
     assert results.solution("track").policy.digest == made["track"].digest
-    again = ls.replay(results, ls.Cell("offset_free", "own", 2.0), 3)
+    again = ls.stress.replay(results, ls.stress.Cell("offset_free", "own", 2.0), 3)
     wanted = ls.simulate(plant, plan, controller=made["offset_free"], disturbances=wrong, first_trial=3)
     np.testing.assert_array_equal(again.states, wanted.states)
 
 
-def test_what_is_stated_is_written_down_and_part_of_the_digest(results: ls.Results, tmp_path: Path) -> None:
-    assert ls.Campaign.from_json(json.loads(json.dumps(CAMPAIGN.as_json()))) == CAMPAIGN
+def test_what_is_stated_is_written_down_and_part_of_the_digest(results: ls.stress.Results, tmp_path: Path) -> None:
+    assert ls.stress.Campaign.from_json(json.loads(json.dumps(CAMPAIGN.as_json()))) == CAMPAIGN
     assert results.manifest["campaign"]["stated"][2] == {
         "kind": "AxleMismatch",
         "settings": {"std": 0.01, "factor": None},
     }
-    other = replace(CAMPAIGN, stated=(ls.ControlNoise(0.1), ls.MeasurementNoise(0.01)), trials=1)
+    other = replace(CAMPAIGN, stated=(ControlNoise(0.1), MeasurementNoise(0.01)), trials=1)
     with pytest.raises(InputError, match=r"^stated: got .*want .* or another folder"):
-        ls.run_campaign(replace(other, trials=4), results.folder, workers=0)
+        ls.stress.run_campaign(replace(other, trials=4), results.folder, workers=0)
     small = replace(other, policies=("track",), strengths=(1.0,))
     digests = []
     for number, stated in enumerate((None, LIGHT, other.stated)):
-        ls.run_campaign(replace(small, stated=stated), tmp_path / str(number), workers=0)
+        ls.stress.run_campaign(replace(small, stated=stated), tmp_path / str(number), workers=0)
         digests.append(read_manifest(tmp_path / str(number))["digest"])
     assert len(set(digests)) == 3
 
@@ -99,7 +105,7 @@ def test_what_is_stated_is_written_down_and_part_of_the_digest(results: ls.Resul
 def test_by_default_the_preset_in_the_middle_is_stated(
     differential_drive: ls.Scenario, drive_solution: ls.Solution
 ) -> None:
-    moderate = ls.preset("moderate", differential_drive.plant())
+    moderate = ls.disturbances.preset("moderate", differential_drive.plant())
     for policy in TOLD:
         digests = []
         for stated in (None, moderate):
@@ -109,7 +115,7 @@ def test_by_default_the_preset_in_the_middle_is_stated(
 
 
 @dataclass(frozen=True)
-class Own(ls.ControlNoise):
+class Own(ControlNoise):
     """One of a user's own."""
 
 
@@ -118,7 +124,7 @@ def test_the_file_of_a_stated_disturbance_of_ones_own_is_hashed_too() -> None:
 
 
 def test_the_usual_four_are_run_unless_others_are_asked_for() -> None:
-    assert ls.Campaign(scenario="quadrotor", sweeps={"own": LIGHT}).policies == USUAL == POLICIES[:4]
+    assert ls.stress.Campaign(scenario="quadrotor", sweeps={"own": LIGHT}).policies == USUAL == POLICIES[:4]
     assert len({*COLOURS}) == len({*LINES}) == len({*MARKERS}) == len(POLICIES)
 
 
@@ -138,7 +144,7 @@ def test_campaigns_that_make_no_sense_are_refused(changes: dict[str, object], li
 
 def test_what_the_robot_cannot_have_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^stated: Gusts: got robot differential_drive, which has no drag"):
-        ls.run_campaign(replace(CAMPAIGN, stated=(ls.Gusts(),)), tmp_path / "new", workers=0)
+        ls.stress.run_campaign(replace(CAMPAIGN, stated=(ls.disturbances.Gusts(),)), tmp_path / "new", workers=0)
     assert not (tmp_path / "new").exists()
 
 
@@ -147,8 +153,8 @@ def test_what_the_robot_cannot_have_is_refused_before_anything_is_written(tmp_pa
 
 @pytest.mark.parametrize("policy", TOLD)
 def test_rare_and_break_run_them(policy: str, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
-    problem = ls.ReliabilityProblem("differential_drive", sweep="light", policy=policy, stated="severe")
-    severe = ls.uncertainty_of(differential_drive.plant(), ls.preset("severe", differential_drive.plant()))
+    problem = ls.stress.ReliabilityProblem("differential_drive", sweep="light", policy=policy, stated="severe")
+    severe = ls.uncertainty_of(differential_drive.plant(), ls.disturbances.preset("severe", differential_drive.plant()))
     plan = replace(drive_solution, goal_radius=differential_drive.target_radius())
     law = (
         ls.Feedback(ls.track(differential_drive.problem, plan, uncertainty=severe))
@@ -165,8 +171,8 @@ def test_rare_and_break_run_them(policy: str, differential_drive: ls.Scenario, d
 
 def test_searches_that_make_no_sense_are_refused() -> None:
     with pytest.raises(InputError, match=r"^stated: got it with smooth, want it with track or offset_free"):
-        ls.ReliabilityProblem("differential_drive", stated="light")
-    problem = ls.ReliabilityProblem("differential_drive", policy="track", stated="gale")
+        ls.stress.ReliabilityProblem("differential_drive", stated="light")
+    problem = ls.stress.ReliabilityProblem("differential_drive", policy="track", stated="gale")
     with pytest.raises(InputError, match=r"^sweep: got 'gale', want .*light"):
         _ = problem.score
 
@@ -181,8 +187,8 @@ def test_simulate_runs_a_controller_by_its_name(
     told = ["--stated", "light"] if name in TOLD else []
     options = ["--disturbances", "light", "--trials", "3", "--out", str(tmp_path), "--controller", name, *told]
     assert main(["simulate", str(solved), *options]) == 0
-    solution, plant = ls.load_solution(solved), differential_drive.plant()
-    light = ls.preset("light", plant)
+    solution, plant = ls.load(solved, ls.Solution), differential_drive.plant()
+    light = ls.disturbances.preset("light", plant)
     stated, problem = ls.uncertainty_of(plant, light), differential_drive.problem
     law = {
         "feedback": lambda: ls.Feedback(solution.policy),
@@ -191,7 +197,7 @@ def test_simulate_runs_a_controller_by_its_name(
         "replan": lambda: ls.Replanning(problem, solution, every=problem.steps * problem.dt / 10),
     }[name]()
     wanted = ls.simulate(plant, solution, controller=law, disturbances=light, trials=3)
-    found = ls.load_rollout(tmp_path / "rollout.npz")
+    found = ls.load(tmp_path / "rollout.npz", ls.Rollout)
     np.testing.assert_array_equal(found.states, wanted.states)
     assert found.policy_digest == law.digest
 
@@ -225,7 +231,7 @@ def test_commands_that_make_no_sense_are_refused(
 
 def test_view_takes_a_controller_for_live_runs_only(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = str(solved.with_name("rollout.npz"))
-    solution = ls.load_solution(solved)
+    solution = ls.load(solved, ls.Solution)
     ls.save(ls.simulate(ls.scenarios.differential_drive().plant(), solution), run)
     assert main(["view", run, "--controller", "track"]) == 2
     assert "--controller, --stated: got one with" in capsys.readouterr().err
@@ -241,4 +247,4 @@ def test_stress_takes_the_new_ones_by_name(tmp_path: Path, capsys: pytest.Captur
     assert [line.split()[2] for line in rows] == ["smooth", "track", "offset_free"]
     assert len({len(line) for line in rows}) == 1  # in columns, though a name is longer than others
     plant = ls.scenarios.differential_drive().plant()
-    assert ls.Results(tmp_path).campaign.stated == tuple(ls.preset("calm", plant))
+    assert ls.stress.Results(tmp_path).campaign.stated == tuple(ls.disturbances.preset("calm", plant))

@@ -93,7 +93,7 @@ class TestGoalState:
     def test_any_penalty_leads_there(self, penalty: float) -> None:
         """From the first iteration on; whatever it is, the optimum is that of the KKT conditions."""
         case = problem(ls.GoalState([1, -0.5]), soft=False, weight=0.3)
-        logged: list[ls.Iteration] = []
+        logged: list[ls.types.Iteration] = []
         start = np.zeros((case.steps, 1))
         solution = ls.smooth(case, start=start, penalty=penalty, callback=logged.append, **EXACT)
         dense = Dense(case)
@@ -333,7 +333,7 @@ class TestInfeasible:
 def test_a_file_and_a_warm_start_keep_multipliers_of_either_sign(tmp_path: Path) -> None:
     case = problem(ls.GoalState([1, 0]), ls.StateBounds(high={"v": 0.6}))
     solution = ls.smooth(case)
-    loaded = ls.load_solution(ls.save(solution, tmp_path / "solution.npz"))
+    loaded = ls.load(ls.save(solution, tmp_path / "solution.npz"), ls.Solution)
     assert loaded.multipliers[0].values.min() < 0
     for one, other in zip(loaded.multipliers, solution.multipliers, strict=True):
         np.testing.assert_array_equal(one.values, other.values)

@@ -22,12 +22,12 @@ STRUCTURES = (
     (3, 2, 2, ("first", "shared", "gain"), True),
 )
 UNKNOWNS = {
-    "constant": ls.Unknown("d0", 0.7),
-    "first": ls.Unknown("d0", 0.7, time_constant=0.5),
-    "second": ls.Unknown("d0", 0.7, time_constant=0.4, order=2),
-    "shared": ls.Unknown({"d0": 0.6, "d1": -0.8}, 1.5),
-    "gain": ls.Unknown("gain of u1", 0.1),
-    "offset": ls.Unknown("offset of u0", 0.2),
+    "constant": ls.disturbances.Unknown("d0", 0.7),
+    "first": ls.disturbances.Unknown("d0", 0.7, time_constant=0.5),
+    "second": ls.disturbances.Unknown("d0", 0.7, time_constant=0.4, order=2),
+    "shared": ls.disturbances.Unknown({"d0": 0.6, "d1": -0.8}, 1.5),
+    "gain": ls.disturbances.Unknown("gain of u1", 0.1),
+    "offset": ls.disturbances.Unknown("offset of u0", 0.2),
 }
 
 
@@ -59,7 +59,7 @@ class Oracle:
         # Each unknown: how its states go on, and what of d, gains and offsets it is.
         self.unknowns = [self._unknown(one, m) for one in uncertainty.unknowns]
 
-    def _unknown(self, one: ls.Unknown, m: int) -> tuple[Array, Array, dict[str, float]]:
+    def _unknown(self, one: ls.disturbances.Unknown, m: int) -> tuple[Array, Array, dict[str, float]]:
         step = DT / one.time_constant
         if one.order == 2:
             move = expm(step * np.array([[0.0, 1.0], [-1.0, -2.0]]))
@@ -223,7 +223,7 @@ def test_drakes_finite_horizon_regulator_has_the_same_gains() -> None:
         ({"tolerate": 1.0, "effort": 1.0, "at_end": 0.0}, "at_end: got 0.0, want"),
         ({"uncertainty": 0.1, "effort": 1.0}, "track: uncertainty: got 0.1, want an Uncertainty"),
         (
-            {"uncertainty": ls.Uncertainty(unknowns=[ls.Unknown("wind_x", 1.0)]), "effort": 1.0},
+            {"uncertainty": ls.Uncertainty(unknowns=[ls.disturbances.Unknown("wind_x", 1.0)]), "effort": 1.0},
             "Uncertainty: unknowns: got 'wind_x', want one of: a00",
         ),
         ({"uncertainty": ls.Uncertainty(start={"rad": 1.0}), "effort": 1.0}, "start: got 'rad', want one of: s0, s1"),
@@ -244,17 +244,23 @@ def test_what_does_not_fit_is_refused_in_a_line(options: dict, says: str) -> Non
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: ls.Unknown("d0", -1.0), "Unknown: std: got -1"),
-        (lambda: ls.Unknown("d0", 1.0, time_constant=-1.0), "Unknown: time_constant: got -1"),
-        (lambda: ls.Unknown("d0", 1.0, order=3), "Unknown: order: got 3"),
-        (lambda: ls.Unknown("d0", 1.0, order=2), "Unknown: order: got 2 with a time constant of inf s, want 1"),
-        (lambda: ls.Unknown("d0", 1.0, time_constant=1.0, drift=0.1), "Unknown: drift: got 0.1 with a time constant"),
-        (lambda: ls.Unknown({}, 1.0), "Unknown: of: got no name"),
+        (lambda: ls.disturbances.Unknown("d0", -1.0), "Unknown: std: got -1"),
+        (lambda: ls.disturbances.Unknown("d0", 1.0, time_constant=-1.0), "Unknown: time_constant: got -1"),
+        (lambda: ls.disturbances.Unknown("d0", 1.0, order=3), "Unknown: order: got 3"),
+        (
+            lambda: ls.disturbances.Unknown("d0", 1.0, order=2),
+            "Unknown: order: got 2 with a time constant of inf s, want 1",
+        ),
+        (
+            lambda: ls.disturbances.Unknown("d0", 1.0, time_constant=1.0, drift=0.1),
+            "Unknown: drift: got 0.1 with a time constant",
+        ),
+        (lambda: ls.disturbances.Unknown({}, 1.0), "Unknown: of: got no name"),
         (lambda: ls.Uncertainty(lag=-0.1), "Uncertainty: lag: got -0.1"),
         (lambda: ls.Uncertainty(loss=1.5), "Uncertainty: loss: got 1.5"),
         (lambda: ls.Uncertainty(delay=1.5), "Uncertainty: delay: got 1.5"),  # type: ignore[arg-type]
         (lambda: ls.Uncertainty(unknowns=["wind_x"]), "Uncertainty: unknowns: got"),  # type: ignore[list-item]
-        (lambda: ls.Uncertainty(unknowns=ls.Unknown("d0", 1.0)), "Uncertainty: unknowns: got"),  # type: ignore[arg-type]
+        (lambda: ls.Uncertainty(unknowns=ls.disturbances.Unknown("d0", 1.0)), "Uncertainty: unknowns: got"),  # type: ignore[arg-type]
     ],
 )
 def test_numbers_that_make_no_sense_are_refused(make, says: str) -> None:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
+from lqrsim.disturbances import ControlDelay, ControlNoise, MeasurementLatency, MeasurementNoise, Push
 from lqrsim.simulation.tube_under import tube_under
 
-NOISE = ls.ControlNoise(0.05)
+NOISE = ControlNoise(0.05)
 
 
 def test_what_the_linear_model_does_not_have_is_said_in_one_line(
@@ -16,15 +17,15 @@ def test_what_the_linear_model_does_not_have_is_said_in_one_line(
 ) -> None:
     problem, plant = differential_drive.problem, differential_drive.plant()
     cases = {
-        "latency": ([NOISE, ls.MeasurementLatency(2)], None),
-        "delay": ([NOISE, ls.ControlDelay(1)], None),
+        "latency": ([NOISE, MeasurementLatency(2)], None),
+        "delay": ([NOISE, ControlDelay(1)], None),
         "an OffsetFree, a Feedback or an AffinePolicy": (
             [NOISE],
             ls.Replanning(problem, drive_solution, every=1.0),
         ),
         "told of other disturbances": (
             [NOISE],
-            ls.OffsetFree(problem, drive_solution, ls.uncertainty_of(plant, [ls.ControlNoise(0.06)])),
+            ls.OffsetFree(problem, drive_solution, ls.uncertainty_of(plant, [ControlNoise(0.06)])),
         ),
     }
     for word, (disturbances, controller) in cases.items():
@@ -43,7 +44,7 @@ def test_what_is_left_out_is_named_and_the_rest_is_predicted(
     tube, line = tube_under(problem, drive_solution, plant, [NOISE])
     assert tube is not None
     assert line == ""
-    pushed, line = tube_under(problem, drive_solution, plant, [NOISE, ls.Push((1, 0, 0), at=2.0)])
+    pushed, line = tube_under(problem, drive_solution, plant, [NOISE, Push((1, 0, 0), at=2.0)])
     assert pushed is not None
     assert line.startswith("the predicted tube leaves out push of (1, 0, 0) N s at 2 s")
     np.testing.assert_array_equal(tube.covariance, pushed.covariance)
@@ -79,7 +80,7 @@ def test_a_tube_is_added_to_runs_of_its_plan_alone(
 def test_four_hundred_runs_are_within_their_tube(differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
     """2 sigma: 95.4 % along each direction. 400 runs at a knot have a standard error of 1 %."""
     problem, plant = differential_drive.problem, differential_drive.plant()
-    noise = [NOISE, ls.MeasurementNoise(0.005)]
+    noise = [NOISE, MeasurementNoise(0.005)]
     tube, _ = tube_under(problem, drive_solution, plant, noise)
     assert tube is not None
     run = ls.simulate(plant, drive_solution, disturbances=noise, trials=400, frames=False, contacts=False)

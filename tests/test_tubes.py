@@ -164,7 +164,7 @@ def simulated(
     return np.array(states), np.array(applied)
 
 
-STATED = ls.Uncertainty(unknowns=[ls.Unknown("d0", 0.3)], start=0.1, control=0.2, measurement=0.02)
+STATED = ls.Uncertainty(unknowns=[ls.disturbances.Unknown("d0", 0.3)], start=0.1, control=0.2, measurement=0.02)
 
 
 def weave(limit: float) -> Linear:
@@ -273,7 +273,9 @@ def test_effects_are_those_of_finite_differences(quadrotor: ls.Scenario) -> None
         states.append(dynamics.step(states[-1], control, dt))
     plan = ls.Trajectory(np.array(states), controls, dt)
     names = ["wind_x", "force_z", "torque_y", "mass", "gain of rotor_2", "offset of rotor_3"]
-    model = PlanModel.of(dynamics, plan, ls.Uncertainty(unknowns=[ls.Unknown(name, 1.0) for name in names]))
+    model = PlanModel.of(
+        dynamics, plan, ls.Uncertainty(unknowns=[ls.disturbances.Unknown(name, 1.0) for name in names])
+    )
     h = 1e-4
     for t in range(3):
         for i, name in enumerate(names):

@@ -10,6 +10,34 @@ from tracking import hover, weave
 
 import lqrsim as ls
 from lqrsim.control.uncertainty import per_entry
+from lqrsim.disturbances import (
+    ActuatorLoss,
+    AxleMismatch,
+    CommandDropouts,
+    ControlDelay,
+    ControlNoise,
+    DisplacedObstacles,
+    Disturbance,
+    Dryden,
+    Effect,
+    ForceNoise,
+    FrictionMismatch,
+    GilbertElliott,
+    Gusts,
+    InertiaMismatch,
+    InitialStateError,
+    MassMismatch,
+    MeasurementBias,
+    MeasurementDropouts,
+    MeasurementLatency,
+    MotorLag,
+    Push,
+    Saturation,
+    ThrustMismatch,
+    TorqueNoise,
+    Unknown,
+    WheelRadiusMismatch,
+)
 from lqrsim.errors import InputError
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.differential_drive import DifferentialDrive
@@ -22,15 +50,15 @@ from lqrsim.simulation.plant import Plant
 DT = 1 / 30
 # One of each; "in words" are those that no linear model has.
 EXAMPLES = [
-    ls.InitialStateError(0.01), ls.DisplacedObstacles(0.05), ls.MassMismatch(0.1), ls.MeasurementNoise(0.005),
-    ls.MeasurementLatency(1), ls.MeasurementDropouts(0.2), ls.ControlNoise(0.02), ls.ControlDelay(1),
-    ls.MotorLag(0.05), ls.ForceNoise(0.1), ls.TorqueNoise(0.002), ls.ThrustMismatch(0.05),
-    ls.MeanWind((0.5, 0.2, 0.0)), ls.Gusts(0.5, 0.5), ls.Dryden("light"), ls.WheelRadiusMismatch(0.01),
-    ls.AxleMismatch(0.02),
+    InitialStateError(0.01), DisplacedObstacles(0.05), MassMismatch(0.1), ls.disturbances.MeasurementNoise(0.005),
+    MeasurementLatency(1), MeasurementDropouts(0.2), ControlNoise(0.02), ControlDelay(1),
+    MotorLag(0.05), ForceNoise(0.1), TorqueNoise(0.002), ThrustMismatch(0.05),
+    ls.disturbances.MeanWind((0.5, 0.2, 0.0)), Gusts(0.5, 0.5), Dryden("light"), WheelRadiusMismatch(0.01),
+    AxleMismatch(0.02),
 ]  # fmt: skip
 IN_WORDS = [
-    ls.InertiaMismatch(0.1), ls.MeasurementBias(0.005), ls.CommandDropouts(0.2), ls.Saturation(share=0.9),
-    ls.ActuatorLoss(at=0.2, remaining=0.7), ls.Push((0.1, 0.0, 0.0), at=0.1), ls.FrictionMismatch(0.1),
+    InertiaMismatch(0.1), MeasurementBias(0.005), CommandDropouts(0.2), Saturation(share=0.9),
+    ActuatorLoss(at=0.2, remaining=0.7), Push((0.1, 0.0, 0.0), at=0.1), FrictionMismatch(0.1),
 ]  # fmt: skip
 
 
@@ -46,7 +74,7 @@ def arena():
 
 @pytest.fixture(scope="module")
 def plant_of(cage, arena):
-    on_wheels = ls.WheelRadiusMismatch, ls.AxleMismatch, ls.FrictionMismatch
+    on_wheels = WheelRadiusMismatch, AxleMismatch, FrictionMismatch
     return lambda one: arena if isinstance(one, on_wheels) else cage
 
 
@@ -90,7 +118,7 @@ def test_presets_of_the_quadrotor_are_the_numbers_written_out(cage, name):
     for axis in "xyz":
         assert of[f"force_{axis}"].white
         np.testing.assert_allclose(of[f"force_{axis}"].std, 0.01 * 0.5 * 9.8 * k, rtol=1e-12)
-    wind = ls.Dryden("light", altitude=2.0).scaled(k)
+    wind = Dryden("light", altitude=2.0).scaled(k)
     for axis, std, length, order in zip("xyz", wind.std, wind.lengths, (1, 2, 2), strict=True):
         one = of[f"wind_{axis}"]
         assert one.order == order
@@ -104,7 +132,7 @@ def test_the_cut_normal_numbers_have_the_standard_deviation_that_is_stated(cage)
     from lqrsim.simulation.disturbances.mismatch import cut_normal
 
     drawn = np.array([cut_normal(generator) for generator in [np.random.default_rng(0)] * 100_000])
-    (mass,) = ls.uncertainty_of(cage, [ls.MassMismatch(0.1)]).unknowns
+    (mass,) = ls.uncertainty_of(cage, [MassMismatch(0.1)]).unknowns
     np.testing.assert_allclose(mass.std, 0.1 * 0.5 * drawn.std(), rtol=0.01)
     assert mass.std != 0.05
 
@@ -130,7 +158,11 @@ def covariance_of(unknowns, lag):
 
 @pytest.mark.parametrize(
     "wind",
-    [ls.Gusts((1.0, 0.5, 2.0), 0.4), ls.Dryden(4.0, altitude=3.0), ls.Dryden("moderate", 6.0, direction=0.7)],
+    [
+        Gusts((1.0, 0.5, 2.0), 0.4),
+        Dryden(4.0, altitude=3.0),
+        Dryden("moderate", 6.0, direction=0.7),
+    ],
     ids=["gusts", "dryden", "dryden, turned"],
 )
 def test_winds_have_the_covariance_and_autocorrelation_that_is_stated(cage, wind):
@@ -145,7 +177,7 @@ def test_winds_have_the_covariance_and_autocorrelation_that_is_stated(cage, wind
 
 
 def test_a_constant_wind_is_a_constant_of_its_size(cage):
-    x, y = ls.uncertainty_of(cage, [ls.MeanWind((1.5, -0.5, 0.0))]).unknowns
+    x, y = ls.uncertainty_of(cage, [ls.disturbances.MeanWind((1.5, -0.5, 0.0))]).unknowns
     assert (x.name, x.std, x.constant, y.name, y.std, y.constant) == ("wind_x", 1.5, True, "wind_y", 0.5, True)
 
 
@@ -153,8 +185,8 @@ def test_one_simulated_step_scatters_as_stated(cage):
     """Covariance of where 3,000 trials are after a control period in MuJoCo, and of the model by differences."""
     trials, solution, robot = 3000, hover(1).open_loop(), cage.robot
     wrong = [
-        ls.InitialStateError([0.01] * 3 + [0.02] * 3 + [0.01] * 3 + [0.03] * 3), ls.MassMismatch(0.08),
-        ls.ThrustMismatch(0.05), ls.ControlNoise(0.03), ls.ForceNoise((0.1, 0.2, 0.3)), ls.TorqueNoise(0.01),
+        InitialStateError([0.01] * 3 + [0.02] * 3 + [0.01] * 3 + [0.03] * 3), MassMismatch(0.08),
+        ThrustMismatch(0.05), ControlNoise(0.03), ForceNoise((0.1, 0.2, 0.3)), TorqueNoise(0.01),
     ]  # fmt: skip
     stated = ls.uncertainty_of(cage, wrong)
     assert len(stated.unknowns) == 1 + 4 + 3 + 3
@@ -184,9 +216,9 @@ def test_one_simulated_step_scatters_as_stated(cage):
 @pytest.mark.parametrize(
     ("wrong", "name", "amount"),
     [
-        (ls.WheelRadiusMismatch(factor=(1.02, 1.0)), "gain of left", 0.02),
-        (ls.WheelRadiusMismatch(factor=(1.0, 0.98)), "gain of right", -0.02),
-        (ls.AxleMismatch(factor=1.03), "axle_length", 0.03 * 0.258),
+        (WheelRadiusMismatch(factor=(1.02, 1.0)), "gain of left", 0.02),
+        (WheelRadiusMismatch(factor=(1.0, 0.98)), "gain of right", -0.02),
+        (AxleMismatch(factor=1.03), "axle_length", 0.03 * 0.258),
     ],
 )
 def test_wheels_that_are_off_take_the_drive_where_the_unknown_that_is_stated_does(arena, wrong, name, amount):
@@ -210,25 +242,35 @@ def test_wheels_that_are_off_take_the_drive_where_the_unknown_that_is_stated_doe
 
 
 def test_obstacles_are_displaced_by_the_rms_of_the_axes_that_count(cage, arena):
-    wrong = ls.DisplacedObstacles((0.03, 0.04, 0.1))
+    wrong = DisplacedObstacles((0.03, 0.04, 0.1))
     np.testing.assert_allclose(ls.uncertainty_of(cage, [wrong]).obstacles, np.sqrt(0.0125 / 3), rtol=1e-12)
     np.testing.assert_allclose(ls.uncertainty_of(arena, [wrong]).obstacles, np.sqrt(0.0025 / 2), rtol=1e-12)
 
 
 def test_losses_in_bursts_count_by_their_share(cage):
-    bursts = ls.GilbertElliott(0.1, 0.3, 0.02, 0.9)
-    assert ls.uncertainty_of(cage, [ls.MeasurementDropouts(bursts)]).loss == pytest.approx(0.25 * 0.9 + 0.75 * 0.02)
+    bursts = GilbertElliott(0.1, 0.3, 0.02, 0.9)
+    assert ls.uncertainty_of(cage, [MeasurementDropouts(bursts)]).loss == pytest.approx(0.25 * 0.9 + 0.75 * 0.02)
 
 
 def test_several_add_up(cage):
-    twice = ls.uncertainty_of(cage, [ls.ControlNoise(0.03), ls.ControlNoise([0.04] * 4), ls.ControlDelay(1)] * 2)
+    twice = ls.uncertainty_of(
+        cage,
+        [ControlNoise(0.03), ControlNoise([0.04] * 4), ControlDelay(1)] * 2,
+    )
     controls = cage.robot.dynamics.control_coordinates
     np.testing.assert_allclose(per_entry("", twice.control, controls), np.sqrt(2) * 0.05, rtol=1e-12)
     assert twice.delay == 2
 
 
 def test_what_the_robot_does_not_declare_is_left_out_by_name(arena):
-    stated = ls.uncertainty_of(arena, [ls.ForceNoise(0.1), ls.TorqueNoise((0.0, 0.0, 0.1)), ls.MassMismatch(0.1)])
+    stated = ls.uncertainty_of(
+        arena,
+        [
+            ForceNoise(0.1),
+            TorqueNoise((0.0, 0.0, 0.1)),
+            MassMismatch(0.1),
+        ],
+    )
     assert stated == ls.Uncertainty()
     missing = [re.search(r"have no (.*)$", words) for words in stated.left_out]
     assert [one and one[1] for one in missing] == ["force_x, force_y, force_z", "torque_z", "mass"]
@@ -244,20 +286,20 @@ class Swept(Quadrotor):
 
 
 def test_only_what_a_control_does_alone_and_in_proportion_is_its_gain():
-    stated = ls.uncertainty_of(Plant(Swept(), load_scene("cage")), [ls.ThrustMismatch(0.05)])
+    stated = ls.uncertainty_of(Plant(Swept(), load_scene("cage")), [ThrustMismatch(0.05)])
     assert list(named(stated)) == ["gain of rotor_4"]
     (words,) = stated.left_out
     assert words.endswith("no control is that of quadrotor_rotor_1, quadrotor_rotor_2, quadrotor_rotor_3 alone")
 
 
 @dataclasses.dataclass(frozen=True)
-class Own(ls.Disturbance):
+class Own(Disturbance):
     """One of a user's own."""
 
     told: Any = None
 
     def start(self, plant, plan, generators):
-        return ls.Effect()
+        return Effect()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -268,20 +310,20 @@ class OwnInNumbers(Own):
 
 def test_those_of_ones_own(cage):
     assert ls.uncertainty_of(cage, [Own()]).left_out == ("Own(told=None): Own does not override `uncertainty`",)
-    told = ls.Uncertainty(unknowns=[ls.Unknown("force_x", 0.2)])
+    told = ls.Uncertainty(unknowns=[Unknown("force_x", 0.2)])
     assert ls.uncertainty_of(cage, [OwnInNumbers(told)]) == told
     with pytest.raises(InputError, match=r"^OwnInNumbers: uncertainty: got 3, want a method that returns"):
         ls.uncertainty_of(cage, [OwnInNumbers(3)])
-    wrong = ls.Uncertainty(unknowns=[ls.Unknown("forse_x", 0.2)])
+    wrong = ls.Uncertainty(unknowns=[Unknown("forse_x", 0.2)])
     with pytest.raises(InputError, match=r"^Uncertainty: unknowns: got 'forse_x', want .*force_x"):
         ls.uncertainty_of(cage, [OwnInNumbers(wrong)])
 
 
 def test_what_does_not_fit_is_refused(cage, arena):
     with pytest.raises(InputError, match=r"^MeanWind: got robot differential_drive, which has no drag"):
-        ls.uncertainty_of(arena, [ls.MeanWind((1.0, 0.0, 0.0))])
+        ls.uncertainty_of(arena, [ls.disturbances.MeanWind((1.0, 0.0, 0.0))])
     with pytest.raises(InputError, match=r"^MeasurementNoise: std: got 3 numbers, want 1 or 12"):
-        ls.uncertainty_of(cage, [ls.MeasurementNoise([0.1] * 3)])
+        ls.uncertainty_of(cage, [ls.disturbances.MeasurementNoise([0.1] * 3)])
     with pytest.raises(InputError, match=r"^disturbances: got 'light'"):
         ls.uncertainty_of(cage, "light")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match=r"^plant: got "):

@@ -64,7 +64,7 @@ def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     return Case(name, solution, run, other, path, list(faults.decoded(path)), video_metadata.read(path))
 
 
-def failed(found: ls.Verification) -> set[str]:
+def failed(found: ls.types.Verification) -> set[str]:
     return {test.name for test in found.tests if test.passed is False}
 
 

@@ -25,7 +25,7 @@ OBSERVER = 0.3, 20.0  # of an error in the angle, how much of it goes into the a
 class Plan:
     """What one run goes by: a plan, the step of the plans at which it began, and the turns to upright as it is."""
 
-    law: ls.Solution | ls.Replan
+    law: ls.Solution | ls.types.Replan
     first: int
     turns: tuple[int, int]
 
@@ -99,7 +99,7 @@ class SwingUp:
                 found.append((worth if np.isfinite(worth) else np.inf, Plan(solution, step, to)))
         return min(found, key=lambda one: one[0])[1]
 
-    def _missed(self, law: ls.Solution | ls.Replan, turns: tuple[int, int]) -> float:
+    def _missed(self, law: ls.Solution | ls.types.Replan, turns: tuple[int, int]) -> float:
         off = law.trajectory.states[-1] - _upright(turns)
         with np.errstate(over="ignore"):  # a plan that is no good may end anywhere; what it misses is then infinite
             missed = float(off @ self._end @ off)

@@ -65,7 +65,7 @@ def _ours(solver: Callable[..., ls.Solution], problem: ls.Problem, *, compile: b
     return solve
 
 
-def _missed(iteration: ls.Iteration) -> float:
+def _missed(iteration: ls.types.Iteration) -> float:
     """By how much constraints are missed; of the interior point, whose plans have gaps at first, the dynamics, too."""
     return max(iteration.violation, iteration.gap) if iteration.method == "interior point" else iteration.violation
 

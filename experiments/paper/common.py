@@ -102,15 +102,15 @@ def figure(config: Settings, result: Result, name: str, size: tuple[float, float
     result["figures"] += files
 
 
-def still(config: Settings, result: Result, name: str, rollout: ls.Rollout, **options: Any) -> None:
-    """A picture of MuJoCo's as `lqrsim.still` draws it, noted in the result; without OpenGL, why there is none."""
+def render_still(config: Settings, result: Result, name: str, rollout: ls.Rollout, **options: Any) -> None:
+    """A picture by `lqrsim.view.render_still`, noted in the result; without OpenGL, why there is none."""
     try:
         gl.bind()
     except ls.InputError as error:
         result.setdefault("not drawn", {})[name] = str(error)
         return
     size = (320, 180) if config.quick else (1280, 720)
-    ls.still(rollout, config.out / FIGURES / f"{name}.png", size=size, **options)
+    ls.view.render_still(rollout, config.out / FIGURES / f"{name}.png", size=size, **options)
     result["figures"].append(f"{name}.png")
 
 

@@ -17,7 +17,7 @@ from lqrsim.view import obstacle_plots
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 from paper.rates import tail
 
-Log = Sequence[ls.Iteration]
+Log = Sequence[ls.types.Iteration]
 Logs = Sequence[Mapping[str, Mapping[str, Log]]]  # of queries, by case and solver
 
 LINES = 50  # queries with a line of their own

@@ -22,7 +22,7 @@ MOST = 2000  # iterations
 class Measured:
     """One query: logs by case and solver, the factor of what is thrown away by solver, consistency by form and stop."""
 
-    logs: dict[str, dict[str, tuple[ls.Iteration, ...]]]
+    logs: dict[str, dict[str, tuple[ls.types.Iteration, ...]]]
     discarded: dict[str, float]
     consistency: dict[str, dict[str, dict[str, float]]]
 

@@ -134,7 +134,7 @@ def problem_of(task: Task) -> ls.Problem:
         control_limits=(-task.top, task.top),
     )
     world = ls.World([shape.obstacle for shape in task.obstacles])
-    balls = ls.Balls(_places, [RADIUS] * (len(ALONG_CAR) + count * len(ALONG_TRAILER)))
+    balls = ls.CollisionSpheres(_places, [RADIUS] * (len(ALONG_CAR) + count * len(ALONG_TRAILER)))
     cost: ls.Cost = ls.ControlCost(task.effort)
     if task.repulsion is not None:
         weight, sharpness = task.repulsion

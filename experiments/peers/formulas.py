@@ -164,7 +164,7 @@ def _constraint(problem: ls.Problem, constraint: ls.Constraint, x: Any, u: Any, 
     raise NotImplementedError(f"the constraint {type(constraint).__name__}")
 
 
-def _coordinates(balls: ls.Balls) -> Callable[[Any, Any, Any], list[Any]]:
+def _coordinates(balls: ls.CollisionSpheres) -> Callable[[Any, Any, Any], list[Any]]:
     """The coordinates of all balls as a formula of x, u and p, three a ball."""
 
     def places(x: Any, u: Any, p: Any) -> list[Any]:

@@ -32,7 +32,7 @@ def measure(config: Config) -> dict[str, Any]:
         for name, how in LAWS.items():
             law = ls.Replanning(problem, solution, every=EVERY, **how)
             rollout = ls.simulate(
-                plant, solution, controller=law, disturbances=ls.preset("light", plant), trials=each,
+                plant, solution, controller=law, disturbances=ls.disturbances.preset("light", plant), trials=each,
                 first_trial=query * each, seed=config.seed, frames=False, contacts=False,
             )  # fmt: skip
             ended[name] += [one == "reached" for one in rollout.outcome]

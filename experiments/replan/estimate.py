@@ -23,7 +23,7 @@ def measure(config: Config) -> dict[str, Any]:
         scenario = ls.scenarios.quadrotor(query)
         plant = scenario.plant()
         for preset in PRESETS[:1] if config.quick else PRESETS:
-            disturbances = ls.preset(preset, plant)
+            disturbances = ls.disturbances.preset(preset, plant)
             stated = ls.uncertainty_of(plant, disturbances)
             safe = ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=ASKED[preset])
             common = safe.problem, safe.solution, stated

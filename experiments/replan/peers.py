@@ -85,7 +85,7 @@ class EveryPeriod(ls.Controller):
 def prepared(problem: ls.Problem, solution: ls.Solution) -> Contestant:
     solver = ls.prepare(problem)
 
-    def again(state: Array, begin: ls.Solution | ls.Replan) -> Made:
+    def again(state: Array, begin: ls.Solution | ls.types.Replan) -> Made:
         found = solver.solve(state, begin)
         return Made(found.trajectory.controls[0], found.iterations, found.success, found.shifted(1))
 

@@ -88,9 +88,9 @@ def plant_at(scenario: ls.Scenario, dt: float) -> ls.Plant:
     return ls.Plant(scenario.robot, scene_from_xml(xml, scenario.scene.name))
 
 
-def noise(scenario: ls.Scenario) -> list[ls.Disturbance]:
+def noise(scenario: ls.Scenario) -> list[ls.disturbances.Disturbance]:
     """The scenario's, but for the push: of a run of 2 s it would be after the end."""
-    return [one for one in scenario.disturbances if not isinstance(one, ls.Push)]
+    return [one for one in scenario.disturbances if not isinstance(one, ls.disturbances.Push)]
 
 
 def report(found: dict[str, Any]) -> list[str]:

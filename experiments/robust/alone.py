@@ -12,11 +12,12 @@ from paper.stress_figures import NAMES
 from stress_test import GRID, half_fail, in_words, possible
 
 import lqrsim as ls
+from lqrsim.disturbances import ControlDelay, MeasurementLatency
 from lqrsim.stress.statistics import rate
 from robust.common import ASKED, Config, progress, reached, safe_plan
 
 OWN, DEFAULT, SAFE = "smoother's policy", "offset free, default plan", "offset free, safe plan"
-LATE = (ls.ControlDelay(1), ls.MeasurementLatency(1))
+LATE = (ControlDelay(1), MeasurementLatency(1))
 
 
 def measure(config: Config) -> dict[str, Any]:
@@ -30,7 +31,7 @@ def of_quadrotor(config: Config) -> dict[str, Any]:
     flown = {OWN: (scenario.problem, plan), DEFAULT: (scenario.problem, plan), SAFE: (safe.problem, safe.solution)}
     rows = []
     grid = GRID[6::12] if config.quick else GRID
-    kinds = [*ls.preset("light", plant), *LATE]
+    kinds = [*ls.disturbances.preset("light", plant), *LATE]
     kinds = kinds[-1:] if config.quick else kinds
     for one in progress(kinds, f"{NAMES[scenario.name]}, one disturbance alone"):
         strengths = [strength for strength in possible(one, grid) if strength >= 1 or one not in LATE]

@@ -20,20 +20,22 @@ def measure(config: Config) -> dict[str, Any]:
     return {"rows": rows}
 
 
-def planned(query: int, preset: str, asked: float) -> tuple[ls.Plant, list[ls.Disturbance], ls.SafePlan]:
+def planned(
+    query: int, preset: str, asked: float
+) -> tuple[ls.Plant, list[ls.disturbances.Disturbance], ls.types.SafePlan]:
     plant = ls.scenarios.quadrotor(query).plant()
-    return plant, ls.preset(preset, plant), safe_plan(query, preset, asked)
+    return plant, ls.disturbances.preset(preset, plant), safe_plan(query, preset, asked)
 
 
 def of_light(config: Config, query: int) -> dict[str, Any]:
     asked = ASKED[query % len(ASKED)]
     plant, disturbances, safe = planned(query, "light", asked)
-    score = ls.TrialScore(plant, safe.solution, disturbances, controller=safe.controller)
+    score = ls.stress.TrialScore(plant, safe.solution, disturbances, controller=safe.controller)
     row: dict[str, Any] = {"query": query, "asked": asked, "predicted": safe.tube.collision_chance}
     try:
-        found = ls.split(score, score.size, particles=config.particles, repetitions=6, moves=3, seed=config.seed)
+        found = ls.stress.split(score, score.size, particles=config.particles, repetitions=6, moves=3, seed=config.seed)
         return row | {"measured": interval(found.probability), "simulations": found.simulations}
-    except ls.NoFailure:
+    except ls.stress.NoFailure:
         return row | {"measured": None, "simulations": score.simulations}
 
 

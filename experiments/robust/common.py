@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 import lqrsim as ls
 from lqrsim.control.controllers import Controller
+from lqrsim.disturbances import Disturbance
 from lqrsim.stress.statistics import rate
 
 Reached = npt.NDArray[np.bool_]
@@ -59,25 +60,25 @@ def reach_exactly(problem: ls.Problem) -> ls.Problem:
 
 
 @cache
-def safe_plan(query: int, preset: str, asked: float) -> ls.SafePlan:
+def safe_plan(query: int, preset: str, asked: float) -> ls.types.SafePlan:
     """Of a query of the quadrotor; several sections ask for the same one."""
     scenario = ls.scenarios.quadrotor(query)
     plant = scenario.plant()
-    stated = ls.uncertainty_of(plant, ls.preset(preset, plant))
+    stated = ls.uncertainty_of(plant, ls.disturbances.preset(preset, plant))
     return ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=asked)
 
 
 def reached(
-    plant: ls.Plant, solution: ls.Solution, controller: Controller | None, disturbances: Sequence[ls.Disturbance],
+    plant: ls.Plant, solution: ls.Solution, controller: Controller | None, disturbances: Sequence[Disturbance],
     *, trials: int, seed: int, first: int = 0,
 ) -> Reached:  # fmt: skip
     """Which trials reach the goal."""
     rollout = run(plant, solution, controller, disturbances, trials=trials, seed=seed, first=first)
-    return np.array(ls.outcomes(rollout).outcome) == "reached"
+    return np.array(ls.stress.outcomes(rollout).outcome) == "reached"
 
 
 def run(
-    plant: ls.Plant, solution: ls.Solution, controller: Controller | None, disturbances: Sequence[ls.Disturbance],
+    plant: ls.Plant, solution: ls.Solution, controller: Controller | None, disturbances: Sequence[Disturbance],
     *, trials: int, seed: int, first: int = 0,
 ) -> ls.Rollout:  # fmt: skip
     """The trials."""

@@ -22,12 +22,12 @@ def measure(config: Config) -> dict[str, Any]:
     plant, trials = scenario.plant(), 2 * config.trials
     rows = {}
     for preset in PRESETS[:1] if config.quick else PRESETS:
-        disturbances = ls.preset(preset, plant)
+        disturbances = ls.disturbances.preset(preset, plant)
         stated = ls.uncertainty_of(plant, disturbances)
         safe = safe_plan(0, preset, ASKED[preset])
         law = ls.OffsetFree(safe.problem, safe.solution, stated, record=True)
         rollout = run(plant, safe.solution, law, disturbances, trials=trials, seed=config.seed)
-        well = np.flatnonzero(np.array(ls.outcomes(rollout).outcome) == "reached")
+        well = np.flatnonzero(np.array(ls.stress.outcomes(rollout).outcome) == "reached")
         rows[preset] = of_run(law, rollout, well)
     return {"rows": rows, "trials": trials}
 

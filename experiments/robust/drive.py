@@ -18,7 +18,7 @@ def measure(config: Config) -> dict[str, Any]:
     plant, plan = scenario.plant(), ls.smooth(scenario.problem)
     rows, trials = [], 3 * config.trials
     for strength in progress(STRENGTHS[:1] if config.quick else STRENGTHS, "differential drive"):
-        disturbances = [one.scaled(strength) for one in ls.preset("light", plant)]
+        disturbances = [one.scaled(strength) for one in ls.disturbances.preset("light", plant)]
         stated = ls.uncertainty_of(plant, disturbances)
         safe = ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=ASKED)
         flown = {

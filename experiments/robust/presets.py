@@ -29,7 +29,7 @@ def measure(config: Config) -> dict[str, Any]:
         scenario = ls.scenarios.quadrotor(query)
         plant, plan = scenario.plant(), ls.smooth(scenario.problem)
         for preset in PRESETS[:1] if config.quick else PRESETS:
-            disturbances = ls.preset(preset, plant)
+            disturbances = ls.disturbances.preset(preset, plant)
             stated = ls.uncertainty_of(plant, disturbances)
             safe = safe_plan(query, preset, ASKED[preset])
             costs[preset].append([plan.cost, safe.solution.cost, safe.tube.collision_chance])
@@ -54,7 +54,7 @@ def measure(config: Config) -> dict[str, Any]:
 
 
 def laws(
-    scenario: ls.Scenario, plan: ls.Solution, safe: ls.SafePlan, stated: ls.Uncertainty, preset: str
+    scenario: ls.Scenario, plan: ls.Solution, safe: ls.types.SafePlan, stated: ls.Uncertainty, preset: str
 ) -> dict[str, tuple[ls.Solution, Controller | None]]:
     """Name -> plan and what flies it."""
     problem = scenario.problem

@@ -6,6 +6,7 @@ import numpy as np
 from paper.common import between, table
 
 import lqrsim as ls
+from lqrsim.disturbances import MassMismatch, MeanWind
 from robust.common import ASKED, Config, progress, reached, run, safe_plan, share
 
 SPEED = 3.0  # m/s
@@ -22,8 +23,8 @@ def measure(config: Config) -> dict[str, Any]:
         safe = safe_plan(query, "moderate", ASKED["moderate"])
         flown = ("smoother", plan, None), ("offset free", safe.solution, safe.controller)
         winds = rng.normal(size=(DIRECTIONS, 3))
-        cases = {f"wind of {SPEED:g} m/s": [[ls.MeanWind(SPEED * one / np.linalg.norm(one))] for one in winds]}
-        cases |= {f"mass times {factor:g}": [[ls.MassMismatch(factor=factor)]] for factor in MASSES}
+        cases = {f"wind of {SPEED:g} m/s": [[MeanWind(SPEED * one / np.linalg.norm(one))] for one in winds]}
+        cases |= {f"mass times {factor:g}": [[MassMismatch(factor=factor)]] for factor in MASSES}
         for name, several in cases.items():
             for disturbances in several:
                 for policy, solution, law in flown:
@@ -43,12 +44,12 @@ def hover(config: Config) -> dict[str, float]:
         final_cost=ls.QuadraticCost(np.full(12, 500.0), about=here),
     )  # fmt: skip
     plan = ls.smooth(problem)
-    law = ls.OffsetFree(problem, plan, ls.uncertainty_of(plant, ls.preset("moderate", plant)))
+    law = ls.OffsetFree(problem, plan, ls.uncertainty_of(plant, ls.disturbances.preset("moderate", plant)))
     errors = {}
     for name, one in {
-        f"wind of {SPEED:g} m/s along x": ls.MeanWind((SPEED, 0, 0)),
-        f"wind of {SPEED:g} m/s upward": ls.MeanWind((0, 0, SPEED)),
-        **{f"mass times {factor:g}": ls.MassMismatch(factor=factor) for factor in MASSES},
+        f"wind of {SPEED:g} m/s along x": MeanWind((SPEED, 0, 0)),
+        f"wind of {SPEED:g} m/s upward": MeanWind((0, 0, SPEED)),
+        **{f"mass times {factor:g}": MassMismatch(factor=factor) for factor in MASSES},
     }.items():
         rollout = run(plant, plan, law, [one], trials=1, seed=config.seed)
         last = round(1 / problem.dt)

@@ -42,7 +42,7 @@ def of_world(config: Config, robot: ls.Quadrotor, scene: ls.Scene, start: Array,
         final_cost=ls.QuadraticCost(np.full(12, 500.0), about=goal),
         constraints=[ls.Clearance(scene.world, radius=robot.radius)],
     )  # fmt: skip
-    disturbances = ls.preset("light", plant)
+    disturbances = ls.disturbances.preset("light", plant)
     bare = ls.smooth(problem)  # which only keeps clear, and has no chance in mind
     safe = ls.smooth_chance_constrained(problem, ls.uncertainty_of(plant, disturbances), chance=ASKED)
     rollout = run(plant, safe.solution, safe.controller, disturbances, trials=config.world_trials, seed=config.seed)

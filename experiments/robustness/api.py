@@ -104,7 +104,7 @@ class Caller:
 def exercise(made: Any) -> None:
     """Ask what was made for all that it has: properties, and methods without arguments."""
     # Results and paths do things to files when asked.
-    if type(made).__module__.partition(".")[0] != "lqrsim" or isinstance(made, (ls.Results, Path)):
+    if type(made).__module__.partition(".")[0] != "lqrsim" or isinstance(made, (ls.stress.Results, Path)):
         if inspect.isgenerator(made):
             list(made)
         return

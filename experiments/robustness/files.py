@@ -90,9 +90,7 @@ class Spoiler:
 
     def _saved(self, name: str, one: ls.Solution | ls.Rollout) -> Saved:
         path = ls.save(one, self.folder / f"{name}.npz")
-        saved = Saved.read(
-            path, *((ls.load_rollout, use_rollout) if name == "rollout" else (ls.load_solution, self.use))
-        )
+        saved = Saved.read(path, *((ls.load, use_rollout) if name == "rollout" else (ls.load, self.use)))
         assert same(saved.loaded, one), f"{name} is not what was saved"
         assert ls.save(saved.loaded, self.folder / "again.npz").read_bytes() == saved.data, f"{name} is saved otherwise"
         return saved
@@ -228,7 +226,7 @@ def campaign(folder: Path) -> Path:
     """A small one."""
     asked = Campaign(
         scenario="differential_drive",
-        sweeps={"gusts": (ls.ForceNoise(0.2), ls.ControlNoise(0.01))},
+        sweeps={"gusts": (ls.disturbances.ForceNoise(0.2), ls.disturbances.ControlNoise(0.01))},
         strengths=(0.0, 1.0),
         policies=("smooth", "open_loop"),
         trials=5,

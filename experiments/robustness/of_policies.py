@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 
 import lqrsim as ls
+from lqrsim.disturbances import ControlNoise, Unknown
 from robustness.place import Place
 
 
 def policies(place: Place) -> dict[str, tuple[Any, ...]]:
-    unknown = ls.Unknown("gain of left", 0.05)
+    unknown = Unknown("gain of left", 0.05)
     uncertainty = ls.Uncertainty(unknowns=[unknown], start=0.01, measurement=0.01, control=0.01)
     common = {"problem": place.problem, "solution": place.solution, "uncertainty": uncertainty}
     chosen = {"tolerate": {"m": 0.05, "rad": 0.1}, "effort": 0.1, "at_end": 0.2}
     law = ls.OffsetFree(**common, **chosen)
     policy, tube = law.policy, ls.predict_tube(**common, controller=law)
-    saved = ls.save(policy, place.folder / "policy.npz")
 
     def fields(one: Any) -> dict[str, Any]:
         return {field.name: getattr(one, field.name) for field in dataclasses.fields(one) if field.init}
@@ -52,22 +52,21 @@ def policies(place: Place) -> dict[str, tuple[Any, ...]]:
             },
         ),
         "Tube.added_to": ({"self": tube, "rollout": place.rollout},),
-        "load_policy": ({"path": saved},),
         **replanning(place),
         **funnels(place),
     }
 
 
 def funnels(place: Place) -> dict[str, tuple[Any, ...]]:
-    common = {"plant": place.plant, "solution": place.solution, "disturbances": [ls.ControlNoise(0.01)], "threads": 1,
+    common = {"plant": place.plant, "solution": place.solution, "disturbances": [ControlNoise(0.01)], "threads": 1,
               "controller": ls.Feedback(place.solution.policy), "goal_radius": 1.0, "goal_tolerance": None}  # fmt: skip
     asked = {"rate": 0.5, "confidence": 0.8, "knots": (0, 2), "states": ("x", "y"), "shape": None, "largest": 0.5,
              "failures": 2, "seed": 0, "progress": lambda done, of: None}  # fmt: skip
     funnel = ls.funnel(**common, **asked)
     check = {"trials": 3, "between": (0.0, 0.5), "seed": 1}
-    chosen = {"problem": place.problem, "plant": place.plant, "disturbances": [ls.ControlNoise(0.01)], "trials": 2,
+    chosen = {"problem": place.problem, "plant": place.plant, "disturbances": [ControlNoise(0.01)], "trials": 2,
               "starts": 2, "seed": 0, "goal_radius": 1.0, "goal_tolerance": None, "threads": 1}  # fmt: skip
-    safest = ls.smooth_safest(**chosen)
+    safest = ls.stress.smooth_safest(**chosen)
     state = place.solution.trajectory.states[0]
     where = {"self": funnel, "x": state, "t": 0.2, "about": state}
     return {
@@ -87,7 +86,6 @@ def funnels(place: Place) -> dict[str, tuple[Any, ...]]:
             {"funnel": funnel, "path": place.folder / "funnel.png", "world": place.plant.world, "radius": 0.1},
             0.3,
         ),
-        "load_funnel": ({"path": ls.save(funnel, place.folder / "funnel.npz")},),
     }
 
 

@@ -39,7 +39,7 @@ def reach_slopes(x: Any, p: Any, slopes: Any) -> None:
 
 def check_functions(
     f: Any, jacobian: Any, function: Any, derivatives: Any, depends_on: Any, formula: Any, parameters: Any
-) -> list[ls.DerivativeCheck]:
+) -> list[ls.types.DerivativeCheck]:
     """A problem of a user's own functions, each of which is called."""
     dynamics = ls.Dynamics(
         f,
@@ -86,7 +86,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         high=(1.0,) * 3,
     )
     cost = ls.QuadraticCost([1.0, 1.0, 1.0], about=[0.0, 0.0, 0.0])
-    balls = ls.Balls(reach, [0.1], level="plain")
+    balls = ls.CollisionSpheres(reach, [0.1], level="plain")
     places = balls.bind(cart)
     at, there = {"state": [0.1, 0.2], "control": [0.3]}, {"vector": [0.1, 0.2, 9.0], "near": [0.0, 0.0, 0.0]}
     source = "def value(x, u, t, row, data):\n    return x[0]\n\n\ndef slope(x, u, t, row, data, gradient):\n    pass\n"
@@ -138,12 +138,12 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         "ObstacleCost": ({"world": world, "radius": 0.2, "sharpness": 10.0, "weight": 1.0},),
         "ObstacleCost of balls": ({"call": ls.ObstacleCost, "world": world, "balls": balls, "weight": 1.0},),
         "ObstacleCost.weighing": ({"self": ls.ObstacleCost(world, radius=0.2), "weight": 2.0},),
-        "Balls": ({
+        "CollisionSpheres": ({
             "places": reach, "radii": [0.1], "names": ("hand",), "sites": ("tip",), "jacobian": reach_slopes,
             "depends_on": ("x",), "level": "plain",
         },),
-        "Balls.centres": ({"self": balls, "dynamics": cart, "states": [[0.1, 0.2]]},),
-        "Places": ({field.name: getattr(places, field.name) for field in dataclasses.fields(places)},),
+        "CollisionSpheres.centres": ({"self": balls, "dynamics": cart, "states": [[0.1, 0.2]]},),
+        "SphereCenters": ({field.name: getattr(places, field.name) for field in dataclasses.fields(places)},),
         "Capsule": ({"length": 0.4, "radius": 0.03, "tolerance": 0.002},),
         "Capsule.between": ({"self": ls.Capsule(0.4, 0.1, 0.02), "start": (0, 0, 0), "end": [1.0, 2.0, 3.0]},),
         "SymbolicCost": ({"function": bowl, "parameters": {"a": 1.0}, "convex": True},),
@@ -159,7 +159,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
                 "FunctionCost": ls.FunctionCost(bowl),
             }.items()
         },
-        "Term": ({field.name: getattr(term, field.name) for field in dataclasses.fields(term)},),
+        "CostTerm": ({field.name: getattr(term, field.name) for field in dataclasses.fields(term)},),
         "Clearance": ({"world": world, "radius": 0.2, "margin": 0.1},),
         "Clearance of balls": ({"call": ls.Clearance, "world": world, "balls": balls, "margin": 0.1},),
         "ConstraintTerm": ({
@@ -235,9 +235,9 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
 
 def solving(place: Place) -> dict[str, tuple[Any, ...]]:
     eye, n = np.eye(2), 3
-    stages = ls.Stage(A=np.tile(eye, (4, 1, 1)), B=np.ones((2, 1)), R=[[1.0]], Q=eye)
-    stage = ls.Stage(A=-eye, B=np.ones((2, 1)), R=[[1.0]], Q=eye)
-    end = ls.Quadratic(eye, np.ones(2), 0.0)
+    stages = ls.lq.Stage(A=np.tile(eye, (4, 1, 1)), B=np.ones((2, 1)), R=[[1.0]], Q=eye)
+    stage = ls.lq.Stage(A=-eye, B=np.ones((2, 1)), R=[[1.0]], Q=eye)
+    end = ls.types.Quadratic(eye, np.ones(2), 0.0)
     tests = {"stop": "cost", "tolerance": 1e-3, "max_iterations": 2}
     both = tests | {
         "form": "dual", "first_pass": "forward", "safeguard": False, "gap_tolerance": 1e-3, "starts": 1,
@@ -290,11 +290,12 @@ def results(place: Place) -> dict[str, tuple[Any, ...]]:
     policy, plan, total = solution.policy, solution.trajectory, solution.total_cost
     go, come = solution.cost_to_go, solution.cost_to_come
     eye = np.eye(2)
-    flowing = ls.smooth_lq_continuous(
-        ls.Stage(A=-eye, B=np.ones((2, 1)), R=[[1.0]], Q=eye), horizon=0.1, initial=ls.Quadratic(eye, np.ones(2), 0.0),
-        final=ls.Quadratic(eye, np.ones(2), 0.0), rtol=1e-4, atol=1e-4,
+    flowing = ls.lq.smooth_lq_continuous(
+        ls.lq.Stage(A=-eye, B=np.ones((2, 1)), R=[[1.0]], Q=eye), horizon=0.1,
+        initial=ls.types.Quadratic(eye, np.ones(2), 0.0), final=ls.types.Quadratic(eye, np.ones(2), 0.0),
+        rtol=1e-4, atol=1e-4,
     )  # fmt: skip
-    candidate = ls.Candidate("straight", 1.0, 3, ls.Status.CONVERGED, plan)
+    candidate = ls.types.Candidate("straight", 1.0, 3, ls.Status.CONVERGED, plan)
     checks = {
         "DerivativeCheck": ls.check_derivatives(place.problem.dynamics, samples=1)[0],
         "PlantCheck": ls.check_plant(ls.DifferentialDrive(), ls.load_scene("arena"), samples=1),
@@ -302,9 +303,9 @@ def results(place: Place) -> dict[str, tuple[Any, ...]]:
     built: dict[str, Any] = {
         "AffinePolicy": policy, "Trajectory": plan, "Quadratic": go, "Moments": come, "TotalCost": total,
         "Candidate": candidate, "Iteration": solution.iterations[-1], "Rollout": rollout,
-        "Multipliers": ls.Multipliers(np.zeros((5, 2)), 1.0), "ContinuousSolution": flowing,
+        "Multipliers": ls.types.Multipliers(np.zeros((5, 2)), 1.0), "ContinuousSolution": flowing,
         "Solution": dataclasses.replace(solution, candidates=(candidate,)),
-        "Outcomes": ls.outcomes(rollout), **checks,
+        "Outcomes": ls.stress.outcomes(rollout), **checks,
     }  # fmt: skip
     at = {"x": np.zeros(2), "t": 0.05}
     return {
@@ -327,6 +328,5 @@ def results(place: Place) -> dict[str, tuple[Any, ...]]:
             for name in ("cost_to_go", "cost_to_come", "total_cost", "x_hat", "u_hat")
         },
         "save": ({"result": solution, "path": place.folder / "saved.npz"},),
-        "load_solution": ({"path": ls.save(solution, place.folder / "solution.npz")},),
-        "load_rollout": ({"path": ls.save(rollout, place.folder / "rollout.npz")},),
+        "load": ({"path": ls.save(solution, place.folder / "solution.npz")},),
     }  # fmt: skip

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 import lqrsim as ls
+from lqrsim.disturbances import ControlNoise, Disturbance, Effect, GilbertElliott
 from robustness.of_problems import print_nothing
 from robustness.place import Place
 
@@ -27,7 +28,7 @@ DISTURBANCES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-class Hooked(ls.Disturbance):
+class Hooked(Disturbance):
     """A user's own disturbance, whose effect is spoilt."""
 
     def __init__(self, effect: Any) -> None:
@@ -42,7 +43,7 @@ class Hooked(ls.Disturbance):
 
 def simulate_effect(plant: ls.Plant, solution: ls.Solution, **effects: Any) -> ls.Rollout:
     """One trial of a user's own disturbance with that effect."""
-    return ls.simulate(plant, solution, disturbances=[Hooked(ls.Effect(**effects))])
+    return ls.simulate(plant, solution, disturbances=[Hooked(Effect(**effects))])
 
 
 def simulate_kind(kind: Any, plant: ls.Plant, solution: ls.Solution, **settings: Any) -> ls.Rollout:
@@ -85,7 +86,7 @@ def nothing_of_three(step: int, states: Any) -> Any:
     return np.zeros((len(states), 3))
 
 
-def fits(disturbance: ls.Disturbance, place: Place) -> bool:
+def fits(disturbance: Disturbance, place: Place) -> bool:
     """Whether the robot can have it: wind takes drag, for example."""
     try:
         ls.simulate(place.plant, place.solution, disturbances=[disturbance], trials=2)
@@ -107,7 +108,7 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
         **{name: (dict(DISTURBANCES[name]), 0.5) for name in DISTURBANCES},
         **{f"{name}.scaled": ({"self": one, "strength": 2.0}, 0.5) for name, one in disturbances.items()},
         "Disturbance.scaled": ({"self": noise, "strength": 2.0}, 0.5),
-        "GilbertElliott": (dataclasses.asdict(ls.GilbertElliott(0.1, 0.5)), 0.5),
+        "GilbertElliott": (dataclasses.asdict(GilbertElliott(0.1, 0.5)), 0.5),
         **{
             f"simulate {name}": (
                 {"call": functools.partial(simulate_kind, getattr(ls, name)), "plant": plant, "solution": solution}
@@ -152,13 +153,13 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
 def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
     reference = "tiny.py:tiny"
     asked = {
-        "scenario": reference, "sweeps": {"noise": (ls.ControlNoise(0.1),)}, "strengths": (0.0, 1.0),
+        "scenario": reference, "sweeps": {"noise": (ControlNoise(0.1),)}, "strengths": (0.0, 1.0),
         "policies": ("open_loop",), "trials": 2, "seed": 0, "replan_every": 0.5, "goal_radius": 0.1,
         "goal_tolerance": None, "shard": 2, "time_limit": 60.0, "stated": None,
     }  # fmt: skip
-    campaign = ls.Campaign(**asked)
-    results = ls.run_campaign(campaign, place.folder / "campaign", workers=0)
-    score = ls.TrialScore(place.plant, place.solution, [ls.ControlNoise(0.5)], threads=1)
+    campaign = ls.stress.Campaign(**asked)
+    results = ls.stress.run_campaign(campaign, place.folder / "campaign", workers=0)
+    score = ls.stress.TrialScore(place.plant, place.solution, [ControlNoise(0.5)], threads=1)
     cell = results.cells[0]
     fields = (
         "plant",
@@ -175,7 +176,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
     )
     searching = {"score": line, "size": 3, "seed": 0}
     # One in five or so fails.
-    reliability = ls.ReliabilityProblem(reference, policy="open_loop", failure="miss", goal_radius=0.0565)
+    reliability = ls.stress.ReliabilityProblem(reference, policy="open_loop", failure="miss", goal_radius=0.0565)
     return {
         "Campaign": (asked,),
         "Campaign.disturbances": ({"self": campaign, "cell": cell},),

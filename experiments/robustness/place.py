@@ -32,7 +32,7 @@ class Place:
         self.problem = self.scenario.problem
         self.plant = self.scenario.plant()
         self.solution = ls.smooth(self.problem, starts=1)
-        self.rollout = ls.simulate(self.plant, self.solution, disturbances=[ls.ControlNoise(0.01)])
+        self.rollout = ls.simulate(self.plant, self.solution, disturbances=[ls.disturbances.ControlNoise(0.01)])
         self.space = self.problem.dynamics.state_coordinates
         self.controls = self.problem.dynamics.control_coordinates
         # Of one kind with the packaged scenario's, so that nothing else is compiled.

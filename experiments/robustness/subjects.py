@@ -49,6 +49,9 @@ class Subject:
 def public() -> Iterator[tuple[str, Any]]:
     """Each public callable by its name: `smooth`, `Problem`, `AffinePolicy.control`, `rotations.rotate`."""
     offered = {name: getattr(ls, name) for name in ls.__all__}
+    for room in (ls.disturbances, ls.lq, ls.stress, ls.types, ls.view):
+        del offered[room.__name__.removeprefix("lqrsim.")]
+        offered |= {name: getattr(room, name) for name in room.__all__}
     offered |= {f"gym.{name}": getattr(gym, name) for name in gym.__all__}
     for name, item in offered.items():
         if isinstance(item, ModuleType):

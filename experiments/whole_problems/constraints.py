@@ -129,7 +129,7 @@ def _listed(function: Any) -> Any:
 
 
 @cache
-def _coordinates(balls: ls.Balls) -> Any:
+def _coordinates(balls: ls.CollisionSpheres) -> Any:
     """The middles of all balls as a formula of x, u and p, three numbers a ball."""
 
     def coordinates(x: Any, u: Any, p: Any) -> list[Any]:

@@ -76,7 +76,10 @@ def _writers() -> str:
     """The code that writes what is kept: with other code, something else may be right."""
     package = Path(__file__).parents[1]
     files = [package / "codegen" / "symbolic.py"]
-    files += [package / "problem" / f"{name}.py" for name in ("dynamics", "costs", "constraints", "balls", "noise")]
+    files += [
+        package / "problem" / f"{name}.py"
+        for name in ("dynamics", "costs", "constraints", "collision_spheres", "noise")
+    ]
     return "".join(file.read_text(encoding="utf-8") for file in files)
 
 

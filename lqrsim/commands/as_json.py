@@ -111,7 +111,7 @@ def of_rollout(rollout: "Rollout", problem: "Problem | None" = None) -> Object:
     Args:
       problem: whose cost the trials have; none is worked out without one, or where it has another horizon.
     """
-    from lqrsim.simulation.outcome_table import outcomes
+    from lqrsim.stress.outcome_table import outcomes
 
     if problem is not None and (problem.steps, problem.dt) != (rollout.plan.steps, rollout.plan.dt):
         problem = None

@@ -190,6 +190,7 @@ class Simulate:
         from lqrsim.commands import as_json, console
         from lqrsim.errors import InputError
         from lqrsim.results import save_load
+        from lqrsim.results.solution import Solution
         from lqrsim.scenarios.references import resolve
         from lqrsim.simulation.closed_loop import simulate
         from lqrsim.simulation.tube_under import tube_under
@@ -200,7 +201,7 @@ class Simulate:
             raise InputError(f"--open-loop: got it with --controller {self.controller}, want one of them")
         folder = self.out or self.solution.parent
         console.check_output("--out", folder)
-        solution = save_load.load_solution(self.solution)
+        solution = save_load.load(self.solution, Solution)
         if not self.scenario and not solution.scenario:
             raise InputError(
                 "--scenario: got none, and the solution names none, want the one whose robot and scene to use"

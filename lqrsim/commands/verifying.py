@@ -36,16 +36,18 @@ class Verify:
         """Run the command. Returns the exit code: 1 if a test failed."""
         from lqrsim.commands import as_json, console
         from lqrsim.results import save_load
+        from lqrsim.results.rollout import Rollout
+        from lqrsim.results.solution import Solution
         from lqrsim.verify.ground_truth import ran_policy_of
         from lqrsim.verify.rollout_check import verify_run
         from lqrsim.verify.video_check import run_beside, verify_video
 
         is_run = self.file.suffix.lower() == ".npz"
         path = self.file if is_run else self.run_file or run_beside(self.file)
-        rollout, beside = save_load.load_rollout(path), path.with_name("solution.npz")
+        rollout, beside = save_load.load(path, Rollout), path.with_name("solution.npz")
         solution = None
         if self.solution or os.path.isfile(beside):
-            solution = save_load.load_solution(self.solution or beside)
+            solution = save_load.load(self.solution or beside, Solution)
             # What lies beside a run may be another's; what is given is meant.
             solution = solution if self.solution or ran_policy_of(solution, rollout) else None
         with console.progress("verifying", "frame") as progress:

@@ -74,7 +74,10 @@ class Render:
         from lqrsim.commands import console
         from lqrsim.errors import InputError
         from lqrsim.results import save_load
-        from lqrsim.view.render import render, still
+        from lqrsim.results.funnel import Funnel
+        from lqrsim.results.rollout import Rollout
+        from lqrsim.results.solution import Solution
+        from lqrsim.view.render import render, render_still
 
         if not self.rollouts:
             raise InputError("ROLLOUT: got none, want at least one that `lqrsim simulate` wrote")
@@ -87,12 +90,12 @@ class Render:
         if not is_still and (self.time is not None or self.every is not None):
             raise InputError(f"--time, --every: got them for {out.name}, want --out FILE.png: they are of stills")
         console.check_output("--out", out.parent, out.name)
-        runs = [save_load.load_rollout(path) for path in self.rollouts]
+        runs = [save_load.load(path, Rollout) for path in self.rollouts]
         if self.overlays != OVERLAYS and "tube" in self.overlays:
             for path in (path for path, run in zip(self.rollouts, runs, strict=True) if run.tube is None):
                 console.say(f"no tube in {path}: none was predicted for it")
-        solutions = [save_load.load_solution(path) for path in self.solution]
-        funnels = [save_load.load_funnel(path) for path in self.funnel]
+        solutions = [save_load.load(path, Solution) for path in self.solution]
+        funnels = [save_load.load(path, Funnel) for path in self.funnel]
         one_trial = len(self.trial) == 1
         options = {
             "trial": self.trial[0] if one_trial else self.trial, "camera": self.camera, "insets": self.inset,
@@ -102,7 +105,7 @@ class Render:
         }  # fmt: skip
         shown = runs[0] if len(runs) == 1 else runs
         if is_still:
-            still(shown, out, time=self.time, every=self.every, **options)
+            render_still(shown, out, time=self.time, every=self.every, **options)
         else:
             with console.progress("rendering", "frame") as progress:
                 render(shown, out, fps=self.fps, speed=self.speed, progress=progress, **options)
@@ -114,6 +117,8 @@ class Render:
         from lqrsim.commands import console
         from lqrsim.errors import InputError
         from lqrsim.results import save_load
+        from lqrsim.results.funnel import Funnel
+        from lqrsim.results.rollout import Rollout
         from lqrsim.view import rerun_file
 
         own, paths, trials = ("rollouts", "out", "trial", "funnel"), list(self.rollouts), list(self.trial)
@@ -123,8 +128,8 @@ class Render:
             want = "one run, one --trial, at most one --funnel, and nothing else"
             raise InputError(f"--out: got {out.name} with {got}, want it with {want}")
         console.check_output("--out", out.parent, out.name)
-        funnel = save_load.load_funnel(self.funnel[0]) if self.funnel else None
-        for name in rerun_file.write(save_load.load_rollout(paths[0]), out, trial=trials[0], funnel=funnel):
+        funnel = save_load.load(self.funnel[0], Funnel) if self.funnel else None
+        for name in rerun_file.write(save_load.load(paths[0], Rollout), out, trial=trials[0], funnel=funnel):
             console.say(f"left out: {name}, of a kind that Rerun has no shape for")
         console.wrote(out)
         return 0
@@ -175,6 +180,7 @@ class View:
         from lqrsim.commands import console
         from lqrsim.errors import InputError, check_count, check_number, check_seed
         from lqrsim.results import save_load
+        from lqrsim.results.rollout import Rollout
         from lqrsim.scenarios.references import resolve
         from lqrsim.stress.trials import controller_by_name
         from lqrsim.view import viewer
@@ -193,7 +199,7 @@ class View:
                 raise InputError(f"--controller, --stated: got one with {self.what}, want them with a SCENARIO")
             if self.replan is not None:
                 raise InputError(f"--replan: got {self.replan:g} with {self.what}, want it with a SCENARIO")
-            rollout = save_load.load_rollout(self.what)
+            rollout = save_load.load(self.what, Rollout)
             shown = viewer.arguments_for_rollout(rollout, self.trial)
 
             def go(screen: "Viewer") -> None:

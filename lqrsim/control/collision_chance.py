@@ -14,8 +14,8 @@ from scipy.special import ndtr
 
 from lqrsim.codegen.distances import distances_with_normals
 from lqrsim.errors import Array, InputError
-from lqrsim.problem.balls import Places, bind_outline, evaluate_slopes
 from lqrsim.problem.clearance import Clearance
+from lqrsim.problem.collision_spheres import SphereCenters, bind_outline, evaluate_slopes
 from lqrsim.problem.costs import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.scenes.world import World
@@ -46,7 +46,7 @@ class Surroundings:
 
     worlds: tuple[ObstacleCost | Clearance, ...]
     seen: tuple[World, ...]
-    places: tuple[Places | None, ...]
+    places: tuple[SphereCenters | None, ...]
     place: tuple[int, ...]
     position: tuple[int, ...]
     std: float
@@ -101,7 +101,7 @@ class Surroundings:
         )
 
     def _of_one(
-        self, one: ObstacleCost | Clearance, seen: World, places: Places | None, states: Array
+        self, one: ObstacleCost | Clearance, seen: World, places: SphereCenters | None, states: Array
     ) -> tuple[Array, Array]:
         if one.balls is None or places is None:
             distances, across = distances_with_normals(seen, states[:, list(self.place)])

@@ -31,8 +31,9 @@ class Environment(gymnasium.Env[Any, Any]):
     same to the last bit as that trial in `simulate`, if the same controls are commanded.
 
     Options of `reset`, for that episode alone: `disturbances` and `strength` as below; `preset`, a name as in
-    `lqrsim.preset`; `trial`, its number. The info that comes with an observation has `seed`, `trial`, `time` in s, the
-    true `state` (n,) and the `clearance` in m; with the last one `outcome`, as in `Rollout.outcome`, and `is_success`.
+    `lqrsim.disturbances.preset`; `trial`, its number. The info that comes with an observation has `seed`, `trial`,
+    `time` in s, the true `state` (n,) and the `clearance` in m; with the last one `outcome`, as in `Rollout.outcome`,
+    and `is_success`.
 
     Args:
       scenario: a reference as on the command line, such as "quadrotor,query=3", or a Scenario.

@@ -21,7 +21,7 @@ from lqrsim.errors import (
     excerpt,
     shaped,
 )
-from lqrsim.results.save_load import load_solution
+from lqrsim.results.save_load import load
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
@@ -90,7 +90,7 @@ class Task:
         """
         if self._given is None:
             return smooth(self.scenario.problem)
-        given = load_solution(self._given) if isinstance(self._given, str | os.PathLike) else self._given
+        given = load(self._given, Solution) if isinstance(self._given, str | os.PathLike) else self._given
         return check_kind("solution", given, Solution, "a Solution, the path of one, or None")
 
     @cached_property

@@ -4,7 +4,7 @@
 on, how many at a step, of which row r has number r modulo that, how many obstacles there are, and at how many steps
 they are told, of which the last holds from there on; then the radius of each ball, the margins, a step after the other,
 and for each step the ROW numbers of each obstacle. The rows are those of the first ball, an obstacle after the other,
-then those of the second. What `places` and `places_jacobian` are, `Places` says.
+then those of the second. What `places` and `places_jacobian` are, `SphereCenters` says.
 """
 
 from lqrsim.kernels.declarations import ROW, N, stack

@@ -2,7 +2,7 @@
 
 `data` has what `places` reads, and from AT on the sharpness, the weight, how many obstacles there are and at how many
 steps they are told, of which the last holds from there on; the radius of each ball, and for each step the ROW numbers
-of each obstacle. What `places` and `places_jacobian` are, `Places` says.
+of each obstacle. What `places` and `places_jacobian` are, `SphereCenters` says.
 """
 
 from lqrsim.kernels.declarations import ROW, N, places, places_jacobian, stack

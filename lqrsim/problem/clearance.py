@@ -6,7 +6,7 @@ import numpy.typing as npt
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt, real
 from lqrsim.kernels import ball_clearance, clearance
-from lqrsim.problem.balls import Balls, bind_outline, check_outline
+from lqrsim.problem.collision_spheres import CollisionSpheres, bind_outline, check_outline
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
@@ -31,7 +31,7 @@ class Clearance(Constraint):
         world: World,
         *,
         radius: float | None = None,
-        balls: Balls | None = None,
+        balls: CollisionSpheres | None = None,
         margin: float | npt.ArrayLike = 0.0,
     ) -> None:
         if not isinstance(world, World):

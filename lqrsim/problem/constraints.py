@@ -41,7 +41,7 @@ class ConstraintTerm:
 
     Attributes:
       source: defines `value(x, u, t, row, data)`, which returns one of the numbers, and `slope(x, u, t, row, data,
-        gradient)`, which *adds* its gradient (n+m,), states before controls. As the source of a `costs.Term`.
+        gradient)`, which *adds* its gradient (n+m,), states before controls. As the source of a `costs.CostTerm`.
         Functions go by their bare names: `cos`, not `math.cos` or `np.cos`, which are refused.
       data: (any,) float64.
       rows: how many numbers there are at a step.
@@ -50,8 +50,8 @@ class ConstraintTerm:
       equality: whether they are to be zero.
       final_only: whether they act at the last step alone.
       balls: of how many balls the numbers are, whose places all of them share; mostly none. With it the source defines
-        `places` and `places_jacobian`, too, as `Places` has them, and `value` and `slope` get the places (3 balls,) and
-        their derivatives (3 balls, n) in place of x and u.
+        `places` and `places_jacobian`, too, as `SphereCenters` has them, and `value` and `slope` get the places
+        (3 balls,) and their derivatives (3 balls, n) in place of x and u.
       functions: what the source calls with `call`; their addresses come first in the data that it is given.
     """
 

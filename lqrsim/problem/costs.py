@@ -29,13 +29,13 @@ from lqrsim.errors import (
     excerpt,
 )
 from lqrsim.kernels import ball_cost, cost_differences, function_cost, obstacle_cost, quadratic_cost
-from lqrsim.problem.balls import Balls, Places, bind_outline, check_outline
+from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters, bind_outline, check_outline
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
 
 
 @dataclass(frozen=True)
-class Term:
+class CostTerm:
     """A cost term, made for one system: what gets compiled, and the numbers it reads.
 
     Attributes:
@@ -66,23 +66,23 @@ class Term:
     @functools.cached_property
     def code(self) -> Source:
         """The source, checked. Raises InputError."""
-        return check_source("Term", self.source, {"value": 4, "derivatives": 6})
+        return check_source("CostTerm", self.source, {"value": 4, "derivatives": 6})
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "data", check_array("Term: data", self.data, (None,), infinite=True))
+        object.__setattr__(self, "data", check_array("CostTerm: data", self.data, (None,), infinite=True))
         _ = self.code
         if self.nonconvex_in is not None:
             wanted = "a tuple of indices, or None"
-            given = check_items("Term: nonconvex_in", self.nonconvex_in, (int, np.integer), wanted)
-            entries = tuple(check_count("Term: nonconvex_in", i, at_least=0) for i in given)
+            given = check_items("CostTerm: nonconvex_in", self.nonconvex_in, (int, np.integer), wanted)
+            entries = tuple(check_count("CostTerm: nonconvex_in", i, at_least=0) for i in given)
             object.__setattr__(self, "nonconvex_in", entries)
         for name in ("uses_control", "exact_hessian"):
-            object.__setattr__(self, name, check_flag(f"Term: {name}", getattr(self, name)))
+            object.__setattr__(self, name, check_flag(f"CostTerm: {name}", getattr(self, name)))
         if self.factor is not None:
             last = len(self.data) - 1
-            object.__setattr__(self, "factor", check_count("Term: factor", self.factor, at_least=0, at_most=last))
+            object.__setattr__(self, "factor", check_count("CostTerm: factor", self.factor, at_least=0, at_most=last))
         wanted = "a tuple of UserFunction, as FunctionCost makes them"
-        object.__setattr__(self, "functions", check_items("Term: functions", self.functions, UserFunction, wanted))
+        object.__setattr__(self, "functions", check_items("CostTerm: functions", self.functions, UserFunction, wanted))
 
 
 class Cost(abc.ABC):
@@ -94,14 +94,14 @@ class Cost(abc.ABC):
         return type(self).__name__
 
     @abc.abstractmethod
-    def bind(self, dynamics: Dynamics) -> Term:
+    def bind(self, dynamics: Dynamics) -> CostTerm:
         """Bind the cost to a system.
 
         Args:
           dynamics: of the system.
 
         Returns:
-          The Term that solvers use.
+          The CostTerm that solvers use.
 
         Raises:
           InputError: it does not fit the system.
@@ -112,7 +112,7 @@ class Cost(abc.ABC):
         """Whether it changes with time; see `_bind_at`."""
         return False
 
-    def _bind_at(self, dynamics: Dynamics, times: Array) -> Term:
+    def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
         """This cost for a system and the times (T+1,) in s of a problem's knots."""
         return self.bind(dynamics)
 
@@ -126,7 +126,7 @@ class CostSum(Cost):
     def __init__(self, terms: tuple[Cost, ...]) -> None:
         self.terms = terms
 
-    def bind(self, dynamics: Dynamics) -> Term:
+    def bind(self, dynamics: Dynamics) -> CostTerm:
         raise InputError("cost: got a sum to bind, want its terms one by one")
 
 
@@ -151,9 +151,9 @@ class QuadraticCost(Cost):
         self.weight = check_weight("QuadraticCost: weight", weight)
         self.about = check_array("QuadraticCost: about", about, (len(self.weight),))
 
-    def bind(self, dynamics: Dynamics) -> Term:
+    def bind(self, dynamics: Dynamics) -> CostTerm:
         _check_size("QuadraticCost: weight", self.weight, len(dynamics.state_coordinates), "states")
-        return Term(source_of(quadratic_cost, CONTROL=0), np.concatenate([self.about, self.weight.ravel()]))
+        return CostTerm(source_of(quadratic_cost, CONTROL=0), np.concatenate([self.about, self.weight.ravel()]))
 
 
 class ControlCost(Cost):
@@ -170,10 +170,10 @@ class ControlCost(Cost):
         about = np.zeros(len(self.weight)) if about is None else about
         self.about = check_array("ControlCost: about", about, (len(self.weight),))
 
-    def bind(self, dynamics: Dynamics) -> Term:
+    def bind(self, dynamics: Dynamics) -> CostTerm:
         _check_size("ControlCost: weight", self.weight, len(dynamics.control_coordinates), "controls")
         numbers = np.concatenate([self.about, self.weight.ravel()])
-        return Term(source_of(quadratic_cost, CONTROL=1), numbers, uses_control=True)
+        return CostTerm(source_of(quadratic_cost, CONTROL=1), numbers, uses_control=True)
 
 
 class ObstacleCost(Cost):
@@ -199,7 +199,7 @@ class ObstacleCost(Cost):
         world: World,
         *,
         radius: float | None = None,
-        balls: Balls | None = None,
+        balls: CollisionSpheres | None = None,
         sharpness: float = 10.0,
         weight: float = 1.0,
     ) -> None:
@@ -226,10 +226,10 @@ class ObstacleCost(Cost):
     def moving(self) -> bool:
         return self.world.moving
 
-    def bind(self, dynamics: Dynamics) -> Term:
+    def bind(self, dynamics: Dynamics) -> CostTerm:
         return self._bind_at(dynamics, np.zeros(1))
 
-    def _bind_at(self, dynamics: Dynamics, times: Array) -> Term:
+    def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
         places, world = bind_outline("ObstacleCost", self.balls, dynamics, self.world)
         tables = world.tables(times)
         if self.balls is not None and places is not None:
@@ -237,13 +237,13 @@ class ObstacleCost(Cost):
         position = dynamics.state_coordinates.position
         first = [self.radius, self.sharpness, self.weight, len(world), len(tables)]
         data = np.concatenate([first, tables.ravel()])
-        return Term(source_of(obstacle_cost, AXES=position), data, nonconvex_in=position, factor=2)
+        return CostTerm(source_of(obstacle_cost, AXES=position), data, nonconvex_in=position, factor=2)
 
-    def _bind_balls(self, balls: Balls, places: Places, tables: Array) -> Term:
+    def _bind_balls(self, balls: CollisionSpheres, places: SphereCenters, tables: Array) -> CostTerm:
         own = np.concatenate([[self.sharpness, self.weight, tables.shape[1], len(tables)], balls.radii, tables.ravel()])
         count, axes = len(balls), places.depends_on
         kernel = source_of(ball_cost, AT=places.numbers, BALLS=count, PLACES=3 * count, AXES=axes)
-        return Term(
+        return CostTerm(
             kernel.filled(places=places.code, places_jacobian=places.code),
             np.concatenate([places.data, own]),
             nonconvex_in=axes or None,
@@ -282,13 +282,13 @@ class SymbolicCost(Cost):
         """The name of its function."""
         return f"{name_of(self.function)}(x, u, p)"
 
-    def bind(self, dynamics: Dynamics) -> Term:
+    def bind(self, dynamics: Dynamics) -> CostTerm:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         details = ("cost", n, m, tuple(self.parameters))
         made = symbolic.kept(
             self.function, details, lambda: self._trace(n, m), source=str, nonconvex_in=list, uses_control=bool
         )
-        return Term(
+        return CostTerm(
             made["source"],
             np.array(list(self.parameters.values()), dtype=np.float64),
             nonconvex_in=None if self.convex or not made["nonconvex_in"] else tuple(made["nonconvex_in"]),
@@ -368,7 +368,7 @@ class FunctionCost(Cost):
         """The name of its function."""
         return f"{name_of(self.function)}(x, u, p)"
 
-    def bind(self, dynamics: Dynamics) -> Term:
+    def bind(self, dynamics: Dynamics) -> CostTerm:
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
         names = (*dynamics.state_coordinates.names, *dynamics.control_coordinates.names)
         wanted = names if self.depends_on is None else self.depends_on
@@ -382,7 +382,7 @@ class FunctionCost(Cost):
         source = source_of(function_cost)
         if self.derivatives is None:
             source = source_of(cost_differences, AXES=axes)
-        return Term(
+        return CostTerm(
             source,
             np.array(list(self.parameters.values()), dtype=np.float64),
             nonconvex_in=None if self.convex else axes,

@@ -10,7 +10,7 @@ from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.user_functions import UserFunction, brief, plain_calls
 from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, check_text, excerpt, real, shaped
 from lqrsim.problem.constraints import ConstraintTerm
-from lqrsim.problem.costs import Term, terms_of
+from lqrsim.problem.costs import CostTerm, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import NoiseTerm
 from lqrsim.problem.problem import FixedState, Problem
@@ -69,7 +69,7 @@ def check_start(problem: Problem, x: Array, u: Array) -> None:
                     )
 
 
-def _terms(problem: Problem) -> Iterator[tuple[str, Term]]:
+def _terms(problem: Problem) -> Iterator[tuple[str, CostTerm]]:
     """The cost terms, with what messages call them."""
     for name in ("initial", "stage_cost", "final_cost"):
         cost = getattr(problem, name)
@@ -77,7 +77,7 @@ def _terms(problem: Problem) -> Iterator[tuple[str, Term]]:
             yield from ((f"{name}: {c.name}", t) for c, t in zip(terms_of(cost), problem.terms(name), strict=True))
 
 
-def evaluate(term: Term, dynamics: Dynamics, x: Array, u: Array) -> tuple[float, Array, Array]:
+def evaluate(term: CostTerm, dynamics: Dynamics, x: Array, u: Array) -> tuple[float, Array, Array]:
     """A cost term in plain Python: its value, gradient (n+m,) and Hessian (n+m, n+m), before any projection."""
     n, m = len(x), len(u)
     names, data = _run_plainly(term, n, m)
@@ -85,7 +85,7 @@ def evaluate(term: Term, dynamics: Dynamics, x: Array, u: Array) -> tuple[float,
     return float(names["derivatives"](x, u, 1, data, hessian, gradient)), gradient, hessian
 
 
-def _run_plainly(term: Term | ConstraintTerm, n: int, m: int) -> tuple[dict[str, Any], Array]:
+def _run_plainly(term: CostTerm | ConstraintTerm, n: int, m: int) -> tuple[dict[str, Any], Array]:
     """What a term's source defines, as plain Python, and the data that it is given."""
     first = term.functions[:1]
     parameters = dict(zip(first[0].parameters, term.data.tolist(), strict=False)) if first else {}
@@ -265,7 +265,7 @@ def _of_costs(problem: Problem, points: Sequence[tuple[Array, Array]]) -> Iterat
         if len(term.functions) == 1 and term.exact_hessian:
             continue  # without derivatives: what is stated are central differences
 
-        def at(z: Array, term: Term = term) -> tuple[float, Array, Array]:
+        def at(z: Array, term: CostTerm = term) -> tuple[float, Array, Array]:
             return evaluate(term, dynamics, z[:n], z[n:])
 
         for x, u in points:

@@ -20,9 +20,9 @@ from lqrsim.errors import (
     check_number,
     excerpt,
 )
-from lqrsim.problem.balls import evaluate
+from lqrsim.problem.collision_spheres import evaluate
 from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, goals_of
-from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost, Term, terms_of
+from lqrsim.problem.costs import ControlCost, Cost, CostTerm, ObstacleCost, QuadraticCost, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.results.coordinates import Coordinates
@@ -93,7 +93,7 @@ class Problem:
     risk: float = 0.0
     duration: tuple[float, float] | None = None
     time_weight: float = 0.0
-    _terms: dict[str, tuple[Term, ...]] = field(init=False, repr=False, compare=False)
+    _terms: dict[str, tuple[CostTerm, ...]] = field(init=False, repr=False, compare=False)
     _constraint_terms: tuple[ConstraintTerm, ...] = field(init=False, repr=False, compare=False)
     _noise_term: NoiseTerm | None = field(init=False, repr=False, compare=False)
     _controls: tuple[Coordinates, Coordinates] = field(init=False, repr=False, compare=False)
@@ -154,10 +154,10 @@ class Problem:
         """Whether it changes with the time at which it begins: whether obstacles move."""
         return any(one.moving for one in (*terms_of(self.stage_cost), *self.constraints))
 
-    def _bound(self, costs: tuple[Cost, ...]) -> tuple[Term, ...]:
+    def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
         """The costs for the system. Raises InputError if what is bound is no term."""
         return tuple(
-            check_kind(f"{type(cost).__name__}.bind", cost._bind_at(self.dynamics, self.times), Term, "a Term")
+            check_kind(f"{type(cost).__name__}.bind", cost._bind_at(self.dynamics, self.times), CostTerm, "a CostTerm")
             for cost in costs
         )
 
@@ -280,7 +280,7 @@ class Problem:
         """The terms that keep the robot clear of obstacles."""
         return tuple(cost for cost in terms_of(self.stage_cost) if isinstance(cost, ObstacleCost))
 
-    def terms(self, which: str) -> tuple[Term, ...]:
+    def terms(self, which: str) -> tuple[CostTerm, ...]:
         """The bound terms of `initial`, `stage_cost` or `final_cost`.
 
         Args:

@@ -9,8 +9,8 @@ import numpy as np
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.goal import Target, tracking_unit
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.simulation.outcome_table import OUTCOMES
 from lqrsim.stress import analysis
+from lqrsim.stress.outcome_table import OUTCOMES
 from lqrsim.stress.specification import Cell
 from lqrsim.stress.statistics import Estimate
 

@@ -136,21 +136,24 @@ class Archive:
 
 
 @contextlib.contextmanager
-def opened(path: Path, kind: str, version: int) -> Iterator[Archive]:
-    """The file of this kind, while the block lasts; whatever the block raises, the file is to blame.
+def opened(path: Path, kind: str | None, versions: Mapping[str, int]) -> Iterator[Archive]:
+    """A file of this kind, or of any in `versions`, while the block lasts; whatever it raises, the file is to blame.
 
     Raises:
       InputError: no such file; not of this kind or version; or anything in it is not as it was written.
     """
-    with blamed(path, kind), path.open("rb") as file, zipfile.ZipFile(file) as archive:
+    field = kind or "path"
+    with blamed(path, field), path.open("rb") as file, zipfile.ZipFile(file) as archive:
         found = Archive(archive, os.fstat(file.fileno()).st_size)
-        if found.meta.get("format") != f"lqrsim {kind}":
-            raise Other(
-                f"{kind}: got {path}, which holds a {excerpt(found.meta.get('format'))}, want a {f'lqrsim {kind}'!r}"
-            )
+        said = found.meta.get("format")
+        wanted = [f"lqrsim {one}" for one in versions if kind in (None, one)]
+        if said not in wanted:
+            names = " or ".join(repr(one) for one in wanted)
+            raise Other(f"{field}: got {path}, which holds a {excerpt(said)}, want a {names}")
+        version = versions[str(said).removeprefix("lqrsim ")]
         if found.meta.get("version") != version:
             was = excerpt(found.meta.get("version"))
-            raise Other(f"{kind}: got {path} of version {was}, want version {version}: write it again")
+            raise Other(f"{field}: got {path} of version {was}, want version {version}: write it again")
         yield found
 
 
@@ -184,16 +187,21 @@ def replacing(path: Path) -> Iterator[Path]:
     """A name to write to, which takes the place of `path` when the block ends, and disappears if it fails.
 
     Raises:
-      InputError: the folder or the file cannot be written, or the disk is full.
+      InputError: the folder or the file cannot be written, the disk is full, or `path` is no regular file.
     """
+    # What a link points to is replaced, not the link.
+    target = Path(os.path.realpath(check_path("output", path)))
+    if target.exists() and not target.is_file():
+        what = "a folder" if target.is_dir() else "neither a file nor a folder"
+        raise InputError(f"output: got {excerpt_of(path)}, which is {what}, want the name of a file")
     # A name of its own, so that two writers cannot meet, and known before the file is there, so that Ctrl-C at any
     # moment removes it; the suffix stays, for it says the format.
-    unfinished = check_path("output", path).parent / f".unfinished-{secrets.token_hex(8)}{path.suffix}"
+    unfinished = target.parent / f".unfinished-{secrets.token_hex(8)}{path.suffix}"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
         unfinished.touch(exist_ok=False)
         yield unfinished
-        unfinished.replace(path)
+        unfinished.replace(target)
     except OSError as error:
         reason = error.strerror or error
         raise InputError(f"output: got {excerpt_of(path)}, want a file that can be written ({reason})") from None

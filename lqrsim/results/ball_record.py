@@ -44,5 +44,7 @@ class BallRecord:
         """
         body, *place = self.anchors[-1].tolist()
         if not np.isfinite(body):
-            raise InputError("balls: got none of a site for the last of them, want sites= in Balls with one for it")
+            raise InputError(
+                "balls: got none of a site for the last of them, want sites= in CollisionSpheres with one for it"
+            )
         return int(body), np.array(place)

@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, astuple, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -89,6 +89,7 @@ _POLICY_TEXTS: dict[str, schema.Check] = {
 }  # fmt: skip
 
 Saved = Solution | Rollout | AffinePolicy | OutputFeedbackPolicy | Funnel
+_Kind = TypeVar("_Kind", Solution, Rollout, AffinePolicy, OutputFeedbackPolicy, Funnel)
 
 
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:
@@ -123,70 +124,40 @@ def save(result: Saved, path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def load_solution(path: str | os.PathLike[str]) -> Solution:
-    """Read what `save` wrote of a Solution. Loading never runs code.
+@overload
+def load(path: str | os.PathLike[str]) -> Saved: ...
+@overload
+def load(path: str | os.PathLike[str], kind: type[_Kind]) -> _Kind: ...
+def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved:
+    """Read what `save` wrote. Loading never runs code.
+
+        solution = ls.load("plan.npz", ls.Solution)
 
     Args:
       path: of a file that `save` wrote.
+      kind: what it has to be: `ls.Solution`, `ls.Rollout`, `ls.AffinePolicy`, `ls.OutputFeedbackPolicy` or `ls.Funnel`.
+        By default, whatever it is.
 
     Returns:
-      The Solution.
+      What was saved.
 
     Raises:
-      InputError: no such file, not a solution, of another version, or anything in it is not what was written.
+      InputError: the file is missing, damaged, of another version or of another kind.
     """
-    return _load(path, "solution")
-
-
-def load_rollout(path: str | os.PathLike[str]) -> Rollout:
-    """Read what `save` wrote of a Rollout.
-
-    Args:
-      path: of a file that `save` wrote.
-
-    Returns:
-      The Rollout.
-
-    Raises:
-      InputError: the file is missing, damaged or of another kind.
-    """
-    return _load(path, "rollout")
-
-
-def load_policy(path: str | os.PathLike[str]) -> AffinePolicy | OutputFeedbackPolicy:
-    """Read what `save` wrote of a policy alone.
-
-    Args:
-      path: of a file that `save` wrote.
-
-    Returns:
-      An AffinePolicy or an OutputFeedbackPolicy.
-
-    Raises:
-      InputError: the file is missing, damaged or of another kind.
-    """
-    return _load(path, "policy")
-
-
-def load_funnel(path: str | os.PathLike[str]) -> Funnel:
-    """Read what `save` wrote of a Funnel.
-
-    Args:
-      path: of a file that `save` wrote.
-
-    Returns:
-      The Funnel.
-
-    Raises:
-      InputError: the file is missing, damaged or of another kind.
-    """
-    return _load(path, "funnel")
-
-
-def _load(path: str | os.PathLike[str], kind: str) -> Any:
-    with opened(check_path(kind, path), kind, VERSIONS[kind]) as archive:
-        _check(kind, archive.headers, archive.meta)
-        return _MAKERS[kind](archive.arrays(), archive.meta)
+    if kind is not None and kind not in _PARTS:
+        raise InputError(f"kind: got {excerpt(kind)}, want one of {', '.join(f'ls.{one.__name__}' for one in _PARTS)}")
+    wanted = None if kind is None else _PARTS[kind][0]
+    path = check_path(wanted or "path", path)
+    if path.is_dir():
+        known = "; the folder of a campaign is opened with ls.stress.Results(folder)"
+        raise InputError(f"{wanted or 'path'}: got {path}, a folder, want a file{known}")
+    with opened(path, wanted, VERSIONS) as archive:
+        found = str(archive.meta["format"]).removeprefix("lqrsim ")
+        _check(found, archive.headers, archive.meta)
+        result = _MAKERS[found](archive.arrays(), archive.meta)
+    if kind is not None and not isinstance(result, kind):
+        raise InputError(f"{wanted}: got {path}, which holds an {type(result).__name__}, want an {kind.__name__}")
+    return result
 
 
 def _check(kind: str, headers: Mapping[str, Header], meta: dict[str, Any]) -> None:

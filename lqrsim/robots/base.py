@@ -9,7 +9,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array, check_number
 
 if TYPE_CHECKING:
-    from lqrsim.problem.balls import Balls
+    from lqrsim.problem.collision_spheres import CollisionSpheres
     from lqrsim.problem.dynamics import Dynamics
 
 
@@ -38,7 +38,7 @@ class Robot(abc.ABC):
     drag: float = 0.0
     activations: int = 0
     radius: float
-    balls: "Balls | None" = None
+    balls: "CollisionSpheres | None" = None
 
     @property
     @abc.abstractmethod

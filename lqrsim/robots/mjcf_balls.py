@@ -10,13 +10,13 @@ from lqrsim.codegen.sources import source_of
 from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_places
-from lqrsim.problem.balls import Balls, Places
+from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes.mjcf_outline import Outline
 
 
-class MjcfBalls(Balls):
+class MjcfBalls(CollisionSpheres):
     """Balls that are fixed to bodies of an MJCF; `MjcfRobot` makes them.
 
     Args:
@@ -32,13 +32,13 @@ class MjcfBalls(Balls):
     def name(self) -> str:
         return "MuJoCo's kinematics"
 
-    def bind(self, dynamics: Dynamics) -> Places:
+    def bind(self, dynamics: Dynamics) -> SphereCenters:
         if not isinstance(dynamics, MjcfDynamics):
             raise InputError(f"balls: got those of an MJCF for {dynamics.name}, want its own dynamics, robot.dynamics")
         memory = _Memory.of(dynamics, self)
         positions = dynamics.physics.model.nv
         data = np.concatenate([[len(self), positions], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
-        return Places(source_of(mjcf_places), data, tuple(range(positions)), functions=(memory,))
+        return SphereCenters(source_of(mjcf_places), data, tuple(range(positions)), functions=(memory,))
 
 
 class _Memory(UserFunction):

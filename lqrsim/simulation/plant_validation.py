@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from lqrsim.errors import Array, InputError, check_kind, check_number, excerpt
-from lqrsim.problem.balls import Balls
+from lqrsim.problem.collision_spheres import CollisionSpheres
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene
@@ -24,11 +24,16 @@ MIXED = 10  # of so many controls at most, all corners of their limits are looke
 def check_names(robot: Robot, scene: Scene) -> None:
     """Raises InputError unless the robot's body, joints, actuators and wheels are in the scene by their names.
 
-    Its radius and its drag must be numbers that are not negative, and its balls Balls.
+    Its radius and its drag must be numbers that are not negative, and its balls CollisionSpheres.
     """
     check_number(f"robot {robot.name}: radius", getattr(robot, "radius", None), at_least=0.0)
     check_number(f"robot {robot.name}: drag", robot.drag, at_least=0.0)
-    check_kind(f"robot {robot.name}: balls", robot.balls, (Balls, type(None)), "Balls(places, radii), or None")
+    check_kind(
+        f"robot {robot.name}: balls",
+        robot.balls,
+        (CollisionSpheres, type(None)),
+        "CollisionSpheres(places, radii), or None",
+    )
     model = scene.model
     wanted = {
         "body": ("body", [robot.body], model.nbody),
@@ -164,7 +169,7 @@ def anchor_of(model: mujoco.MjModel, site: str) -> Array:
     return np.array([model.geom_bodyid[number], *model.geom_pos[number]])
 
 
-def _check_sites(plant: "Plant", balls: Balls) -> None:
+def _check_sites(plant: "Plant", balls: CollisionSpheres) -> None:
     """Raises InputError unless each ball that names a site or a geom has its middle where MuJoCo has that."""
     robot, model, data = plant.robot, plant.model, mujoco.MjData(plant.model)
     who, n = f"robot {robot.name}: balls", len(robot.dynamics.state_coordinates)

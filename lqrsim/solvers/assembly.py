@@ -7,8 +7,8 @@ import numpy as np
 
 from lqrsim.codegen import distances
 from lqrsim.errors import Array
-from lqrsim.problem.balls import clearances
 from lqrsim.problem.clearance import Clearance
+from lqrsim.problem.collision_spheres import clearances
 from lqrsim.problem.costs import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy

@@ -28,7 +28,7 @@ from lqrsim.kernels import (
 from lqrsim.kernels import noise as noise_kernel
 from lqrsim.kernels.records import Constraints, CostModel, DynamicsModel, Limits, Model, NoiseModel, Plan, Policy
 from lqrsim.problem.constraints import ConstraintTerm
-from lqrsim.problem.costs import Term
+from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import NoiseTerm, numbers_of
 from lqrsim.problem.problem import FixedState, Problem
@@ -104,14 +104,14 @@ def dynamics_model(dynamics: Dynamics, *, second_order: bool = False) -> Dynamic
     return DynamicsModel(advance, step_jacobian, curvature, numbers(dynamics))
 
 
-def numbers(part: Dynamics | Term | ConstraintTerm) -> Array:
+def numbers(part: Dynamics | CostTerm | ConstraintTerm) -> Array:
     """The numbers that a part reads: the addresses of its functions, then its own."""
     if not part.functions:
         return part.data
     return np.concatenate([[address_of(function) for function in part.functions], part.data])
 
 
-def cost_terms(problem: Problem, field: str) -> list[Term]:
+def cost_terms(problem: Problem, field: str) -> list[CostTerm]:
     """The terms of a cost in the order of `CostModel`: those that may be indefinite come first."""
     return sorted(problem.terms(field), key=lambda term: term.nonconvex_in is None)
 

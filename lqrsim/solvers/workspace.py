@@ -132,7 +132,7 @@ class Workspace:
         return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_law": law}
 
     def eased(self, share: float) -> CostModel:
-        """The stage cost with that share of what may be eased; see `Term.factor`."""
+        """The stage cost with that share of what may be eased; see `CostTerm.factor`."""
         if share == 1:
             return self.model.stage
         data = list(self.model.stage.data)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_count, check_name, check_number
-from lqrsim.simulation.outcome_table import Outcomes
+from lqrsim.stress.outcome_table import Outcomes
 from lqrsim.stress.specification import Cell
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, Pairs, compare, holm, mean, paired_difference, rate, wilson
 

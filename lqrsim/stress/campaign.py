@@ -1,6 +1,6 @@
 """Many trials of policies under disturbances of growing strength, into a folder; it can be interrupted anywhere.
 
-    campaign = Campaign(scenario="quadrotor", sweeps={"gusts": (ls.ForceNoise(0.2),)})
+    campaign = Campaign(scenario="quadrotor", sweeps={"gusts": (ls.disturbances.ForceNoise(0.2),)})
     results = run_campaign(campaign, "runs/stress/quadrotor")
 
 On equal processors a trial's rows depend on the campaign alone: not on how many workers there are, on what they do at

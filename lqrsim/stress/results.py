@@ -16,9 +16,9 @@ from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.references import from_anywhere, resolve
-from lqrsim.simulation.outcome_table import OUTCOMES, Outcomes
 from lqrsim.stress.analysis import alike
 from lqrsim.stress.manifest import cells_of, digest_of_solution, read_manifest
+from lqrsim.stress.outcome_table import OUTCOMES, Outcomes
 from lqrsim.stress.specification import Campaign, Cell, Shard, shards_of
 from lqrsim.stress.statistics import CONFIDENCE, rate
 from lqrsim.stress.trial_tables import Damaged, Table, read
@@ -203,7 +203,7 @@ class Results:
           InputError: its file is damaged.
         """
         path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
-        hashes, solution = self.manifest["policies"][policy], save_load.load_solution(path)
+        hashes, solution = self.manifest["policies"][policy], save_load.load(path, Solution)
         if sha256(path.read_bytes()) != hashes["sha256"] or digest_of_solution(solution) != hashes["digest"]:
             raise InputError(f"policy: got {path}, which is damaged, want what the campaign wrote: run it elsewhere")
         return solution

@@ -20,10 +20,10 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, preset
-from lqrsim.simulation.outcome_table import Outcomes, outcomes
 from lqrsim.simulation.uncertainty_of import uncertainty_of
 from lqrsim.solvers.ilqr import ilqr
 from lqrsim.solvers.smoother import smooth
+from lqrsim.stress.outcome_table import Outcomes, outcomes
 from lqrsim.stress.specification import POLICIES, TOLD, Campaign, Cell, Shard, check_told
 from lqrsim.stress.sweeps import sweep
 from lqrsim.stress.trial_tables import Table, pack

@@ -30,7 +30,7 @@ def run_beside(path: str | os.PathLike[str]) -> Path:
     metadata, folder = video_metadata.read(path), Path(path).parent
     for found in sorted(folder.glob("*.npz")):
         with contextlib.suppress(InputError):  # a solution, or what is damaged
-            if video_metadata.digest(save_load.load_rollout(found)) in metadata.runs:
+            if video_metadata.digest(save_load.load(found, Rollout)) in metadata.runs:
                 return found
     raise InputError(f"run: got none, and none in {folder} is what the video says it shows, want the run's file")
 

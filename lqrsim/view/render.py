@@ -107,7 +107,7 @@ def render(
     return PictureFile(path)
 
 
-def still(
+def render_still(
     runs: Rollout | Sequence[Rollout],
     path: str | os.PathLike[str],
     *,

@@ -123,7 +123,10 @@ def double_integrator(**options: Any) -> Linear:
 
 
 def law_of(
-    system: Linear, *, unknowns: Sequence[ls.Unknown] = (ls.Unknown("d0", 0.5),), **options: Any
+    system: Linear,
+    *,
+    unknowns: Sequence[ls.disturbances.Unknown] = (ls.disturbances.Unknown("d0", 0.5),),
+    **options: Any,
 ) -> ls.OffsetFree:
     """Output feedback for it, with noise; the rest is of Uncertainty, but for `sensors`."""
     sensors = options.pop("sensors", None)

@@ -56,9 +56,9 @@ class PlanarArm(ls.Robot):
         )
 
     @cached_property
-    def balls(self) -> ls.Balls:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def balls(self) -> ls.CollisionSpheres:  # pyright: ignore[reportIncompatibleVariableOverride]
         sites = [None] * (LINK.count - 1)
-        return ls.Balls(places, 3 * LINK.radii, sites=[*sites, "end 0", *sites, "end 1", *sites, "end 2"])
+        return ls.CollisionSpheres(places, 3 * LINK.radii, sites=[*sites, "end 0", *sites, "end 1", *sites, "end 2"])
 
     def state(self, qpos, qvel, near=None):
         state = np.concatenate([qpos, qvel], axis=-1)

@@ -27,7 +27,7 @@ class Effort(ls.Constraint):
     def __init__(self, most: float, power: float = 1e3) -> None:
         self.most, self.power = most, power
 
-    def bind(self, dynamics: ls.Dynamics) -> ls.ConstraintTerm:
+    def bind(self, dynamics: ls.Dynamics) -> ls.types.ConstraintTerm:
         source = """\
 def value(x, u, t, row, data):
     if row == 0:
@@ -44,7 +44,7 @@ def slope(x, u, t, row, data, gradient):
             gradient[4 + i] -= x[2 + i]
 """
         numbers = np.array([self.most, self.power])
-        return ls.ConstraintTerm(source, numbers, 2, lambda row: ("effort", "power")[row], uses_control=True)
+        return ls.types.ConstraintTerm(source, numbers, 2, lambda row: ("effort", "power")[row], uses_control=True)
 
 
 def balls(*places: tuple[float, float, float], velocity: tuple[float, float] = (0.0, 0.0)) -> ls.World:

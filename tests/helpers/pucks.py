@@ -76,7 +76,7 @@ def solution() -> ls.Solution:
         gain=np.tile(gain, (STEPS, 1, 1)), offset=np.zeros((STEPS, 2)), nominal=np.zeros((STEPS, 4)), dt=DT,
         state_coordinates=space, control_coordinates=controls,
     )  # fmt: skip
-    value = ls.Quadratic(np.tile(np.eye(4), (STEPS + 1, 1, 1)), np.zeros((STEPS + 1, 4)), np.zeros(STEPS + 1))
+    value = ls.types.Quadratic(np.tile(np.eye(4), (STEPS + 1, 1, 1)), np.zeros((STEPS + 1, 4)), np.zeros(STEPS + 1))
     return replace(by_hand(plan, policy), goal=np.zeros(4), cost_to_go=value)
 
 

@@ -80,8 +80,8 @@ def scenario(goal_x: float = 1.2, goal_y: float = 0.3) -> ls.Scenario:
         problem=problem,
         tracking_bound=1e-3,
         disturbances=(
-            ls.ControlNoise(0.05),
-            ls.ForceNoise((0.05, 0.05, 0.0)),
-            ls.MeasurementNoise((0.005, 0.005, 0.02, 0.02)),
+            ls.disturbances.ControlNoise(0.05),
+            ls.disturbances.ForceNoise((0.05, 0.05, 0.0)),
+            ls.disturbances.MeasurementNoise((0.005, 0.005, 0.02, 0.02)),
         ),
     )

@@ -33,13 +33,13 @@ from lqrsim.scenes.world import SPACE, World
 
 
 @dataclass(frozen=True)
-class Places:
+class SphereCenters:
     """Where balls are, made for one system: what gets compiled, and the numbers it reads.
 
     Attributes:
       source: defines `places(x, data, out)`, which writes three coordinates a ball, ball by ball, and
         `places_jacobian(x, data, out, slopes)`, which writes them and the derivatives in the states (3 K, N) that are
-        not zero, to zeros. As the source of a `costs.Term`.
+        not zero, to zeros. As the source of a `costs.CostTerm`.
       data: (any,) float64, which the source reads from the first on, after the addresses of its functions.
       depends_on: the states that the places depend on, by their indices.
       in_plane: whether they are places in the plane of the robot's position, the third coordinate 0; or in space.
@@ -55,16 +55,18 @@ class Places:
     @functools.cached_property
     def code(self) -> Source:
         """The source, checked. Raises InputError."""
-        return check_source("Places", self.source, {"places": 3, "places_jacobian": 4})
+        return check_source("SphereCenters", self.source, {"places": 3, "places_jacobian": 4})
 
     def __post_init__(self) -> None:
         _ = self.code
-        object.__setattr__(self, "data", check_array("Places: data", self.data, (None,), infinite=True))
-        given = check_items("Places: depends_on", self.depends_on, (int, np.integer), "a tuple of indices of states")
-        indices = tuple(check_count("Places: depends_on", i, at_least=0) for i in given)
+        object.__setattr__(self, "data", check_array("SphereCenters: data", self.data, (None,), infinite=True))
+        given = check_items(
+            "SphereCenters: depends_on", self.depends_on, (int, np.integer), "a tuple of indices of states"
+        )
+        indices = tuple(check_count("SphereCenters: depends_on", i, at_least=0) for i in given)
         object.__setattr__(self, "depends_on", indices)
-        object.__setattr__(self, "in_plane", check_flag("Places: in_plane", self.in_plane))
-        functions = check_items("Places: functions", self.functions, UserFunction, "a tuple of UserFunction")
+        object.__setattr__(self, "in_plane", check_flag("SphereCenters: in_plane", self.in_plane))
+        functions = check_items("SphereCenters: functions", self.functions, UserFunction, "a tuple of UserFunction")
         object.__setattr__(self, "functions", functions)
 
     @property
@@ -85,7 +87,7 @@ class Places:
         return world.seen_by(space.plane, space.offset) if self.in_plane else world.seen_by(SPACE)
 
 
-class Balls:
+class CollisionSpheres:
     """A robot's outline as balls that its state moves: the links of an arm, the rotors of a quadrotor.
 
         def rotors(x, p):
@@ -93,7 +95,7 @@ class Balls:
             arms = [(0.2, 0, 0), (0, 0.2, 0), (-0.2, 0, 0), (0, -0.2, 0)]
             return [[a + b for a, b in zip(x[:3], ls.rotations.rotate(r, arm))] for arm in arms]
 
-        ls.Balls(rotors, [0.12] * 4)
+        ls.CollisionSpheres(rotors, [0.12] * 4)
 
     `ObstacleCost(world, balls=...)` and `Clearance(world, balls=...)` keep all of them clear, and the `balls` of a
     `Robot` are what collides when it is run. A robot without any is one ball at its position. `Capsule` makes chains.
@@ -136,42 +138,46 @@ class Balls:
         if jacobian is not None:
             if self.level == "symbolic":
                 wanted = "none (it is derived) or level='compiled' or 'plain'"
-                raise InputError(f"Balls: jacobian: got one for {name_of(places)}, which is symbolic, want {wanted}")
-            check_function("Balls: jacobian", jacobian, "a function of (x, p, slopes)")
+                raise InputError(
+                    f"CollisionSpheres: jacobian: got one for {name_of(places)}, which is symbolic, want {wanted}"
+                )
+            check_function("CollisionSpheres: jacobian", jacobian, "a function of (x, p, slopes)")
             level_of(jacobian, self.level)
             check_signature(jacobian, ("x", "p", "slopes"))
         self.function, self.jacobian = places, jacobian
         self._set_balls(radii, names, sites)
         if isinstance(depends_on, str):
             said = excerpt(depends_on)
-            raise InputError(f"Balls: depends_on: got {said}, want a tuple of names: ({said},)")
+            raise InputError(f"CollisionSpheres: depends_on: got {said}, want a tuple of names: ({said},)")
         self.depends_on = None
         if depends_on is not None:
             if self.level == "symbolic":
-                raise InputError("Balls: depends_on: got names for a symbolic function, want None: they are derived")
-            self.depends_on = check_items("Balls: depends_on", depends_on, str, "a tuple of names of states")
+                raise InputError(
+                    "CollisionSpheres: depends_on: got names for a symbolic function, want None: they are derived"
+                )
+            self.depends_on = check_items("CollisionSpheres: depends_on", depends_on, str, "a tuple of names of states")
 
     def _set_balls(self, radii: npt.ArrayLike, names: Sequence[str] | None, sites: Sequence[str | None] | None) -> None:
         """What each ball has, checked."""
-        self.radii = check_array("Balls: radii", radii, (None,))
+        self.radii = check_array("CollisionSpheres: radii", radii, (None,))
         count = len(self.radii)
         if not count:
-            raise InputError("Balls: radii: got none, want one a ball, at least one")
+            raise InputError("CollisionSpheres: radii: got none, want one a ball, at least one")
         if (self.radii < 0).any():
             k = int(np.argmax(self.radii < 0))
-            raise InputError(f"Balls: radii: got {self.radii[k]:g} for ball {k}, want at least 0")
+            raise InputError(f"CollisionSpheres: radii: got {self.radii[k]:g} for ball {k}, want at least 0")
         wanted = f"{count} different texts, one a ball"
         self.names = tuple(f"ball {k}" for k in range(count))
         if names is not None:
-            self.names = check_items("Balls: names", names, str, wanted)
+            self.names = check_items("CollisionSpheres: names", names, str, wanted)
             if len(set(self.names)) < count or len(self.names) != count:
-                raise InputError(f"Balls: names: got {excerpt(self.names)}, want {wanted}")
+                raise InputError(f"CollisionSpheres: names: got {excerpt(self.names)}, want {wanted}")
         self.sites: tuple[str | None, ...] = (None,) * count
         if sites is not None:
             wanted = f"{count} names of sites or geoms, one a ball, or None in place of one"
-            self.sites = check_items("Balls: sites", sites, (str, type(None)), wanted)
+            self.sites = check_items("CollisionSpheres: sites", sites, (str, type(None)), wanted)
             if len(self.sites) != count:
-                raise InputError(f"Balls: sites: got {len(self.sites)}, want {wanted}")
+                raise InputError(f"CollisionSpheres: sites: got {len(self.sites)}, want {wanted}")
 
     def __len__(self) -> int:
         return len(self.radii)
@@ -181,14 +187,14 @@ class Balls:
         """What messages call the function."""
         return f"{name_of(self.function)}(x, p)"
 
-    def bind(self, dynamics: Dynamics) -> Places:
+    def bind(self, dynamics: Dynamics) -> SphereCenters:
         """Bind the places to a system.
 
         Args:
           dynamics: of the system whose states move the balls.
 
         Returns:
-          The `Places`.
+          The `SphereCenters`.
 
         Raises:
           InputError: the places do not fit the system.
@@ -202,7 +208,7 @@ class Balls:
             source=str, size=int, depends_on=list,
         )  # fmt: skip
         self._check_plane(made["size"], dynamics.state_coordinates)
-        return Places(made["source"], dynamics.data, tuple(made["depends_on"]), made["size"] == 2)
+        return SphereCenters(made["source"], dynamics.data, tuple(made["depends_on"]), made["size"] == 2)
 
     def _trace(self, n: int, parameters: Mapping[str, float], constants: Mapping[str, float]) -> dict[str, Any]:
         sizes: set[int] = set()
@@ -237,10 +243,10 @@ class Balls:
             "depends_on": sorted({int(target[:-1].split(", ")[1]) for target in slopes}),
         }
 
-    def _bind_functions(self, dynamics: Dynamics) -> Places:
+    def _bind_functions(self, dynamics: Dynamics) -> SphereCenters:
         names, parameters = dynamics.state_coordinates.names, tuple(dynamics.parameters)
         wanted = names if self.depends_on is None else self.depends_on
-        axes = tuple(sorted({names.index(check_name("Balls: depends_on", name, names)) for name in wanted}))
+        axes = tuple(sorted({names.index(check_name("CollisionSpheres: depends_on", name, names)) for name in wanted}))
         rest: dict[str, Any] = {"level": self.level, "states": len(names), "controls": 0, "parameters": parameters}
         rest |= {"offset": 1 if self.jacobian is None else 2, "with_control": False}
         size = self._size_of(dynamics)
@@ -253,10 +259,10 @@ class Balls:
         if self.jacobian is not None:
             shape = len(self), size, len(names)
             functions += (UserFunction(function=self.jacobian, writes=(shape,), **rest),)
-            return Places(source_of(function_places, **filled), dynamics.data, axes, size == 2, functions)
+            return SphereCenters(source_of(function_places, **filled), dynamics.data, axes, size == 2, functions)
         given = source_of(function_places, **filled)
         source = source_of(place_differences, PLACES=coordinates, AXES=axes).filled(places=given)
-        return Places(source, dynamics.data, axes, size == 2, functions)
+        return SphereCenters(source, dynamics.data, axes, size == 2, functions)
 
     def _size_of(self, dynamics: Dynamics) -> int:
         """How many coordinates a compiled or plain function returns of each ball, which is seen by trying it."""
@@ -302,7 +308,7 @@ class Balls:
         return dynamics.state_coordinates.in_world(found[..., :2]) if places.in_plane else found
 
 
-def check_outline(field: str, radius: float | None, balls: Balls | None) -> float:
+def check_outline(field: str, radius: float | None, balls: CollisionSpheres | None) -> float:
     """The radius of what an obstacle is kept clear of, checked; of balls, that of the largest.
 
     Raises:
@@ -310,14 +316,16 @@ def check_outline(field: str, radius: float | None, balls: Balls | None) -> floa
     """
     if balls is None and radius is not None:
         return check_number(f"{field}: radius", radius, at_least=0.0)
-    check_kind(f"{field}: balls", balls, (Balls, type(None)), "Balls(places, radii)")
+    check_kind(f"{field}: balls", balls, (CollisionSpheres, type(None)), "CollisionSpheres(places, radii)")
     if balls is None or radius is not None:
         given = "neither radius nor balls" if balls is None else "radius and balls"
         raise InputError(f"{field}: got {given}, want one of them: radius=robot.radius or balls=robot.balls")
     return float(balls.radii.max())
 
 
-def bind_outline(field: str, balls: Balls | None, dynamics: Dynamics, world: World) -> tuple[Places | None, World]:
+def bind_outline(
+    field: str, balls: CollisionSpheres | None, dynamics: Dynamics, world: World
+) -> tuple[SphereCenters | None, World]:
     """The balls' places, None for a robot that is one at its position, and the world as they see it.
 
     Raises:
@@ -333,7 +341,7 @@ def bind_outline(field: str, balls: Balls | None, dynamics: Dynamics, world: Wor
     return None, world.seen_by(space.plane, space.offset)
 
 
-def evaluate(places: Places, count: int, states: npt.ArrayLike) -> Array:
+def evaluate(places: SphereCenters, count: int, states: npt.ArrayLike) -> Array:
     """Where so many balls are, compiled: (..., count, 3) at states (..., n), as `places` has it."""
     given = np.asarray(states, dtype=np.float64)
     flat = in_c_order(given.reshape(-1, given.shape[-1]))
@@ -342,7 +350,7 @@ def evaluate(places: Places, count: int, states: npt.ArrayLike) -> Array:
     return out.reshape(*given.shape[:-1], count, 3)
 
 
-def evaluate_slopes(places: Places, count: int, states: Array) -> tuple[Array, Array]:
+def evaluate_slopes(places: SphereCenters, count: int, states: Array) -> tuple[Array, Array]:
     """Where so many balls are (K, count, 3), and the derivatives in the states (K, count, 3, n), at states (K, n)."""
     flat = in_c_order(states)
     out, slopes = np.empty((len(flat), 3 * count)), np.zeros((len(flat), 3 * count, flat.shape[1]))
@@ -350,7 +358,7 @@ def evaluate_slopes(places: Places, count: int, states: Array) -> tuple[Array, A
     return out.reshape(-1, count, 3), slopes.reshape(len(flat), count, 3, -1)
 
 
-def _call(places: Places, name: str, states: Array, *outputs: Array) -> None:
+def _call(places: SphereCenters, name: str, states: Array, *outputs: Array) -> None:
     """Call a function of `kernels/ball_places.py`; what a user's function raises comes through."""
     filled = source_of(ball_places).filled(places=places.code, places_jacobian=places.code)
     module = module_of(filled, f"places of balls ({states.shape[1]} states)", N=states.shape[1])
@@ -363,7 +371,7 @@ def _call(places: Places, name: str, states: Array, *outputs: Array) -> None:
             raise error
 
 
-def clearances(balls: Balls, dynamics: Dynamics, world: World, states: npt.ArrayLike, times: Array) -> Array:
+def clearances(balls: CollisionSpheres, dynamics: Dynamics, world: World, states: npt.ArrayLike, times: Array) -> Array:
     """Signed distance of each ball to the nearest obstacle minus its radius, (T, K).
 
     At states (T, n), and for obstacles that move at the times (T,) in s.

@@ -1,0 +1,36 @@
+"""Records that other functions return or take, for annotations and for extensions."""
+
+from lqrsim.control.chance_constrained import SafePlan
+from lqrsim.control.replanner import ReplanRecord
+from lqrsim.control.tubes import Tube
+from lqrsim.problem.collision_spheres import SphereCenters
+from lqrsim.problem.constraints import ConstraintTerm
+from lqrsim.problem.costs import CostTerm
+from lqrsim.problem.derivative_check import DerivativeCheck
+from lqrsim.results.replan import Replan
+from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers
+from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
+from lqrsim.simulation.plant_check import PlantCheck
+from lqrsim.solvers.prepared import PreparedSolver
+from lqrsim.verify.verdict import Verification
+
+__all__ = [
+    "Candidate",
+    "Certificate",
+    "ConstraintTerm",
+    "CostTerm",
+    "DerivativeCheck",
+    "Iteration",
+    "Moments",
+    "Multipliers",
+    "PlantCheck",
+    "PreparedSolver",
+    "Quadratic",
+    "Replan",
+    "ReplanRecord",
+    "SafePlan",
+    "SphereCenters",
+    "TotalCost",
+    "Tube",
+    "Verification",
+]
