@@ -92,7 +92,7 @@ def test_every_class_is_found_by_its_name_and_exported():
     assert set(EXAMPLES) == set(KINDS)
     for name, kind in KINDS.items():
         assert kind.__name__ == name
-        assert kind is getattr(ls, name) is getattr(disturbances, name)
+        assert kind is getattr(ls.disturbances, name) is getattr(disturbances, name)
         assert dataclasses.is_dataclass(kind)
         assert dataclasses.fields(kind)
         assert kind.__doc__

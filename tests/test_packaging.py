@@ -69,6 +69,39 @@ def test_sdist_is_complete(built: Path) -> None:
     } <= inside
 
 
+# Optional packages as if they were not installed: neither modules nor metadata.
+WITHOUT = """
+import importlib.metadata, sys
+
+OPTIONAL = ("casadi", "crocoddyl", "distributed", "gymnasium", "numba", "rerun")
+found = importlib.metadata.Distribution.from_name.__func__
+
+
+def from_name(cls, name):
+    if name.partition("-")[0] in OPTIONAL:
+        raise importlib.metadata.PackageNotFoundError(name)
+    return found(cls, name)
+
+
+importlib.metadata.Distribution.from_name = classmethod(from_name)
+sys.modules.update(dict.fromkeys(OPTIONAL))
+import lqrsim as ls
+
+for name in ls.scenarios.names():
+    problem = ls.scenarios.get(name).problem
+    solution = ls.smooth(problem, starts=1)
+    assert solution.success, solution
+ls.save(solution, "solution.npz")
+assert ls.load("solution.npz", ls.Solution).cost == solution.cost
+"""
+
+
+def test_solves_without_optional_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From formulas to a file, with nothing cached; some 10 s."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    run(sys.executable, "-c", WITHOUT, cwd=tmp_path)
+
+
 @pytest.mark.long
 def test_wheel_solves_from_an_empty_environment(built: Path, tmp_path: Path) -> None:
     """Installs for real, with the dependencies that the wheel names and no others: 15 s where pip has them cached."""

@@ -100,7 +100,7 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
     effect = {"initial_states": lambda states: states, "alter": print_nothing, "measure": hook,
               "actuate": hook, "force": nothing_of_three, "torque": nothing_of_three,
               "displaced": np.zeros((1, len(plant.world), 3))}  # fmt: skip
-    disturbances = {name: getattr(ls, name)(**arguments) for name, arguments in DISTURBANCES.items()}
+    disturbances = {name: getattr(ls.disturbances, name)(**arguments) for name, arguments in DISTURBANCES.items()}
     for name, one in disturbances.items():  # those whose arguments are all optional
         DISTURBANCES[name] = {field.name: getattr(one, field.name) for field in dataclasses.fields(one) if field.init}
     noise, robot = disturbances["ControlNoise"], place.scenario.robot
@@ -111,7 +111,7 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
         "GilbertElliott": (dataclasses.asdict(GilbertElliott(0.1, 0.5)), 0.5),
         **{
             f"simulate {name}": (
-                {"call": functools.partial(simulate_kind, getattr(ls, name)), "plant": plant, "solution": solution}
+                {"call": functools.partial(simulate_kind, getattr(ls.disturbances, name)), "plant": plant, "solution": solution}
                 | DISTURBANCES[name],
                 0.3,
             )

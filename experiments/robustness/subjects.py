@@ -82,6 +82,12 @@ def _own(item: type, key: str) -> int:
     return 0 if isinstance(inspect.getattr_static(item, key), classmethod | staticmethod) else 1
 
 
+def _offered(name: str) -> Any:
+    """A public name, in whichever room it is."""
+    rooms = (ls, ls.disturbances, ls.lq, ls.stress, ls.types, ls.view)
+    return next(getattr(room, name) for room in rooms if name in room.__all__)
+
+
 def subjects(folder: Path) -> dict[str, Subject]:
     """Arguments for every public callable; some of them are solved for and run, and files of them written."""
     logging.getLogger("lqrsim").setLevel(logging.ERROR)
@@ -92,9 +98,9 @@ def subjects(folder: Path) -> dict[str, Subject]:
             owner, _, method = name.partition(".")
             if "call" in arguments:
                 call = arguments.pop("call")
-            elif method and not isinstance(getattr(ls, owner), ModuleType):
-                call = getattr(arguments.pop("self", getattr(ls, owner)), method)
+            elif method and not isinstance(_offered(owner), ModuleType):
+                call = getattr(arguments.pop("self", _offered(owner)), method)
             else:
-                call = getattr(getattr(ls, owner), method) if method else getattr(ls, owner)
+                call = getattr(_offered(owner), method) if method else _offered(owner)
             found[name] = Subject(call, arguments, *weight, raises=RAISES.get(name, ()))
     return found

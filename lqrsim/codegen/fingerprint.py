@@ -47,9 +47,17 @@ def fingerprint(function: Any) -> str | None:
         return None
 
 
+def _version(name: str) -> str:
+    """Of a package; numba need not be there, and no function can refer to it then."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
 @functools.cache
 def _versions() -> tuple[str, ...]:
-    installed = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES if name != "math")
+    installed = (f"{name} {_version(name)}" for name in _PACKAGES if name != "math")
     return (
         sys.version,
         *installed,
