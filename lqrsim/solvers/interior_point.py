@@ -114,33 +114,13 @@ class Stages:
     """
 
     def __init__(self, problem: Problem) -> None:
-        self.problem, self.steps = problem, problem.steps
         n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
         self.n, self.m, steps = n, m, problem.steps
-        self.free = np.full(n, 0.0 if isinstance(problem.initial, FixedState) else 1.0)
-        self._soft = 0 if isinstance(problem.initial, FixedState) else 1
-        terms = problem.constraint_terms
-        own = [compiled.no_multipliers(problem, term) for term in terms]
-        self._model = compiled.arguments(problem, multipliers=own, second_order=True)
         self._module = module_of(source_of(kernel), f"interior point, {n} states and {m} controls", N=n, M=m, W=n + m)
-        self._costs = compiled.costs_module(problem)
-        self._values = tuple(np.empty((steps + 1) * term.rows) for term in terms)
-
-        limits = self._model.limits
-        self.low, self.high = limits.low, limits.high
-        self.limits = [
-            (sign, i, side[i]) for sign, side in ((1.0, limits.low), (-1.0, limits.high)) for i in range(m)
-            if np.isfinite(side[i])
-        ]  # fmt: skip
-        counts = [term.rows for term in terms]
-        rows = sum(counts) + len(self.limits)
-        self.equality = np.repeat([*(term.equality for term in terms), False], [*counts, len(self.limits)]).astype(bool)
-        self.owners = np.repeat([*range(len(terms)), -1], [*counts, len(self.limits)])
-        self.live = np.ones((steps + 1, rows), dtype=bool)
-        for k, (term, array) in enumerate(zip(terms, own, strict=True)):
-            self.live[: int(array[2]), self.owners == k] = False
-            self.live[steps, self.owners == k] &= not term.uses_control
-        self.live[steps, self.owners == -1] = False
+        self._take(problem)
+        counts = [term.rows for term in problem.constraint_terms]
+        rows = len(self.owners)
+        self._values = tuple(np.empty((steps + 1) * count) for count in counts)
         self.slopes = np.zeros((steps + 1, rows, n + m))
         for row, (sign, i, _) in enumerate(self.limits, start=sum(counts)):
             self.slopes[:steps, row, n + i] = sign
@@ -153,6 +133,40 @@ class Stages:
         self.gain, self.offset = np.zeros((steps, m, n)), np.zeros((steps, m))
         self.to_go = CostToGo(np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1))
         self.changes = Plan(np.zeros((steps + 1, n)), np.zeros((steps, m)))
+
+    def _take(self, problem: Problem) -> None:
+        """Take a problem's numbers, and which of its rows can act."""
+        self.problem, self.steps = problem, problem.steps
+        fixed, steps = isinstance(problem.initial, FixedState), problem.steps
+        self.free, self._soft = np.full(self.n, 0.0 if fixed else 1.0), 0 if fixed else 1
+        terms = problem.constraint_terms
+        own = [compiled.no_multipliers(problem, term) for term in terms]
+        self._model = compiled.arguments(problem, multipliers=own, second_order=True)
+        self._costs = compiled.costs_module(problem)
+        limits = self._model.limits
+        self.low, self.high = limits.low, limits.high
+        self.limits = [
+            (sign, i, side[i]) for sign, side in ((1.0, limits.low), (-1.0, limits.high)) for i in range(self.m)
+            if np.isfinite(side[i])
+        ]  # fmt: skip
+        counts = [*(term.rows for term in terms), len(self.limits)]
+        self.equality = np.repeat([*(term.equality for term in terms), False], counts).astype(bool)
+        self.owners = np.repeat([*range(len(terms)), -1], counts)
+        self.live = np.ones((steps + 1, sum(counts)), dtype=bool)
+        for k, (term, array) in enumerate(zip(terms, own, strict=True)):
+            self.live[: int(array[2]), self.owners == k] = False
+            self.live[steps, self.owners == k] &= not term.uses_control
+        self.live[steps, self.owners == -1] = False
+
+    def renewed(self, problem: Problem) -> "Stages":
+        """Those of a problem of the same structure, in the memory of these if it has as many steps and rows."""
+        owners, limits, steps = self.owners, [one[:2] for one in self.limits], self.steps
+        self._take(problem)
+        same = steps == self.steps and np.array_equal(owners, self.owners)
+        if not same or limits != [one[:2] for one in self.limits]:
+            return Stages(problem)
+        self._rows.support[...] = 0.0
+        return self
 
     def values(self, plan: Plan) -> Array:
         """The rows' numbers (T+1, R); of no meaning where they do not act."""
@@ -177,9 +191,13 @@ class Stages:
         support[...] = np.maximum(support, (self.slopes != 0).any(axis=0))
         return cost
 
+    def act_at(self, plan: Plan) -> None:
+        """Find out which rows act."""
+        self.live &= ~np.isposinf(self.values(plan))  # so a constraint says that it does not act at a step
+
     def look_about(self, plan: Plan) -> None:
         """Find out which rows act, and which entries each depends on: slopes at the plan or a little beside it tell."""
-        self.live &= ~np.isposinf(self.values(plan))  # so a constraint says that it does not act at a step
+        self.act_at(plan)
         wiggle = np.sin(1.0 + np.arange(self.n + self.m))
         nowhere, none = np.zeros((self.steps + 1, self.n)), np.zeros(self.live.shape)
         for far in (1e-3, 0.0):
@@ -187,7 +205,12 @@ class Stages:
             self.linearize(beside, nowhere, none, np.inf)
 
     def sizes(self, plan: Plan) -> Sizes:
-        """By how much things change, as far as a plan and the problem tell.
+        """By how much things change, as far as a plan and the problem tell."""
+        self.look_about(plan)
+        return self.sizes_of(plan)
+
+    def sizes_of(self, plan: Plan) -> Sizes:
+        """The same of a plan about which the models are.
 
         A control without limits has the size with which it moves states by theirs.
         """
@@ -196,7 +219,6 @@ class Stages:
         if problem.goal is not None and problem.start is not None:
             reach = np.maximum(reach, np.abs(np.nan_to_num(problem.goal - problem.start)))
         states = np.where(reach > 1e-3, reach, 1.0)
-        self.look_about(plan)
         moved = np.abs(self.models.jacobian[:, :, self.n :]).sum(axis=0) / states[:, None]
         enough = np.maximum(1 / np.maximum(moved.max(axis=0), 1e-6), np.abs(plan.controls).max(axis=0))
         controls = np.where(np.isfinite(self.high - self.low), self.high - self.low, enough)
