@@ -41,9 +41,9 @@ class ActiveSet:
       violation: by how much equalities may be missed; a share of that is what inequalities are to have to spare.
 
     Attributes:
-      plan: where the steps have come to. force, held: of the live rows (K,) the multipliers, and which are held at zero.
-      measures: of the plan. sizes: by how much things change. hopeless: whether it is an optimum but for rows that no
-        multiplier brings to be kept.
+      plan: where the steps have come to. measures: of that. force, held: of the live rows (K,) the multipliers, and
+        which are held at zero. sizes: by how much things change. hopeless: whether it is an optimum but for rows that
+        no multiplier brings to be kept.
     """
 
     def __init__(self, stages: Stages, plan: Plan, multipliers: tuple[Array, ...], violation: float) -> None:
@@ -59,7 +59,9 @@ class ActiveSet:
         self._limit = np.broadcast_to(stages.owners == -1, shape)[live]
         self._aim = np.where(self._equality | self._limit, 0.0, INSIDE * violation)
         self._costates = np.zeros((stages.steps + 1, stages.n))
-        stages.linearize(plan, self._costates, np.zeros(shape), np.inf)
+        self._where = np.nonzero(live)
+        stages.second_order(plan, self._costates, np.zeros(shape), np.inf, second=False)
+        stages.convexify(plan)
         self.sizes = stages.sizes_of(plan)
         self._size = np.broadcast_to(self.sizes.rows, shape)[live]
         self._costates, _ = self._adjoint()
@@ -92,10 +94,11 @@ class ActiveSet:
         The gains are those of a step with a price on missing the rows that press, and zero at limits.
         """
         stages, low, high = self.stages, self.stages.low, self.stages.high
-        sigma = np.where(self._limit, 1 / REGULARISATION, PENALTY) * self.held * self._scale / self._size**2
-        soft, none = stages.curvature(sigma), np.zeros((stages.steps, stages.n))
+        sigma = np.where(self._limit, 1 / REGULARISATION, PENALTY) * self._scale / self._size**2
+        none = np.zeros((stages.steps, stages.n))
         for share in MIXES:
-            if stages.direction(self._hessian(share) + soft, stages.models.gradient, none):
+            models = self._with(self._hessian(share), stages.models.gradient, self.held, sigma, np.zeros(len(sigma)))
+            if stages.direction(*models, none):
                 break
         else:
             stages.gain[...] = 0.0
@@ -120,7 +123,8 @@ class ActiveSet:
     def _measure(self) -> None:
         """Make the models about the plan, and work out the measures."""
         stages = self.stages
-        cost = stages.linearize(self.plan, self._costates, stages.spread(self.force), 0.0)
+        cost = stages.second_order(self.plan, self._costates, stages.spread(self.force), 0.0)
+        self._convex = False
         self._numbers = stages.values(self.plan)[stages.live]
         self._gaps = stages.models.arrived - self.plan.states[1:]
         self._scale = max(abs(cost), 1e-6 * self.sizes.cost) if np.isfinite(cost) else np.nan
@@ -176,8 +180,8 @@ class ActiveSet:
         for pivot in range(most + 1):
             sigma = np.where(held, self._scale / (REGULARISATION * self._size**2), 0.0)
             force = np.where(held, self.force, 0.0)
-            gradient = stages.models.gradient - stages.pull(force - sigma * numbers)
-            if not stages.direction(hessian + stages.curvature(sigma), gradient, self._gaps):
+            models = self._with(hessian, stages.models.gradient, held, sigma, sigma * numbers - force)
+            if not stages.direction(*models, self._gaps):
                 return None
             ahead = numbers + np.matmul(stages.slopes, stages.joined()[:, :, None])[:, :, 0][stages.live]
             force = force - sigma * ahead
@@ -199,7 +203,22 @@ class ActiveSet:
 
     def _hessian(self, share: float) -> Array:
         models = self.stages.models
-        return models.hessian if share == 0 else (1 - share) * models.hessian + share * models.convex
+        if share == 0:
+            return models.hessian
+        if not self._convex:
+            self.stages.convexify(self.plan)
+            self._convex = True
+        return (1 - share) * models.hessian + share * models.convex if share < 1 else models.convex
+
+    def _with(self, hessian: Array, gradient: Array, held: Flags, weights: Array, pulls: Array) -> tuple[Array, Array]:
+        """A Hessian and a gradient with what the rows (K,) that are held add: by a weight, and by a slope."""
+        rows = np.flatnonzero(held)
+        steps = self._where[0][rows]
+        slopes = self.stages.slopes[steps, self._where[1][rows]]
+        hessian, gradient = hessian.copy(), gradient.copy()
+        np.add.at(hessian, steps, weights[rows, None, None] * slopes[:, :, None] * slopes[:, None, :])
+        np.add.at(gradient, steps, pulls[rows, None] * slopes)
+        return hessian, gradient
 
 
 def _last(wrong: Flags) -> Flags:

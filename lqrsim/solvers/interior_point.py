@@ -13,11 +13,11 @@ p. A highest multiplier is the price, in cost a unit, for which a constraint may
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from lqrsim.codegen.compiled_module import in_c_order, module_of
+from lqrsim.codegen.compiled_module import Call, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import interior_point as kernel
@@ -117,6 +117,7 @@ class Stages:
         n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
         self.n, self.m, steps = n, m, problem.steps
         self._module = module_of(source_of(kernel), f"interior point, {n} states and {m} controls", N=n, M=m, W=n + m)
+        self._calls: dict[str, Call] = {}
         self._take(problem)
         counts = [term.rows for term in problem.constraint_terms]
         rows = len(self.owners)
@@ -168,6 +169,13 @@ class Stages:
         self._rows.support[...] = 0.0
         return self
 
+    def _call(self, name: str, *arguments: Any) -> Any:
+        """Call a compiled function; what is the same as the last time is not laid out again."""
+        call = self._calls.get(name)
+        if call is None:
+            call = self._calls[name] = self._module.lay_out(name, *arguments)
+        return call(*arguments)
+
     def values(self, plan: Plan) -> Array:
         """The rows' numbers (T+1, R); of no meaning where they do not act."""
         if self._values:
@@ -181,15 +189,27 @@ class Stages:
     def trial(self, plan: Plan) -> tuple[float, Array]:
         """The cost of a plan, and where its steps lead (T, n)."""
         arrived = np.empty((self.steps, self.n))
-        return self._module.trial(self.steps, self._soft, plan, self._model, arrived), arrived
+        return self._call("trial", self.steps, self._soft, plan, self._model, arrived), arrived
 
     def linearize(self, plan: Plan, costates: Array, multipliers: Array, least: float) -> float:
         """Make the models about a plan, with costates (T+1, n) and multipliers (T+1, R); return its cost."""
-        support = self._rows.support
+        cost = self.second_order(plan, costates, multipliers, least)
+        self.convexify(plan)
+        return cost
+
+    def second_order(
+        self, plan: Plan, costates: Array, multipliers: Array, least: float, *, second: bool = True
+    ) -> float:
+        """The same without the projected Hessians; without `second`, nor those of the steps and constraints."""
         rows = self._rows._replace(least=float(least), multipliers=in_c_order(multipliers).reshape(-1))
-        cost = self._module.models(self.steps, self._soft, plan, costates, self._model, rows, self.models)
+        cost = self._call("models", self.steps, self._soft, int(second), plan, costates, self._model, rows, self.models)
+        support = rows.support
         support[...] = np.maximum(support, (self.slopes != 0).any(axis=0))
         return cost
+
+    def convexify(self, plan: Plan) -> None:
+        """Make the projected Hessians about a plan."""
+        self._call("convex_models", self.steps, self._soft, plan, self._model, self.models)
 
     def act_at(self, plan: Plan) -> None:
         """Find out which rows act."""
@@ -246,19 +266,19 @@ class Stages:
     def follow(self, plan: Plan, part: float, policy: tuple[Array, Array], limits: Limits) -> Plan:
         """The motion that a part of a step leads to; see the kernel's."""
         out = Plan(np.empty((self.steps + 1, self.n)), np.empty((self.steps, self.m)))
-        self._module.follow(self.steps, float(part), plan, Policy(*policy), limits, self._model, out)
+        self._call("follow", self.steps, float(part), plan, Policy(*policy), limits, self._model, out)
         return out
 
     def adjoint(self, gradient: Array) -> tuple[Array, Array]:
         """Costates (T+1, n) of stages with these gradients (T+1, n+m), and their slopes in the controls (T, m)."""
         costates, slopes = np.zeros((self.steps + 1, self.n)), np.zeros((self.steps, self.m))
-        self._module.adjoint(self.steps, gradient, self.models.jacobian, costates, slopes)
+        self._call("adjoint", self.steps, gradient, self.models.jacobian, costates, slopes)
         return costates, slopes
 
     def direction(self, hessian: Array, gradient: Array, gaps: Array) -> bool:
         """Write the step to the minimum of models, and the costates there; whether there is one."""
-        failed = self._module.direction(
-            self.steps, self.free,
+        failed = self._call(
+            "direction", self.steps, self.free,
             StepModels(in_c_order(hessian), in_c_order(gradient), self.models.jacobian, in_c_order(gaps)),
             Policy(self.gain, self.offset), self.to_go, self.changes,
         )  # fmt: skip

@@ -284,6 +284,9 @@ class _Neighbour:
     def _result(self, active: ActiveSet, solved: bool) -> AttemptResult:
         """Where the plan leads with a policy about it."""
         attempt, work = self._attempt, self._attempt.work
+        if not np.isfinite(active.measures).all():
+            status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS
+            return replace(_unchanged(attempt, self._best), status=status, iterations=tuple(self._iterations))
         plan, gain = active.law()
         cost, _ = self._stages.trial(plan)
         values = work.constraint_values(*plan)
