@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lqrsim.codegen.compiled_module import Call, in_c_order, module_of
+from lqrsim.codegen.compiled_module import Call, CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import interior_point as kernel
@@ -169,22 +169,28 @@ class Stages:
         self._rows.support[...] = 0.0
         return self
 
-    def _call(self, name: str, *arguments: Any) -> Any:
+    def _call(self, name: str, *arguments: Any, module: CompiledModule | None = None) -> Any:
         """Call a compiled function; what is the same as the last time is not laid out again."""
         call = self._calls.get(name)
         if call is None:
-            call = self._calls[name] = self._module.lay_out(name, *arguments)
+            call = self._calls[name] = (module or self._module).lay_out(name, *arguments)
         return call(*arguments)
 
     def values(self, plan: Plan) -> Array:
         """The rows' numbers (T+1, R); of no meaning where they do not act."""
+        numbers = np.empty(self.live.shape)
         if self._values:
-            constraints = self._model.stage.constraints
-            self._costs.evaluate_constraints(self.steps, plan.states, plan.controls, constraints, self._values)
-        shaped = [one.reshape(self.steps + 1, -1) for one in self._values]
-        held = np.concatenate([plan.controls, plan.controls[-1:]])
-        limits = [(sign * (held[:, i] - side))[:, None] for sign, i, side in self.limits]
-        return np.concatenate([*shaped, *limits, np.zeros((self.steps + 1, 0))], axis=1)
+            constraints, costs = self._model.stage.constraints, self._costs
+            self._call("evaluate_constraints", self.steps, *plan, constraints, self._values, module=costs)
+        begin = 0
+        for one in self._values:
+            end = begin + len(one) // (self.steps + 1)
+            numbers[:, begin:end] = one.reshape(self.steps + 1, -1)
+            begin = end
+        for row, (sign, i, side) in enumerate(self.limits, start=begin):
+            numbers[:-1, row] = sign * (plan.controls[:, i] - side)
+            numbers[-1, row] = numbers[-2, row]
+        return numbers
 
     def trial(self, plan: Plan) -> tuple[float, Array]:
         """The cost of a plan, and where its steps lead (T, n)."""
@@ -244,7 +250,7 @@ class Stages:
         controls = np.where(np.isfinite(self.high - self.low), self.high - self.low, enough)
         both = np.concatenate([states, controls])
         counts = np.maximum(self.live.sum(axis=0), 1)
-        rows = np.sqrt(((self.slopes * both) ** 2).sum(axis=2).sum(axis=0) / counts)
+        rows = np.sqrt(np.einsum("trw,trw,w->r", self.slopes, self.slopes, both**2) / counts)
         cost = 0.5 * float(np.abs(np.einsum("tww->w", self.models.convex)) @ both**2)
         return Sizes(states, controls, np.where(rows > 0, rows, 1.0), cost or 1.0)
 

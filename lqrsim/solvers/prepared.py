@@ -25,6 +25,7 @@ from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.interior_point import INTERIOR, InteriorPoint, Measures, Stages, iteration_of
 from lqrsim.solvers.strategy import LITTLE
 
+SLOPES = 1e-6  # of a Lagrangian, relative to the cost; what they promise is about the square of that
 ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
 
 
@@ -59,6 +60,8 @@ def prepare(
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=None, start=None, starts=1,
         constraint_tolerance=constraint_tolerance, finish=finish,
     )  # fmt: skip
+    if tolerance is None and getattr(problem, "constraints", ()) and settings.newton(problem):
+        settings = replace(settings, tolerance=SLOPES)
     return PreparedSolver(problem, settings)
 
 
