@@ -24,7 +24,7 @@ from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measu
 Flags = npt.NDArray[np.bool_]
 
 STEPS = 12  # at most, as two thirds of a second-order step lead nowhere
-PIVOTS, FEW = 40, 4  # of the rows in a convex problem, at most; and in one that need not be
+PIVOTS, FEW = 15, 4  # of the rows in a convex problem, at most; and in one that need not be
 PATIENCE = 3  # pivots that do not bring fewer wrong rows, before they change one at a time
 SHARES = (0.0, 0.3)  # of the convex models in those of a step, tried in turn
 PENALTY = 8.0  # that holds the policy to the constraints, in cost for a change by a row's size

@@ -292,7 +292,9 @@ class Stages:
 
     def joined(self) -> Array:
         """The changes of states and controls side by side, (T+1, n+m)."""
-        return np.concatenate([self.changes.states, np.pad(self.changes.controls, ((0, 1), (0, 0)))], axis=1)
+        joined = np.zeros((self.steps + 1, self.n + self.m))
+        joined[:, : self.n], joined[:-1, self.n :] = self.changes
+        return joined
 
 
 class Point(NamedTuple):

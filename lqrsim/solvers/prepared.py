@@ -82,7 +82,7 @@ class PreparedSolver:
         self._states = problem.dynamics.state_coordinates
         self._controls = problem.applied_coordinates
         self._structure = compiled.structure(problem)
-        self._pace = 0.0  # s, of a slow iteration
+        self._pace, self._closing = 0.0, 0.0  # s, of a slow iteration, and of what follows the last one
         self._idle: list[Stages] = []  # whose memory waits for the next solve
         self._compile()
 
@@ -154,22 +154,25 @@ class PreparedSolver:
         problem = (self.problem if problem is None else self.check(problem)).from_state(state, after=after)
         check_kind("start", start, (Solution, Replan, InitialGuess), "a Solution or a Replan")
         stop = Stop() if time_limit is None else Stop(clock + check_number("time_limit", time_limit, above=0.0))
-        stop.reserve = self._pace
+        stop.reserve = self._pace + self._closing
         guess = start if isinstance(start, InitialGuess) else _initial_guess(start, problem)
         attempt = Attempt.lent(problem, self.settings, guess, np.asarray(state, dtype=np.float64), stop)
         best = _Best(attempt)
         with problem.dynamics.solving(1):
             if problem.constraints and attempt.newton:
                 stages = self._stages_of(problem)
-                found = _Neighbour(attempt, stages, _plan_of(start, best), best).find()
+                neighbour = _Neighbour(attempt, stages, _plan_of(start, best), best)
+                found, ended = neighbour.find(), neighbour.ended
                 self._idle.append(stages)
             else:
                 found = _run(attempt, best)
+                ended = time.perf_counter()
         iterating = best.rolling_out + sum(one.seconds for one in found.iterations)
         self._pace = max(0.5 * self._pace, max((one.seconds for one in found.iterations), default=0.0))
         best.consider(found)
         answer = self._answer(problem, best, found, clock, iterating)
         attempt.give_back()  # but not where something was raised
+        self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
         return answer
 
     def _answer(self, problem: Problem, best: "_Best", found: AttemptResult, clock: float, iterating: float) -> Replan:
@@ -242,13 +245,16 @@ class _Neighbour:
       attempt: with the law and multipliers to begin with. stages: of its problem.
       plan: states and controls that the law belongs to, the first state being the start.
       best: the plan that the law leads to.
+
+    Attributes:
+      ended: when the last iteration did.
     """
 
     def __init__(self, attempt: Attempt, stages: Stages, plan: Plan, best: "_Best") -> None:
         self._attempt, self._stages, self._plan, self._best = attempt, stages, plan, best
         self._allowed = attempt.settings.missed(attempt.problem)
         self._iterations: list[Iteration] = []
-        self._clock, self._cost = time.perf_counter(), np.inf
+        self.ended, self._cost = time.perf_counter(), np.inf
 
     def find(self) -> AttemptResult:
         """Run until it converges or has to stop."""
@@ -261,6 +267,7 @@ class _Neighbour:
         known = tuple(one.values for one in attempt.initial_guess.multipliers)
         with np.errstate(all="ignore"):
             active = ActiveSet(self._stages, self._plan, known, self._allowed)
+            self.ended = time.perf_counter()
             solved = active.run(attempt.final, lambda measures: self._watch(measures, "active set"))
             left = attempt.iterations_left(tuple(self._iterations))
             if not (solved or active.hopeless or stop.due) and left:
@@ -280,8 +287,8 @@ class _Neighbour:
     def _watch(self, measures: Measures, method: str) -> bool:
         """Log an iteration; whether to stop."""
         now = time.perf_counter()
-        self._iterations.append(replace(iteration_of(measures, self._cost, now - self._clock), method=method))
-        self._clock, self._cost = now, measures.cost
+        self._iterations.append(replace(iteration_of(measures, self._cost, now - self.ended), method=method))
+        self.ended, self._cost = now, measures.cost
         return self._attempt.stop.due or not self._attempt.iterations_left(tuple(self._iterations))
 
     def _result(self, active: ActiveSet, solved: bool) -> AttemptResult:
@@ -301,10 +308,6 @@ class _Neighbour:
         status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
         offset = plan.controls - np.einsum("tij,tj->ti", gain, plan.states[:-1])
-        if self._iterations:  # what belongs to an iteration takes its time
-            last = self._iterations[-1]
-            seconds = last.seconds + time.perf_counter() - self._clock
-            self._iterations[-1] = replace(last, seconds=seconds)
         return AttemptResult(
             status=Status.CONVERGED if solved else status, detail=detail, iterations=tuple(self._iterations),
             states=plan.states, controls=plan.controls, law=(gain, offset), cost=cost,
