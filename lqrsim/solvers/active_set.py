@@ -102,7 +102,7 @@ class ActiveSet:
                 break
         else:
             stages.gain[...] = 0.0
-        held = stages.spread(self.held & self._limit)[:-1, stages.owners == -1]
+        held = stages.spread((self.held & self._limit).astype(np.float64))[:-1, stages.owners == -1]
         controls, gain = np.clip(self.plan.controls, low, high), stages.gain.copy()
         for (_, i, side), at in zip(stages.limits, held.T > 0, strict=True):
             controls[at, i], gain[at, i] = side, 0.0
