@@ -1045,9 +1045,11 @@ class TestInteriorPoint:
         plan = Plan(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
         multipliers = rng.uniform(0.1, 1.0, size=stages.live.size)
         rows = stages._rows._replace(least=0.0, support=np.ones((len(stages.owners), 5)), multipliers=multipliers)
-        begun = 3, 1, plan
-        replay(source, SIZES, "models", *begun, rng.normal(size=(4, 3)), stages._model, rows, stages.models)
-        replay(source, SIZES, "trial", *begun, stages._model, np.zeros((3, 3)))
+        begun, costates = (3, 1), rng.normal(size=(4, 3))
+        for second in (0, 1):
+            replay(source, SIZES, "models", *begun, second, plan, costates, stages._model, rows, stages.models)
+        replay(source, SIZES, "convex_models", *begun, plan, stages._model, stages.models)
+        replay(source, SIZES, "trial", *begun, plan, stages._model, np.zeros((3, 3)))
         gradient, jacobian = stages.models.gradient, stages.models.jacobian
         replay(source, SIZES, "adjoint", 3, gradient, jacobian, np.zeros((4, 3)), np.zeros((3, 2)))
         policy = Policy(np.zeros((3, 2, 3)), np.zeros((3, 2)))
