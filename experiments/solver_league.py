@@ -6,9 +6,11 @@
 
 Problems: the nine of Altro.jl as `altro_problems.py` has them, with RK4 for the cart-pole as everywhere here, where the
 original has RK3; `concar`, a car among four random circles, of InteriorPointDDP.jl; a planar quadrotor with a wall to
-get over and a clearance; the paper's quadrotor, whose obstacles are a cost; and an arm of three links among posts. All
-solvers begin with the same: controls and the states that they lead to, or for `escape` states that do not belong
-together.
+get over and a clearance; the paper's quadrotor, whose obstacles are a cost; an arm of three links among posts; a planar
+quadrotor through a gap that it passes tilted, and a rocket that lands, each with a given duration and with a free one.
+All solvers begin with the same: controls and the states that they lead to, or for `escape` and the gap states that do
+not belong together. A free duration begins as the one that is stated, its price is in the cost, and of lqrsim the end
+alone is compared: all of its iterations, with shorter durations that it tries.
 
 lqrsim            ls.smooth with its default settings.
 lqrsim, no finish the same with finish=None and tolerance=1e-8: no Newton steps, and the augmented Lagrangian, with 1e-6

@@ -13,7 +13,7 @@ import numpy as np
 import peers
 import pytest
 import solver_league
-from league import contestants, problems, verification
+from league import contestants, flights, problems, verification
 from peers.shooting import Moment, Shooting
 
 import lqrsim as ls
@@ -140,7 +140,10 @@ def test_concar_is_drawn_within_its_bounds() -> None:
     assert problems.concar(3)[0].digest == problems.concar(3)[0].digest != problems.concar(4)[0].digest
 
 
-@pytest.mark.parametrize("name", ["parallel_park", "zigzag", "escape", "concar", "planar", "quadrotor"])
+TOLD = ("parallel_park", "zigzag", "escape", "concar", "planar", "quadrotor", "gap_least_time", "rocket_free_time")
+
+
+@pytest.mark.parametrize("name", TOLD)
 def test_others_are_told_the_same_problem(name: str) -> None:
     """The cost and the constraints that IPOPT and FATROP are told, at a plan that keeps to nothing but the dynamics."""
     problem, _ = problems.FAMILIES[name].make(0)
@@ -194,3 +197,44 @@ def test_ctrl_c_ends_what_is_solved(plugin: str) -> None:
     with pytest.raises(KeyboardInterrupt):
         [solver.solve(problem, *guess) for _ in range(1000)]
     assert solver.solve(problem, *guess).converged
+
+
+@pytest.mark.parametrize("name", ["gap", "gap_least_time", "rocket", "rocket_free_time"])
+def test_flights_cost_what_ipopt_finds_from_the_same_start(name: str) -> None:
+    """IPOPT's own tolerance leaves some 1e-7 of the cost."""
+    problem, start = problems.FAMILIES[name].make(0)
+    try:
+        theirs = contestants.CONTESTANTS["IPOPT"](problem, compile=False)(problem, start)
+    except peers.Unavailable as error:
+        pytest.skip(str(error))
+    ours = contestants.CONTESTANTS["lqrsim"](problem, compile=False)(problem, start)
+    assert theirs.solved
+    assert ours.solved
+    for one in (ours, theirs):
+        assert verification.verify(problem, one.plan, one.cost).faults == ()
+    assert ours.cost == pytest.approx(theirs.cost, rel=1e-6)
+
+
+def test_the_quadrotor_tilts_in_the_gap() -> None:
+    """The gap's normal is 45 degrees below level, and rotors are clear of its walls within 26 of that.
+
+    At the knot that is nearest to the gap the middle may be some centimetres off, which is worth a few degrees.
+    """
+    problem, start = problems.FAMILIES["gap"].make(0)
+    solution = ls.smooth(problem, start=start)
+    assert solution.status is ls.Status.CONVERGED
+    assert verification.verify(problem, solution.trajectory, solution.cost).faults == ()
+    x, y, roll = solution.trajectory.states[:, :3].T
+    assert np.degrees(roll[np.abs(x - y).argmin()]) == pytest.approx(-45.0, abs=30.0)
+
+
+def test_the_rocket_burns_as_little_or_as_much_as_it_can() -> None:
+    """Least fuel is a matter of switching: no more than three steps are in between. Its price is the cost."""
+    problem, start = problems.FAMILIES["rocket"].make(0)
+    solution = ls.smooth(problem, start=start)
+    assert solution.status is ls.Status.CONVERGED
+    assert verification.verify(problem, solution.trajectory, solution.cost).faults == ()
+    burnt = flights.WET - solution.trajectory.states[-1, 6]
+    assert solution.cost == pytest.approx(flights.PRICE * burnt, rel=1e-9)
+    thrust = np.linalg.norm(solution.trajectory.controls, axis=1)
+    assert np.sum((thrust > 0.0401) & (thrust < 0.1399)) <= 3

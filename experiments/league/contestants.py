@@ -23,7 +23,7 @@ class Run:
     """What came of a solve.
 
     Attributes:
-      plan: what was returned. cost: of it, as the solver has it.
+      plan: what was returned. cost: of it, as the solver has it, with the price of a free duration.
       status: how it says that it ended. solved: whether that is a success.
       exact: when its own measure of optimality was below TOLERANCE; None if never.
       first: the first moment that is enough; None if there is none.
@@ -44,6 +44,10 @@ def _ours(solver: Callable[..., ls.Solution], problem: ls.Problem, *, compile: b
     """`ls.smooth` or `ls.ilqr`. The time is that of the iterations."""
     if solver is ls.ilqr and problem.constraints:
         raise NotImplementedError("constraints")
+    if problem.duration is not None:
+        if solver is ls.ilqr or options.get("finish", "newton") is None:
+            raise NotImplementedError("a free duration")
+        return _ours_in_free_time(partial(solver, **options))
 
     def solve(problem: ls.Problem, start: Start) -> Run:
         solution = solver(problem, start=start, **options)
@@ -60,6 +64,25 @@ def _ours(solver: Callable[..., ls.Solution], problem: ls.Problem, *, compile: b
         return Run(
             plan=solution.trajectory, cost=solution.cost, status=solution.status.name, solved=solution.success,
             exact=next(exact, None), first=partial(_first, moments),
+        )  # fmt: skip
+
+    return solve
+
+
+def _ours_in_free_time(solver: Callable[..., ls.Solution]) -> Solve:
+    """With a free duration. Of its iterations, those with the stated one among them, the end alone is compared.
+
+    The price of time is not in the costs of all of them.
+    """
+
+    def solve(problem: ls.Problem, start: Start) -> Run:
+        log: list[ls.types.Iteration] = []
+        solution = solver(problem, start=start, callback=log.append)
+        cost = solution.cost + problem.time_weight * solution.trajectory.horizon
+        end = Moment(len(log), sum(one.seconds for one in log), cost, solution.violation)
+        return Run(
+            plan=solution.trajectory, cost=cost, status=solution.status.name, solved=solution.success,
+            exact=end if solution.success and solution.optimality <= TOLERANCE else None, first=partial(_first, [end]),
         )  # fmt: skip
 
     return solve
@@ -82,8 +105,9 @@ def _shooting(plugin: Literal["ipopt", "fatrop"], problem: ls.Problem, *, compil
         begun = time.perf_counter()
         answer = solver.solve(problem, *guess)
         seconds = time.perf_counter() - begun
+        dt = problem.dt if answer.duration is None else answer.duration / problem.steps
         return Run(
-            plan=ls.Trajectory(answer.states, answer.controls, problem.dt), cost=answer.cost,
+            plan=ls.Trajectory(answer.states, answer.controls, dt), cost=answer.cost,
             status="solved" if answer.converged else "failed", solved=answer.converged,
             exact=Moment(answer.iterations, seconds, answer.cost, 0.0) if answer.converged else None,
             first=partial(solver.first, problem, *guess, answer.iterations),

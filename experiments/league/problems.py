@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from whole_problems import planar_quadrotor
 
 import lqrsim as ls
+from league import flights
 
 Start = NDArray[np.float64] | ls.Trajectory
 Instance = tuple[ls.Problem, Start]
@@ -126,6 +127,11 @@ FAMILIES = {name: _of_altro(name) for name in altro_problems.CASES} | {
     "planar": Family(make=planar, instances=10),
     "quadrotor": Family(make=quadrotor, instances=10),
     "arm": Family(make=arm),
+    "gap": Family(make=flights.gap),
+    "gap_least_time": Family(make=flights.gap_in_least_time),
+    "rocket": Family(make=flights.rocket),
+    "rocket_free_time": Family(make=flights.rocket_in_free_time),
+    "rocket_least_time": Family(make=flights.rocket_in_least_time),
 }
 
 

@@ -21,8 +21,10 @@ class Verified:
     """What was found.
 
     Attributes:
-      cost: of the plan. motion: by how much a state is off the step from the one before, at most. violation: by how
-        much a constraint, a limit of the controls or the given start is missed, at most.
+      cost: of the plan, with the price of a free duration.
+      motion: by how much a state is off the step from the one before, at most.
+      violation: by how much a constraint, a limit of the controls, a bound of the duration or the given start is
+        missed, at most.
       faults: in words, what is not as it must be; empty where all is.
     """
 
@@ -44,8 +46,8 @@ def verify(problem: ls.Problem, plan: ls.Trajectory, claimed: float) -> Verified
     assert isinstance(problem.initial, ls.FixedState)
     z = np.hstack([states[:-1], controls])
     with np.errstate(all="ignore"):
-        arrived = _step(problem, states[:-1], controls)
-        cost = float(
+        arrived = _step(problem, states[:-1], controls, plan.dt)
+        cost = problem.time_weight * plan.horizon + float(
             kkt.cost_values(problem, problem.stage_cost, z, n, first=0).sum()
             + kkt.cost_values(problem, problem.final_cost, states[-1:], n, first=-1)[0]
         )
@@ -55,11 +57,16 @@ def verify(problem: ls.Problem, plan: ls.Trajectory, claimed: float) -> Verified
     start = float(np.abs(states[0] - np.asarray(problem.initial.state)).max())
     low, high = np.array(problem.control_coordinates.low), np.array(problem.control_coordinates.high)
     limits = float(np.maximum(low - controls, controls - high).max())
-    kept = {"the dynamics": motion, "the start": start, "a limit of the controls": limits, "a constraint": missed}
+    shortest, longest = (problem.steps * problem.dt,) * 2 if problem.duration is None else problem.duration
+    late = max(shortest - plan.horizon, plan.horizon - longest)
+    kept = {
+        "the dynamics": motion, "the start": start, "a limit of the controls": limits, "a constraint": missed,
+        "the duration": late,
+    }  # fmt: skip
     faults = [f"{what}: missed by {amount:.2g}" for what, amount in kept.items() if not amount < VIOLATION]
     if not abs(cost - claimed) <= COST * abs(cost):
         faults.append(f"it costs {cost:.9g}, not {claimed:.9g}")
-    return Verified(cost, motion, max(start, limits, missed), tuple(faults))
+    return Verified(cost, motion, max(start, limits, missed, late), tuple(faults))
 
 
 def rolled_out(problem: ls.Problem, controls: Array) -> Array:
@@ -67,11 +74,11 @@ def rolled_out(problem: ls.Problem, controls: Array) -> Array:
     assert isinstance(problem.initial, ls.FixedState)
     states = [np.array(problem.initial.state, dtype=float)]
     for control in controls:
-        states.append(_step(problem, states[-1], control))
+        states.append(_step(problem, states[-1], control, problem.dt))
     return np.array(states)
 
 
-def _step(problem: ls.Problem, states: Array, controls: Array) -> Array:
+def _step(problem: ls.Problem, states: Array, controls: Array, dt: float) -> Array:
     """Where states (..., n) are a step later under controls (..., m)."""
     written = kkt.quadrotor_rate if problem.dynamics.f is ls.Quadrotor().dynamics.f else None
-    return kkt.step(kkt.rate_of(problem, written), states, controls, kkt.numbers_of(problem), problem.dt)
+    return kkt.step(kkt.rate_of(problem, written), states, controls, kkt.numbers_of(problem), dt)

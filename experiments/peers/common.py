@@ -31,13 +31,17 @@ class Unavailable(Exception):
 
 @dataclass(frozen=True)
 class Answer:
-    """States (T+1, n), controls (T, m), their cost as the solver has it, and how many iterations it took."""
+    """States (T+1, n), controls (T, m), their cost as the solver has it, and how many iterations it took.
+
+    `duration` is in s where that was free; its price is in the cost.
+    """
 
     states: Array
     controls: Array
     cost: float
     iterations: int
     converged: bool
+    duration: float | None = None
 
 
 @dataclass(frozen=True)

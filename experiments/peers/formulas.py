@@ -1,7 +1,8 @@
 """Any problem that is stated by formulas, as functions of CasADi's: a step, the costs and the constraints at a knot.
 
 What differs between problems of one kind is a parameter, so that one compiled solver serves all of them: the start, the
-state and control that costs are about, and the numbers of formulas. Obstacles and weights are constants.
+state and control that costs are about, and the numbers of formulas. Obstacles and weights are constants. A free
+duration is one more state, in s, that a step leaves as it is.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -41,6 +42,7 @@ def formulas(problem: ls.Problem) -> Formulas:
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     numbers = parameters(problem)
     x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", len(numbers))
+    duration = ca.SX.sym("duration", 0 if problem.duration is None else 1)
     given = _Given(p)
     given(n)  # the start
     values = given(len(dynamics.parameters))
@@ -48,7 +50,7 @@ def formulas(problem: ls.Problem) -> Formulas:
     def rate(x: Any) -> Any:
         return ca.vertcat(*evaluate(dynamics.f, tuple(dynamics.parameters), x, u, values, dynamics.constants))
 
-    h = problem.dt
+    h = problem.dt if problem.duration is None else duration / problem.steps
     first = rate(x)
     second = rate(x + h / 2 * first)
     third = rate(x + h / 2 * second)
@@ -60,6 +62,8 @@ def formulas(problem: ls.Problem) -> Formulas:
         begin += 0 if isinstance(one, ls.ObstacleCost) else cost  # which does not act there
     for one in terms_of(problem.final_cost):
         end += _cost(problem, one, x, u, given)
+    if problem.duration is not None:
+        end += problem.time_weight * duration
     rows = [_constraint(problem, one, x, u, given) for one in problem.constraints]
     kinds = [
         [one for one in rows if one.with_control],
@@ -67,6 +71,7 @@ def formulas(problem: ls.Problem) -> Formulas:
         [one for one in rows if not one.with_control],
     ]
     stacked = [ca.vertcat(*[one.values for one in kind]) for kind in kinds]
+    after, x = ca.vertcat(after, duration), ca.vertcat(x, duration)
     return Formulas(
         step=ca.Function("step", [x, u, p], [after]),
         costs=(
@@ -181,7 +186,10 @@ def _from_obstacles(problem: ls.Problem, world: ls.World, x: Any) -> Any:
 
 
 def state_bounds(problem: ls.Problem) -> tuple[Array, Array]:
-    """Bounds (T+1, n) of the states; infinite where there is none, and at the given start."""
+    """Bounds (T+1, n) of the states; infinite where there is none, and at the given start.
+
+    One column more with a free duration.
+    """
     names = problem.dynamics.state_coordinates.names
     fixed = goals_of(problem.constraints, problem.dynamics)
     low = np.full((problem.steps + 1, len(names)), -np.inf)
@@ -193,6 +201,11 @@ def state_bounds(problem: ls.Problem) -> tuple[Array, Array]:
                     i = names.index(name)
                     last = problem.steps if i in fixed else problem.steps + 1
                     side[1:last, i] = tighter(side[1:last, i], number)
+    if problem.duration is not None:
+        low, high = (
+            np.column_stack([side, np.full(len(side), bound)])
+            for side, bound in zip((low, high), problem.duration, strict=True)
+        )
     return low, high
 
 

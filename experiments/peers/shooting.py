@@ -73,12 +73,16 @@ class Shooting:
         """Solve from states (T+1, n) and controls (T, m), whether or not they belong together."""
         found = self._run(self._solver, problem, states, controls)
         stats = self._solver.stats()
+        states, controls = self._unpacked(problem, found["x"].full().ravel())
+        n = len(problem.dynamics.state_coordinates)
         return Answer(
-            *self._unpacked(problem, found["x"].full().ravel()),
+            states[:, :n].copy(),
+            controls,
             cost=float(found["f"]),
             iterations=stats["iter_count"],
             # No more than its acceptable level is not what was asked for.
             converged=bool(stats["success"]) and "Acceptable" not in str(stats["return_status"]),
+            duration=None if problem.duration is None else float(states[-1, n]),
         )
 
     def first(
@@ -110,8 +114,11 @@ class Shooting:
             yield Moment(count, time.perf_counter() - begun, *self._worth(problem, plan))
 
     def worth(self, problem: ls.Problem, states: Array, controls: Array) -> tuple[float, float]:
-        """Cost and largest violation of a plan, the dynamics included, as the solver is told of them."""
-        return self._worth(problem, _packed(states, controls))
+        """Cost and largest violation of a plan, the dynamics included, as the solver is told of them.
+
+        A free duration is the stated one.
+        """
+        return self._worth(problem, _packed(_stated(problem, states), controls))
 
     def _settings(self, iterations: int) -> dict[str, Any]:
         settings: dict[str, Any] = {"print_level": 0, "max_iter": iterations, "tol": TOLERANCE}
@@ -123,13 +130,13 @@ class Shooting:
         return ipopt.made(self._plugin, self._source, own)
 
     def _run(self, solver: Any, problem: ls.Problem, states: Array, controls: Array) -> Any:
-        guess = _packed(states, controls)
+        guess = _packed(_stated(problem, states), controls)
         low, high = _bounds(problem)
         with _signals_wait():
             return solver(x0=guess, p=formulas.parameters(problem), lbx=low, ubx=high, **self._limits)
 
     def _unpacked(self, problem: ls.Problem, values: Array) -> tuple[Array, Array]:
-        n = len(problem.dynamics.state_coordinates)
+        n = _stage_states(problem)
         stages = values[:-n].reshape(problem.steps, -1)
         return np.vstack([stages[:, :n], values[-n:]]), stages[:, n:].copy()
 
@@ -159,6 +166,18 @@ def _signals_wait() -> Iterator[None]:
             signal.raise_signal(number)
 
 
+def _stage_states(problem: ls.Problem) -> int:
+    """How many states a knot has, a free duration among them."""
+    return len(problem.dynamics.state_coordinates) + (problem.duration is not None)
+
+
+def _stated(problem: ls.Problem, states: Array) -> Array:
+    """States (T+1, n) with the stated duration, if that is free."""
+    if problem.duration is None:
+        return states
+    return np.column_stack([states, np.full(len(states), problem.steps * problem.dt)])
+
+
 def _packed(states: Array, controls: Array) -> Array:
     """As the variables are: knot by knot, and the last state."""
     return np.append(np.hstack([states[:-1], controls]), states[-1])
@@ -180,7 +199,8 @@ def _nlp(problem: ls.Problem, told: formulas.Formulas) -> tuple[dict[str, Any], 
     Besides, which of the constraints are equalities.
     """
     ca, steps = ipopt.casadi(), problem.steps
-    n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
+    n, m = _stage_states(problem), len(problem.control_coordinates)
+    given = len(problem.dynamics.state_coordinates)  # of the start: all but a free duration
     stages, last = ca.MX.sym("w", n + m, steps), ca.MX.sym("last", n)
     p = ca.MX.sym("p", len(formulas.parameters(problem)))
     x, u = stages[:n, :], stages[n:, :]
@@ -189,8 +209,8 @@ def _nlp(problem: ls.Problem, told: formulas.Formulas) -> tuple[dict[str, Any], 
     begin, between, end = told.costs
     cost = begin(x[:, 0], u[:, 0], p) + end(last, p)
     first, rows, final = told.rows
-    g = [gaps[:, 0], x[:, 0] - p[:n], first(x[:, 0], u[:, 0], p)]
-    equal = [True] * (2 * n) + told.equalities[0]
+    g = [gaps[:, 0], x[:given, 0] - p[:given], first(x[:, 0], u[:, 0], p)]
+    equal = [True] * (n + given) + told.equalities[0]
     if steps > 1:
         rest = ca.repmat(p, 1, steps - 1)
         cost += ca.sum2(between.map(steps - 1)(x[:, 1:], u[:, 1:], rest))

@@ -111,12 +111,12 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
         "GilbertElliott": (dataclasses.asdict(GilbertElliott(0.1, 0.5)), 0.5),
         **{
             f"simulate {name}": (
-                {"call": functools.partial(simulate_kind, getattr(ls.disturbances, name)), "plant": plant, "solution": solution}
+                {"call": functools.partial(simulate_kind, type(one)), "plant": plant, "solution": solution}
                 | DISTURBANCES[name],
                 0.3,
             )
-            for name in DISTURBANCES
-            if fits(disturbances[name], place)
+            for name, one in disturbances.items()
+            if fits(one, place)
         },
         "preset": ({"name": "light", "plant": plant},),
         "uncertainty_of": ({"plant": plant, "disturbances": [noise]},),
