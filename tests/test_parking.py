@@ -19,8 +19,8 @@ pytestmark = pytest.mark.timeout(600)
 
 
 def test_nothing_false_is_said() -> None:
-    """However few are solved within the time."""
-    found = [outcomes.look(one, improve=True, time_limit=1.2, max_iterations=3000) for one in SAMPLE]
+    """However few are solved within so many iterations."""
+    found = [outcomes.look(one, improve=True, time_limit=None, max_iterations=80) for one in SAMPLE]
     assert [(one.number, one.verdict, one.said) for one in found if one.verdict not in ("right", "unsolved")] == []
     assert "CONVERGED" in {one.status for one in found if one.verdict == "right"}
 

@@ -84,8 +84,8 @@ def _own(item: type, key: str) -> int:
 
 def _offered(name: str) -> Any:
     """A public name, in whichever room it is."""
-    rooms = (ls, ls.disturbances, ls.lq, ls.stress, ls.types, ls.view)
-    return next(getattr(room, name) for room in rooms if name in room.__all__)
+    rooms = (ls.disturbances, ls.lq, ls.stress, ls.types, ls.view)
+    return getattr(next((room for room in rooms if name in room.__all__), ls), name)
 
 
 def subjects(folder: Path) -> dict[str, Subject]:
