@@ -23,7 +23,7 @@ from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measu
 
 Flags = npt.NDArray[np.bool_]
 
-STEPS = 12  # at most, as two thirds of a second-order step lead nowhere
+STEPS = 12  # at most: what takes more does not get there
 PIVOTS, FEW = 15, 4  # of the rows in a convex problem, at most; and in one that need not be
 PATIENCE = 3  # pivots that do not bring fewer wrong rows, before they change one at a time
 SHARES = (0.0, 0.3)  # of the convex models in those of a step, tried in turn

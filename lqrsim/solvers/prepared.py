@@ -42,12 +42,13 @@ def prepare(
 
     Args:
       problem: what is to be solved again and again, with other states, goals, obstacles and parameters.
-      tolerance: as in `smooth`.
+      tolerance: as in `smooth`; with constraints by default 1e-6, of the slopes of the Lagrangian in the controls, times
+        their ranges and relative to the cost.
       gap_tolerance: as in `smooth`.
-      constraint_tolerance: as in `smooth` with the augmented Lagrangian: what inequalities are to have to spare, by
-        default 1e-3.
+      constraint_tolerance: by how much equalities may be missed, by default 1e-6; inequalities are kept. With noise, or
+        dynamics of an MJCF, what inequalities are to have to spare, by default 1e-3.
       max_iterations: as in `smooth`.
-      finish: as in `smooth`; with constraints it is None.
+      finish: as in `smooth`; None has constraints kept by the augmented Lagrangian.
 
     Returns:
       A PreparedSolver.
