@@ -23,7 +23,7 @@ from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measu
 
 Flags = npt.NDArray[np.bool_]
 
-STEPS = 12  # at most, as two thirds of a second-order step lead nowhere
+STEPS = 12  # at most: what takes more does not get there
 PIVOTS, FEW = 15, 4  # of the rows in a convex problem, at most; and in one that need not be
 PATIENCE = 3  # pivots that do not bring fewer wrong rows, before they change one at a time
 SHARES = (0.0, 0.3)  # of the convex models in those of a step, tried in turn
@@ -61,21 +61,22 @@ class ActiveSet:
         self._costates = np.zeros((stages.steps + 1, stages.n))
         self._where = np.nonzero(live)
         stages.second_order(plan, self._costates, np.zeros(shape), np.inf, second=False)
-        stages.convexify(plan)
-        self.sizes = stages.sizes_of(plan)
+        self.sizes = stages.sizes_of(plan, stages.models.hessian)
         self._size = np.broadcast_to(self.sizes.rows, shape)[live]
         self._costates, _ = self._adjoint()
         self.held = self._equality | (self.force > 0)
         self.held |= self._limit & (stages.values(plan)[live] <= AT_LIMIT * self._size)
         self._measure()
 
-    def run(self, tolerance: float, watch: Callable[[Measures], bool]) -> bool:
+    def run(self, tolerance: float, watch: Callable[[Measures], bool], due: Callable[[], bool]) -> bool:
         """Go on until the measures are within tolerance; whether they are.
 
         Args:
           tolerance: of stationarity, gaps and complementarity.
           watch: called with the measures after each step; True ends it.
+          due: called before each pivot; True ends it where the plan was before that step.
         """
+        self._due = due
         ended = False
         for _ in range(STEPS):
             before = self.measures
@@ -151,13 +152,14 @@ class ActiveSet:
             convex = self._pivoted(1.0, self.held, PIVOTS)
             if convex is None:
                 return False
-            for share in SHARES:
-                found = self._pivoted(share, convex[0], FEW)
-                if found is not None and not found[2]:
+            for share in (*SHARES, 1.0):
+                found = self._pivoted(share, convex[0], FEW if share < 1 else 0)
+                if self._due():
+                    return False
+                if found is not None and (share == 1 or not found[2]):
                     break
             else:
-                found = self._pivoted(1.0, convex[0], 0)
-                assert found is not None
+                return False
         stages = self.stages
         self.held, force, _ = found
         self.force = np.where(self._equality, force, np.maximum(force, 0.0))
@@ -178,6 +180,8 @@ class ActiveSet:
         numbers = self._numbers - self._aim
         fewest, patience = len(held) + 1, PATIENCE
         for pivot in range(most + 1):
+            if pivot > 0 and self._due():
+                return None
             sigma = np.where(held, self._scale / (REGULARISATION * self._size**2), 0.0)
             force = np.where(held, self.force, 0.0)
             models = self._with(hessian, stages.models.gradient, held, sigma, sigma * numbers - force)

@@ -233,10 +233,10 @@ class Stages:
     def sizes(self, plan: Plan) -> Sizes:
         """By how much things change, as far as a plan and the problem tell."""
         self.look_about(plan)
-        return self.sizes_of(plan)
+        return self.sizes_of(plan, self.models.convex)
 
-    def sizes_of(self, plan: Plan) -> Sizes:
-        """The same of a plan about which the models are.
+    def sizes_of(self, plan: Plan, hessian: Array) -> Sizes:
+        """The same of a plan about which the models are, with the Hessians of its cost.
 
         A control without limits has the size with which it moves states by theirs.
         """
@@ -251,7 +251,7 @@ class Stages:
         both = np.concatenate([states, controls])
         counts = np.maximum(self.live.sum(axis=0), 1)
         rows = np.sqrt(np.einsum("trw,trw,w->r", self.slopes, self.slopes, both**2) / counts)
-        cost = 0.5 * float(np.abs(np.einsum("tww->w", self.models.convex)) @ both**2)
+        cost = 0.5 * float(np.abs(np.einsum("tww->w", hessian)) @ both**2)
         return Sizes(states, controls, np.where(rows > 0, rows, 1.0), cost or 1.0)
 
     def spread(self, rows: Array) -> Array:

@@ -10,6 +10,7 @@ from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array, InputError, check_array, check_kind, check_number
 from lqrsim.kernels.records import Plan
 from lqrsim.problem.constraints import allowed_violation, violation_of
+from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.replan import Replan
@@ -19,7 +20,7 @@ from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.active_set import ActiveSet
 from lqrsim.solvers.attempt import Attempt, AttemptResult
-from lqrsim.solvers.common import SmootherSettings, Stop, check_problem
+from lqrsim.solvers.common import SmootherSettings, Stop, check_problem, raised_by
 from lqrsim.solvers.constrained import satisfy
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.interior_point import INTERIOR, InteriorPoint, Measures, Stages, iteration_of
@@ -42,12 +43,13 @@ def prepare(
 
     Args:
       problem: what is to be solved again and again, with other states, goals, obstacles and parameters.
-      tolerance: as in `smooth`.
+      tolerance: as in `smooth`; with constraints by default 1e-6, of the slopes of the Lagrangian in the controls,
+        times their ranges and relative to the cost.
       gap_tolerance: as in `smooth`.
-      constraint_tolerance: as in `smooth` with the augmented Lagrangian: what inequalities are to have to spare, by
-        default 1e-3.
+      constraint_tolerance: by how much equalities may be missed, by default 1e-6; inequalities are kept. With noise, or
+        dynamics of an MJCF, what inequalities are to have to spare, by default 1e-3.
       max_iterations: as in `smooth`.
-      finish: as in `smooth`; with constraints it is None.
+      finish: as in `smooth`; None has constraints kept by the augmented Lagrangian.
 
     Returns:
       A PreparedSolver.
@@ -161,7 +163,7 @@ class PreparedSolver:
         with problem.dynamics.solving(1):
             if problem.constraints and attempt.newton:
                 stages = self._stages_of(problem)
-                neighbour = _Neighbour(attempt, stages, _plan_of(start, best), best)
+                neighbour = _Neighbour(attempt, stages, _plan_of(start, best), best, self._closing)
                 found, ended = neighbour.find(), neighbour.ended
                 self._idle.append(stages)
             else:
@@ -244,14 +246,15 @@ class _Neighbour:
     Args:
       attempt: with the law and multipliers to begin with. stages: of its problem.
       plan: states and controls that the law belongs to, the first state being the start.
-      best: the plan that the law leads to.
+      best: the plan that the law leads to. closing: how long what follows the last iteration takes, in s.
 
     Attributes:
       ended: when the last iteration did.
     """
 
-    def __init__(self, attempt: Attempt, stages: Stages, plan: Plan, best: "_Best") -> None:
+    def __init__(self, attempt: Attempt, stages: Stages, plan: Plan, best: "_Best", closing: float = 0.0) -> None:
         self._attempt, self._stages, self._plan, self._best = attempt, stages, plan, best
+        self._closing = closing
         self._allowed = attempt.settings.missed(attempt.problem)
         self._iterations: list[Iteration] = []
         self.ended, self._cost = time.perf_counter(), np.inf
@@ -265,10 +268,12 @@ class _Neighbour:
             detail = "the law that it begins with leads to infinity"
             return replace(_unchanged(attempt, self._best), status=Status.NOT_FINITE, detail=detail)
         known = tuple(one.values for one in attempt.initial_guess.multipliers)
+        for function in functions_of(attempt.problem):
+            function.forget()
         with np.errstate(all="ignore"):
             active = ActiveSet(self._stages, self._plan, known, self._allowed)
             self.ended = time.perf_counter()
-            solved = active.run(attempt.final, lambda measures: self._watch(measures, "active set"))
+            solved = active.run(attempt.final, lambda measures: self._watch(measures, "active set"), self._late)
             left = attempt.iterations_left(tuple(self._iterations))
             if not (solved or active.hopeless or stop.due) and left:
                 point = InteriorPoint(
@@ -281,8 +286,13 @@ class _Neighbour:
                 )  # fmt: skip
                 if found.solved or not np.isfinite(active.measures.cost):
                     active = ActiveSet(self._stages, found.plan, found.multipliers, self._allowed)
-                    solved = active.run(attempt.final, lambda measures: self._watch(measures, "active set"))
+                    solved = active.run(attempt.final, lambda measures: self._watch(measures, "active set"), self._late)
             return self._result(active, solved)
+
+    def _late(self) -> bool:
+        """Whether the deadline is so near that what is begun is to be left."""
+        stop = self._attempt.stop
+        return time.perf_counter() + self._closing >= stop.deadline
 
     def _watch(self, measures: Measures, method: str) -> bool:
         """Log an iteration; whether to stop."""
@@ -296,7 +306,8 @@ class _Neighbour:
         attempt, work = self._attempt, self._attempt.work
         if not np.isfinite(active.measures).all():
             status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS
-            return replace(_unchanged(attempt, self._best), status=status, iterations=tuple(self._iterations))
+            detail, done = raised_by(functions_of(attempt.problem)), tuple(self._iterations)
+            return replace(_unchanged(attempt, self._best), status=status, detail=detail, iterations=done)
         plan, gain = active.law()
         cost, _ = self._stages.trial(plan)
         values = work.constraint_values(*plan)
