@@ -304,6 +304,7 @@ def results(place: Place) -> dict[str, tuple[Any, ...]]:
         "AffinePolicy": policy, "Trajectory": plan, "Quadratic": go, "Moments": come, "TotalCost": total,
         "Candidate": candidate, "Iteration": solution.iterations[-1], "Rollout": rollout,
         "Multipliers": ls.types.Multipliers(np.zeros((5, 2)), 1.0), "ContinuousSolution": flowing,
+        "Certificate": solution.certificate,
         "Solution": dataclasses.replace(solution, candidates=(candidate,)),
         "Outcomes": ls.stress.outcomes(rollout), **checks,
     }  # fmt: skip
