@@ -89,7 +89,7 @@ def main(config: Config) -> list[Path]:
 
 def _small(line: str) -> str:
     line = line.replace("--rate 0.9", "--rate 0.5")
-    return re.sub(r"--fps \d+", "--fps 1", re.sub(r"--size \d+ \d+", "--size 320 240", line))
+    return re.sub(r"--fps \d+", "--fps 0.5", re.sub(r"--size \d+ \d+", "--size 320 240", line))
 
 
 if __name__ == "__main__":

@@ -425,3 +425,39 @@ def test_a_cost_without_end_is_not_called_a_solution() -> None:
     solution = ls.smooth(racing(limit=np.inf))
     assert not solution.success
     assert solution.status.remedy
+
+
+# Re-plans.
+
+
+@pytest.mark.parametrize("number", [0, 3, 5, 8, 12, 17, 22, 29])
+def test_the_rest_of_drawn_problems(number: int) -> None:
+    """With bounds, goals as equalities, and limits of any kind, from beside the plan at a later step."""
+    of, rng = drawn(number), np.random.default_rng(number)
+    before = ls.smooth(of)
+    assert before.success
+    after = int(rng.integers(1, of.steps // 2))
+    state = before.trajectory.states[after] + 1e-3 * rng.normal(size=2)
+    found = ls.prepare(of).solve(state, before.shifted(after, horizon="shrinking"), after=after)
+    rest = of.from_state(state, after=after)
+    assert found.status is Status.CONVERGED, found.detail
+    conditions = Shooting(rest).conditions(found)  # pyright: ignore[reportArgumentType]
+    assert max(conditions.slope, conditions.pressing, conditions.spare) < 1e-5, conditions
+    assert conditions.sign == 0
+    assert conditions.violation <= 1e-6
+
+
+def test_what_cannot_be_kept_is_not_called_converged() -> None:
+    """Twice as much power as there may be, at once: the plan is the one that misses least, or no worse."""
+    numbers = {"power": 1.0, "most": 9.0, "beside": 0.5, "force": 1.0, "speed": 1.0}
+    of = problem(
+        ls.StateBounds(high={"v": 0.5}), ls.SymbolicConstraint(power, parameters=numbers), dynamics=system(), limit=2.0
+    )
+    before = ls.smooth(of)
+    found = ls.prepare(of).solve([0.0, 1.5], before.shifted(0), time_limit=5.0)
+    assert not found.success
+    went = Shooting(of.from_state([0.0, 1.5]))
+    z = went.pack(found.trajectory)
+    assert found.violation == pytest.approx(-went.rows(z, False).min(), abs=1e-9)
+    # From 1.5 m/s the bound of 0.5 is missed at the first step by what full braking leaves.
+    assert found.violation >= 1.5 - 2.0 * DT - 0.5 - 1e-9

@@ -78,6 +78,7 @@ from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.kernels.records import Settings as KernelSettings
 from lqrsim.problem.balls import Places
 from lqrsim.problem.noise import numbers_of
+from lqrsim.results.hashing import sha256
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import compiled
@@ -87,7 +88,8 @@ from lqrsim.solvers.initial_guess import resolve
 from lqrsim.solvers.interior_point import Stages
 
 MEMORY = 1 << 20  # numbers from which an array is memory at an address, which has no end
-MADE: dict[Any, tuple[Loaded, Entry]] = {}  # what was compiled, by all that it depends on
+MADE: dict[Any, Entry] = {}  # what was compiled, by all that it depends on
+LOADED: dict[str, Loaded] = {}  # the same, by a hash of its IR: much of what problems differ in, kernels do not see
 PLAIN: dict[Any, Callable[..., Any]] = {}  # kernels as plain Python, and whom their calls are told to
 CALLERS: list[Callable[..., Any]] = []
 EACH = 1  # calls of a kernel that are compared, of each entry
@@ -204,11 +206,14 @@ def compare(one: Recorded) -> None:
     if key not in MADE:
         program = Program()
         returns = program.entry(one.function, one.types, "entry")
-        loaded = Loaded(object_code(program.text), tuple(program.libraries))
+        text = program.text
+        digest = sha256(text)
+        if digest not in LOADED:
+            LOADED[digest] = Loaded(object_code(text), tuple(program.libraries))
         laid_out = tuple(Rows(kind.fields) if isinstance(kind, Row) else kind for kind in one.types)
-        MADE[key] = loaded, Entry(laid_out, loaded.address("entry"), returns)
+        MADE[key] = Entry(laid_out, LOADED[digest].address("entry"), returns)
     size = max(map(size_of, arrays_of(one.before)), default=0.0)
-    returned = Call(MADE[key][1], one.before)()
+    returned = Call(MADE[key], one.before)()
     size *= 1 + 1e12 * DIVIDED.get(one.name, 0.0)
     same(returned, one.returned, size, f"what {one.name} returns")
     for found, wanted in zip(arrays_of(one.before), arrays_of(one.after), strict=True):
@@ -1040,9 +1045,11 @@ class TestInteriorPoint:
         plan = Plan(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
         multipliers = rng.uniform(0.1, 1.0, size=stages.live.size)
         rows = stages._rows._replace(least=0.0, support=np.ones((len(stages.owners), 5)), multipliers=multipliers)
-        begun = 3, 1, plan
-        replay(source, SIZES, "models", *begun, rng.normal(size=(4, 3)), stages._model, rows, stages.models)
-        replay(source, SIZES, "trial", *begun, stages._model, np.zeros((3, 3)))
+        begun, costates = (3, 1), rng.normal(size=(4, 3))
+        for second in (0, 1):
+            replay(source, SIZES, "models", *begun, second, plan, costates, stages._model, rows, stages.models)
+        replay(source, SIZES, "convex_models", *begun, plan, stages._model, stages.models)
+        replay(source, SIZES, "trial", *begun, plan, stages._model, np.zeros((3, 3)))
         gradient, jacobian = stages.models.gradient, stages.models.jacobian
         replay(source, SIZES, "adjoint", 3, gradient, jacobian, np.zeros((4, 3)), np.zeros((3, 2)))
         policy = Policy(np.zeros((3, 2, 3)), np.zeros((3, 2)))

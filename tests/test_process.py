@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -33,14 +32,6 @@ from lqrsim.commands import reproduce
 reproduce.EXPERIMENTS = pathlib.Path(sys.argv.pop(1))
 sys.exit(cli.main())
 """
-
-
-@pytest.fixture(autouse=True)
-def heard() -> Iterator[None]:
-    """Whatever started the tests may ignore Ctrl-C, as shells have what runs in the background do."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 def start(*command: str | Path, **options: object) -> subprocess.Popen[str]:

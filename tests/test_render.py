@@ -91,7 +91,11 @@ def difference(first: np.ndarray, second: np.ndarray) -> float:
 @draws
 def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
     """Where its geoms are, painting it changes what the default camera sees, obstacles before it or not."""
-    with open_picture(rollout, PictureOptions(size=(640, 360))) as drawn:
+    with (
+        open_picture(rollout, PictureOptions(size=(640, 360))) as drawn,
+        mujoco.Renderer(drawn.parts[0].renderer.model, 360, 640) as segmenter,
+    ):
+        segmenter.enable_segmentation_rendering()
         renderer = drawn.parts[0].renderer
         model = renderer.model
         robot = np.isin(model.geom_group, (0, 1, 2)) & (model.body_weldid[model.geom_bodyid] != 0)
@@ -103,7 +107,7 @@ def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
 
         for time in np.linspace(0, rollout.times[-1], 12):
             hide(~robot)
-            masked = segmented(model, renderer.recorded, time)
+            masked = segmented(segmenter, renderer.recorded, time)
             hide(np.zeros(0, dtype=int))
             seen = drawn.draw(time).astype(int)
             hide(robot)
@@ -113,14 +117,12 @@ def test_robot_is_seen_throughout(rollout: ls.Rollout) -> None:
             assert changed.mean() > 0.4, f"at {time:.2f} s"
 
 
-def segmented(model: mujoco.MjModel, recorded: RecordedTrial, time: float) -> np.ndarray:
+def segmented(renderer: mujoco.Renderer, recorded: RecordedTrial, time: float) -> np.ndarray:
     """Which pixels of the overview show a geom."""
-    data = mujoco.MjData(model)
+    data = mujoco.MjData(renderer.model)
     recorded.pose(data, time)
-    with mujoco.Renderer(model, 360, 640) as renderer:
-        renderer.enable_segmentation_rendering()
-        renderer.update_scene(data, "overview")
-        return renderer.render()[..., 1] == mujoco.mjtObj.mjOBJ_GEOM.value
+    renderer.update_scene(data, "overview")
+    return renderer.render()[..., 1] == mujoco.mjtObj.mjOBJ_GEOM.value
 
 
 @draws

@@ -141,7 +141,9 @@ class TestShifted:
         for name in ("states", "controls"):
             np.testing.assert_array_equal(getattr(left.trajectory, name), getattr(whole.trajectory, name)[6:])
         np.testing.assert_array_equal(left.policy.gain, whole.policy.gain[6:])
-        np.testing.assert_array_equal(left.cost_to_go.gradient, whole.cost_to_go.gradient[6:])
+        assert (whole.cost_to_go is None) == (of == "replan")  # next to an active set none is needed
+        if of == "solution":
+            np.testing.assert_array_equal(left.cost_to_go.gradient, whole.cost_to_go.gradient[6:])
         for one, other in zip(left.multipliers, whole.multipliers, strict=True):
             np.testing.assert_array_equal(one.values, other.values[6:])
         moving = whole.shifted(6)

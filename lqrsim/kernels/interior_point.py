@@ -14,6 +14,7 @@ from lqrsim.kernels.model_functions import (
     cost_quadratic,
     cost_value,
     slope_of_constraint,
+    step_jacobian,
     step_second_order,
 )
 
@@ -21,29 +22,46 @@ TINY = 1e-9  # what is left of a control's own curvature when that is as good as
 STEP = 6e-6  # of differences of slopes, relative to a number and at least 1: the cube root of rounding
 
 
-def models(steps, soft, plan, costates, model, rows, out):
+def models(steps, soft, second, plan, costates, model, rows, out):
     """Write the models of all stages at a plan: those of its cost, its steps and its constraints. Return the cost.
 
     Args:
-      soft: 1 where there is an initial cost. costates: (T+1, N), of where each step leads.
+      soft: 1 where there is an initial cost. second: 1 where the steps' and constraints' second derivatives are wanted.
+      costates: (T+1, N), of where each step leads.
       rows: `records.ConstraintRows`, with the constraints' multipliers. out: `records.StageModels`.
     """
-    gradient, none, total = stack(W), stack(M), 0.0
+    none, total = stack(M), 0.0
     for i in range(M):
         none[i] = 0.0
     for t in range(steps + 1):
         x, u = plan.states[t], plan.controls[min(t, steps - 1)]
         if t < steps:
             total += cost_of_order(x, u, t, model.stage, 1.0, out.hessian[t], out.gradient[t])
-            cost_quadratic(x, u, t, model.stage, out.convex[t], gradient)
-            step_second_order(x, u, model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
+            if second == 1:
+                step_second_order(x, u, model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
+            else:
+                step_jacobian(x, u, model, model.dt, out.arrived[t], out.jacobian[t])
         else:
             total += cost_of_order(x, none, t, model.final, 1.0, out.hessian[t], out.gradient[t])
-            cost_quadratic(x, none, t, model.final, out.convex[t], gradient)
-        constraint_models(x, u, t, steps, model.stage.constraints, rows, out)
+        constraint_models(x, u, t, steps, model.stage.constraints, rows, second, out)
     if soft == 1:
         total += add_initial(plan.states[0], none, model, out)
     return total
+
+
+def convex_models(steps, soft, plan, model, out):
+    """Write the projected Hessians of the cost at a plan."""
+    gradient, none, hessian = stack(W), stack(M), stack(W, W)
+    for i in range(M):
+        none[i] = 0.0
+    for t in range(steps):
+        cost_quadratic(plan.states[t], plan.controls[t], t, model.stage, out.convex[t], gradient)
+    cost_quadratic(plan.states[steps], none, steps, model.final, out.convex[steps], gradient)
+    if soft == 1:
+        cost_quadratic(plan.states[0], none, 0, model.initial, hessian, gradient)
+        for i in range(N):
+            for j in range(N):
+                out.convex[0, i, j] += hessian[i, j]
 
 
 def add_initial(x, none, model, out):
@@ -54,15 +72,11 @@ def add_initial(x, none, model, out):
         out.gradient[0, i] += gradient[i]
         for j in range(N):
             out.hessian[0, i, j] += hessian[i, j]
-    cost_quadratic(x, none, 0, model.initial, hessian, gradient)
-    for i in range(N):
-        for j in range(N):
-            out.convex[0, i, j] += hessian[i, j]
     return cost
 
 
-def constraint_models(x, u, t, steps, constraints, rows, out):
-    """Write the slopes of all constraints at a step, and subtract their Hessians times the multipliers."""
+def constraint_models(x, u, t, steps, constraints, rows, second, out):
+    """Write the slopes of all constraints at a step; where wanted, subtract their Hessians times the multipliers."""
     slope = stack(W)
     for k in range(constraints.size):
         own, begin = int(constraints.multipliers[k][1]), constraints.multipliers[k][2]
@@ -76,7 +90,7 @@ def constraint_models(x, u, t, steps, constraints, rows, out):
                 slope_of_constraint(k, row, x, u, t, constraints, slope)
             for i in range(W):
                 out.slopes[at, i] = slope[i]
-            if acts and abs(rows.multipliers[at]) > rows.least:
+            if acts and second == 1 and abs(rows.multipliers[at]) > rows.least:
                 subtract_curvature(k, row, x, u, t, constraints, rows, out.hessian[t])
 
 

@@ -26,7 +26,7 @@ class Replan:
       cost: of the plan, start and end included.
       before: of where the law led that the solve began with.
       violation: by how much the worst constraint is missed at the steps; 0 where none is.
-      cost_to_go: with which the next solve begins.
+      cost_to_go: with which the next solve begins; None with constraints, where it needs none.
       multipliers: with which the next solve begins.
       iterations: how many there were.
       seconds: how long the solve took.

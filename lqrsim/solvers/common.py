@@ -305,8 +305,13 @@ def iterate(
                     raise function.raised  # Ctrl-C
     except BaseException as error:  # the callback's, or Ctrl-C: raised again when there is a solution
         stop.error, outcome = error, declarations.TIMED_OUT
+    return Termination((*before, *iterations), outcome, backward, failed, raised_by(functions))
+
+
+def raised_by(functions: Iterable[UserFunction]) -> str:
+    """What functions have raised since they were told to forget it."""
     raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
-    return Termination((*before, *iterations), outcome, backward, failed, "; ".join(raised))
+    return "; ".join(raised)
 
 
 def solve_all(

@@ -13,11 +13,11 @@ p. A highest multiplier is the price, in cost a unit, for which a constraint may
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from lqrsim.codegen.compiled_module import in_c_order, module_of
+from lqrsim.codegen.compiled_module import Call, CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import interior_point as kernel
@@ -114,33 +114,14 @@ class Stages:
     """
 
     def __init__(self, problem: Problem) -> None:
-        self.problem, self.steps = problem, problem.steps
         n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
         self.n, self.m, steps = n, m, problem.steps
-        self.free = np.full(n, 0.0 if isinstance(problem.initial, FixedState) else 1.0)
-        self._soft = 0 if isinstance(problem.initial, FixedState) else 1
-        terms = problem.constraint_terms
-        own = [compiled.no_multipliers(problem, term) for term in terms]
-        self._model = compiled.arguments(problem, multipliers=own, second_order=True)
         self._module = module_of(source_of(kernel), f"interior point, {n} states and {m} controls", N=n, M=m, W=n + m)
-        self._costs = compiled.costs_module(problem)
-        self._values = tuple(np.empty((steps + 1) * term.rows) for term in terms)
-
-        limits = self._model.limits
-        self.low, self.high = limits.low, limits.high
-        self.limits = [
-            (sign, i, side[i]) for sign, side in ((1.0, limits.low), (-1.0, limits.high)) for i in range(m)
-            if np.isfinite(side[i])
-        ]  # fmt: skip
-        counts = [term.rows for term in terms]
-        rows = sum(counts) + len(self.limits)
-        self.equality = np.repeat([*(term.equality for term in terms), False], [*counts, len(self.limits)]).astype(bool)
-        self.owners = np.repeat([*range(len(terms)), -1], [*counts, len(self.limits)])
-        self.live = np.ones((steps + 1, rows), dtype=bool)
-        for k, (term, array) in enumerate(zip(terms, own, strict=True)):
-            self.live[: int(array[2]), self.owners == k] = False
-            self.live[steps, self.owners == k] &= not term.uses_control
-        self.live[steps, self.owners == -1] = False
+        self._calls: dict[str, Call] = {}
+        self._take(problem)
+        counts = [term.rows for term in problem.constraint_terms]
+        rows = len(self.owners)
+        self._values = tuple(np.empty((steps + 1) * count) for count in counts)
         self.slopes = np.zeros((steps + 1, rows, n + m))
         for row, (sign, i, _) in enumerate(self.limits, start=sum(counts)):
             self.slopes[:steps, row, n + i] = sign
@@ -154,32 +135,95 @@ class Stages:
         self.to_go = CostToGo(np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1))
         self.changes = Plan(np.zeros((steps + 1, n)), np.zeros((steps, m)))
 
+    def _take(self, problem: Problem) -> None:
+        """Take a problem's numbers, and which of its rows can act."""
+        self.problem, self.steps = problem, problem.steps
+        fixed, steps = isinstance(problem.initial, FixedState), problem.steps
+        self.free, self._soft = np.full(self.n, 0.0 if fixed else 1.0), 0 if fixed else 1
+        terms = problem.constraint_terms
+        own = [compiled.no_multipliers(problem, term) for term in terms]
+        self._model = compiled.arguments(problem, multipliers=own, second_order=True)
+        self._costs = compiled.costs_module(problem)
+        limits = self._model.limits
+        self.low, self.high = limits.low, limits.high
+        self.limits = [
+            (sign, i, side[i]) for sign, side in ((1.0, limits.low), (-1.0, limits.high)) for i in range(self.m)
+            if np.isfinite(side[i])
+        ]  # fmt: skip
+        counts = [*(term.rows for term in terms), len(self.limits)]
+        self.equality = np.repeat([*(term.equality for term in terms), False], counts).astype(bool)
+        self.owners = np.repeat([*range(len(terms)), -1], counts)
+        self.live = np.ones((steps + 1, sum(counts)), dtype=bool)
+        for k, (term, array) in enumerate(zip(terms, own, strict=True)):
+            self.live[: int(array[2]), self.owners == k] = False
+            self.live[steps, self.owners == k] &= not term.uses_control
+        self.live[steps, self.owners == -1] = False
+
+    def renewed(self, problem: Problem) -> "Stages":
+        """Those of a problem of the same structure, in the memory of these if it has as many steps and rows."""
+        owners, limits, steps = self.owners, [one[:2] for one in self.limits], self.steps
+        self._take(problem)
+        same = steps == self.steps and np.array_equal(owners, self.owners)
+        if not same or limits != [one[:2] for one in self.limits]:
+            return Stages(problem)
+        self._rows.support[...] = 0.0
+        return self
+
+    def _call(self, name: str, *arguments: Any, module: CompiledModule | None = None) -> Any:
+        """Call a compiled function; what is the same as the last time is not laid out again."""
+        call = self._calls.get(name)
+        if call is None:
+            call = self._calls[name] = (module or self._module).lay_out(name, *arguments)
+        return call(*arguments)
+
     def values(self, plan: Plan) -> Array:
         """The rows' numbers (T+1, R); of no meaning where they do not act."""
+        numbers = np.empty(self.live.shape)
         if self._values:
-            constraints = self._model.stage.constraints
-            self._costs.evaluate_constraints(self.steps, plan.states, plan.controls, constraints, self._values)
-        shaped = [one.reshape(self.steps + 1, -1) for one in self._values]
-        held = np.concatenate([plan.controls, plan.controls[-1:]])
-        limits = [(sign * (held[:, i] - side))[:, None] for sign, i, side in self.limits]
-        return np.concatenate([*shaped, *limits, np.zeros((self.steps + 1, 0))], axis=1)
+            constraints, costs = self._model.stage.constraints, self._costs
+            self._call("evaluate_constraints", self.steps, *plan, constraints, self._values, module=costs)
+        begin = 0
+        for one in self._values:
+            end = begin + len(one) // (self.steps + 1)
+            numbers[:, begin:end] = one.reshape(self.steps + 1, -1)
+            begin = end
+        for row, (sign, i, side) in enumerate(self.limits, start=begin):
+            numbers[:-1, row] = sign * (plan.controls[:, i] - side)
+            numbers[-1, row] = numbers[-2, row]
+        return numbers
 
     def trial(self, plan: Plan) -> tuple[float, Array]:
         """The cost of a plan, and where its steps lead (T, n)."""
         arrived = np.empty((self.steps, self.n))
-        return self._module.trial(self.steps, self._soft, plan, self._model, arrived), arrived
+        return self._call("trial", self.steps, self._soft, plan, self._model, arrived), arrived
 
     def linearize(self, plan: Plan, costates: Array, multipliers: Array, least: float) -> float:
         """Make the models about a plan, with costates (T+1, n) and multipliers (T+1, R); return its cost."""
-        support = self._rows.support
+        cost = self.second_order(plan, costates, multipliers, least)
+        self.convexify(plan)
+        return cost
+
+    def second_order(
+        self, plan: Plan, costates: Array, multipliers: Array, least: float, *, second: bool = True
+    ) -> float:
+        """The same without the projected Hessians; without `second`, nor those of the steps and constraints."""
         rows = self._rows._replace(least=float(least), multipliers=in_c_order(multipliers).reshape(-1))
-        cost = self._module.models(self.steps, self._soft, plan, costates, self._model, rows, self.models)
+        cost = self._call("models", self.steps, self._soft, int(second), plan, costates, self._model, rows, self.models)
+        support = rows.support
         support[...] = np.maximum(support, (self.slopes != 0).any(axis=0))
         return cost
 
+    def convexify(self, plan: Plan) -> None:
+        """Make the projected Hessians about a plan."""
+        self._call("convex_models", self.steps, self._soft, plan, self._model, self.models)
+
+    def act_at(self, plan: Plan) -> None:
+        """Find out which rows act."""
+        self.live &= ~np.isposinf(self.values(plan))  # so a constraint says that it does not act at a step
+
     def look_about(self, plan: Plan) -> None:
         """Find out which rows act, and which entries each depends on: slopes at the plan or a little beside it tell."""
-        self.live &= ~np.isposinf(self.values(plan))  # so a constraint says that it does not act at a step
+        self.act_at(plan)
         wiggle = np.sin(1.0 + np.arange(self.n + self.m))
         nowhere, none = np.zeros((self.steps + 1, self.n)), np.zeros(self.live.shape)
         for far in (1e-3, 0.0):
@@ -187,7 +231,12 @@ class Stages:
             self.linearize(beside, nowhere, none, np.inf)
 
     def sizes(self, plan: Plan) -> Sizes:
-        """By how much things change, as far as a plan and the problem tell.
+        """By how much things change, as far as a plan and the problem tell."""
+        self.look_about(plan)
+        return self.sizes_of(plan, self.models.convex)
+
+    def sizes_of(self, plan: Plan, hessian: Array) -> Sizes:
+        """The same of a plan about which the models are, with the Hessians of its cost.
 
         A control without limits has the size with which it moves states by theirs.
         """
@@ -196,14 +245,13 @@ class Stages:
         if problem.goal is not None and problem.start is not None:
             reach = np.maximum(reach, np.abs(np.nan_to_num(problem.goal - problem.start)))
         states = np.where(reach > 1e-3, reach, 1.0)
-        self.look_about(plan)
         moved = np.abs(self.models.jacobian[:, :, self.n :]).sum(axis=0) / states[:, None]
         enough = np.maximum(1 / np.maximum(moved.max(axis=0), 1e-6), np.abs(plan.controls).max(axis=0))
         controls = np.where(np.isfinite(self.high - self.low), self.high - self.low, enough)
         both = np.concatenate([states, controls])
         counts = np.maximum(self.live.sum(axis=0), 1)
-        rows = np.sqrt(((self.slopes * both) ** 2).sum(axis=2).sum(axis=0) / counts)
-        cost = 0.5 * float(np.abs(np.einsum("tww->w", self.models.convex)) @ both**2)
+        rows = np.sqrt(np.einsum("trw,trw,w->r", self.slopes, self.slopes, both**2) / counts)
+        cost = 0.5 * float(np.abs(np.einsum("tww->w", hessian)) @ both**2)
         return Sizes(states, controls, np.where(rows > 0, rows, 1.0), cost or 1.0)
 
     def spread(self, rows: Array) -> Array:
@@ -224,19 +272,19 @@ class Stages:
     def follow(self, plan: Plan, part: float, policy: tuple[Array, Array], limits: Limits) -> Plan:
         """The motion that a part of a step leads to; see the kernel's."""
         out = Plan(np.empty((self.steps + 1, self.n)), np.empty((self.steps, self.m)))
-        self._module.follow(self.steps, float(part), plan, Policy(*policy), limits, self._model, out)
+        self._call("follow", self.steps, float(part), plan, Policy(*policy), limits, self._model, out)
         return out
 
     def adjoint(self, gradient: Array) -> tuple[Array, Array]:
         """Costates (T+1, n) of stages with these gradients (T+1, n+m), and their slopes in the controls (T, m)."""
         costates, slopes = np.zeros((self.steps + 1, self.n)), np.zeros((self.steps, self.m))
-        self._module.adjoint(self.steps, gradient, self.models.jacobian, costates, slopes)
+        self._call("adjoint", self.steps, gradient, self.models.jacobian, costates, slopes)
         return costates, slopes
 
     def direction(self, hessian: Array, gradient: Array, gaps: Array) -> bool:
         """Write the step to the minimum of models, and the costates there; whether there is one."""
-        failed = self._module.direction(
-            self.steps, self.free,
+        failed = self._call(
+            "direction", self.steps, self.free,
             StepModels(in_c_order(hessian), in_c_order(gradient), self.models.jacobian, in_c_order(gaps)),
             Policy(self.gain, self.offset), self.to_go, self.changes,
         )  # fmt: skip
@@ -244,7 +292,9 @@ class Stages:
 
     def joined(self) -> Array:
         """The changes of states and controls side by side, (T+1, n+m)."""
-        return np.concatenate([self.changes.states, np.pad(self.changes.controls, ((0, 1), (0, 0)))], axis=1)
+        joined = np.zeros((self.steps + 1, self.n + self.m))
+        joined[:, : self.n], joined[:-1, self.n :] = self.changes
+        return joined
 
 
 class Point(NamedTuple):

@@ -1,24 +1,32 @@
 """Solving again and again in real time: all is compiled beforehand, and each solve ends in time with what it has."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array, InputError, check_array, check_kind, check_number
+from lqrsim.kernels.records import Plan
+from lqrsim.problem.constraints import allowed_violation, violation_of
+from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.replan import Replan
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Iteration, Status, Trajectory
+from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
+from lqrsim.solvers.active_set import ActiveSet
 from lqrsim.solvers.attempt import Attempt, AttemptResult
-from lqrsim.solvers.common import SmootherSettings, Stop, check_problem
+from lqrsim.solvers.common import SmootherSettings, Stop, check_problem, raised_by
 from lqrsim.solvers.constrained import satisfy
 from lqrsim.solvers.initial_guess import InitialGuess
+from lqrsim.solvers.interior_point import INTERIOR, InteriorPoint, Measures, Stages, iteration_of
+from lqrsim.solvers.strategy import LITTLE
 
+SLOPES = 1e-6  # of a Lagrangian, relative to the cost; what they promise is about the square of that
 ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
 
 
@@ -35,12 +43,13 @@ def prepare(
 
     Args:
       problem: what is to be solved again and again, with other states, goals, obstacles and parameters.
-      tolerance: as in `smooth`.
+      tolerance: as in `smooth`; with constraints by default 1e-6, of the slopes of the Lagrangian in the controls,
+        times their ranges and relative to the cost.
       gap_tolerance: as in `smooth`.
-      constraint_tolerance: as in `smooth` with the augmented Lagrangian: what inequalities are to have to spare, by
-        default 1e-3.
+      constraint_tolerance: by how much equalities may be missed, by default 1e-6; inequalities are kept. With noise, or
+        dynamics of an MJCF, what inequalities are to have to spare, by default 1e-3.
       max_iterations: as in `smooth`.
-      finish: as in `smooth`; with constraints it is None.
+      finish: as in `smooth`; None has constraints kept by the augmented Lagrangian.
 
     Returns:
       A PreparedSolver.
@@ -48,13 +57,13 @@ def prepare(
     Raises:
       InputError: an argument is not as described.
     """
-    if getattr(problem, "constraints", ()):
-        finish = None
     settings = SmootherSettings(
         form="dual", first_pass="forward", safeguard=True, stop="optimal", tolerance=tolerance,
         gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=None, start=None, starts=1,
         constraint_tolerance=constraint_tolerance, finish=finish,
     )  # fmt: skip
+    if tolerance is None and getattr(problem, "constraints", ()) and settings.newton(problem):
+        settings = replace(settings, tolerance=SLOPES)
     return PreparedSolver(problem, settings)
 
 
@@ -75,7 +84,8 @@ class PreparedSolver:
         self._states = problem.dynamics.state_coordinates
         self._controls = problem.applied_coordinates
         self._structure = compiled.structure(problem)
-        self._pace = 0.0  # s, of a slow iteration
+        self._pace, self._closing = 0.0, 0.0  # s, of a slow iteration, and of what follows the last one
+        self._idle: list[Stages] = []  # whose memory waits for the next solve
         self._compile()
 
     def _compile(self) -> None:
@@ -89,6 +99,14 @@ class PreparedSolver:
         attempt.work.constraint_values(*attempt.work.plan)
         for which in range(len(self.problem.constraint_terms)):
             attempt.work.constraint_slope(which, 0, state, control, 0)
+        if self.problem.constraints and attempt.newton:
+            _Neighbour(attempt, Stages(self.problem), Plan(*attempt.work.plan), _Best(attempt)).find()
+
+    def _stages_of(self, problem: Problem) -> Stages:
+        try:
+            return self._idle.pop().renewed(problem)
+        except IndexError:  # others are at work in the memory that there is
+            return Stages(problem)
 
     def check(self, problem: Problem) -> Problem:
         """Check that solving a problem compiles nothing: only numbers may differ from the prepared one.
@@ -138,17 +156,25 @@ class PreparedSolver:
         problem = (self.problem if problem is None else self.check(problem)).from_state(state, after=after)
         check_kind("start", start, (Solution, Replan, InitialGuess), "a Solution or a Replan")
         stop = Stop() if time_limit is None else Stop(clock + check_number("time_limit", time_limit, above=0.0))
-        stop.reserve = self._pace
+        stop.reserve = self._pace + self._closing
         guess = start if isinstance(start, InitialGuess) else _initial_guess(start, problem)
         attempt = Attempt.lent(problem, self.settings, guess, np.asarray(state, dtype=np.float64), stop)
         best = _Best(attempt)
         with problem.dynamics.solving(1):
-            found = _run(attempt, best)
+            if problem.constraints and attempt.newton:
+                stages = self._stages_of(problem)
+                neighbour = _Neighbour(attempt, stages, _plan_of(start, best), best, self._closing)
+                found, ended = neighbour.find(), neighbour.ended
+                self._idle.append(stages)
+            else:
+                found = _run(attempt, best)
+                ended = time.perf_counter()
         iterating = best.rolling_out + sum(one.seconds for one in found.iterations)
         self._pace = max(0.5 * self._pace, max((one.seconds for one in found.iterations), default=0.0))
         best.consider(found)
         answer = self._answer(problem, best, found, clock, iterating)
         attempt.give_back()  # but not where something was raised
+        self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
         return answer
 
     def _answer(self, problem: Problem, best: "_Best", found: AttemptResult, clock: float, iterating: float) -> Replan:
@@ -169,6 +195,16 @@ class PreparedSolver:
         )  # fmt: skip
 
 
+def _plan_of(start: Solution | Replan | InitialGuess, best: "_Best") -> Plan:
+    """The plan that a law belongs to, but for where it begins; else where the law leads."""
+    states, controls = best.plan
+    if isinstance(start, InitialGuess) or start.trajectory.states.shape != states.shape:
+        return Plan(states.copy(), controls.copy())
+    plan = Plan(start.trajectory.states.copy(), start.trajectory.controls.copy())
+    plan.states[0] = states[0]
+    return plan
+
+
 def _initial_guess(start: Solution | Replan, problem: Problem) -> InitialGuess:
     """The law to begin with, and what is known of its cost-to-go and of the multipliers."""
     n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
@@ -184,7 +220,7 @@ def _initial_guess(start: Solution | Replan, problem: Problem) -> InitialGuess:
 
 
 def _run(attempt: Attempt, best: "_Best") -> AttemptResult:
-    """The method, its safeguard and the constraints, until it converges or has to stop."""
+    """The method, its safeguard and what else keeps the constraints, until it converges or has to stop."""
     try:
         if attempt.initial_guess.multipliers:
             return satisfy(attempt, None, each=True, callback=best)
@@ -193,10 +229,101 @@ def _run(attempt: Attempt, best: "_Best") -> AttemptResult:
             found = satisfy(attempt, found, each=True, callback=best)
         return found
     except InputError as error:  # a function that is not finite at the start
-        states, controls = attempt.work.states, attempt.work.controls
+        return replace(_unchanged(attempt, best), status=Status.NOT_FINITE, detail=str(error))
+
+
+def _unchanged(attempt: Attempt, best: "_Best") -> AttemptResult:
+    """What there is before the first iteration."""
+    return AttemptResult(
+        status=Status.TIME_LIMIT, detail="", iterations=(), states=best.plan[0], controls=best.plan[1], law=best.law,
+        cost=np.inf, violation=np.inf, gap=np.nan,
+    )  # fmt: skip
+
+
+class _Neighbour:
+    """The optimum with constraints that is next to the plan of a law: by its active set, or by the interior point.
+
+    Args:
+      attempt: with the law and multipliers to begin with. stages: of its problem.
+      plan: states and controls that the law belongs to, the first state being the start.
+      best: the plan that the law leads to. closing: how long what follows the last iteration takes, in s.
+
+    Attributes:
+      ended: when the last iteration did.
+    """
+
+    def __init__(self, attempt: Attempt, stages: Stages, plan: Plan, best: "_Best", closing: float = 0.0) -> None:
+        self._attempt, self._stages, self._plan, self._best = attempt, stages, plan, best
+        self._closing = closing
+        self._allowed = attempt.settings.missed(attempt.problem)
+        self._iterations: list[Iteration] = []
+        self.ended, self._cost = time.perf_counter(), np.inf
+
+    def find(self) -> AttemptResult:
+        """Run until it converges or has to stop."""
+        attempt, stop = self._attempt, self._attempt.stop
+        if stop.due:
+            return _unchanged(attempt, self._best)
+        if not np.isfinite(self._best.cost):
+            detail = "the law that it begins with leads to infinity"
+            return replace(_unchanged(attempt, self._best), status=Status.NOT_FINITE, detail=detail)
+        known = tuple(one.values for one in attempt.initial_guess.multipliers)
+        for function in functions_of(attempt.problem):
+            function.forget()
+        with np.errstate(all="ignore"):
+            active = ActiveSet(self._stages, self._plan, known, self._allowed)
+            self.ended = time.perf_counter()
+            solved = active.run(attempt.final, lambda measures: self._watch(measures, "active set"), self._late)
+            left = attempt.iterations_left(tuple(self._iterations))
+            if not (solved or active.hopeless or stop.due) and left:
+                point = InteriorPoint(
+                    attempt.problem, Plan(*(array.copy() for array in self._best.plan)), barrier=LITTLE[0],
+                    room=LITTLE[1], multipliers=known, stages=self._stages,
+                )  # fmt: skip
+                found = point.run(
+                    tolerance=attempt.final, violation=self._allowed, most=left,
+                    watch=lambda measures: self._watch(measures, INTERIOR),
+                )  # fmt: skip
+                if found.solved or not np.isfinite(active.measures.cost):
+                    active = ActiveSet(self._stages, found.plan, found.multipliers, self._allowed)
+                    solved = active.run(attempt.final, lambda measures: self._watch(measures, "active set"), self._late)
+            return self._result(active, solved)
+
+    def _late(self) -> bool:
+        """Whether the deadline is so near that what is begun is to be left."""
+        stop = self._attempt.stop
+        return time.perf_counter() + self._closing >= stop.deadline
+
+    def _watch(self, measures: Measures, method: str) -> bool:
+        """Log an iteration; whether to stop."""
+        now = time.perf_counter()
+        self._iterations.append(replace(iteration_of(measures, self._cost, now - self.ended), method=method))
+        self.ended, self._cost = now, measures.cost
+        return self._attempt.stop.due or not self._attempt.iterations_left(tuple(self._iterations))
+
+    def _result(self, active: ActiveSet, solved: bool) -> AttemptResult:
+        """Where the plan leads with a policy about it."""
+        attempt, work = self._attempt, self._attempt.work
+        if not np.isfinite(active.measures).all():
+            status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS
+            detail, done = raised_by(functions_of(attempt.problem)), tuple(self._iterations)
+            return replace(_unchanged(attempt, self._best), status=status, detail=detail, iterations=done)
+        plan, gain = active.law()
+        cost, _ = self._stages.trial(plan)
+        values = work.constraint_values(*plan)
+        terms = attempt.problem.constraint_terms
+        pairs = zip(terms, values, strict=True)
+        solved = solved and all(
+            violation_of(term, one) <= allowed_violation(term, self._allowed) for term, one in pairs
+        )
+        status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS
+        detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
+        offset = plan.controls - np.einsum("tij,tj->ti", gain, plan.states[:-1])
         return AttemptResult(
-            status=Status.NOT_FINITE, detail=str(error), iterations=(), states=states, controls=controls,
-            law=(attempt.initial_guess.gain, attempt.initial_guess.offset), cost=np.inf, violation=np.inf, gap=np.nan,
+            status=Status.CONVERGED if solved else status, detail=detail, iterations=tuple(self._iterations),
+            states=plan.states, controls=plan.controls, law=(gain, offset), cost=cost,
+            violation=work.violation(values), gap=np.nan,
+            multipliers=tuple(Multipliers(*one) for one in active.multipliers()),
         )  # fmt: skip
 
 
@@ -220,6 +347,9 @@ class _Best:
         self.plan = self._work.states.copy(), self._work.controls.copy()
         self.law, self.cost_to_go, self.multipliers = (guess.gain, guess.offset), guess.cost_to_go, guess.multipliers
         self.improved = False
+        # Equalities are never kept but within a tolerance.
+        allowed = attempt.settings.missed(attempt.problem)
+        self._none = max((allowed_violation(term, allowed) for term in attempt.problem.constraint_terms), default=0.0)
         self._copies: tuple[Array, ...] = ()
 
     def __call__(self, iteration: Iteration) -> None:
@@ -243,7 +373,7 @@ class _Best:
         """What it ended with: that, if it converged and is as good; and if it is better in any case."""
         as_good = found.success and not self._better(self.cost, self.violation, found.cost, found.violation)
         if as_good or self._beaten_by(found.cost, found.violation):
-            there = found.states, found.controls, *found.law, *self._work.arrays.to_go
+            there = found.states, found.controls, *found.law, *(self._work.arrays.to_go if found.values else ())
             self._keep(found.cost, found.violation, there)
             self.multipliers = found.multipliers
 
@@ -254,7 +384,7 @@ class _Best:
         """Whether one plan is better than another: constraints first, then the cost, beyond rounding."""
         if not np.isfinite(cost) or np.isnan(violation):
             return False
-        if violation > 0 or than_violation > 0:
+        if max(violation, than_violation) > self._none:
             return violation < than_violation
         return not cost >= than_cost - ROUNDING * abs(than_cost)
 
