@@ -31,6 +31,9 @@ INTERIOR = "interior point"  # what its iterations are called
 MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # shares of the projected Hessian, tried in turn
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)  # on changes of controls, where not even that has a minimum; relative to the cost
 REGULARISATION = 1e-8  # of equalities, relative
+# Of rows that press, at the end. Where a row couples controls, what is across it must not look like rounding beside its
+# weight, of which the kernel takes a share of 1e-9 for nothing.
+CROSSING = 1e-6
 LONG = 0.3  # the part of a step from which the next one takes Mehrotra's rule
 BOUNDARY = 0.99  # of the way to where a slack is zero, how much is taken at least
 NOTHING = 1e-4  # of what it typically costs to change all, a cost that is as good as none
@@ -44,6 +47,7 @@ FINER, FINEST = 1e-2, 1e-13  # by what the tolerance falls where these are not r
 AT_LIMIT = 1e-9  # of its range, how far a control may be from a limit and count as at it
 CREEP, CREEPING = 0.1, 20  # the part of a step that is short; and how many of them in a row lead nowhere
 STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # part of a step below which equalities are softer, by how much, and at most
+ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the cost, that no plan can pay
 FARTHEST = 10.0  # times what the first plan misses, what others may; of gaps and rows at least 1/20 a step
 EDGE = 0.05  # how far inside of their limits controls begin, relative to their range
 
@@ -508,7 +512,7 @@ class InteriorPoint:
         right = False
         for _ in range(CROSSINGS):
             numbers = self.point.numbers - aim
-            sigma = np.where(presses, self._scale / (REGULARISATION * size**2), 0.0)
+            sigma = np.where(presses, self._scale / (CROSSING * size**2), 0.0)
             self._force = np.where(presses, self._force, np.where(paid, np.sign(self._force) * highest, 0.0))
             stages.linearize(self.point.plan, self._costates, self.stages.spread(self._force), 0.0)
             gaps = stages.models.arrived - self.point.plan.states[1:]
@@ -596,7 +600,7 @@ class InteriorPoint:
         duals = self._duals(self._force)
         ratio = point.slack / duals
         while True:
-            # Far away, equalities as linearised may ask for a step to nowhere: softly they ask for a part of it.
+            # Far away, equalities as linearised may ask for what no plan can pay: softly they ask for a part of it.
             soft = self._soft * self._regularised
             sigma = 1 / (soft + np.bincount(self._row, ratio, len(point.numbers)))
             barrier = stages.curvature(sigma)
@@ -612,8 +616,9 @@ class InteriorPoint:
             step = self._step(sigma, duals, corrections)
             slope = self._slope(step)
             taken = self._search(step, slope, hessian, sigma, duals, corrections)
-            long_enough = taken is not None and taken[1] >= STUCK
-            if long_enough or not soft.any() or self._soft >= SOFTEST:
+            moving = taken is not None and taken[1] >= STUCK
+            asked = float((np.abs(step.multipliers) * self._size * (soft > 0)).max(initial=0.0))
+            if moving or asked < ABSURD * scale or self._soft >= SOFTEST:
                 break
             self._soft *= SOFTER
         self.iterations += 1
