@@ -164,9 +164,10 @@ def test_the_second_search_may_begin_within_an_obstacle(differential_drive) -> N
     np.testing.assert_array_equal(harder.final_cost.terms[0].weight, 10 * final.weight)  # pyright: ignore[reportAttributeAccessIssue]
     solution = ls.smooth(of)
     assert any("times the weight" in one.start for one in solution.candidates)
-    x = solution.trajectory.states[-1]
-    assert np.hypot(*(x[:2] - of.goal[:2])) < 0.05, solution.summary()  # pyright: ignore[reportOptionalSubscript]
-    assert (solution.clearance[0] < 0) & (solution.clearance[-1] > 0)
+    assert of.goal is not None
+    np.testing.assert_allclose(solution.trajectory.states[-1, :2], of.goal[:2], rtol=0, atol=0.05)
+    assert solution.clearance is not None
+    assert solution.clearance[0] < 0 < solution.clearance[-1]
 
 
 def in_the_plane(*, plain: bool = False, **changes: Any) -> ls.Problem:
