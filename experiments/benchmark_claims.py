@@ -8,6 +8,7 @@ Every claim is held against the problem alone, by whole_problems/claims.py, whic
 
 drawn        Random systems with fixed and soft starts, limits, constraints, warm starts, few and many iterations.
 planar       A planar quadrotor that has to get over a wall: 60 starts and goals, with a clearance and without.
+known        Problems of which the answer is known beforehand, whole_problems/known.py: 100 of each kind.
 certificate  What the certificate costs of a solve, on the paper's queries and on warm starts.
 """
 
@@ -25,7 +26,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import tyro
 from tqdm import tqdm
-from whole_problems import planar_quadrotor
+from whole_problems import known, planar_quadrotor
 from whole_problems.claims import contradictions
 from whole_problems.draws import KINDS, draw, solve
 
@@ -34,7 +35,7 @@ from lqrsim.machine import processors
 from lqrsim.solvers.attempt import Attempt
 from lqrsim.versions import versions
 
-Section = Literal["drawn", "planar", "certificate"]
+Section = Literal["drawn", "planar", "known", "certificate"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +61,7 @@ def main(config: Config) -> dict[str, Any]:
         config = dataclasses.replace(config, problems=min(config.problems, 110), queries=min(config.queries, 10))
     result: dict[str, Any] = {"config": asdict(config), "versions": versions(), "processors": processors()}
     for name in config.sections:
-        result[name] = {"drawn": _drawn, "planar": _planar, "certificate": _certificate}[name](config)
+        result[name] = {"drawn": _drawn, "planar": _planar, "known": _known, "certificate": _certificate}[name](config)
     return result
 
 
@@ -128,6 +129,27 @@ def _planar(config: Config) -> dict[str, Any]:
     return result
 
 
+def _known(config: Config) -> dict[str, Any]:
+    count, result = 10 if config.quick else 100, dict[str, Any]()
+    for kind in known.KINDS:
+        ended, wrong = Counter[str](), list[str]()
+        for number in tqdm(range(count), desc=kind, leave=False, disable=None):
+            drawn = known.draw(kind, number, seed=config.seed)
+            solution = ls.smooth(drawn.problem, start=drawn.start, threads=1)
+            ended[f"{solution.status.name}, {'with' if drawn.possible else 'without'} a plan"] += 1
+            says = [*known.false(drawn, solution), *contradictions(_settled(drawn.problem, solution), solution)]
+            wrong += [f"{kind} {number} (seed {config.seed}): {one}" for one in says]
+        result[kind] = {"problems": count, "statuses": ended, "false": wrong}
+    return result
+
+
+def _settled(problem: ls.Problem, solution: ls.Solution) -> ls.Problem:
+    """With the solution's duration, where that was free."""
+    if problem.duration is None:
+        return problem
+    return replace(problem, dt=solution.trajectory.dt, duration=None, time_weight=0.0)
+
+
 def _goal(problem: ls.Problem) -> np.ndarray:
     assert problem.goal is not None
     return problem.goal
@@ -178,6 +200,10 @@ def report(result: dict[str, Any]) -> str:
             f" median cost {row['cost']:.4g}; {row['seconds']:.1f} s"
         )
         lines += [f"  FALSE: {wrong}" for wrong in row["false"]]
+    for kind, row in result.get("known", {}).items():
+        ended = "; ".join(f"{count} {how}" for how, count in Counter(row["statuses"]).most_common())
+        lines.append(f"known, {kind}: {row['problems']} problems, {len(row['false'])} false claims: {ended}")
+        lines += [f"  FALSE: {wrong}" for wrong in row["false"]]
     if certificate := result.get("certificate"):
         shares = ", ".join(f"{100 * share:.1f} % ({name})" for name, share in certificate.items())
         lines.append(f"the certificate's share of a solve, in the median: {shares}")
@@ -190,6 +216,6 @@ if __name__ == "__main__":
     print(json.dumps(outcome) if settings.json else report(outcome))
     wrong = [
         *outcome.get("drawn", {}).get("false", []),
-        *(w for row in outcome.get("planar", {}).values() for w in row["false"]),
+        *(w for name in ("planar", "known") for row in outcome.get(name, {}).values() for w in row["false"]),
     ]
     raise SystemExit(1 if wrong else 0)

@@ -19,6 +19,8 @@ limits       With narrow limits of the controls: kept to the last bit, and what 
 worlds       Random worlds of both robots, one in five nearly blocked; settings untouched.
 resolve      Started with a solution of a similar problem: of a horizon that moved along, of another goal.
 ingredients  What each choice of the search brings; see lqrsim/solvers/multistart.py.
+finish       Newton's method at the end against smoothing alone, from hover: iterations to 1e-8, and whether both end in
+             the same optimum.
 """
 
 import json
@@ -28,7 +30,7 @@ from typing import Any
 
 import peers
 import tyro
-from quality import clearances, ingredients, limits, random_worlds, resolve, starts, timing
+from quality import clearances, finish, ingredients, limits, random_worlds, resolve, starts, timing
 from quality.common import Config, Section
 
 from lqrsim.machine import processors
@@ -42,6 +44,7 @@ SECTIONS: dict[Section, ModuleType] = {
     "worlds": random_worlds,
     "resolve": resolve,
     "ingredients": ingredients,
+    "finish": finish,
 }
 
 

@@ -8,6 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import lqrsim as ls
+
 rates = import_module("paper.rates")
 
 
@@ -51,6 +53,7 @@ def test_second_order_would_be_noticed() -> None:
     script = import_module("convergence")
     published = Path(__file__).parent.parent / "docs" / "results.json"
     result = json.loads(published.read_text(encoding="utf-8"))["results"]["convergence"]["result"]
+    settling = import_module("paper.settling")
     for run, seen in ((costs(0.3, 1.0, 2.0), True), (costs(9e-4, 1.0, 2.0), True), (costs(0.3, 0.5), False)):
         log = [SimpleNamespace(cost=cost) for cost in run]
         solvers = script.SMOOTHING, script.ILQR, script.FINISHED
@@ -59,6 +62,8 @@ def test_second_order_would_be_noticed() -> None:
         result["rates"]["quadrotor"] = {
             case: {who: script.rates(queries, case, who) for who in logs} for case, logs in cases.items()
         }
+        left = np.array([1e-2, 1e-4, 1e-8]) if seen else np.array([1e-2, 1e-3, 1e-4])
+        result["settling"] = {"one": {"status": "CONVERGED", "errors": [], "order": settling.order(left)}}
         said = {one.paper: one.holds for one in script.statements(result)}
         assert said["a second-order convergence rate was not observed, for neither iLQR nor smoothing"] != seen
         assert (
@@ -66,3 +71,19 @@ def test_second_order_would_be_noticed() -> None:
         )
         finished = "a second-order convergence rate was not observed; Newton's method at the end has one"
         assert said[finished] == seen
+        interior = "a second-order convergence rate was not observed; the interior point has one where constraints act"
+        assert said[interior] == seen
+
+
+def test_the_interior_point_settles_by_newtons_steps() -> None:
+    """A pendulum with a torque at its limits: each error is about the square of the one before, which Gauss-Newton's
+    would not be."""
+    settling = import_module("paper.settling")
+    (found,) = (
+        settling.errors(problem, ls.smooth(problem, start=start), np.random.default_rng(1))
+        for name, problem, start in settling.problems(0)
+        if name == "pendulum"
+    )
+    assert settling.order(found) > 1.4
+    assert found[0] > 1e-3
+    assert found[4] < 1e-12

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim.disturbances import ControlNoise
 from lqrsim.errors import (
     LONGEST,
     InputError,
@@ -177,7 +176,7 @@ class TestCounts:
         assert "steps: got" in refusal(lambda: dataclasses.replace(problem, steps=count))
         for options in ({"starts": count}, {"threads": count}, {"max_iterations": count}):
             name = next(iter(options))
-            assert refusal(lambda o=options: ls.smooth(problem, **o)).startswith(f"{name}: got {count}, want a whole")
+            assert refusal(lambda o=options: lq.smooth(problem, **o)).startswith(f"{name}: got {count}, want a whole")
 
     @pytest.mark.parametrize("count", COUNTS)
     def test_of_runs(self, count: int, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
@@ -193,10 +192,12 @@ class TestCounts:
     @pytest.mark.parametrize("name", ["size", "particles", "moves", "repetitions", "most_levels"])
     def test_of_splitting(self, name: str, count: int) -> None:
         options = {"size": 2, name: count}
-        assert refusal(lambda: ls.stress.split(lambda z: z[:, 0], **options)).startswith(f"{name}: got {count}, ")
+        assert refusal(lambda: lq.stress.split(lambda z: z[:, 0], **options)).startswith(f"{name}: got {count}, ")
 
     def test_of_campaigns(self, tmp_path: Path) -> None:
-        campaign = ls.stress.Campaign(scenario="quadrotor", sweeps={"noise": (ControlNoise(0.1),)}, trials=1)
+        campaign = ls.stress.Campaign(
+            scenario="quadrotor", sweeps={"noise": (ls.disturbances.ControlNoise(0.1),)}, trials=1
+        )
         assert "workers" in refusal(lambda: ls.stress.run_campaign(campaign, tmp_path / "a", workers=2**31))
         assert "trials" in refusal(lambda: dataclasses.replace(campaign, trials=10**20))
 
@@ -234,7 +235,7 @@ class TestDataThatUsersBuild:
             ("nominal", policy.nominal.T), ("state_coordinates", None), ("gain", np.zeros((0, 2, 3))),
         ):  # fmt: skip
             assert refusal(lambda f=field, v=value: dataclasses.replace(policy, **{f: v})).startswith("AffinePolicy: ")
-        assert refusal(lambda: ls.AffinePolicy.__call__(policy, np.zeros(3), "soon")).startswith(
+        assert refusal(lambda: lq.AffinePolicy.__call__(policy, np.zeros(3), "soon")).startswith(
             "t: got 'soon', want a finite number >= 0"
         )
         assert policy(np.zeros(3), 1e300).shape == (2,)  # the last law stays in force
@@ -295,30 +296,30 @@ class TestDataThatUsersBuild:
     def test_objects_of_the_wrong_kind(self, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
         plant, problem = differential_drive.plant(), differential_drive.problem
         for call in (
-            lambda: ls.smooth("problem"), lambda: ls.ilqr([problem]), lambda: ls.simulate(plant, [drive_solution]),
-            lambda: ls.simulate("plant", drive_solution), lambda: ls.simulate(plant, drive_solution, controller="none"),
-            lambda: ls.Feedback(drive_solution), lambda: ls.Replanning("problem", drive_solution, every=1.0),
-            lambda: ls.view.plot_run("solution", {}, "a.png", world=differential_drive.scene.world),
-            lambda: ls.report("results", "a.html"), lambda: ls.verify_run("run"),
-            lambda: ls.stress.outcomes("run", plant), lambda: ls.render("run", "a.mp4"),
-            lambda: ls.Plant("robot", differential_drive.scene),
-            lambda: ls.save("solution", "a.npz"), lambda: ls.World(["box"]),
-            lambda: ls.disturbances.preset("light", "plant"),
-            lambda: ls.smooth(problem, start=lambda: 0), lambda: ls.smooth_many(itertools.repeat(3)),
+            lambda: lq.smooth("problem"), lambda: lq.ilqr([problem]), lambda: lq.simulate(plant, [drive_solution]),
+            lambda: lq.simulate("plant", drive_solution), lambda: lq.simulate(plant, drive_solution, controller="none"),
+            lambda: lq.Feedback(drive_solution), lambda: lq.Replanning("problem", drive_solution, every=1.0),
+            lambda: lq.view.plot_run("solution", {}, "a.png", world=differential_drive.scene.world),
+            lambda: lq.report("results", "a.html"), lambda: lq.verify_run("run"),
+            lambda: lq.stress.outcomes("run", plant),
+            lambda: lq.render("run", "a.mp4"), lambda: lq.Plant("robot", differential_drive.scene),
+            lambda: lq.save("solution", "a.npz"), lambda: lq.World(["box"]),
+            lambda: lq.disturbances.preset("light", "plant"),
+            lambda: lq.smooth(problem, start=lambda: 0), lambda: lq.smooth_many(itertools.repeat(3)),
         ):  # fmt: skip
             assert ": got " in refusal(call)
 
     def test_names_are_one_short_line(
         self, differential_drive: ls.Scenario, drive_solution: ls.Solution, tmp_path: Path
     ) -> None:
-        rollout, world = ls.simulate(differential_drive.plant(), drive_solution), differential_drive.scene.world
+        rollout, world = lq.simulate(differential_drive.plant(), drive_solution), differential_drive.scene.world
         path = tmp_path / "run.png"
         for label in ("x" * 5000, "two\nlines", "", 3):
-            call = lambda name=label: ls.view.plot_run(drive_solution, {name: rollout}, path, world=world)  # noqa: E731
+            call = lambda name=label: lq.view.plot_run(drive_solution, {name: rollout}, path, world=world)  # noqa: E731
             assert refusal(call).startswith("rollouts: label: got ")
-        assert "titles" in refusal(lambda: ls.render(rollout, tmp_path / "a.mp4", titles=["two\nlines"]))
-        assert "sweeps: name" in refusal(lambda: ls.stress.Campaign(scenario="quadrotor", sweeps={"a\nb": ()}))
-        ls.view.plot_run(drive_solution, {"a run for $5, or $x^": rollout}, path, world=world)
+        assert "titles" in refusal(lambda: lq.render(rollout, tmp_path / "a.mp4", titles=["two\nlines"]))
+        assert "sweeps: name" in refusal(lambda: lq.stress.Campaign(scenario="quadrotor", sweeps={"a\nb": ()}))
+        lq.view.plot_run(drive_solution, {"a run for $5, or $x^": rollout}, path, world=world)
         assert path.is_file()
 
 

@@ -11,7 +11,7 @@ from whole_problems import kkt
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.results.solution_parts import Iteration, Status
-from lqrsim.solvers.multistart import bends, guides, path
+from lqrsim.solvers.multistart import bends, bold, guides, path
 
 STARTS = ["straight", *(f"{far} m to the {side}" for far in (1, 2, 3) for side in ("left", "right"))]
 
@@ -150,6 +150,24 @@ class TestPaths:
         assert same(many[0], drive_solution)
         assert same(many[1], ls.smooth(other, start=guides(other, 1)[0][1]))
         assert {id(one) for one in calls} == {id(problem), id(other)}
+
+
+def test_the_second_search_may_begin_within_an_obstacle(differential_drive) -> None:
+    """As a robot may that has been pushed: a problem that is stated must not, and what is made of this one may."""
+    pillar = next(one for one in ls.load_scene("arena").world.obstacles if one.name == "pillar_1")
+    x, y, _ = pillar.position
+    of = differential_drive.problem.from_state((x + 0.1, y, np.pi / 2))
+    with pytest.raises(ls.InputError, match="pillar_1"):
+        replace(of)
+    harder, (weight,), (final,) = bold(of, 10.0), of.obstacle_costs, [of.final_cost]
+    assert [one.weight for one in harder.obstacle_costs] == [10 * weight.weight]
+    np.testing.assert_array_equal(harder.final_cost.terms[0].weight, 10 * final.weight)  # pyright: ignore[reportAttributeAccessIssue]
+    solution = ls.smooth(of)
+    assert any("times the weight" in one.start for one in solution.candidates)
+    assert of.goal is not None
+    np.testing.assert_allclose(solution.trajectory.states[-1, :2], of.goal[:2], rtol=0, atol=0.05)
+    assert solution.clearance is not None
+    assert solution.clearance[0] < 0 < solution.clearance[-1]
 
 
 def in_the_plane(*, plain: bool = False, **changes: Any) -> ls.Problem:

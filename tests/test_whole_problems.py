@@ -7,7 +7,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
-from whole_problems import draws, planar_quadrotor
+from whole_problems import draws, known, planar_quadrotor
 from whole_problems.claims import contradictions
 
 import lqrsim as ls
@@ -43,6 +43,30 @@ def test_a_draw_does_not_depend_on_what_else_is_drawn() -> None:
     assert draws.draw("car", 5).problem.digest == draws.draw("car", 5).problem.digest
     digests = {draws.draw("car", number).problem.digest for number in range(20)}
     assert len(digests) == 20
+
+
+@pytest.mark.parametrize("kind", known.KINDS)
+def test_what_is_known_beforehand_is_found(kind: str) -> None:
+    """A sample of what benchmark_claims.py draws: all that can be solved is, and nothing that is said is false."""
+    for number in range(4):
+        drawn = known.draw(kind, number)
+        solution = ls.smooth(drawn.problem, start=drawn.start)
+        assert known.false(drawn, solution) == [], f"{kind} {number}"
+        assert solution.success == drawn.possible, f"{kind} {number}"
+
+
+def test_what_is_known_otherwise_is_noticed() -> None:
+    drawn = known.draw("weights", 0)
+    solution = ls.smooth(drawn.problem)
+    assert drawn.controls is not None
+    other = dataclasses.replace(drawn, controls=1.0001 * drawn.controls)
+    assert "off by" in known.false(other, solution)[0]
+    assert "no plan" in known.false(dataclasses.replace(drawn, possible=False), solution)[0]
+    assert (
+        "takes" in known.false(dataclasses.replace(drawn, duration=1.0001 * solution.trajectory.horizon), solution)[0]
+    )
+    refused = dataclasses.replace(solution, status=Status.INFEASIBLE)
+    assert "INFEASIBLE" in known.false(drawn, refused)[0]
 
 
 Case = tuple[ls.Problem, ls.Solution]

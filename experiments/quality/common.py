@@ -17,7 +17,7 @@ from tqdm import tqdm
 import lqrsim as ls
 from lqrsim.errors import Array
 
-Section = Literal["starts", "time", "clearance", "limits", "worlds", "resolve", "ingredients"]
+Section = Literal["starts", "time", "clearance", "limits", "worlds", "resolve", "ingredients", "finish"]
 Solve = Callable[[ls.Problem], peers.Answer]
 Found = dict[str, Any]
 

@@ -190,6 +190,24 @@ class Problem:
         left, begin = tuple(one.ahead(after) for one in self.constraints), self.begin + after * self.dt
         return other._with(steps=self.steps - after, begin=begin, constraints=left)._bound_anew()
 
+    def with_costs(self, *, stage_cost: Cost | None = None, final_cost: Cost | None = None) -> "Problem":
+        """The same with other costs. It may begin within an obstacle if this does; see `from_state`.
+
+        Args:
+          stage_cost: or None for the one there is.
+          final_cost: or None for the one there is.
+
+        Returns:
+          A Problem.
+
+        Raises:
+          InputError: a cost does not belong to the system.
+        """
+        given = {"stage_cost": stage_cost, "final_cost": final_cost}
+        costs = {name: cost for name, cost in given.items() if cost is not None}
+        terms = {name: self._bound(terms_of(cost, name)) for name, cost in costs.items()}
+        return self._with(**costs, _terms=self._terms | terms)
+
     def later(self, seconds: float) -> "Problem":
         """The same problem with a later begin: moving obstacles are where they are then.
 

@@ -108,7 +108,7 @@ def _first_feasible(
             callback(without_cost(iteration))
 
     costs = [cost.weighing(0.0) if isinstance(cost, ObstacleCost) else cost for cost in terms_of(problem.stage_cost)]
-    plain = dataclasses.replace(problem, stage_cost=CostSum(tuple(costs)))
+    plain = problem.with_costs(stage_cost=CostSum(tuple(costs)))
     without = _again(attempt, plain, dataclasses.replace(attempt.initial_guess, prior=None), found.iterations)
     kept = without.finish(each=each, callback=told)
     if kept.success and not attempt.stop.due and without.iterations_left(kept.iterations):

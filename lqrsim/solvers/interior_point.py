@@ -31,6 +31,9 @@ INTERIOR = "interior point"  # what its iterations are called
 MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # shares of the projected Hessian, tried in turn
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)  # on changes of controls, where not even that has a minimum; relative to the cost
 REGULARISATION = 1e-8  # of equalities, relative
+# Of rows that press, at the end. Where a row couples controls, what is across it must not look like rounding beside its
+# weight, of which the kernel takes a share of 1e-9 for nothing.
+CROSSING = 1e-6
 LONG = 0.3  # the part of a step from which the next one takes Mehrotra's rule
 BOUNDARY = 0.99  # of the way to where a slack is zero, how much is taken at least
 NOTHING = 1e-4  # of what it typically costs to change all, a cost that is as good as none
@@ -43,6 +46,9 @@ CROSSINGS = 8  # steps without a barrier, at the end
 FINER, FINEST = 1e-2, 1e-13  # by what the tolerance falls where these are not right, and how far
 AT_LIMIT = 1e-9  # of its range, how far a control may be from a limit and count as at it
 CREEP, CREEPING = 0.1, 20  # the part of a step that is short; and how many of them in a row lead nowhere
+STUCK, SOFTER, SOFTEST = 1e-2, 1e2, 1e10  # part of a step below which equalities are softer, by how much, and at most
+ABSURD = 1e3  # change of a multiplier, times its row's size and relative to the cost, that no plan can pay
+FARTHEST = 10.0  # times what the first plan misses, what others may; of gaps and rows at least 1/20 a step
 EDGE = 0.05  # how far inside of their limits controls begin, relative to their range
 
 
@@ -354,12 +360,14 @@ class InteriorPoint:
         self.sizes = stages.sizes(plan)
         self._state_size, self._range, self._row_size, self._typical = self.sizes
         self._rows_of(plan, barrier, room, price, multipliers)
-        self.iterations, self.gain = 0, stages.gain
+        self.iterations = 0
         self._filter: list[tuple[float, float]] = []
         self._mixed, self._part, self._forced = False, 1.0, 0
+        self._soft = 1.0
         stages.linearize(plan, self._costates, self.stages.spread(self._force), np.inf)
-        self._costates, self._slopes = self._adjoint()
+        self._costates, _ = self._adjoint()
         self._measure()
+        self._farthest = FARTHEST * max(0.05 * stages.steps, self._off(self.point))
 
     def _rows_of(self, plan: Plan, barrier: float, room: float, price: float, multipliers: tuple[Array, ...]) -> None:
         """Set up slacks and multipliers."""
@@ -504,7 +512,7 @@ class InteriorPoint:
         right = False
         for _ in range(CROSSINGS):
             numbers = self.point.numbers - aim
-            sigma = np.where(presses, self._scale / (REGULARISATION * size**2), 0.0)
+            sigma = np.where(presses, self._scale / (CROSSING * size**2), 0.0)
             self._force = np.where(presses, self._force, np.where(paid, np.sign(self._force) * highest, 0.0))
             stages.linearize(self.point.plan, self._costates, self.stages.spread(self._force), 0.0)
             gaps = stages.models.arrived - self.point.plan.states[1:]
@@ -591,21 +599,29 @@ class InteriorPoint:
             self._lower_barrier(least)
         duals = self._duals(self._force)
         ratio = point.slack / duals
-        sigma = 1 / (self._regularised + np.bincount(self._row, ratio, len(point.numbers)))
-        barrier = stages.curvature(sigma)
-        mix = self._mix(barrier, sigma, duals)
-        if mix is None:
-            return False
+        while True:
+            # Far away, equalities as linearised may ask for what no plan can pay: softly they ask for a part of it.
+            soft = self._soft * self._regularised
+            sigma = 1 / (soft + np.bincount(self._row, ratio, len(point.numbers)))
+            barrier = stages.curvature(sigma)
+            mix = self._mix(barrier, sigma, duals)
+            if mix is None:
+                return False
+            corrections = np.zeros(len(point.slack))
+            self._mixed = mix > 0
+            hessian = self._hessian(mix, barrier)
+            if not self._mixed and self._part >= LONG and len(self._row):
+                corrections = self._predict(hessian, sigma, duals, least)
+                self._solve(hessian, sigma, duals, corrections, self._missed(point) * 0)
+            step = self._step(sigma, duals, corrections)
+            slope = self._slope(step)
+            taken = self._search(step, slope, hessian, sigma, duals, corrections)
+            moving = taken is not None and taken[1] >= STUCK
+            asked = float((np.abs(step.multipliers) * self._size * (soft > 0)).max(initial=0.0))
+            if moving or asked < ABSURD * scale or self._soft >= SOFTEST:
+                break
+            self._soft *= SOFTER
         self.iterations += 1
-        corrections = np.zeros(len(point.slack))
-        self._mixed = mix > 0
-        hessian = self._hessian(mix, barrier)
-        if not self._mixed and self._part >= LONG and len(self._row):
-            corrections = self._predict(hessian, sigma, duals, least)
-            self._solve(hessian, sigma, duals, corrections, self._missed(point) * 0)
-        step = self._step(sigma, duals, corrections)
-        slope = self._slope(step)
-        taken = self._search(step, slope, hessian, sigma, duals, corrections)
         if taken is None:
             self._forced += 1
             if self._forced > FORCED or not self._solve(
@@ -625,6 +641,8 @@ class InteriorPoint:
         new, part, step = taken
         self._filter.append(((1 - MARGIN) * before[0], before[1] - MARGIN * before[0]))
         self._part = part
+        if part >= LONG:
+            self._soft = max(1.0, self._soft / SOFTER)
         dual_part = self._longest(duals, self._sign * step.multipliers[self._row])
         held = np.isfinite(self._regularised) & (self._regularised > 0)
         self._force = self._force + np.where(held, part, dual_part) * step.multipliers
@@ -746,7 +764,9 @@ class InteriorPoint:
         """Whether the filter takes it."""
         off, merit = self._off(tried), self._merit(tried)
         before, at_first = self._off(self.point), self._merit(self.point)
-        if not np.isfinite(merit) or any(off > worst and merit > dearest for worst, dearest in self._filter):
+        if not np.isfinite(merit) or off > self._farthest:
+            return False
+        if any(off > worst and merit > dearest for worst, dearest in self._filter):
             return False
         small = 1e-4 * max(1.0, 1e-2 * self._gaps.size)
         if before < small and slope < 0 and (-part * slope) ** 2.3 > before**1.1:

@@ -78,7 +78,7 @@ def bold(problem: Problem, times: float) -> Problem:
 
     stage = [heavier(cost) if isinstance(cost, ObstacleCost) else cost for cost in terms_of(problem.stage_cost)]
     final = [heavier(cost) for cost in terms_of(problem.final_cost)]
-    return dataclasses.replace(problem, stage_cost=CostSum(tuple(stage)), final_cost=CostSum(tuple(final)))
+    return problem.with_costs(stage_cost=CostSum(tuple(stage)), final_cost=CostSum(tuple(final)))
 
 
 def swayed(problem: Problem, cycles: int) -> Array:

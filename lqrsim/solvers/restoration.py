@@ -22,7 +22,7 @@ LAST = 1e-6  # the same of all rows at the end: shares are right to its root
 ARMIJO, SHORTEST = 1e-4, 1e-6
 INSIDE = 0.01  # of the way to a limit, what is left by a step
 EDGE = 0.01  # of the range, how far inside of the limits controls begin
-WEIGHTS = (0.0, 1e-6, 1e-4, 1e-2, 1.0, 1e2)  # on changes of controls, relative to cost and price
+WEIGHTS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)  # on changes of controls, relative to cost and price
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def _direction(stages: Stages, barrier: Array, gradient: Array, sizes: Sizes, pr
         if stages.direction((1 - mix) * models.hessian + mix * models.convex + barrier, gradient, none):
             return True
     diagonal = np.arange(stages.n, stages.n + stages.m)
-    for weight in WEIGHTS[1:]:
+    for weight in WEIGHTS:
         heavier = models.convex + barrier
         heavier[:, diagonal, diagonal] += weight * price * sizes.cost / sizes.controls**2 / stages.steps
         if stages.direction(heavier, gradient, none):

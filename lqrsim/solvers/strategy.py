@@ -40,10 +40,11 @@ FAR = 100.0  # times what may be missed: then the price is too low, or there is 
 STARTS = 2  # from which what is missed has to be stationary, before that is called infeasible
 AUGMENTED = 100  # iterations of the augmented Lagrangian
 OPENING, GUIDED = 10, 60  # iterations of smoothing at most before constraints come in; and with an ObstacleCost
-MOST = 150  # of the interior point from one plan
+MOST, RESTORED = 300, 150  # of the interior point from one plan; and of a descent at one price
 RESTORATION = "restoration"  # what its iterations are called
 MUCH, LITTLE = (1.0, 0.02), (0.01, 0.01)  # barrier and room of a first plan, and of one that is near to the answer
 PRICES = (1e2, 1e4)  # of missing a constraint by its size, relative to the cost
+SLOW, PATIENCE = 1e-2, 3  # change of cost that ends such a descent where nothing is missed, and how often in a row
 PENALTY = 8.0  # of the augmented Lagrangian that holds the policy to the constraints, in the same unit
 UPDATES = 5  # of multipliers, where Newton's steps at the end come to miss constraints
 ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
@@ -219,12 +220,12 @@ class Ladder:
             if priced is None:
                 return None
             plan = priced.plan
-            values = self._attempt.work.constraint_values(plan.states, plan.controls)
-            missed = self._attempt.work.violation(values) > FAR * self._allowed
-            if missed and price == PRICES[-1] and priced.settled and self._look_for_evidence(priced, sizes):
+            there = self._note(self._result(plan.states, plan.controls, self._without_gains(plan)))
+            missed = there.violation > FAR * self._allowed
+            if missed and price == PRICES[-1] and priced.settled and self._look_for_evidence(priced, there, sizes):
                 return None
             if not missed or price == PRICES[-1]:
-                found = self._interior(plan, LITTLE)
+                found = self._interior(plan, MUCH)
                 if found is not None and found.success:
                     return found
         return None
@@ -232,39 +233,38 @@ class Ladder:
     def _restore(self, plan: Plan, price: float) -> tuple[Restored | None, Sizes]:
         """Descent at a price, with a line of the log each."""
         stop, left = self._attempt.stop, self._attempt.iterations_left(self._iterations) - 1
-        before, clock = np.inf, time.perf_counter()
+        before, clock, slow = np.inf, time.perf_counter(), 0
 
         def watch(cost: float, violation: float, promised: float) -> bool:
-            nonlocal before, clock
+            nonlocal before, clock, slow
             now = time.perf_counter()
             improvement = (before - cost) / max(abs(cost), 1e-300)
             self._iterations += (Iteration(cost, improvement, 0.0, promised, 0.0, violation, now - clock, RESTORATION),)
+            slow = slow + 1 if violation <= self._allowed and abs(improvement) < SLOW else 0
             before, clock = cost, now
             if self._callback is not None:
                 self._callback(self._iterations[-1])
-            return stop.due
+            return stop.due or slow == PATIENCE
 
         sizes = self._stages.sizes(plan)
         if left < 1 or stop.due:
             return None, sizes
         try:
             with np.errstate(all="ignore"):
-                return restore(self._stages, plan, sizes, price=price, most=min(MOST, left), watch=watch), sizes
+                return restore(self._stages, plan, sizes, price=price, most=min(RESTORED, left), watch=watch), sizes
         except BaseException as error:  # as above
             stop.error = error
             return None, sizes
 
-    def _look_for_evidence(self, priced: Restored, sizes: Sizes) -> bool:
+    def _look_for_evidence(self, priced: Restored, there: AttemptResult, sizes: Sizes) -> bool:
         """Whether what is missed there is stationary; if so it is kept."""
-        plan = priced.plan
-        there = self._rolled_out(plan, np.zeros((len(plan.controls), plan.controls.shape[1], plan.states.shape[1])))
         rows = [sizes.rows[self._stages.owners == k] for k in range(len(priced.shares))]
         found = evidence(
             self._problem, self._attempt.work, there.states, there.controls, shares=priced.shares, sizes=rows,
             allowed=self._allowed, control_size=sizes.controls, state_size=sizes.states,
         )  # fmt: skip
         if found is not None:
-            self._evidence.append((found, self._note(there)))
+            self._evidence.append((found, there))
         return found is not None
 
     def _interior(
@@ -317,6 +317,9 @@ class Ladder:
         guess = self._attempt.initial_guess
         states, controls = compiled.rollout(self._problem, guess.gain, guess.offset, work.start.copy())
         return self._result(states, controls, (guess.gain, guess.offset))
+
+    def _without_gains(self, plan: Plan) -> tuple[Array, Array]:
+        return np.zeros((*plan.controls.shape, plan.states.shape[1])), plan.controls
 
     def _rolled_out(self, plan: Plan, gain: Array) -> AttemptResult:
         """Where a plan leads with gains about it; or without, if that misses less."""

@@ -1,0 +1,106 @@
+"""How fast the interior point settles: its last steps, without a barrier, are Newton's on the optimality conditions.
+
+Smoothing and Newton's method without constraints are measured by their costs, in `rates.py`. Next to an optimum with
+constraints a cost says little, for a plan may be cheaper that misses them; here the error is that of the plan itself.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from league.problems import FAMILIES, Start
+from numpy.random import Generator
+
+import lqrsim as ls
+from lqrsim.codegen.compiled_module import in_c_order
+from lqrsim.errors import Array
+from lqrsim.kernels.records import Plan
+from lqrsim.solvers.interior_point import InteriorPoint
+from paper.common import numbers
+
+ASIDE = (1e-2, 1e-3, 1e-4)  # of what states and controls change by: how far from the optimum it settles from, in turn
+NEAR = {"barrier": 0.01, "room": 0.01}  # as the strategy begins near an answer
+MOST = 100  # iterations with the barrier
+CLOSE, ROUNDING = 0.1, 1e-11  # relative to what changes: errors that say something of the order
+FEWEST = 3  # of these, for an order
+
+
+class Watched(InteriorPoint):
+    """Which can be told to settle once more from beside its plan, and keeps the plans that it comes by."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self._plans: list[Plan] = []
+        super().__init__(*arguments, **options)
+
+    def settle_from(self, plan: Plan) -> list[Plan]:
+        """The plans of each step: all that it can be told to take, for nothing is good enough.
+
+        It keeps its multipliers, and to begin with what it knows of the rows: which of them press.
+        """
+        kept = self.point, self._force, self._costates
+        cost, arrived = self.stages.trial(plan)
+        self.point = self.point._replace(plan=plan, cost=cost, arrived=arrived)
+        self._plans.clear()
+        self._cross(0.0, 0.0)
+        self.point, self._force, self._costates = kept
+        return self._plans[:-1]  # the last is where it goes back to
+
+    def _measure(self) -> None:
+        super()._measure()
+        self._plans.append(self.point.plan)
+
+
+def errors(problem: ls.Problem, solution: ls.Solution, rng: Generator) -> Array:
+    """Errors of the plan (K,) from step to step: the largest of a control, relative to what that changes by.
+
+    From as far beside the optimum as leads back to it; empty if nothing does.
+    """
+    plan = solution.trajectory
+    point = Watched(problem, Plan(in_c_order(plan.states), in_c_order(plan.controls)), **NEAR)
+    with np.errstate(all="ignore"):
+        found = point.run(tolerance=1e-8, violation=1e-6, most=MOST)
+    best, (of_states, of_controls, *_) = found.plan, point.sizes
+    if not found.solved:
+        return np.array([])
+    inside = (best.controls > point.stages.low) & (best.controls < point.stages.high)
+    shifts = [rng.uniform(-1, 1, part.shape) for part in best]
+    shifts[0][0] = 0.0  # the start is given
+    for aside in ASIDE:
+        states = best.states + aside * of_states * shifts[0]
+        controls = best.controls + aside * of_controls * inside * shifts[1]
+        with np.errstate(all="ignore"):
+            steps = point.settle_from(Plan(in_c_order(states), in_c_order(controls)))
+        if steps and _apart(steps[-1], best, of_controls) < 1e-6:
+            return np.array([_apart(one, steps[-1], of_controls) for one in steps[:-1]])
+    return np.array([])
+
+
+def problems(planar: int) -> Iterator[tuple[str, ls.Problem, Start | None]]:
+    """Name, problem, and what a solve begins with: of Altro.jl's, then of the planar quadrotor with a clearance."""
+    for name in ("pendulum", "cartpole", "acrobot", "parallel_park", "three_obstacles"):
+        yield name, *FAMILIES[name].make(0)
+    for seed in range(planar):
+        yield f"planar quadrotor {seed}", FAMILIES["planar"].make(seed)[0], None
+
+
+def measure(planar: int) -> dict[str, dict[str, Any]]:
+    """Of each problem the errors and their order; of one that is not solved why not."""
+    found: dict[str, dict[str, Any]] = {}
+    for name, problem, start in problems(planar):
+        solution, rng = ls.smooth(problem, start=start), np.random.default_rng(0)
+        each = errors(problem, solution, rng) if solution.success else np.array([])
+        found[name] = {"status": solution.status.name, "errors": each.tolist(), "order": numbers([order(each)])[0]}
+    return found
+
+
+def _apart(one: Plan, other: Plan, size: Array) -> float:
+    return float((np.abs(one.controls - other.controls) / size).max())
+
+
+def order(found: Array) -> float:
+    """p of `e[k+1] = C e[k]^p`, by least squares over errors that say something of it; NaN where these are too few."""
+    far = np.flatnonzero(~(found < CLOSE))
+    found = found[far[-1] + 1 :] if len(far) else found
+    lost = np.flatnonzero(~(found > ROUNDING))
+    left = np.log(found[: lost[0]] if len(lost) else found)
+    return float(np.polyfit(left[:-1], left[1:], 1)[0]) if len(left) >= FEWEST else np.nan
