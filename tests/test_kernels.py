@@ -31,6 +31,7 @@ from lqrsim.codegen.sources import Function, Scope, Source, source_of, text_sour
 from lqrsim.control.law import turning_of
 from lqrsim.errors import Array
 from lqrsim.kernels import (
+    active_set,
     augmented_lagrangian,
     ball_constraint,
     ball_places,
@@ -59,6 +60,7 @@ from lqrsim.kernels import noise as noise_kernel
 from lqrsim.kernels.records import (
     CERTIFICATE,
     LOG,
+    ActiveRows,
     CostModel,
     CostToCome,
     CostToGo,
@@ -1073,6 +1075,58 @@ class TestInteriorPoint:
         bent = convex.copy()
         bent[0, :3, :3] -= 1e6 * np.eye(3)
         assert direction(bent) == 4  # nor has the start
+
+
+class TestActiveSet:
+    """What is taken of a problem whose rows are held or not, and pivots."""
+
+    def test_models_and_pivots(self) -> None:
+        """From a soft start, with constraints that bend, an equality and limits, some of them held."""
+        rng = np.random.default_rng(0)
+        kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState([1.4], states=("x",))]
+        stages, source = Stages(problem(steps=3, constraints=kept)), source_of(active_set)
+        plan = Plan(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
+        rows = len(stages.owners)
+        live = stages.live.astype(np.float64).ravel()
+        drawn, force = live * rng.integers(0, 2, size=live.size), live * rng.uniform(-0.1, 1.0, size=live.size)
+        kind = np.where(stages.equality, active_set.EQUALITY, active_set.INEQUALITY)
+        table = np.column_stack(
+            [kind, rng.uniform(0.5, 2.0, size=(rows, 1)), np.full((rows, 1), 1e-2), np.zeros((rows, 3))]
+        )
+        table[stages.owners == -1, 0] = active_set.LIMIT
+        table[stages.owners == -1, 3:] = [(i, sign, side) for sign, i, side in stages.limits]
+        numbers, pressing, wrong = np.zeros((3, live.size))
+        active = ActiveRows(rows, table, live, drawn, numbers, force, pressing, wrong)
+        known = stages._rows._replace(least=0.0, multipliers=force)
+        gaps, costates = np.zeros((3, 3)), rng.normal(size=(4, 3))
+        for own in (0, 1):
+            replay(
+                source, SIZES, "look", 3, 1, own, plan, costates, stages._model, stages._values, known, stages.models,
+                active,
+            )  # fmt: skip
+        replay(source, SIZES, "measure", 3, plan, stages.models, gaps, active, np.full(3, 0.5), np.full(2, 2.0))
+        stages.convexify(plan)
+        stages.models.convex[...] += np.eye(5)
+        policy = Policy(np.zeros((3, 2, 3)), np.zeros((3, 2)))
+        to_go = CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4))
+        changes = Plan(np.zeros((4, 3)), np.zeros((3, 2)))
+
+        def pivot(share: float, free: float = 1.0) -> tuple[int, int]:
+            given = 3, np.full(3, free), share, 2.0, 1e3, 0.5, stages.models, gaps, active, policy, to_go, changes
+            return replay(source, SIZES, "pivot", *given)
+
+        for worst in (1, 0):
+            failed, wrong = pivot(1.0, free=float(worst))
+            assert failed == -1
+            assert wrong == np.count_nonzero(active.wrong) > 1
+            before = active.held.copy()
+            replay(source, SIZES, "change", 3, worst, active)
+            changed = np.flatnonzero(active.held != before)
+            assert (active.wrong[changed] < 0).all()
+            assert 1 <= len(changed) <= (wrong if worst else 1)
+        stages.models.hessian[2, 3:, 3:] -= 1e6 * np.eye(2)
+        assert pivot(0.5)[0] == 2  # the controls of that step have no least
+        replay(source, SIZES, "settle", 3, stages.low, stages.high, active, plan.controls.copy(), policy.gain.copy())
 
 
 def test_no_kernel_is_left_out() -> None:

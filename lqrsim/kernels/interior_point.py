@@ -30,22 +30,31 @@ def models(steps, soft, second, plan, costates, model, rows, out):
       costates: (T+1, N), of where each step leads.
       rows: `records.ConstraintRows`, with the constraints' multipliers. out: `records.StageModels`.
     """
-    none, total = stack(M), 0.0
+    total = 0.0
+    slopes(steps, plan, model.stage.constraints, rows, out)
+    for t in range(steps + 1):
+        total += stage_models(t, steps, second, plan, costates, model, rows, out)
+    if soft == 1:
+        total += add_initial(plan.states[0], model, out)
+    return total
+
+
+def stage_models(t, steps, second, plan, costates, model, rows, out):
+    """Write those of a stage, but for the constraints' slopes, which `slopes` has written. Return its cost."""
+    none = stack(M)
     for i in range(M):
         none[i] = 0.0
-    for t in range(steps + 1):
-        x, u = plan.states[t], plan.controls[min(t, steps - 1)]
-        if t < steps:
-            total += cost_of_order(x, u, t, model.stage, 1.0, out.hessian[t], out.gradient[t])
-            if second == 1:
-                step_second_order(x, u, model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
-            else:
-                step_jacobian(x, u, model, model.dt, out.arrived[t], out.jacobian[t])
+    x, u = plan.states[t], plan.controls[min(t, steps - 1)]
+    if t < steps:
+        total = cost_of_order(x, u, t, model.stage, 1.0, out.hessian[t], out.gradient[t])
+        if second == 1:
+            step_second_order(x, u, model, costates[t + 1], out.arrived[t], out.jacobian[t], out.hessian[t])
         else:
-            total += cost_of_order(x, none, t, model.final, 1.0, out.hessian[t], out.gradient[t])
-        constraint_models(x, u, t, steps, model.stage.constraints, rows, second, out)
-    if soft == 1:
-        total += add_initial(plan.states[0], none, model, out)
+            step_jacobian(x, u, model, model.dt, out.arrived[t], out.jacobian[t])
+    else:
+        total = cost_of_order(x, none, t, model.final, 1.0, out.hessian[t], out.gradient[t])
+    if second == 1:
+        curvatures(x, u, t, steps, model.stage.constraints, rows, out.hessian[t])
     return total
 
 
@@ -64,9 +73,11 @@ def convex_models(steps, soft, plan, model, out):
                 out.convex[0, i, j] += hessian[i, j]
 
 
-def add_initial(x, none, model, out):
+def add_initial(x, model, out):
     """Add the initial cost to the first stage; return its value."""
-    hessian, gradient = stack(W, W), stack(W)
+    hessian, gradient, none = stack(W, W), stack(W), stack(M)
+    for i in range(M):
+        none[i] = 0.0
     cost = cost_of_order(x, none, 0, model.initial, 1.0, hessian, gradient)
     for i in range(N):
         out.gradient[0, i] += gradient[i]
@@ -75,23 +86,38 @@ def add_initial(x, none, model, out):
     return cost
 
 
-def constraint_models(x, u, t, steps, constraints, rows, second, out):
-    """Write the slopes of all constraints at a step; where wanted, subtract their Hessians times the multipliers."""
+def slopes(steps, plan, constraints, rows, out):
+    """Write the slopes of all constraints at all steps, and which entries they depend on."""
     slope = stack(W)
+    for t in range(steps + 1):
+        x, u = plan.states[t], plan.controls[min(t, steps - 1)]
+        for k in range(constraints.size):
+            acts = acts_at(k, t, steps, constraints)
+            for row in range(int(constraints.multipliers[k][1])):
+                place = int(rows.first[k]) + row
+                for i in range(W):
+                    slope[i] = 0.0
+                if acts:
+                    slope_of_constraint(k, row, x, u, t, constraints, slope)
+                for i in range(W):
+                    out.slopes[rows.size * t + place, i] = slope[i]
+                    if slope[i] != 0:
+                        rows.support[place, i] = 1.0
+
+
+def acts_at(k, t, steps, constraints):
+    """Whether a constraint acts at a step."""
+    return t >= constraints.multipliers[k][2] and not (t == steps and constraints.functions[k, USES_CONTROL] != 0)
+
+
+def curvatures(x, u, t, steps, constraints, rows, hessian):
+    """Subtract the Hessians of all constraints at a step times their multipliers."""
     for k in range(constraints.size):
-        own, begin = int(constraints.multipliers[k][1]), constraints.multipliers[k][2]
-        acts = t >= begin and not (t == steps and constraints.functions[k, USES_CONTROL] != 0)
-        for row in range(own):
-            place = int(rows.first[k]) + row
-            at = rows.size * t + place
-            for i in range(W):
-                slope[i] = 0.0
-            if acts:
-                slope_of_constraint(k, row, x, u, t, constraints, slope)
-            for i in range(W):
-                out.slopes[at, i] = slope[i]
-            if acts and second == 1 and abs(rows.multipliers[at]) > rows.least:
-                subtract_curvature(k, row, x, u, t, constraints, rows, out.hessian[t])
+        if not acts_at(k, t, steps, constraints):
+            continue
+        for row in range(int(constraints.multipliers[k][1])):
+            if abs(rows.multipliers[rows.size * t + int(rows.first[k]) + row]) > rows.least:
+                subtract_curvature(k, row, x, u, t, constraints, rows, hessian)
 
 
 def subtract_curvature(k, row, x, u, t, constraints, rows, hessian):
@@ -167,29 +193,46 @@ def direction(steps, free, models, policy, to_go, changes):
     Returns:
       The step whose control block is not positive definite, steps + 1 where it is the start's, or else -1.
     """
-    stage, slope, ahead, least = stack(W, W), stack(W), stack(N), stack(M)
-    for i in range(N):
-        to_go.gradient[steps, i] = models.gradient[steps, i]
-        for j in range(N):
-            to_go.hessian[steps, i, j] = models.hessian[steps, i, j]
-    for t in range(steps - 1, -1, -1):
+    stage, slope = stack(W, W), stack(W)
+    for t in range(steps, -1, -1):
         for i in range(W):
             slope[i] = models.gradient[t, i]
             for j in range(W):
                 stage[i, j] = models.hessian[t, i, j]
-        for i in range(M):
-            least[i] = TINY * abs(stage[N + i, N + i])
-        for i in range(N):
-            ahead[i] = to_go.gradient[t + 1, i]
-            for j in range(N):
-                ahead[i] += to_go.hessian[t + 1, i, j] * models.gaps[t, j]
-        congruence(models.jacobian[t], to_go.hessian[t + 1], ahead, stage, slope)
-        if not definite(stage, least):
+        if t == steps:
+            end_with(steps, stage, slope, to_go)
+        elif not step_back(t, stage, slope, models.jacobian[t], models.gaps[t], policy, to_go):
             return t
-        if minimize_control(stage, slope, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]) < 0:
-            return t
+    return -1 if lead(steps, free, models.jacobian, models.gaps, policy, to_go, changes) else steps + 1
+
+
+def end_with(steps, stage, slope, to_go):
+    """Write the cost-to-go at the end."""
+    for i in range(N):
+        to_go.gradient[steps, i] = slope[i]
+        for j in range(N):
+            to_go.hessian[steps, i, j] = stage[i, j]
+
+
+def step_back(t, stage, slope, jacobian, gap, policy, to_go):
+    """A step of the recursion, from t + 1 to t; uses up the stage. Whether its control block is positive definite."""
+    ahead, least = stack(N), stack(M)
+    for i in range(M):
+        least[i] = TINY * abs(stage[N + i, N + i])
+    for i in range(N):
+        ahead[i] = to_go.gradient[t + 1, i]
+        for j in range(N):
+            ahead[i] += to_go.hessian[t + 1, i, j] * gap[j]
+    congruence(jacobian, to_go.hessian[t + 1], ahead, stage, slope)
+    if not definite(stage, least):
+        return False
+    return minimize_control(stage, slope, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]) >= 0
+
+
+def lead(steps, free, jacobian, gaps, policy, to_go, changes):
+    """Write the changes of the plan, and the costates where they lead; whether the start's have a minimum."""
     if not first_change(free, to_go, changes.states[0]):
-        return steps + 1
+        return False
     for t in range(steps):
         for i in range(M):
             total = policy.offset[t, i]
@@ -197,17 +240,17 @@ def direction(steps, free, models, policy, to_go, changes):
                 total += policy.gain[t, i, j] * changes.states[t, j]
             changes.controls[t, i] = total
         for i in range(N):
-            total = models.gaps[t, i]
+            total = gaps[t, i]
             for j in range(N):
-                total += models.jacobian[t, i, j] * changes.states[t, j]
+                total += jacobian[t, i, j] * changes.states[t, j]
             for j in range(M):
-                total += models.jacobian[t, i, N + j] * changes.controls[t, j]
+                total += jacobian[t, i, N + j] * changes.controls[t, j]
             changes.states[t + 1, i] = total
     for t in range(steps + 1):
         for i in range(N):
             for j in range(N):
                 to_go.gradient[t, i] += to_go.hessian[t, i, j] * changes.states[t, j]
-    return -1
+    return True
 
 
 def first_change(free, to_go, change):

@@ -219,6 +219,25 @@ class StageModels(NamedTuple):
     slopes: Arrays
 
 
+class ActiveRows(NamedTuple):
+    """The rows of a plan of which some are held at zero, `size` at each step, limits of controls among them.
+
+    Attributes:
+      table: (size, 6) of each row what it is; see `active_set.py`. live, held: ((T+1) size,) 1 for those that act, and
+        that are held, else 0. numbers: what they have to spare. force: their multipliers. pressing: those that a step
+        leads to. wrong: by how much a row is on the wrong side there, relative; 0 where it is not.
+    """
+
+    size: int
+    table: Arrays
+    live: Arrays
+    held: Arrays
+    numbers: Arrays
+    force: Arrays
+    pressing: Arrays
+    wrong: Arrays
+
+
 class StepModels(NamedTuple):
     """What a step about a plan minimises: hessian (T+1, W, W), gradient (T+1, W), jacobian (T, N, W), gaps (T, N)."""
 

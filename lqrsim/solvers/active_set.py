@@ -13,22 +13,18 @@ models, where those that pressed before do not do; the step itself is of second 
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
-from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
-from lqrsim.kernels.records import Limits, Plan
+from lqrsim.kernels.active_set import EQUALITY, INEQUALITY, LIMIT
+from lqrsim.kernels.records import ActiveRows, Limits, Plan
 from lqrsim.solvers.common import INSIDE
 from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measures, Stages
-
-Flags = npt.NDArray[np.bool_]
 
 STEPS = 12  # at most: what takes more does not get there
 PIVOTS, FEW = 15, 4  # of the rows in a convex problem, at most; and in one that need not be
 PATIENCE = 3  # pivots that do not bring fewer wrong rows, before they change one at a time
 SHARES = (0.0, 0.3)  # of the convex models in those of a step, tried in turn
 PENALTY = 8.0  # that holds the policy to the constraints, in cost for a change by a row's size
-ROUNDING = 1e-10  # of a row's size, by which it may be missed by a model
 
 
 class ActiveSet:
@@ -41,32 +37,35 @@ class ActiveSet:
       violation: by how much equalities may be missed; a share of that is what inequalities are to have to spare.
 
     Attributes:
-      plan: where the steps have come to. measures: of that. force, held: of the live rows (K,) the multipliers, and
-        which are held at zero. sizes: by how much things change. hopeless: whether it is an optimum but for rows that
-        no multiplier brings to be kept.
+      plan: where the steps have come to. measures: of that. force, held: (T+1, R) the rows' multipliers, and 1 for
+        those that are held at zero, else 0. sizes: by how much things change. hopeless: whether it is an optimum but
+        for rows that no multiplier brings to be kept.
     """
 
     def __init__(self, stages: Stages, plan: Plan, multipliers: tuple[Array, ...], violation: float) -> None:
         self.stages, self.plan, self._violation = stages, plan, violation
         self.hopeless = False
-        stages.act_at(plan)
-        shape, live = stages.live.shape, stages.live
-        force = np.zeros(shape)
+        shape, rows = stages.live.shape, len(stages.owners)
+        live, numbers, pressing, wrong = stages.live.astype(np.float64), *np.zeros((3, *shape))
+        self.force, self.held = np.zeros(shape), np.zeros(shape)
         for k, one in enumerate(multipliers):
-            force[:, stages.owners == k] = one
-        self.force = force[live]
-        self._equality = np.broadcast_to(stages.equality, shape)[live]
-        self._limit = np.broadcast_to(stages.owners == -1, shape)[live]
-        self._aim = np.where(self._equality | self._limit, 0.0, INSIDE * violation)
-        self._costates = np.zeros((stages.steps + 1, stages.n))
-        self._where = np.nonzero(live)
-        stages.second_order(plan, self._costates, np.zeros(shape), np.inf, second=False)
+            self.force[:, stages.owners == k] = one
+        self._equality, limit = stages.equality, stages.owners == -1
+        kind = np.where(self._equality, EQUALITY, np.where(limit, LIMIT, INEQUALITY))
+        aim = np.where(kind == INEQUALITY, INSIDE * violation, 0.0)
+        table = np.column_stack([kind, np.ones(rows), aim, np.zeros((rows, 3))])
+        table[limit, 3:] = np.reshape([(i, sign, side) for sign, i, side in stages.limits], (-1, 3))
+        arrays = (live, self.held, numbers, self.force, pressing, wrong)
+        self._rows = ActiveRows(rows, table, *(array.reshape(-1) for array in arrays))
+        self._pressing = pressing
+        self._gaps, self._costates = np.empty((stages.steps, stages.n)), np.zeros((stages.steps + 1, stages.n))
+        cost = stages.look(plan, self._costates, self._rows, own=True)
+        self._convex, stages.live[...] = False, live > 0
         self.sizes = stages.sizes_of(plan, stages.models.hessian)
-        self._size = np.broadcast_to(self.sizes.rows, shape)[live]
-        self._costates, _ = self._adjoint()
-        self.held = self._equality | (self.force > 0)
-        self.held |= self._limit & (stages.values(plan)[live] <= AT_LIMIT * self._size)
-        self._measure()
+        table[:, 1] = self.sizes.rows
+        begun = self._equality | (self.force > 0) | (limit & (numbers <= AT_LIMIT * self.sizes.rows))
+        self.held[...] = begun & (live > 0)
+        self._measure(cost)
 
     def run(self, tolerance: float, watch: Callable[[Measures], bool], due: Callable[[], bool]) -> bool:
         """Go on until the measures are within tolerance; whether they are.
@@ -94,139 +93,94 @@ class ActiveSet:
 
         The gains are those of a step with a price on missing the rows that press, and zero at limits.
         """
-        stages, low, high = self.stages, self.stages.low, self.stages.high
-        sigma = np.where(self._limit, 1 / REGULARISATION, PENALTY) * self._scale / self._size**2
-        none = np.zeros((stages.steps, stages.n))
+        stages = self.stages
         for share in MIXES:
-            models = self._with(self._hessian(share), stages.models.gradient, self.held, sigma, np.zeros(len(sigma)))
-            if stages.direction(*models, none):
+            if self._solve(share, price=PENALTY * REGULARISATION)[0]:
                 break
         else:
             stages.gain[...] = 0.0
-        held = stages.spread((self.held & self._limit).astype(np.float64))[:-1, stages.owners == -1]
-        controls, gain = np.clip(self.plan.controls, low, high), stages.gain.copy()
-        for (_, i, side), at in zip(stages.limits, held.T > 0, strict=True):
-            controls[at, i], gain[at, i] = side, 0.0
-        box = Limits(*(np.tile(side, (stages.steps, 1)) for side in (low, high)))
+        controls, gain = self.plan.controls.copy(), stages.gain.copy()
+        stages.settle(self._rows, controls, gain)
+        box = Limits(*(np.tile(side, (stages.steps, 1)) for side in (stages.low, stages.high)))
         plan = Plan(self.plan.states, controls)
         return stages.follow(plan, 0.0, (gain, np.zeros_like(controls)), box), gain
 
     def multipliers(self) -> list[tuple[Array, float]]:
         """Of each constraint the multipliers (T+1, rows), and the price that the policy has."""
-        spread, owners = self.stages.spread(self.force), self.stages.owners
+        owners = self.stages.owners
         sizes = [self.sizes.rows[owners == k] for k in range(len(self.stages.problem.constraint_terms))]
         prices = [PENALTY * self._scale / float(np.median(size**2)) if len(size) else 1.0 for size in sizes]
-        return [(spread[:, owners == k].copy(), price) for k, price in enumerate(prices)]
+        return [(self.force[:, owners == k].copy(), price) for k, price in enumerate(prices)]
 
-    def _adjoint(self) -> tuple[Array, Array]:
-        return self.stages.adjoint(in_c_order(self.stages.models.gradient - self.stages.pull(self.force)))
-
-    def _measure(self) -> None:
-        """Make the models about the plan, and work out the measures."""
-        stages = self.stages
-        cost = stages.second_order(self.plan, self._costates, stages.spread(self.force), 0.0)
-        self._convex = False
-        self._numbers = stages.values(self.plan)[stages.live]
-        self._gaps = stages.models.arrived - self.plan.states[1:]
+    def _measure(self, cost: float) -> None:
+        """Work out the measures of a plan about which the models are."""
         self._scale = max(abs(cost), 1e-6 * self.sizes.cost) if np.isfinite(cost) else np.nan
-        _, slopes = self._adjoint()
-        missed = np.where(self._equality, np.abs(self._numbers), -self._numbers)
-        product = np.where(self._equality, 0.0, np.abs(self._numbers) * self.force)
+        steepest, missed, unequal, gap, product = self.stages.measure(self.plan, self._rows, self._gaps, self.sizes)
+        self._kept = missed <= 0 and unequal <= self._violation
         self.measures = Measures(
-            cost=cost, stationarity=float((np.abs(slopes) * self.sizes.controls).max()) / self._scale,
-            violation=float(missed.max(initial=0.0)), gap=float((np.abs(self._gaps) / self.sizes.states).max()),
-            complementarity=float(product.max(initial=0.0)) / self._scale,
+            cost=cost, stationarity=steepest / self._scale, violation=max(missed, unequal, 0.0), gap=gap,
+            complementarity=product / self._scale,
         )  # fmt: skip
 
     def _within(self, tolerance: float) -> bool:
         found = self.measures
         # What leads from the plan to a motion must not take constraints beyond what they have to spare.
-        right = max(found.stationarity, found.gap / INSIDE, found.complementarity) < tolerance
-        kept = np.where(self._equality, np.abs(self._numbers) <= self._violation, self._numbers >= 0)
-        return right and bool(kept.all())
+        return self._kept and max(found.stationarity, found.gap / INSIDE, found.complementarity) < tolerance
 
     def _step(self) -> bool:
         """One step; False where there is none."""
-        found = self._pivoted(0.0, self.held, 0)
-        if found is None or found[2]:
-            convex = self._pivoted(1.0, self.held, PIVOTS)
-            if convex is None:
-                return False
-            for share in (*SHARES, 1.0):
-                found = self._pivoted(share, convex[0], FEW if share < 1 else 0)
-                if self._due():
-                    return False
-                if found is not None and (share == 1 or not found[2]):
-                    break
-            else:
-                return False
+        before = self.held.copy()
+        if self._pivoted(0.0, 0) != 0 and not self._from_convex():
+            self.held[...] = before
+            return False
         stages = self.stages
-        self.held, force, _ = found
-        self.force = np.where(self._equality, force, np.maximum(force, 0.0))
+        self.force[...] = np.where(self._equality, self._pressing, np.maximum(self._pressing, 0.0))
         self._costates = stages.to_go.gradient.copy()
         self.plan = Plan(self.plan.states + stages.changes.states, self.plan.controls + stages.changes.controls)
-        self._measure()
+        cost = stages.look(self.plan, self._costates, self._rows)
+        self._convex = False
+        self._measure(cost)
         return True
 
-    def _pivoted(self, share: float, held: Flags, most: int) -> tuple[Flags, Array, int] | None:
-        """Solve the quadratic problem by so many pivots at most, from rows (K,) that are held.
+    def _from_convex(self) -> bool:
+        """A step with the rows that press in the convex models, or some others; whether there is one."""
+        if self._pivoted(1.0, PIVOTS) is None:
+            return False
+        convex = self.held.copy()
+        for share in (*SHARES, 1.0):
+            self.held[...] = convex
+            wrong = self._pivoted(share, FEW if share < 1 else 0)
+            if self._due():
+                return False
+            if wrong is not None and (share == 1 or not wrong):
+                return True
+        return False
+
+    def _pivoted(self, share: float, most: int) -> int | None:
+        """Solve the quadratic problem by so many pivots at most, from the rows that are held.
 
         The change of the plan is in `stages`.
 
         Returns:
-          The rows that are held, the multipliers (K,), and how many of the rows are wrong; None without a minimum.
+          How many of the rows are wrong; None without a minimum.
         """
-        stages, hessian = self.stages, self._hessian(share)
-        numbers = self._numbers - self._aim
-        fewest, patience = len(held) + 1, PATIENCE
+        fewest, patience = self.held.size + 1, PATIENCE
         for pivot in range(most + 1):
             if pivot > 0 and self._due():
                 return None
-            sigma = np.where(held, self._scale / (REGULARISATION * self._size**2), 0.0)
-            force = np.where(held, self.force, 0.0)
-            models = self._with(hessian, stages.models.gradient, held, sigma, sigma * numbers - force)
-            if not stages.direction(*models, self._gaps):
+            solved, wrong = self._solve(share)
+            if not solved:
                 return None
-            ahead = numbers + np.matmul(stages.slopes, stages.joined()[:, :, None])[:, :, 0][stages.live]
-            force = force - sigma * ahead
-            pulls = np.where(held & ~self._equality, force * self._size / self._scale, 0.0)
-            misses = np.where(held, 0.0, ahead / self._size)
-            wrong = (pulls < -ROUNDING) | (misses < -ROUNDING)
-            count = int(wrong.sum())
-            if count == 0 or pivot == most:
-                return held, force, count
-            fewest, patience = (count, PATIENCE) if count < fewest else (fewest, patience - 1)
-            held = held ^ (self._worst(pulls) | self._worst(misses) if patience > 0 else _last(wrong))
+            if wrong == 0 or pivot == most:
+                return wrong
+            fewest, patience = (wrong, PATIENCE) if wrong < fewest else (fewest, patience - 1)
+            self.stages.change(self._rows, worst=patience > 0)
         return None
 
-    def _worst(self, numbers: Array) -> Flags:
-        """Which of the live rows are below zero, and no higher than at the steps before and after."""
-        below = np.pad(self.stages.spread(np.where(numbers < -ROUNDING, numbers, 0.0)), ((1, 1), (0, 0)))
-        here = below[1:-1]
-        return ((here < 0) & (here <= below[:-2]) & (here < below[2:]))[self.stages.live]
-
-    def _hessian(self, share: float) -> Array:
-        models = self.stages.models
-        if share == 0:
-            return models.hessian
-        if not self._convex:
+    def _solve(self, share: float, price: float = 1.0) -> tuple[bool, int]:
+        """Solve it with the rows that are held; whether there is a minimum, and how many rows are wrong."""
+        if share > 0 and not self._convex:
             self.stages.convexify(self.plan)
             self._convex = True
-        return (1 - share) * models.hessian + share * models.convex if share < 1 else models.convex
-
-    def _with(self, hessian: Array, gradient: Array, held: Flags, weights: Array, pulls: Array) -> tuple[Array, Array]:
-        """A Hessian and a gradient with what the rows (K,) that are held add: by a weight, and by a slope."""
-        rows = np.flatnonzero(held)
-        steps = self._where[0][rows]
-        slopes = self.stages.slopes[steps, self._where[1][rows]]
-        hessian, gradient = hessian.copy(), gradient.copy()
-        np.add.at(hessian, steps, weights[rows, None, None] * slopes[:, :, None] * slopes[:, None, :])
-        np.add.at(gradient, steps, pulls[rows, None] * slopes)
-        return hessian, gradient
-
-
-def _last(wrong: Flags) -> Flags:
-    """Of rows, the last one that is wrong."""
-    last = np.zeros_like(wrong)
-    last[np.flatnonzero(wrong)[-1]] = True
-    return last
+        weight = self._scale / REGULARISATION
+        return self.stages.pivot(self._rows, self._gaps, share=share, scale=self._scale, weight=weight, price=price)

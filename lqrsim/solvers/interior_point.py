@@ -20,8 +20,9 @@ import numpy as np
 from lqrsim.codegen.compiled_module import Call, CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
+from lqrsim.kernels import active_set as active_kernel
 from lqrsim.kernels import interior_point as kernel
-from lqrsim.kernels.records import ConstraintRows, CostToGo, Limits, Plan, Policy, StageModels, StepModels
+from lqrsim.kernels.records import ActiveRows, ConstraintRows, CostToGo, Limits, Plan, Policy, StageModels, StepModels
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Iteration
 from lqrsim.solvers import compiled
@@ -122,7 +123,9 @@ class Stages:
     def __init__(self, problem: Problem) -> None:
         n, m = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates)
         self.n, self.m, steps = n, m, problem.steps
-        self._module = module_of(source_of(kernel), f"interior point, {n} states and {m} controls", N=n, M=m, W=n + m)
+        what, sizes = f"{n} states and {m} controls", {"N": n, "M": m, "W": n + m}
+        self._module = module_of(source_of(kernel), f"interior point, {what}", **sizes)
+        self._active = module_of(source_of(active_kernel), f"active set, {what}", **sizes)
         self._calls: dict[str, Call] = {}
         self._take(problem)
         counts = [term.rows for term in problem.constraint_terms]
@@ -214,10 +217,7 @@ class Stages:
     ) -> float:
         """The same without the projected Hessians; without `second`, nor those of the steps and constraints."""
         rows = self._rows._replace(least=float(least), multipliers=in_c_order(multipliers).reshape(-1))
-        cost = self._call("models", self.steps, self._soft, int(second), plan, costates, self._model, rows, self.models)
-        support = rows.support
-        support[...] = np.maximum(support, (self.slopes != 0).any(axis=0))
-        return cost
+        return self._call("models", self.steps, self._soft, int(second), plan, costates, self._model, rows, self.models)
 
     def convexify(self, plan: Plan) -> None:
         """Make the projected Hessians about a plan."""
@@ -251,12 +251,14 @@ class Stages:
         if problem.goal is not None and problem.start is not None:
             reach = np.maximum(reach, np.abs(np.nan_to_num(problem.goal - problem.start)))
         states = np.where(reach > 1e-3, reach, 1.0)
-        moved = np.abs(self.models.jacobian[:, :, self.n :]).sum(axis=0) / states[:, None]
-        enough = np.maximum(1 / np.maximum(moved.max(axis=0), 1e-6), np.abs(plan.controls).max(axis=0))
-        controls = np.where(np.isfinite(self.high - self.low), self.high - self.low, enough)
+        controls = self.high - self.low
+        if not np.isfinite(controls).all():
+            moved = np.abs(self.models.jacobian[:, :, self.n :]).sum(axis=0) / states[:, None]
+            enough = np.maximum(1 / np.maximum(moved.max(axis=0), 1e-6), np.abs(plan.controls).max(axis=0))
+            controls = np.where(np.isfinite(controls), controls, enough)
         both = np.concatenate([states, controls])
         counts = np.maximum(self.live.sum(axis=0), 1)
-        rows = np.sqrt(np.einsum("trw,trw,w->r", self.slopes, self.slopes, both**2) / counts)
+        rows = np.sqrt(np.einsum("trw,trw->rw", self.slopes, self.slopes) @ both**2 / counts)
         cost = 0.5 * float(np.abs(np.einsum("tww->w", hessian)) @ both**2)
         return Sizes(states, controls, np.where(rows > 0, rows, 1.0), cost or 1.0)
 
@@ -301,6 +303,38 @@ class Stages:
         joined = np.zeros((self.steps + 1, self.n + self.m))
         joined[:, : self.n], joined[:-1, self.n :] = self.changes
         return joined
+
+    def look(self, plan: Plan, costates: Array, active: ActiveRows, *, own: bool = False) -> float:
+        """Make the models about a plan, and write what rows have to spare; return its cost. See the kernel's."""
+        rows = self._rows._replace(least=0.0, multipliers=active.force)
+        return self._call(
+            "look", self.steps, self._soft, int(own), plan, costates, self._model, self._values, rows, self.models,
+            active, module=self._active,
+        )  # fmt: skip
+
+    def measure(self, plan: Plan, active: ActiveRows, gaps: Array, sizes: Sizes) -> tuple[float, ...]:
+        """How far the plan about which the models are is from an optimum; writes its gaps. See the kernel's."""
+        return self._call(
+            "measure", self.steps, plan, self.models, gaps, active, sizes.states, sizes.controls, module=self._active
+        )
+
+    def pivot(
+        self, active: ActiveRows, gaps: Array, *, share: float, scale: float, weight: float, price: float = 1.0
+    ) -> tuple[bool, int]:
+        """As `direction`, with rows that are held; also returns how many are wrong there. See the kernel's."""
+        failed, wrong = self._call(
+            "pivot", self.steps, self.free, share, scale, weight, price, self.models, gaps, active,
+            Policy(self.gain, self.offset), self.to_go, self.changes, module=self._active,
+        )  # fmt: skip
+        return failed == -1, wrong
+
+    def change(self, active: ActiveRows, *, worst: bool) -> None:
+        """Change which rows are held; see the kernel's."""
+        self._call("change", self.steps, int(worst), active, module=self._active)
+
+    def settle(self, active: ActiveRows, controls: Array, gain: Array) -> None:
+        """Put controls (T, m) at the limits that are held; their gains (T, m, n) are zero there."""
+        self._call("settle", self.steps, self.low, self.high, active, controls, gain, module=self._active)
 
 
 class Point(NamedTuple):

@@ -1,0 +1,239 @@
+"""What an iteration with an active set takes of a problem, and its pivots. The kernels' subset.
+
+Rows of constraints and limits of controls, as in `interior_point.py`, some of which are held at zero.
+`solvers/active_set.py` has the method.
+"""
+
+from math import inf, isnan
+
+from lqrsim.kernels.declarations import M, N, W, stack
+from lqrsim.kernels.interior_point import add_initial, end_with, lead, slopes, stage_models, step_back
+from lqrsim.kernels.model_functions import evaluate_constraints
+
+# Columns of `ActiveRows.table`: what a row is, by how much it changes, and what it is to have to spare where it is
+# held; of a limit the control, whether it is the lower one (1) or the upper one (-1), and where that is.
+KIND, SIZE, AIM, CONTROL, SIGN, SIDE = 0, 1, 2, 3, 4, 5
+INEQUALITY, LIMIT, EQUALITY = 0, 1, 2
+ROUNDING = 1e-10  # of a row's size, by which it may be missed by a model
+
+
+def look(steps, soft, own, plan, costates, model, values, rows, out, active):
+    """Write the models of all stages at a plan, of second order, and the rows' numbers. Return the cost.
+
+    Args:
+      soft: 1 where there is an initial cost.
+      own: 1 where the costates (T+1, N) are to be those of this plan with its forces; they are written.
+      values: of each constraint its numbers, which are written. rows: `records.ConstraintRows`. out:
+        `records.StageModels`. active: `records.ActiveRows`; a row that turns out not to act is let go.
+    """
+    evaluate_constraints(steps, plan.states, plan.controls, model.stage.constraints, values)
+    take_numbers(steps, plan, model.stage.constraints, values, rows, active)
+    slopes(steps, plan, model.stage.constraints, rows, out)
+    total, slope = 0.0, stack(W)
+    for t in range(steps, -1, -1):
+        total += stage_models(t, steps, 1, plan, costates, model, rows, out)
+        if own == 1 and t > 0:
+            slope_at(t, steps, costates[min(t + 1, steps)], out, active, slope)
+            for i in range(N):
+                costates[t, i] = slope[i]
+    if soft == 1:
+        total += add_initial(plan.states[0], model, out)
+    return total
+
+
+def take_numbers(steps, plan, constraints, values, rows, active):
+    """Write what all rows have to spare, in the order of rows."""
+    for t in range(steps + 1):
+        u = plan.controls[min(t, steps - 1)]
+        for k in range(constraints.size):
+            count = int(constraints.multipliers[k][1])
+            for row in range(count):
+                active.numbers[active.size * t + int(rows.first[k]) + row] = values[k][count * t + row]
+        for row in range(active.size):
+            at = active.size * t + row
+            if active.table[row, KIND] == LIMIT:
+                number = u[int(active.table[row, CONTROL])] - active.table[row, SIDE]
+                active.numbers[at] = active.table[row, SIGN] * number
+            if active.numbers[at] == inf:  # so a constraint says that it does not act
+                active.live[at] = 0.0
+            if active.live[at] == 0:
+                active.force[at], active.held[at] = 0.0, 0.0
+
+
+def slope_at(t, steps, after, models, active, slope):
+    """Write the slope (W,) of the Lagrangian in the state and the control at t, given the costate (N,) after it."""
+    for i in range(W):
+        slope[i] = models.gradient[t, i]
+    if t < steps:
+        for j in range(N):
+            for i in range(W):
+                slope[i] += models.jacobian[t, j, i] * after[j]
+    for row in range(active.size):
+        at = active.size * t + row
+        if active.force[at] != 0:
+            for i in range(W):
+                slope[i] -= active.force[at] * models.slopes[at, i]
+
+
+def measure(steps, plan, models, gaps, active, state_size, control_size):
+    """How far a plan is from an optimum; writes its gaps (T, N).
+
+    Returns:
+      The largest slope of the Lagrangian in a control, times its size (M,); by how much an inequality is missed, or
+      what it has to spare, negative; by how much an equality is missed; the largest gap, relative to the states' sizes
+      (N,); and the largest product of a multiplier and what is left to spare.
+    """
+    slope, after = stack(W), stack(N)
+    steepest, missed, unequal, widest, product = 0.0, -inf, 0.0, 0.0, 0.0
+    for t in range(steps, -1, -1):
+        slope_at(t, steps, after, models, active, slope)
+        for i in range(N):
+            after[i] = slope[i]
+        if t < steps:
+            for i in range(M):
+                steepest = larger(steepest, abs(slope[N + i]) * control_size[i])
+            for i in range(N):
+                gaps[t, i] = models.arrived[t, i] - plan.states[t + 1, i]
+                widest = larger(widest, abs(gaps[t, i]) / state_size[i])
+        for row in range(active.size):
+            at = active.size * t + row
+            if active.live[at] == 0:
+                continue
+            number = active.numbers[at]
+            if active.table[row, KIND] == EQUALITY:
+                unequal = larger(unequal, abs(number))
+            else:
+                missed = larger(missed, -number)
+                product = larger(product, abs(number) * active.force[at])
+    return steepest, missed, unequal, widest, product
+
+
+def larger(a, b):
+    """The larger one; NaN if one of them is."""
+    return b if b > a or isnan(b) else a
+
+
+def pivot(steps, free, share, scale, weight, price, models, gaps, active, policy, to_go, changes):
+    """The step to the minimum of the stages' models with the rows held at zero that are, and which are wrong there.
+
+    Args:
+      free: (N,) 0 for the states that the start fixes. share: of the projected Hessian of the cost.
+      scale: cost that multipliers are relative to. weight: on what a row that is held is away from zero, by its size;
+        of constraints that share of it that is `price`.
+      models: `records.StageModels`. gaps: (T, N). active: `records.ActiveRows`. policy, to_go, changes: as in
+        `interior_point.direction`.
+
+    Returns:
+      The step whose control block is not positive definite, steps + 1 where it is the start's, or else -1; and how many
+      rows are wrong.
+    """
+    stage, slope = stack(W, W), stack(W)
+    for t in range(steps, -1, -1):
+        for i in range(W):
+            slope[i] = models.gradient[t, i]
+        mix(share, models.hessian[t], models.convex[t], stage)
+        hold(t, weight, price, models, active, stage, slope)
+        if t == steps:
+            end_with(steps, stage, slope, to_go)
+        elif not step_back(t, stage, slope, models.jacobian[t], gaps[t], policy, to_go):
+            return t, 0
+    if not lead(steps, free, models.jacobian, gaps, policy, to_go, changes):
+        return steps + 1, 0
+    return -1, look_ahead(steps, scale, weight, price, models, active, changes)
+
+
+def mix(share, one, other, out):
+    """Write a matrix (W, W) with that share of another one in it."""
+    for i in range(W):
+        for j in range(W):
+            if share == 0:
+                out[i, j] = one[i, j]
+            elif share == 1:
+                out[i, j] = other[i, j]
+            else:
+                out[i, j] = (1 - share) * one[i, j] + share * other[i, j]
+
+
+def hold(t, weight, price, models, active, stage, slope):
+    """Add what the rows at a step that are held add to its model."""
+    for row in range(active.size):
+        at = active.size * t + row
+        if active.held[at] == 0:
+            continue
+        own = weight_of(row, weight, price, active)
+        pull = own * (active.numbers[at] - active.table[row, AIM]) - active.force[at]
+        for i in range(W):
+            entry = models.slopes[at, i]
+            if entry != 0:
+                slope[i] += pull * entry
+                for j in range(W):
+                    stage[i, j] += own * entry * models.slopes[at, j]
+
+
+def weight_of(row, weight, price, active):
+    """The weight on a row that is held."""
+    size = active.table[row, SIZE]
+    return (weight if active.table[row, KIND] == LIMIT else price * weight) / (size * size)
+
+
+def look_ahead(steps, scale, weight, price, models, active, changes):
+    """Write the multipliers that a step leads to, and which rows are wrong there; returns how many."""
+    count = 0
+    for t in range(steps + 1):
+        for row in range(active.size):
+            at = active.size * t + row
+            active.pressing[at], active.wrong[at] = 0.0, 0.0
+            if active.live[at] == 0:
+                continue
+            size, ahead = active.table[row, SIZE], active.numbers[at] - active.table[row, AIM]
+            for i in range(N):
+                ahead += models.slopes[at, i] * changes.states[t, i]
+            if t < steps:
+                for i in range(M):
+                    ahead += models.slopes[at, N + i] * changes.controls[t, i]
+            if active.held[at] != 0:
+                active.pressing[at] = active.force[at] - weight_of(row, weight, price, active) * ahead
+                missed = 0.0 if active.table[row, KIND] == EQUALITY else active.pressing[at] * size / scale
+            else:
+                missed = ahead / size
+            if missed < -ROUNDING:
+                active.wrong[at] = missed
+                count += 1
+    return count
+
+
+def change(steps, worst, active):
+    """Hold rows that are missed, and let those go that pull.
+
+    Args:
+      worst: 1 for those that are worse than at the steps before and after; 0 for the last one alone.
+    """
+    last = -1
+    for row in range(active.size):
+        before, was_held = 0.0, 0.0
+        for t in range(steps + 1):
+            at = active.size * t + row
+            here, held = active.wrong[at], active.held[at]
+            if here < 0:
+                last = max(last, at)
+                after = at + active.size
+                no_worse_before = was_held != held or here <= before
+                worse_after = t == steps or active.held[after] != held or here < active.wrong[after]
+                if worst == 1 and no_worse_before and worse_after:
+                    active.held[at] = 1 - held
+            before, was_held = here, held
+    if worst == 0 and last >= 0:
+        active.held[last] = 1 - active.held[last]
+
+
+def settle(steps, low, high, active, controls, gain):
+    """Put controls between their limits (M,), and those at limits that are held there, where their gains are zero."""
+    for t in range(steps):
+        for i in range(M):
+            controls[t, i] = min(max(controls[t, i], low[i]), high[i])
+        for row in range(active.size):
+            if active.table[row, KIND] == LIMIT and active.held[active.size * t + row] != 0:
+                i = int(active.table[row, CONTROL])
+                controls[t, i] = active.table[row, SIDE]
+                for j in range(N):
+                    gain[t, i, j] = 0.0
