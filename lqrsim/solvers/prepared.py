@@ -196,12 +196,17 @@ class PreparedSolver:
 
 
 def _plan_of(start: Solution | Replan | InitialGuess, best: "_Best") -> Plan:
-    """The plan that a law belongs to, but for where it begins; else where the law leads."""
-    states, controls = best.plan
-    if isinstance(start, InitialGuess) or start.trajectory.states.shape != states.shape:
-        return Plan(states.copy(), controls.copy())
-    plan = Plan(start.trajectory.states.copy(), start.trajectory.controls.copy())
-    plan.states[0] = states[0]
+    """Where a law leads, but for the last state: a horizon that moves has a last step that the law was not made for.
+
+    Where that misses constraints, the plan that the law belongs to, but for where it begins.
+    """
+    plan = Plan(*(array.copy() for array in best.plan))
+    if isinstance(start, InitialGuess) or start.trajectory.states.shape != plan.states.shape:
+        return plan
+    planned = start.trajectory
+    if best.violation > 0:
+        plan.states[1:], plan.controls[...] = planned.states[1:], planned.controls
+    plan.states[-1] = planned.states[-1]
     return plan
 
 
