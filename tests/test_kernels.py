@@ -1126,7 +1126,10 @@ class TestActiveSet:
             assert 1 <= len(changed) <= (wrong if worst else 1)
         stages.models.hessian[2, 3:, 3:] -= 1e6 * np.eye(2)
         assert pivot(0.5)[0] == 2  # the controls of that step have no least
-        replay(source, SIZES, "settle", 3, stages.low, stages.high, active, plan.controls.copy(), policy.gain.copy())
+        limits = Limits(*(np.tile(side, (3, 1)) for side in (stages.low, stages.high)))
+        motion = Plan(np.zeros((4, 3)), np.zeros((3, 2)))
+        given = 3, 1, plan, policy, limits, active, stages._model, stages._values, motion
+        replay(source, SIZES, "carry_out", *given)
 
 
 def test_no_kernel_is_left_out() -> None:

@@ -258,7 +258,7 @@ class Call:
             if argument is not old:
                 if part.parts:
                     self._lay_changes(part, argument, old, place)
-                else:
+                elif not (part.vectors and _same_vectors(argument, old)):
                     self._lay(part, argument, place)
             place += part.size
 
@@ -302,8 +302,14 @@ class _Layout:
         self.parts = tuple(_Layout(member) for member in kind.members) if isinstance(kind, Group) else ()
         self.size = len(scalars(kind))
         self.block = kind.block if isinstance(kind, Pointer) else None
+        self.vectors = isinstance(kind, Pointers)
         self.row = np.dtype([(name, np.float64) for name in kind.fields]) if isinstance(kind, Rows) else None
         self.what = (kind.record or "a tuple") if isinstance(kind, Group) else ""
+
+
+def _same_vectors(one: Any, other: tuple[Array, ...]) -> bool:
+    """Whether a tuple has the same arrays as another one."""
+    return isinstance(one, tuple) and len(one) == len(other) and all(map(operator.is_, one, other))
 
 
 _FLOAT64 = np.dtype(np.float64)

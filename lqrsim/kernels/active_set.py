@@ -7,7 +7,16 @@ Rows of constraints and limits of controls, as in `interior_point.py`, some of w
 from math import inf, isnan
 
 from lqrsim.kernels.declarations import M, N, W, stack
-from lqrsim.kernels.interior_point import add_initial, end_with, lead, slopes, stage_models, step_back
+from lqrsim.kernels.interior_point import (
+    add_initial,
+    cost_of_plan,
+    end_with,
+    follow,
+    lead,
+    slopes,
+    stage_models,
+    step_back,
+)
 from lqrsim.kernels.model_functions import evaluate_constraints
 
 # Columns of `ActiveRows.table`: what a row is, by how much it changes, and what it is to have to spare where it is
@@ -226,14 +235,24 @@ def change(steps, worst, active):
         active.held[last] = 1 - active.held[last]
 
 
-def settle(steps, low, high, active, controls, gain):
-    """Put controls between their limits (M,), and those at limits that are held there, where their gains are zero."""
+def carry_out(steps, soft, plan, policy, limits, active, model, values, out):
+    """Write the motion that a plan comes to with a policy about it, and the constraints' numbers; return its cost.
+
+    Args:
+      soft: 1 where there is an initial cost. plan: its controls are put between their limits (T, M), and those that are
+        held there at them. policy: no offsets; its gains are zero at limits. values: of each constraint its numbers.
+        out: gets the motion.
+    """
     for t in range(steps):
         for i in range(M):
-            controls[t, i] = min(max(controls[t, i], low[i]), high[i])
+            policy.offset[t, i] = 0.0
+            plan.controls[t, i] = min(max(plan.controls[t, i], limits.low[t, i]), limits.high[t, i])
         for row in range(active.size):
             if active.table[row, KIND] == LIMIT and active.held[active.size * t + row] != 0:
                 i = int(active.table[row, CONTROL])
-                controls[t, i] = active.table[row, SIDE]
+                plan.controls[t, i] = active.table[row, SIDE]
                 for j in range(N):
-                    gain[t, i, j] = 0.0
+                    policy.gain[t, i, j] = 0.0
+    follow(steps, 0.0, plan, policy, limits, model, out)
+    evaluate_constraints(steps, out.states, out.controls, model.stage.constraints, values)
+    return cost_of_plan(steps, soft, out, model)

@@ -157,13 +157,19 @@ def put(y, v, j, number):
 
 def trial(steps, soft, plan, model, arrived):
     """The cost of a plan; writes where each of its steps leads, (T, N)."""
+    for t in range(steps):
+        advance(plan.states[t], plan.controls[t], model, model.dt, arrived[t])
+    return cost_of_plan(steps, soft, plan, model)
+
+
+def cost_of_plan(steps, soft, plan, model):
+    """The cost of a plan."""
     none = stack(M)
     for i in range(M):
         none[i] = 0.0
     total = cost_value(plan.states[0], none, 0, model.initial) if soft == 1 else 0.0
     for t in range(steps):
         total += cost_value(plan.states[t], plan.controls[t], t, model.stage)
-        advance(plan.states[t], plan.controls[t], model, model.dt, arrived[t])
     return total + cost_value(plan.states[steps], none, steps, model.final)
 
 

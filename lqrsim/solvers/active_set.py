@@ -10,13 +10,14 @@ Models of second order have a minimum only where the right rows are held. So whi
 models, where those that pressed before do not do; the step itself is of second order as far as that has a minimum.
 """
 
+import time
 from collections.abc import Callable
 
 import numpy as np
 
 from lqrsim.errors import Array
-from lqrsim.kernels.active_set import EQUALITY, INEQUALITY, LIMIT
-from lqrsim.kernels.records import ActiveRows, Limits, Plan
+from lqrsim.kernels.active_set import AIM, CONTROL, EQUALITY, INEQUALITY, KIND, LIMIT, SIZE
+from lqrsim.kernels.records import Plan
 from lqrsim.solvers.common import INSIDE
 from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measures, Stages
 
@@ -39,43 +40,44 @@ class ActiveSet:
     Attributes:
       plan: where the steps have come to. measures: of that. force, held: (T+1, R) the rows' multipliers, and 1 for
         those that are held at zero, else 0. sizes: by how much things change. hopeless: whether it is an optimum but
-        for rows that no multiplier brings to be kept.
+        for rows that no multiplier brings to be kept. looking: how long models of a plan took, in s.
     """
 
     def __init__(self, stages: Stages, plan: Plan, multipliers: tuple[Array, ...], violation: float) -> None:
         self.stages, self.plan, self._violation = stages, plan, violation
         self.hopeless = False
-        shape, rows = stages.live.shape, len(stages.owners)
-        live, numbers, pressing, wrong = stages.live.astype(np.float64), *np.zeros((3, *shape))
-        self.force, self.held = np.zeros(shape), np.zeros(shape)
+        shape, limit, rows = stages.live.shape, stages.owners == -1, stages.active
+        live, self.held, numbers, self.force, self._pressing = (one.reshape(shape) for one in rows[2:-1])
+        live[...], self.held[...], self.force[...] = stages.live, 0.0, 0.0
         for k, one in enumerate(multipliers):
             self.force[:, stages.owners == k] = one
-        self._equality, limit = stages.equality, stages.owners == -1
+        self._equality = stages.equality
         kind = np.where(self._equality, EQUALITY, np.where(limit, LIMIT, INEQUALITY))
-        aim = np.where(kind == INEQUALITY, INSIDE * violation, 0.0)
-        table = np.column_stack([kind, np.ones(rows), aim, np.zeros((rows, 3))])
-        table[limit, 3:] = np.reshape([(i, sign, side) for sign, i, side in stages.limits], (-1, 3))
-        arrays = (live, self.held, numbers, self.force, pressing, wrong)
-        self._rows = ActiveRows(rows, table, *(array.reshape(-1) for array in arrays))
-        self._pressing = pressing
+        rows.table[:, KIND], rows.table[:, SIZE] = kind, 1.0
+        rows.table[:, AIM] = np.where(kind == INEQUALITY, INSIDE * violation, 0.0)
+        for row, (sign, i, side) in zip(np.flatnonzero(limit), stages.limits, strict=True):
+            rows.table[row, CONTROL:] = i, sign, side
         self._gaps, self._costates = np.empty((stages.steps, stages.n)), np.zeros((stages.steps + 1, stages.n))
-        cost = stages.look(plan, self._costates, self._rows, own=True)
+        clock = time.perf_counter()
+        cost = stages.look(plan, self._costates, own=True)
+        self.looking = time.perf_counter() - clock
         self._convex, stages.live[...] = False, live > 0
         self.sizes = stages.sizes_of(plan, stages.models.hessian)
-        table[:, 1] = self.sizes.rows
+        rows.table[:, SIZE] = self.sizes.rows
         begun = self._equality | (self.force > 0) | (limit & (numbers <= AT_LIMIT * self.sizes.rows))
         self.held[...] = begun & (live > 0)
         self._measure(cost)
 
-    def run(self, tolerance: float, watch: Callable[[Measures], bool], due: Callable[[], bool]) -> bool:
+    def run(self, tolerance: float, watch: Callable[[Measures], bool], late: Callable[[float], bool]) -> bool:
         """Go on until the measures are within tolerance; whether they are.
 
         Args:
           tolerance: of stationarity, gaps and complementarity.
           watch: called with the measures after each step; True ends it.
-          due: called before each pivot; True ends it where the plan was before that step.
+          late: called with so many seconds before what takes about that long, in a step; True ends it where the plan
+            was before that step.
         """
-        self._due = due
+        self._late = late
         ended = False
         for _ in range(STEPS):
             before = self.measures
@@ -88,8 +90,8 @@ class ActiveSet:
             ended = ended or self.hopeless
         return self._within(tolerance)
 
-    def law(self) -> tuple[Plan, Array]:
-        """The motion that the plan comes to with gains about it (T, m, n), and these.
+    def carried_out(self) -> tuple[Plan, Array, float, list[Array]]:
+        """The motion that the plan comes to with gains about it (T, m, n); these; its cost; the constraints' numbers.
 
         The gains are those of a step with a price on missing the rows that press, and zero at limits.
         """
@@ -99,11 +101,9 @@ class ActiveSet:
                 break
         else:
             stages.gain[...] = 0.0
-        controls, gain = self.plan.controls.copy(), stages.gain.copy()
-        stages.settle(self._rows, controls, gain)
-        box = Limits(*(np.tile(side, (stages.steps, 1)) for side in (stages.low, stages.high)))
-        plan = Plan(self.plan.states, controls)
-        return stages.follow(plan, 0.0, (gain, np.zeros_like(controls)), box), gain
+        gain = stages.gain.copy()
+        plan, cost, values = stages.carry_out(Plan(self.plan.states, self.plan.controls.copy()), gain)
+        return plan, gain, cost, values
 
     def multipliers(self) -> list[tuple[Array, float]]:
         """Of each constraint the multipliers (T+1, rows), and the price that the policy has."""
@@ -115,7 +115,7 @@ class ActiveSet:
     def _measure(self, cost: float) -> None:
         """Work out the measures of a plan about which the models are."""
         self._scale = max(abs(cost), 1e-6 * self.sizes.cost) if np.isfinite(cost) else np.nan
-        steepest, missed, unequal, gap, product = self.stages.measure(self.plan, self._rows, self._gaps, self.sizes)
+        steepest, missed, unequal, gap, product = self.stages.measure(self.plan, self._gaps, self.sizes)
         self._kept = missed <= 0 and unequal <= self._violation
         self.measures = Measures(
             cost=cost, stationarity=steepest / self._scale, violation=max(missed, unequal, 0.0), gap=gap,
@@ -130,17 +130,23 @@ class ActiveSet:
     def _step(self) -> bool:
         """One step; False where there is none."""
         before = self.held.copy()
-        if self._pivoted(0.0, 0) != 0 and not self._from_convex():
+        if (self._pivoted(0.0, 0) != 0 and not self._from_convex()) or self._due():
             self.held[...] = before
             return False
         stages = self.stages
         self.force[...] = np.where(self._equality, self._pressing, np.maximum(self._pressing, 0.0))
         self._costates = stages.to_go.gradient.copy()
         self.plan = Plan(self.plan.states + stages.changes.states, self.plan.controls + stages.changes.controls)
-        cost = stages.look(self.plan, self._costates, self._rows)
+        clock = time.perf_counter()
+        cost = stages.look(self.plan, self._costates)
         self._convex = False
         self._measure(cost)
+        self.looking = time.perf_counter() - clock
         return True
+
+    def _due(self) -> bool:
+        """Whether models of a plan would be there too late."""
+        return self._late(self.looking)
 
     def _from_convex(self) -> bool:
         """A step with the rows that press in the convex models, or some others; whether there is one."""
@@ -174,7 +180,7 @@ class ActiveSet:
             if wrong == 0 or pivot == most:
                 return wrong
             fewest, patience = (wrong, PATIENCE) if wrong < fewest else (fewest, patience - 1)
-            self.stages.change(self._rows, worst=patience > 0)
+            self.stages.change(worst=patience > 0)
         return None
 
     def _solve(self, share: float, price: float = 1.0) -> tuple[bool, int]:
@@ -183,4 +189,4 @@ class ActiveSet:
             self.stages.convexify(self.plan)
             self._convex = True
         weight = self._scale / REGULARISATION
-        return self.stages.pivot(self._rows, self._gaps, share=share, scale=self._scale, weight=weight, price=price)
+        return self.stages.pivot(self._gaps, share=share, scale=self._scale, weight=weight, price=price)

@@ -116,6 +116,7 @@ class Stages:
     Attributes:
       live: (T+1, R) which rows act at which step. equality: (R,) which are to be zero. owners: (R,) the constraint that
         a row is of; -1 for limits. models: `records.StageModels` of the last plan; slopes (T+1, R, n+m) of its rows.
+      active: `records.ActiveRows`, for an active set. policy: gain and offset of the last step.
       free: (n,) which of the start's states are not fixed. limits: of each row that is one its sign, the control, and
         where it ends.
     """
@@ -141,6 +142,9 @@ class Stages:
         first = np.cumsum([0, *counts])[:-1].astype(np.float64)
         self._rows = ConstraintRows(rows, np.inf, first, np.zeros((rows, n + m)), np.zeros((steps + 1) * rows))
         self.gain, self.offset = np.zeros((steps, m, n)), np.zeros((steps, m))
+        self.policy = Policy(self.gain, self.offset)
+        arrays = (np.zeros(self.live.size) for _ in range(6))
+        self.active = ActiveRows(rows, np.zeros((rows, 6)), *arrays)
         self.to_go = CostToGo(np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1))
         self.changes = Plan(np.zeros((steps + 1, n)), np.zeros((steps, m)))
 
@@ -304,37 +308,43 @@ class Stages:
         joined[:, : self.n], joined[:-1, self.n :] = self.changes
         return joined
 
-    def look(self, plan: Plan, costates: Array, active: ActiveRows, *, own: bool = False) -> float:
+    def look(self, plan: Plan, costates: Array, *, own: bool = False) -> float:
         """Make the models about a plan, and write what rows have to spare; return its cost. See the kernel's."""
-        rows = self._rows._replace(least=0.0, multipliers=active.force)
+        rows = self._rows._replace(least=0.0, multipliers=self.active.force)
         return self._call(
             "look", self.steps, self._soft, int(own), plan, costates, self._model, self._values, rows, self.models,
-            active, module=self._active,
+            self.active, module=self._active,
         )  # fmt: skip
 
-    def measure(self, plan: Plan, active: ActiveRows, gaps: Array, sizes: Sizes) -> tuple[float, ...]:
+    def measure(self, plan: Plan, gaps: Array, sizes: Sizes) -> tuple[float, ...]:
         """How far the plan about which the models are is from an optimum; writes its gaps. See the kernel's."""
-        return self._call(
-            "measure", self.steps, plan, self.models, gaps, active, sizes.states, sizes.controls, module=self._active
-        )
+        of = plan, self.models, gaps, self.active, sizes.states, sizes.controls
+        return self._call("measure", self.steps, *of, module=self._active)
 
-    def pivot(
-        self, active: ActiveRows, gaps: Array, *, share: float, scale: float, weight: float, price: float = 1.0
-    ) -> tuple[bool, int]:
+    def pivot(self, gaps: Array, *, share: float, scale: float, weight: float, price: float = 1.0) -> tuple[bool, int]:
         """As `direction`, with rows that are held; also returns how many are wrong there. See the kernel's."""
         failed, wrong = self._call(
-            "pivot", self.steps, self.free, share, scale, weight, price, self.models, gaps, active,
-            Policy(self.gain, self.offset), self.to_go, self.changes, module=self._active,
+            "pivot", self.steps, self.free, share, scale, weight, price, self.models, gaps, self.active, self.policy,
+            self.to_go, self.changes, module=self._active,
         )  # fmt: skip
         return failed == -1, wrong
 
-    def change(self, active: ActiveRows, *, worst: bool) -> None:
+    def change(self, *, worst: bool) -> None:
         """Change which rows are held; see the kernel's."""
-        self._call("change", self.steps, int(worst), active, module=self._active)
+        self._call("change", self.steps, int(worst), self.active, module=self._active)
 
-    def settle(self, active: ActiveRows, controls: Array, gain: Array) -> None:
-        """Put controls (T, m) at the limits that are held; their gains (T, m, n) are zero there."""
-        self._call("settle", self.steps, self.low, self.high, active, controls, gain, module=self._active)
+    def carry_out(self, plan: Plan, gain: Array) -> tuple[Plan, float, list[Array]]:
+        """The motion that a plan comes to with gains about it, its cost, and of each constraint the numbers.
+
+        Controls are put at the limits that are held; gains (T, m, n) are zero there.
+        """
+        out = Plan(np.empty_like(plan.states), np.empty_like(plan.controls))
+        limits = Limits(*(np.tile(side, (self.steps, 1)) for side in (self.low, self.high)))
+        cost = self._call(
+            "carry_out", self.steps, self._soft, plan, Policy(gain, self.offset), limits, self.active, self._model,
+            self._values, out, module=self._active,
+        )  # fmt: skip
+        return out, cost, [one.reshape(self.steps + 1, -1) for one in self._values]
 
 
 class Point(NamedTuple):

@@ -27,6 +27,7 @@ from lqrsim.solvers.interior_point import INTERIOR, InteriorPoint, Measures, Sta
 from lqrsim.solvers.strategy import LITTLE
 
 SLOPES = 1e-6  # of a Lagrangian, relative to the cost; what they promise is about the square of that
+BEGINNING = 15.0  # times as long as models of a plan, what the interior point takes for its first iteration
 ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
 
 
@@ -263,11 +264,12 @@ class _Neighbour:
         self._allowed = attempt.settings.missed(attempt.problem)
         self._iterations: list[Iteration] = []
         self.ended, self._cost = time.perf_counter(), np.inf
+        self._out_of_time = False
 
     def find(self) -> AttemptResult:
         """Run until it converges or has to stop."""
-        attempt, stop = self._attempt, self._attempt.stop
-        if stop.due:
+        attempt = self._attempt
+        if self._late(0.0):
             return _unchanged(attempt, self._best)
         if not np.isfinite(self._best.cost):
             detail = "the law that it begins with leads to infinity"
@@ -278,50 +280,61 @@ class _Neighbour:
         with np.errstate(all="ignore"):
             active = ActiveSet(self._stages, self._plan, known, self._allowed)
             self.ended = time.perf_counter()
-            solved = active.run(attempt.final, lambda measures: self._watch(measures, "active set"), self._late)
-            left = attempt.iterations_left(tuple(self._iterations))
-            if not (solved or active.hopeless or stop.due) and left:
+            solved = self._run(active)
+            if not (solved or active.hopeless or self._late(BEGINNING * active.looking)) and self._left:
                 point = InteriorPoint(
                     attempt.problem, Plan(*(array.copy() for array in self._best.plan)), barrier=LITTLE[0],
                     room=LITTLE[1], multipliers=known, stages=self._stages,
                 )  # fmt: skip
-                found = point.run(
-                    tolerance=attempt.final, violation=self._allowed, most=left,
-                    watch=lambda measures: self._watch(measures, INTERIOR),
-                )  # fmt: skip
+
+                def watch(measures: Measures) -> bool:
+                    self._log(measures, INTERIOR)
+                    return self._late(self._iterations[-1].seconds) or not self._left
+
+                found = point.run(tolerance=attempt.final, violation=self._allowed, most=self._left, watch=watch)
                 if found.solved or not np.isfinite(active.measures.cost):
                     active = ActiveSet(self._stages, found.plan, found.multipliers, self._allowed)
-                    solved = active.run(attempt.final, lambda measures: self._watch(measures, "active set"), self._late)
+                    solved = self._run(active)
+            self.ended = time.perf_counter()  # also of a step that was left
             return self._result(active, solved)
 
-    def _late(self) -> bool:
-        """Whether the deadline is so near that what is begun is to be left."""
-        stop = self._attempt.stop
-        return time.perf_counter() + self._closing >= stop.deadline
+    def _run(self, active: ActiveSet) -> bool:
+        """Take the steps of an active set; whether it is solved. One that would end too late is left halfway."""
 
-    def _watch(self, measures: Measures, method: str) -> bool:
-        """Log an iteration; whether to stop."""
+        def watch(measures: Measures) -> bool:
+            self._log(measures, "active set")
+            return self._late(active.looking) or not self._left
+
+        return active.run(self._attempt.final, watch, self._late)
+
+    def _late(self, seconds: float) -> bool:
+        """Whether what takes so long would end too late; then it all ends."""
+        self._out_of_time |= time.perf_counter() + seconds + self._closing >= self._attempt.stop.deadline
+        return self._out_of_time
+
+    @property
+    def _left(self) -> int:
+        return self._attempt.iterations_left(tuple(self._iterations))
+
+    def _log(self, measures: Measures, method: str) -> None:
         now = time.perf_counter()
         self._iterations.append(replace(iteration_of(measures, self._cost, now - self.ended), method=method))
         self.ended, self._cost = now, measures.cost
-        return self._attempt.stop.due or not self._attempt.iterations_left(tuple(self._iterations))
 
     def _result(self, active: ActiveSet, solved: bool) -> AttemptResult:
         """Where the plan leads with a policy about it."""
         attempt, work = self._attempt, self._attempt.work
         if not np.isfinite(active.measures).all():
-            status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS
+            status = Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
             detail, done = raised_by(functions_of(attempt.problem)), tuple(self._iterations)
             return replace(_unchanged(attempt, self._best), status=status, detail=detail, iterations=done)
-        plan, gain = active.law()
-        cost, _ = self._stages.trial(plan)
-        values = work.constraint_values(*plan)
+        plan, gain, cost, values = active.carried_out()
         terms = attempt.problem.constraint_terms
         pairs = zip(terms, values, strict=True)
         solved = solved and all(
             violation_of(term, one) <= allowed_violation(term, self._allowed) for term, one in pairs
         )
-        status = Status.TIME_LIMIT if attempt.stop.due else Status.MAX_ITERATIONS
+        status = Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
         offset = plan.controls - np.einsum("tij,tj->ti", gain, plan.states[:-1])
         return AttemptResult(
