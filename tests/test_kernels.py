@@ -74,7 +74,6 @@ from lqrsim.kernels.records import (
     Smoothing,
     Stage,
     Step,
-    StepModels,
 )
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.kernels.records import Settings as KernelSettings
@@ -1060,8 +1059,10 @@ class TestInteriorPoint:
         gaps = 0.1 * rng.normal(size=(3, 3))
 
         def direction(hessian: Array, free: float = 1.0) -> int:
-            models = StepModels(hessian, gradient, jacobian, gaps)
-            return replay(source, SIZES, "direction", 3, np.full(3, free), models, policy, to_go, changes)
+            given = 3, np.full(3, free), 0.0, 1.0, 1.0, 1.0, stages.models._replace(hessian=hessian), gaps
+            rows = stages.active._replace(size=0)
+            failed, _ = replay(source_of(active_set), SIZES, "pivot", *given, rows, policy, to_go, changes)
+            return failed
 
         convex = stages.models.convex + np.eye(5)
         assert direction(convex) == direction(convex, 0.0) == -1

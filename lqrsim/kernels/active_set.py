@@ -129,8 +129,8 @@ def pivot(steps, free, share, scale, weight, price, models, gaps, active, policy
       free: (N,) 0 for the states that the start fixes. share: of the projected Hessian of the cost.
       scale: cost that multipliers are relative to. weight: on what a row that is held is away from zero, by its size;
         of constraints that share of it that is `price`.
-      models: `records.StageModels`. gaps: (T, N). active: `records.ActiveRows`. policy, to_go, changes: as in
-        `interior_point.direction`.
+      models: `records.StageModels`. gaps: (T, N). active: `records.ActiveRows`. policy, to_go: as in `step_back`; the
+        gradients are the costates where the step leads. changes: gets those of the plan.
 
     Returns:
       The step whose control block is not positive definite, steps + 1 where it is the start's, or else -1; and how many

@@ -188,30 +188,6 @@ def adjoint(steps, gradient, jacobian, costates, slopes):
                 slopes[t, j - N] = total
 
 
-def direction(steps, free, models, policy, to_go, changes):
-    """The step to the minimum of the stages' models, the gaps closed: a Riccati recursion, and where it leads.
-
-    Args:
-      free: (N,) 0 for the states that the start fixes. models: `records.StepModels`.
-      policy: gets the gains, and the changes of controls where states do not change. to_go: gets the cost-to-go of
-        changes; its gradients are the costates where the step leads. changes: gets those of the plan.
-
-    Returns:
-      The step whose control block is not positive definite, steps + 1 where it is the start's, or else -1.
-    """
-    stage, slope = stack(W, W), stack(W)
-    for t in range(steps, -1, -1):
-        for i in range(W):
-            slope[i] = models.gradient[t, i]
-            for j in range(W):
-                stage[i, j] = models.hessian[t, i, j]
-        if t == steps:
-            end_with(steps, stage, slope, to_go)
-        elif not step_back(t, stage, slope, models.jacobian[t], models.gaps[t], policy, to_go):
-            return t
-    return -1 if lead(steps, free, models.jacobian, models.gaps, policy, to_go, changes) else steps + 1
-
-
 def end_with(steps, stage, slope, to_go):
     """Write the cost-to-go at the end."""
     for i in range(N):
@@ -221,7 +197,15 @@ def end_with(steps, stage, slope, to_go):
 
 
 def step_back(t, stage, slope, jacobian, gap, policy, to_go):
-    """A step of the recursion, from t + 1 to t; uses up the stage. Whether its control block is positive definite."""
+    """A step of the Riccati recursion, from t + 1 to t, with the gap closed; uses up the stage.
+
+    Args:
+      policy: gets the gains, and the changes of controls where states do not change. to_go: gets the cost-to-go of
+        changes.
+
+    Returns:
+      Whether the control block is positive definite.
+    """
     ahead, least = stack(N), stack(M)
     for i in range(M):
         least[i] = TINY * abs(stage[N + i, N + i])
@@ -236,7 +220,9 @@ def step_back(t, stage, slope, jacobian, gap, policy, to_go):
 
 
 def lead(steps, free, jacobian, gaps, policy, to_go, changes):
-    """Write the changes of the plan, and the costates where they lead; whether the start's have a minimum."""
+    """Write the changes of the plan that a policy makes, and as gradients of the cost-to-go the costates where they
+    lead; whether the start's have a minimum. `free` (N,) is 0 for the states that the start fixes.
+    """
     if not first_change(free, to_go, changes.states[0]):
         return False
     for t in range(steps):
@@ -287,7 +273,7 @@ def follow(steps, part, plan, policy, limits, model, out):
     """The motion that a part of a step leads to, its gains closing the loop; writes states and controls.
 
     Args:
-      plan: a motion. policy: gains, and changes of controls where states do not change; `direction` has written them.
+      plan: a motion. policy: gains, and changes of controls where states do not change, as `step_back` writes them.
       limits: what the controls are held between, at each step, (T, M) each. out: gets the motion.
     """
     for i in range(N):

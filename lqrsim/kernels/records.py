@@ -238,15 +238,6 @@ class ActiveRows(NamedTuple):
     wrong: Arrays
 
 
-class StepModels(NamedTuple):
-    """What a step about a plan minimises: hessian (T+1, W, W), gradient (T+1, W), jacobian (T, N, W), gaps (T, N)."""
-
-    hessian: Arrays
-    gradient: Arrays
-    jacobian: Arrays
-    gaps: Arrays
-
-
 class Reduced(NamedTuple):
     """A step and its stage with the control eliminated by u = w - F x - h, for the dual form.
 

@@ -22,7 +22,7 @@ from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import active_set as active_kernel
 from lqrsim.kernels import interior_point as kernel
-from lqrsim.kernels.records import ActiveRows, ConstraintRows, CostToGo, Limits, Plan, Policy, StageModels, StepModels
+from lqrsim.kernels.records import ActiveRows, ConstraintRows, CostToGo, Limits, Plan, Policy, StageModels
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Iteration
 from lqrsim.solvers import compiled
@@ -295,12 +295,8 @@ class Stages:
 
     def direction(self, hessian: Array, gradient: Array, gaps: Array) -> bool:
         """Write the step to the minimum of models, and the costates there; whether there is one."""
-        failed = self._call(
-            "direction", self.steps, self.free,
-            StepModels(in_c_order(hessian), in_c_order(gradient), self.models.jacobian, in_c_order(gaps)),
-            Policy(self.gain, self.offset), self.to_go, self.changes,
-        )  # fmt: skip
-        return failed == -1
+        models = self.models._replace(hessian=in_c_order(hessian), gradient=in_c_order(gradient))
+        return self._solve(models, self.active._replace(size=0), in_c_order(gaps))[0]
 
     def joined(self) -> Array:
         """The changes of states and controls side by side, (T+1, n+m)."""
@@ -323,9 +319,15 @@ class Stages:
 
     def pivot(self, gaps: Array, *, share: float, scale: float, weight: float, price: float = 1.0) -> tuple[bool, int]:
         """As `direction`, with rows that are held; also returns how many are wrong there. See the kernel's."""
+        return self._solve(self.models, self.active, gaps, share, scale, weight, price)
+
+    def _solve(
+        self, models: StageModels, rows: ActiveRows, gaps: Array, share: float = 0.0, scale: float = 1.0,
+        weight: float = 1.0, price: float = 1.0,
+    ) -> tuple[bool, int]:  # fmt: skip
         failed, wrong = self._call(
-            "pivot", self.steps, self.free, share, scale, weight, price, self.models, gaps, self.active, self.policy,
-            self.to_go, self.changes, module=self._active,
+            "pivot", self.steps, self.free, share, scale, weight, price, models, gaps, rows, self.policy, self.to_go,
+            self.changes, module=self._active,
         )  # fmt: skip
         return failed == -1, wrong
 

@@ -101,7 +101,15 @@ class PreparedSolver:
         for which in range(len(self.problem.constraint_terms)):
             attempt.work.constraint_slope(which, 0, state, control, 0)
         if self.problem.constraints and attempt.newton:
-            _Neighbour(attempt, Stages(self.problem), Plan(*attempt.work.plan), _Best(attempt)).find()
+            stages, plan = Stages(self.problem), Plan(*attempt.work.plan)
+            _Neighbour(attempt, stages, plan, _Best(attempt)).find()
+            # What that can do without, another solve may need.
+            stages.convexify(plan)
+            stages.change(worst=False)
+            with np.errstate(all="ignore"):
+                InteriorPoint(self.problem, plan, stages=stages).run(
+                    tolerance=attempt.final, violation=attempt.settings.missed(self.problem), most=1
+                )
 
     def _stages_of(self, problem: Problem) -> Stages:
         try:
