@@ -1048,7 +1048,8 @@ class TestInteriorPoint:
         rows = stages._rows._replace(least=0.0, support=np.ones((len(stages.owners), 5)), multipliers=multipliers)
         begun, costates = (3, 1), rng.normal(size=(4, 3))
         for second in (0, 1):
-            replay(source, SIZES, "models", *begun, second, plan, costates, stages._model, rows, stages.models)
+            given = *begun, second, 0, plan, costates, stages._model, stages._values, rows, stages.models
+            replay(source_of(active_set), SIZES, "look", *given, stages.active._replace(size=0))
         replay(source, SIZES, "convex_models", *begun, plan, stages._model, stages.models)
         replay(source, SIZES, "trial", *begun, plan, stages._model, np.zeros((3, 3)))
         gradient, jacobian = stages.models.gradient, stages.models.jacobian
@@ -1101,10 +1102,8 @@ class TestActiveSet:
         known = stages._rows._replace(least=0.0, multipliers=force)
         gaps, costates = np.zeros((3, 3)), rng.normal(size=(4, 3))
         for own in (0, 1):
-            replay(
-                source, SIZES, "look", 3, 1, own, plan, costates, stages._model, stages._values, known, stages.models,
-                active,
-            )  # fmt: skip
+            given = 3, 1, 1, own, plan, costates, stages._model, stages._values, known, stages.models
+            replay(source, SIZES, "look", *given, active)
         replay(source, SIZES, "measure", 3, plan, stages.models, gaps, active, np.full(3, 0.5), np.full(2, 2.0))
         stages.convexify(plan)
         stages.models.convex[...] += np.eye(5)

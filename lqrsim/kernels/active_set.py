@@ -26,21 +26,24 @@ INEQUALITY, LIMIT, EQUALITY = 0, 1, 2
 ROUNDING = 1e-10  # of a row's size, by which it may be missed by a model
 
 
-def look(steps, soft, own, plan, costates, model, values, rows, out, active):
-    """Write the models of all stages at a plan, of second order, and the rows' numbers. Return the cost.
+def look(steps, soft, second, own, plan, costates, model, values, rows, out, active):
+    """Write the models of all stages at a plan: those of its cost, its steps and its constraints; and the numbers of
+    the active set's rows, if it has any. Return the cost.
 
     Args:
-      soft: 1 where there is an initial cost.
-      own: 1 where the costates (T+1, N) are to be those of this plan with its forces; they are written.
+      soft: 1 where there is an initial cost. second: 1 where the steps' and constraints' second derivatives are wanted.
+      costates: (T+1, N), of where each step leads.
+      own: 1 where the costates are to be those of this plan with its forces; they are written.
       values: of each constraint its numbers, which are written. rows: `records.ConstraintRows`. out:
         `records.StageModels`. active: `records.ActiveRows`; a row that turns out not to act is let go.
     """
-    evaluate_constraints(steps, plan.states, plan.controls, model.stage.constraints, values)
-    take_numbers(steps, plan, model.stage.constraints, values, rows, active)
+    if active.size > 0:
+        evaluate_constraints(steps, plan.states, plan.controls, model.stage.constraints, values)
+        take_numbers(steps, plan, model.stage.constraints, values, rows, active)
     slopes(steps, plan, model.stage.constraints, rows, out)
     total, slope = 0.0, stack(W)
     for t in range(steps, -1, -1):
-        total += stage_models(t, steps, 1, plan, costates, model, rows, out)
+        total += stage_models(t, steps, second, plan, costates, model, rows, out)
         if own == 1 and t > 0:
             slope_at(t, steps, costates[min(t + 1, steps)], out, active, slope)
             for i in range(N):

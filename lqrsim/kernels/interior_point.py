@@ -22,23 +22,6 @@ TINY = 1e-9  # what is left of a control's own curvature when that is as good as
 STEP = 6e-6  # of differences of slopes, relative to a number and at least 1: the cube root of rounding
 
 
-def models(steps, soft, second, plan, costates, model, rows, out):
-    """Write the models of all stages at a plan: those of its cost, its steps and its constraints. Return the cost.
-
-    Args:
-      soft: 1 where there is an initial cost. second: 1 where the steps' and constraints' second derivatives are wanted.
-      costates: (T+1, N), of where each step leads.
-      rows: `records.ConstraintRows`, with the constraints' multipliers. out: `records.StageModels`.
-    """
-    total = 0.0
-    slopes(steps, plan, model.stage.constraints, rows, out)
-    for t in range(steps + 1):
-        total += stage_models(t, steps, second, plan, costates, model, rows, out)
-    if soft == 1:
-        total += add_initial(plan.states[0], model, out)
-    return total
-
-
 def stage_models(t, steps, second, plan, costates, model, rows, out):
     """Write those of a stage, but for the constraints' slopes, which `slopes` has written. Return its cost."""
     none = stack(M)

@@ -220,8 +220,7 @@ class Stages:
         self, plan: Plan, costates: Array, multipliers: Array, least: float, *, second: bool = True
     ) -> float:
         """The same without the projected Hessians; without `second`, nor those of the steps and constraints."""
-        rows = self._rows._replace(least=float(least), multipliers=in_c_order(multipliers).reshape(-1))
-        return self._call("models", self.steps, self._soft, int(second), plan, costates, self._model, rows, self.models)
+        return self._look(plan, costates, self.active._replace(size=0), in_c_order(multipliers), least, second=second)
 
     def convexify(self, plan: Plan) -> None:
         """Make the projected Hessians about a plan."""
@@ -306,10 +305,16 @@ class Stages:
 
     def look(self, plan: Plan, costates: Array, *, own: bool = False) -> float:
         """Make the models about a plan, and write what rows have to spare; return its cost. See the kernel's."""
-        rows = self._rows._replace(least=0.0, multipliers=self.active.force)
+        return self._look(plan, costates, self.active, self.active.force, 0.0, own=own)
+
+    def _look(
+        self, plan: Plan, costates: Array, active: ActiveRows, multipliers: Array, least: float, *,
+        second: bool = True, own: bool = False,
+    ) -> float:  # fmt: skip
+        rows = self._rows._replace(least=float(least), multipliers=multipliers.reshape(-1))
         return self._call(
-            "look", self.steps, self._soft, int(own), plan, costates, self._model, self._values, rows, self.models,
-            self.active, module=self._active,
+            "look", self.steps, self._soft, int(second), int(own), plan, costates, self._model, self._values, rows,
+            self.models, active, module=self._active,
         )  # fmt: skip
 
     def measure(self, plan: Plan, gaps: Array, sizes: Sizes) -> tuple[float, ...]:
