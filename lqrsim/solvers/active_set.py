@@ -145,8 +145,8 @@ class ActiveSet:
         return True
 
     def _due(self) -> bool:
-        """Whether models of a plan would be there too late."""
-        return self._late(self.looking)
+        """Whether a pivot and models of a plan would be there too late, with as much to spare as the models take."""
+        return self._late(2 * self.looking)
 
     def _from_convex(self) -> bool:
         """A step with the rows that press in the convex models, or some others; whether there is one."""
