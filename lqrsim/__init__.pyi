@@ -40,6 +40,7 @@ from .reports.page import report as report
 from .results.coordinates import Coordinates as Coordinates
 from .results.funnel import Funnel as Funnel
 from .results.output_feedback import OutputFeedbackPolicy as OutputFeedbackPolicy
+from .results.plan import Plan as Plan
 from .results.policy import AffinePolicy as AffinePolicy
 from .results.rollout import Rollout as Rollout
 from .results.save_load import load as load

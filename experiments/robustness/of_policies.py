@@ -104,6 +104,8 @@ def replanning(place: Place) -> dict[str, tuple[Any, ...]]:
         "PreparedSolver.solve": (
             {"self": solver, "state": state, "start": replan, "problem": place.problem, "after": 0, "time_limit": 0.01},
         ),
+        "Plan": ({field.name: parts[field.name] for field in dataclasses.fields(ls.Plan)},),
+        "Plan.shifted": ({"self": replan, "steps": 1, "horizon": "moving"},),
         "Replan": (parts,),
         "Replan.shifted": ({"self": replan, "steps": 1, "horizon": "moving"},),
         "ReplanRecord": (record,),
