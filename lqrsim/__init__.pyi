@@ -11,10 +11,9 @@ from . import view as view
 from .capsules import Capsule as Capsule
 from .control.chance_constrained import smooth_chance_constrained as smooth_chance_constrained
 from .control.controllers import Controller as Controller
-from .control.controllers import Feedback as Feedback
+from .control.controllers import ControllerRun as ControllerRun
 from .control.offset_free import OffsetFree as OffsetFree
-from .control.planner import Planner as Planner
-from .control.replanning import Replanning as Replanning
+from .control.replanner import Replanner as Replanner
 from .control.tracking import track as track
 from .control.tubes import predict_tube as predict_tube
 from .control.uncertainty import Uncertainty as Uncertainty

@@ -307,7 +307,7 @@ class TestDataThatUsersBuild:
         for call in (
             lambda: lq.smooth("problem"), lambda: lq.ilqr([problem]), lambda: lq.simulate(plant, [drive_solution]),
             lambda: lq.simulate("plant", drive_solution), lambda: lq.simulate(plant, drive_solution, controller="none"),
-            lambda: lq.Feedback(drive_solution), lambda: lq.Replanning("problem", drive_solution, every=1.0),
+            lambda: lq.Replanner("problem", drive_solution, every=1.0),
             lambda: lq.view.plot_run("solution", {}, "a.png", world=differential_drive.scene.world),
             lambda: lq.report("results", "a.html"), lambda: lq.verify_run("run"),
             lambda: lq.stress.outcomes("run", plant),

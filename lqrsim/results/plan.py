@@ -34,8 +34,8 @@ class Plan:
       detail: where and why, if it is not a success.
       policy: the feedback law.
       trajectory: the plan: the rollout of the policy by the model from its first state.
-      cost_to_go: the value function of the law, a `Quadratic`; None where it is not known, or not needed, as of re-plans
-        with constraints.
+      cost_to_go: the value function of the law, a `Quadratic`; None where it is not known, and of re-plans with
+        constraints, which do not need it.
       multipliers: of each of the problem's constraints; none where the plan keeps them all without being made to.
       goal: (n,) the state that the problem asks for, NaN in states that do not matter; None where it names no state.
       goal_radius: within which the plan's end counts as at the goal, in `target.unit`; None where that is not known.
