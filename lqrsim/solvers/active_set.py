@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
-from lqrsim.kernels.records import Limits, Plan
+from lqrsim.kernels.records import Limits, Motion
 from lqrsim.solvers.common import INSIDE
 from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measures, Stages
 
@@ -46,7 +46,7 @@ class ActiveSet:
         no multiplier brings to be kept.
     """
 
-    def __init__(self, stages: Stages, plan: Plan, multipliers: tuple[Array, ...], violation: float) -> None:
+    def __init__(self, stages: Stages, plan: Motion, multipliers: tuple[Array, ...], violation: float) -> None:
         self.stages, self.plan, self._violation = stages, plan, violation
         self.hopeless = False
         stages.act_at(plan)
@@ -89,7 +89,7 @@ class ActiveSet:
             ended = ended or self.hopeless
         return self._within(tolerance)
 
-    def law(self) -> tuple[Plan, Array]:
+    def law(self) -> tuple[Motion, Array]:
         """The motion that the plan comes to with gains about it (T, m, n), and these.
 
         The gains are those of a step with a price on missing the rows that press, and zero at limits.
@@ -108,7 +108,7 @@ class ActiveSet:
         for (_, i, side), at in zip(stages.limits, held.T > 0, strict=True):
             controls[at, i], gain[at, i] = side, 0.0
         box = Limits(*(np.tile(side, (stages.steps, 1)) for side in (low, high)))
-        plan = Plan(self.plan.states, controls)
+        plan = Motion(self.plan.states, controls)
         return stages.follow(plan, 0.0, (gain, np.zeros_like(controls)), box), gain
 
     def multipliers(self) -> list[tuple[Array, float]]:
@@ -164,7 +164,7 @@ class ActiveSet:
         self.held, force, _ = found
         self.force = np.where(self._equality, force, np.maximum(force, 0.0))
         self._costates = stages.to_go.gradient.copy()
-        self.plan = Plan(self.plan.states + stages.changes.states, self.plan.controls + stages.changes.controls)
+        self.plan = Motion(self.plan.states + stages.changes.states, self.plan.controls + stages.changes.controls)
         self._measure()
         return True
 

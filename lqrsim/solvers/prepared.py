@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array, InputError, check_array, check_kind, check_number
-from lqrsim.kernels.records import Plan as Motion
+from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
