@@ -157,8 +157,8 @@ def in_gusts(config: Config, gusts: float, rates: tuple[float, ...]) -> dict[str
     problem = firm(scenario)
     solution, plant = ls.smooth(problem), scenario.plant()
     wrong = [ls.disturbances.Gusts(gusts)]
-    laws: dict[str, ls.Replanning | None] = {
-        EACH: ls.Replanning(problem, solution, every=EVERY), "never, the policy alone": None,
+    laws: dict[str, ls.Replanner | None] = {
+        EACH: ls.Replanner(problem, solution, every=EVERY, deadline=0.0), "never, the policy alone": None,
     }  # fmt: skip
     funnels: list[str] = []
     for rate in rates[: 1 if config.quick else None]:
@@ -167,7 +167,7 @@ def in_gusts(config: Config, gusts: float, rates: tuple[float, ...]) -> dict[str
         )  # fmt: skip
         for share in SHARES:
             name = f"beyond {share:g} of the level, rate {rate:g}"
-            laws[name] = ls.Replanning(problem, solution, every=EVERY, when=funnel, share=share)
+            laws[name] = ls.Replanner(problem, solution, every=EVERY, deadline=0.0, when=funnel, share=share)
         funnels.append(funnel.summary())
     found: dict[str, Any] = {}
     ended: dict[str, Any] = {}
@@ -181,7 +181,7 @@ def in_gusts(config: Config, gusts: float, rates: tuple[float, ...]) -> dict[str
         apart = paired_difference(pairs.only_first, pairs.only_second, config.replanned)
         found[name] = {
             "reached": interval(_percent(int(ended[name].sum()), config.replanned)),
-            "solves": 0 if law is None else len(law.records),
+            "solves": 0 if law is None else len(run.controller_run.log.records),
             "more": [100 * part for part in interval(apart)],
         }  # fmt: skip
     return {"strength": gusts, "laws": found, "funnels": funnels}

@@ -11,10 +11,9 @@ from . import view as view
 from .capsules import Capsule as Capsule
 from .control.chance_constrained import smooth_chance_constrained as smooth_chance_constrained
 from .control.controllers import Controller as Controller
-from .control.controllers import Feedback as Feedback
+from .control.controllers import ControllerRun as ControllerRun
 from .control.offset_free import OffsetFree as OffsetFree
-from .control.planner import Planner as Planner
-from .control.replanning import Replanning as Replanning
+from .control.replanner import Replanner as Replanner
 from .control.tracking import track as track
 from .control.tubes import predict_tube as predict_tube
 from .control.uncertainty import Uncertainty as Uncertainty
@@ -40,6 +39,7 @@ from .reports.page import report as report
 from .results.coordinates import Coordinates as Coordinates
 from .results.funnel import Funnel as Funnel
 from .results.output_feedback import OutputFeedbackPolicy as OutputFeedbackPolicy
+from .results.plan import Plan as Plan
 from .results.policy import AffinePolicy as AffinePolicy
 from .results.rollout import Rollout as Rollout
 from .results.save_load import load as load

@@ -19,8 +19,8 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.control.controllers import Control, Controller, Feedback
-from lqrsim.errors import InputError
+from lqrsim.control.controllers import Controller, ControllerRun, Feedback
+from lqrsim.errors import Array, InputError
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
 from lqrsim.stress import trials
@@ -308,12 +308,19 @@ def test_what_hangs_or_kills_its_worker_costs_its_shard(own: Path, tmp_path: Pat
 
 def test_a_policy_that_returns_nan_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Mad(Feedback):
-        def start(self, trials: int) -> Control:
-            sane = super().start(trials)
-            return lambda step, shown: np.where(step == 20, np.nan, sane(step, shown))
+        def start(self, trials: int) -> ControllerRun:
+            return MadRun(super().start(trials))
 
-    def mad(own: trials.Trials, policy: str) -> Controller:
-        return (Mad if policy == "open_loop" else Feedback)(own.solutions[policy].policy)
+    class MadRun(ControllerRun):
+        def __init__(self, sane: ControllerRun) -> None:
+            self.sane = sane
+
+        def control(self, step: int, measured: Array) -> Array:
+            return np.where(step == 20, np.nan, self.sane.control(step, measured))
+
+    def mad(own: trials.Trials, policy: str) -> Controller | ls.AffinePolicy:
+        plain = own.solutions[policy].policy
+        return Mad(plain) if policy == "open_loop" else plain
 
     monkeypatch.setattr(trials.Trials, "_controller", mad)
     results = run_campaign(CAMPAIGN, tmp_path, workers=0)

@@ -38,8 +38,8 @@ def tracked(problem: ls.Problem, solution: ls.Solution) -> ls.AffinePolicy:
 
 def collisions(plan: ls.types.SafePlan, trials: int) -> float:
     """The share of collisions at the knots, by Monte Carlo with the exact discrete double integrator."""
-    assert isinstance(plan.controller, ls.Feedback)
-    rng, policy = np.random.default_rng(1), plan.controller.policy
+    assert isinstance(plan.controller, ls.AffinePolicy)
+    rng, policy = np.random.default_rng(1), plan.controller
     A = np.eye(4) + DT * np.eye(4, k=2)
     B = np.concatenate([DT**2 / 2 * np.eye(2), DT * np.eye(2)])
     x = plan.solution.trajectory.states[0] + 0.05 * rng.standard_normal((trials, 4))

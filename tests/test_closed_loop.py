@@ -393,7 +393,7 @@ def test_a_physics_step_that_takes_for_ever_is_told(tmp_path):
 
 
 def test_a_policy_for_another_robot_is_refused(cage):
-    with pytest.raises(InputError, match=r"^solution: got a policy with states x, y, heading, want those of robot"):
+    with pytest.raises(InputError, match=r"^controller: got a policy with states x, y, heading, want those of robot"):
         simulate(cage, weave(5))
 
 
@@ -402,7 +402,7 @@ def test_a_plan_that_is_not_finite_is_refused(cage):
     states = solution.trajectory.states.copy()
     states[3, 0] = np.inf
     failed = replace(solution, status=Status.NOT_FINITE, trajectory=replace(solution.trajectory, states=states))
-    with pytest.raises(InputError, match=r"^solution: got a plan that is not finite \(NOT_FINITE\), want one"):
+    with pytest.raises(InputError, match=r"^plan: got one that is not finite \(NOT_FINITE\), want one"):
         simulate(cage, failed)
 
 

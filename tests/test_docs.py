@@ -201,8 +201,8 @@ def test_commands_of_pages_exist() -> None:
 def test_replanning_in_simulations_and_on_a_robot() -> None:
     names = run_page("replanning.md")
     assert names["replan"].trajectory.steps == 150
-    assert names["law"].solved > 40
-    assert names["planner"].problem.dynamics.parameters["wind_x"] == 2.0
+    assert names["rollout"].controller_run.log.solved > 40
+    assert names["windy"].problem.dynamics.parameters["wind_x"] == 2.0
 
 
 @pytest.mark.long
@@ -211,7 +211,7 @@ def test_funnels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = run_page("funnels.md")
     assert (names["funnel"].levels > 0).all()
     assert (names["places"].levels > 0).all()
-    assert 0 < len(names["law"].records) < 9
+    assert 0 < len(names["run"].controller_run.log.records) < 9
     assert names["chosen"].reached.value > 0.5
     assert Path("funnel.png").stat().st_size > 0
     (block,) = re.findall(r"^```py\n(.*?)^```$", (DOCS / "funnels.md").read_text("utf-8"), re.MULTILINE | re.DOTALL)

@@ -15,7 +15,7 @@ from tracking import hover, track
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.control.controllers import Control, Controller, Feedback
+from lqrsim.control.controllers import Controller, ControllerRun, Feedback
 from lqrsim.disturbances import (
     ControlNoise,
     DisplacedObstacles,
@@ -477,7 +477,7 @@ def test_a_campaign_says_whose_filter_diverged(tmp_path: Path, monkeypatch: pyte
     # Estimates of drag that are negative make its predictions explode.
     wrong = ls.Uncertainty(unknowns=[Unknown("drag", 60.0)], measurement=0.02, start=0.01)
 
-    def controller(own: trials.Trials, policy: str) -> Controller:
+    def controller(own: trials.Trials, policy: str) -> Controller | ls.AffinePolicy:
         return ls.OffsetFree(scenario.problem, own.solutions[policy], wrong, tolerate=tolerate)
 
     monkeypatch.setattr(trials.Trials, "_controller", controller)
@@ -515,17 +515,25 @@ class Failing(Controller):
     def __init__(self, solution: ls.Solution, how: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
         self.policy, self.how = Feedback(solution.policy), how
 
-    def start(self, trials: int) -> Control:
-        control = self.policy.start(trials)
-        return lambda step, shown: self.how(shown, control(step, shown)) if step == 7 else control(step, shown)
+    def start(self, trials: int) -> ControllerRun:
+        return FailingRun(self.policy.start(trials), self.how)
 
     @property
     def digest(self) -> str:
         return "failing"
 
     @property
-    def spaces(self):
-        return self.policy.spaces
+    def coordinates(self):
+        return self.policy.coordinates
+
+
+class FailingRun(ControllerRun):
+    def __init__(self, plain: ControllerRun, how: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
+        self.plain, self.how = plain, how
+
+    def control(self, step: int, measured: np.ndarray) -> np.ndarray:
+        command = self.plain.control(step, measured)
+        return self.how(measured, command) if step == 7 else command
 
 
 def raising(shown: np.ndarray, command: np.ndarray) -> np.ndarray:

@@ -328,20 +328,21 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "want some of 0 to 149" in capsys.readouterr().err
 
 
-class TestReplanningWhenLeft:
-    """`Replanning(when=funnel)` solves where a trial is outside, and only there."""
+class TestReplannerWhenLeft:
+    """`Replanner(when=funnel)` solves where a trial is outside, and only there."""
 
     def test_only_who_is_outside(self, quadrotor: ls.Scenario, quadrotor_solution: Any, funnel: ls.Funnel) -> None:
         """Of runs that begin on and far off the plan, only the latter are solved for, at the first time they can be."""
-        law = ls.Replanning(quadrotor.problem, quadrotor_solution, every=1.0, when=funnel)
+        law = ls.Replanner(quadrotor.problem, quadrotor_solution, every=1.0, deadline=0.0, when=funnel)
         begun = funnel.states_at(0, np.eye(12)[[0, 0]], 1.0)
         begun[1] += 10 * (begun[1] - funnel.plan.states[0])
         begun[0] = funnel.plan.states[0]
         run = simulate_from(quadrotor.plant(), quadrotor_solution, begun, controller=law, frames=False)
+        records = run.controller_run.log.records
         whole = funnel.deviation(run.measured[:, 30], 1.0)
         assert whole[0] < 1 < whole[1]
-        assert {(one.step, one.trial) for one in law.records if one.step == 30} == {(30, 1)}
-        assert all(one.trial == 1 for one in law.records)
+        assert {(one.step, one.trial) for one in records if one.step == 30} == {(30, 1)}
+        assert all(one.trial == 1 for one in records)
         plain = ls.simulate(quadrotor.plant(), quadrotor_solution, frames=False)
         np.testing.assert_array_equal(run.commanded[0], plain.commanded[0])
 
@@ -349,16 +350,17 @@ class TestReplanningWhenLeft:
         """Then it is what it is without: the same solves, and the same controls to the bit."""
         none = replace(funnel, levels=np.zeros(1), trials=np.zeros(1), successes=np.zeros(1), reasons=("none",))
         runs, laws = [], [
-            ls.Replanning(quadrotor.problem, quadrotor_solution, every=1.5, when=when) for when in (None, none)
+            ls.Replanner(quadrotor.problem, quadrotor_solution, every=1.5, when=when) for when in (None, none)
         ]  # fmt: skip
         for law in laws:
             runs.append(ls.simulate(quadrotor.plant(), quadrotor_solution, controller=law, trials=2, frames=False))
         np.testing.assert_array_equal(runs[0].commanded, runs[1].commanded)
-        assert [one.step for one in laws[0].records] == [one.step for one in laws[1].records]
+        first, second = ([one.step for one in run.controller_run.log.records] for run in runs)
+        assert first == second != []
         assert laws[0].digest != laws[1].digest
 
     def test_bad_input(self, quadrotor: Any, quadrotor_solution: Any, funnel: ls.Funnel) -> None:
-        unchecked: Any = ls.Replanning
+        unchecked: Any = ls.Replanner
         moved = replace(funnel, plan=ls.Trajectory(funnel.plan.states + 1, funnel.plan.controls, funnel.plan.dt))
         for wrong, said in (
             ({"when": 3}, "when: got 3"),

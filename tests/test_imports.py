@@ -42,7 +42,8 @@ FLOORS_WITHIN = {
     "results": (
         ("schema", "hashing", "ball_record", "coordinates", "solution_parts", "trial_outcome", "value_functions"),
         ("archive", "goal", "notebook", "policy"),
-        ("solution",),
+        ("plan",),
+        ("replan", "solution"),
         ("rollout",),
     ),
     "codegen": (

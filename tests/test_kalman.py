@@ -79,13 +79,13 @@ def test_the_estimate_is_the_dense_conditional_mean(case: int, seed: int, unstab
         controls=rng.normal(size=(steps, 1)),
     )  # fmt: skip
     law = law_of(system, case)
-    control, plan = law.start(1), system.plan
+    run, plan = law.start(1), system.plan
     off = rng.normal(size=(steps + 1, 2))
-    inputs = np.array([control(t, (plan.states[t] + off[t])[None])[0] for t in range(steps + 1)])[:steps]
-    assert law.estimates is not None
+    inputs = np.array([run.control(t, (plan.states[t] + off[t])[None])[0] for t in range(steps + 1)])[:steps]
+    assert run.estimates is not None
     for t in range(steps + 1):
         mean, covariance = conditional(law.model, inputs - plan.controls, off, t)
-        estimate = law.estimates[t, 0] - law.nominal[t]
+        estimate = run.estimates[t, 0] - law.nominal[t]
         np.testing.assert_allclose(estimate, mean, rtol=0, atol=1e-8 * (1 + np.abs(mean).max()))
         largest = np.abs(covariance).max()
         np.testing.assert_allclose(law.filter.corrected[t], covariance, rtol=0, atol=1e-8 * (1 + largest))
@@ -147,13 +147,13 @@ def test_it_is_consistent_in_a_thousand_trials(case: int) -> None:
     system = double_integrator(start=[1.0, 0.0], controls=np.sin(np.arange(steps) / 5)[:, None])
     law = law_of(system, case)
     truth = Truth(law, system, trials, np.random.default_rng(case))
-    control, true = law.start(trials), []
+    run, true = law.start(trials), []
     for t in range(steps + 1):
         true.append(truth.z(lags=CASES[case][1] > 0))
-        truth.step(control(t, truth.measured()))
-    assert law.estimates is not None
-    assert law.innovations is not None
-    for values, covariances in ((law.estimates - true, law.filter.corrected), (law.innovations, law.filter.innovation)):
+        truth.step(run.control(t, truth.measured()))
+    assert run.estimates is not None
+    assert run.innovations is not None
+    for values, covariances in ((run.estimates - true, law.filter.corrected), (run.innovations, law.filter.innovation)):
         kept = covariances[0].diagonal() > 0  # what the start is known to be, as what actuators have reached, has none
         means = []
         for t, covariance in enumerate(covariances):
@@ -174,11 +174,11 @@ def test_a_wrong_noise_is_found_out() -> None:
     system = double_integrator(controls=np.zeros((steps, 1)))
     law = law_of(system, 0, measurement=0.05)
     truth = Truth(law, system, trials, np.random.default_rng(0))
-    control = law.start(trials)
+    run = law.start(trials)
     for t in range(steps + 1):
-        truth.step(control(t, truth.measured()))
-    assert law.innovations is not None
-    nis = np.einsum("tki,tij,tkj->tk", law.innovations, np.linalg.inv(law.filter.innovation), law.innovations).mean(
+        truth.step(run.control(t, truth.measured()))
+    assert run.innovations is not None
+    nis = np.einsum("tki,tij,tkj->tk", run.innovations, np.linalg.inv(law.filter.innovation), run.innovations).mean(
         axis=1
     )
     assert (nis > chi2.ppf(0.975, 2 * trials) / trials).all()
@@ -192,15 +192,15 @@ def test_covariances_stay_positive_without_any_noise() -> None:
     for covariance in (*filtered.predicted, *filtered.corrected):
         assert np.linalg.eigvalsh(covariance).min() > -1e-14
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
-    control, x, reached = law.start(1), system.plan.states[0] + [0.7, -1e-6], system.plan.controls[0]
+    run, x, reached = law.start(1), system.plan.states[0] + [0.7, -1e-6], system.plan.controls[0]
     left = np.exp(-DT / 0.05)
     for t in range(system.plan.steps):
-        command = control(t, x[None])[0]
+        command = run.control(t, x[None])[0]
         applied = command + (1 - left) * 0.05 / DT * (reached - command)
         reached = command + left * (reached - command)
         x = system.A @ x + system.B @ applied + system.E @ [0.9]
-    assert law.estimates is not None
-    np.testing.assert_allclose(law.estimates[-2, 0, -1], 0.9, rtol=0, atol=1e-6)
+    assert run.estimates is not None
+    np.testing.assert_allclose(run.estimates[-2, 0, -1], 0.9, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("case", [1, 3])
@@ -211,15 +211,15 @@ def test_each_trial_of_a_batch_has_the_bits_that_it_has_alone(case: int) -> None
     shown = np.random.default_rng(1).normal(size=(steps, 64, 2))
     shown[4, ::3] = shown[3, ::3]  # lost
 
-    def run(chosen: slice) -> tuple[bytes, bytes]:
-        control = law.start(len(shown[0, chosen]))
-        commands = np.array([control(t, shown[t, chosen]) for t in range(steps)])
-        assert law.estimates is not None
-        return commands.transpose(1, 0, 2).tobytes(), law.estimates[:steps].transpose(1, 0, 2).tobytes()
+    def bits(chosen: slice) -> tuple[bytes, bytes]:
+        run = law.start(len(shown[0, chosen]))
+        commands = np.array([run.control(t, shown[t, chosen]) for t in range(steps)])
+        assert run.estimates is not None
+        return commands.transpose(1, 0, 2).tobytes(), run.estimates[:steps].transpose(1, 0, 2).tobytes()
 
-    whole = run(slice(0, 64))
+    whole = bits(slice(0, 64))
     for count in (1, 7):
-        parts = [run(slice(first, first + count)) for first in range(0, 64, count)]
+        parts = [bits(slice(first, first + count)) for first in range(0, 64, count)]
         assert b"".join(part[0] for part in parts) == whole[0]
         assert b"".join(part[1] for part in parts) == whole[1]
 
@@ -233,33 +233,33 @@ def test_so_has_the_quadrotor(quadrotor: ls.Scenario, quadrotor_solution: ls.Sol
     plan, rng = quadrotor_solution.trajectory, np.random.default_rng(0)
     shown = plan.states[:12, None] + 0.02 * rng.normal(size=(12, 64, 12))
 
-    def run(chosen: slice) -> bytes:
-        control = law.start(len(shown[0, chosen]))
-        return np.array([control(t, shown[t, chosen]) for t in range(12)]).transpose(1, 0, 2).tobytes()
+    def bits(chosen: slice) -> bytes:
+        run = law.start(len(shown[0, chosen]))
+        return np.array([run.control(t, shown[t, chosen]) for t in range(12)]).transpose(1, 0, 2).tobytes()
 
-    whole = run(slice(0, 64))
+    whole = bits(slice(0, 64))
     for count in (1, 7):
-        assert b"".join(run(slice(first, first + count)) for first in range(0, 64, count)) == whole
+        assert b"".join(bits(slice(first, first + count)) for first in range(0, 64, count)) == whole
 
 
 def test_what_is_recorded_has_gaps_where_nothing_came() -> None:
     system = double_integrator(steps=6)
     uncertainty = ls.Uncertainty(unknowns=[CONSTANT], latency=2, **NOISE)  # type: ignore[arg-type]
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
-    control = law.start(2)
+    run = law.start(2)
     shown = np.random.default_rng(0).normal(size=(6, 2, 2))
     shown[4, 1] = shown[3, 1]
     for t in range(6):
-        control(t, shown[t])
-    assert law.estimates is not None
-    assert law.innovations is not None
-    assert law.estimates.shape == (7, 2, 3)
-    assert law.innovations.shape == (7, 2, 2)
+        run.control(t, shown[t])
+    assert run.estimates is not None
+    assert run.innovations is not None
+    assert run.estimates.shape == (7, 2, 3)
+    assert run.innovations.shape == (7, 2, 2)
     # Measurements of knots 0 to 3 came, at steps 2 to 5; that of knot 2 got lost on the way to the second trial.
-    assert np.isfinite(law.estimates[:4]).all()
-    assert np.isnan(law.estimates[4:]).all()
-    assert np.isfinite(law.innovations[:4]).all(axis=2).tolist() == [[True] * 2, [True] * 2, [True, False], [True] * 2]
+    assert np.isfinite(run.estimates[:4]).all()
+    assert np.isnan(run.estimates[4:]).all()
+    assert np.isfinite(run.innovations[:4]).all(axis=2).tolist() == [[True] * 2, [True] * 2, [True, False], [True] * 2]
     quiet = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0)
-    quiet.start(2)
-    assert quiet.estimates is None
-    assert quiet.innovations is None
+    unrecorded = quiet.start(2)
+    assert unrecorded.estimates is None
+    assert unrecorded.innovations is None

@@ -67,8 +67,8 @@ from lqrsim.kernels.records import (
     Descent,
     Limits,
     Measured,
+    Motion,
     Passes,
-    Plan,
     Policy,
     Predictor,
     Smoothing,
@@ -341,7 +341,7 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
     attempt.roll_out()
     work.memory["merit"] = work.memory["plan_cost"]
     work.memory["reach"], work.memory["ilqr_next"] = (1.0, 2.0) if task != "reach" else (0.0, 2.0)
-    trial = Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
+    trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
     log = np.zeros(2, LOG)
     for done in range(2 if task else 0):
         arguments = attempt._damped_arguments(done, done + 1, log, 2, trial)
@@ -419,8 +419,8 @@ class TestSolvers:
         states[0] = (0.0, 0.0, 0.3)
         work = Descent(
             start=states[0].copy(), policy=Policy(np.zeros((5, 2, 3)), np.full((5, 2), 0.2)),
-            to_go=CostToGo(np.zeros((6, 3, 3)), np.zeros((6, 3)), np.zeros(6)), plan=Plan(states, controls),
-            trial=Plan(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
+            to_go=CostToGo(np.zeros((6, 3, 3)), np.zeros((6, 3)), np.zeros(6)), plan=Motion(states, controls),
+            trial=Motion(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
         )  # fmt: skip
         options = KernelSettings(5, 3, 1e-4, 0.0, True, True, False, 0)
         source, sizes = compiled._with_form("dual", "entry_points"), sizes_of(one)
@@ -476,7 +476,7 @@ class Begun:
     def damped(self, first: int, last: int, **memory: float) -> tuple[Any, ...]:
         for name, number in memory.items():
             self.work.memory[name] = number
-        trial = Plan(np.zeros_like(self.work.states), np.zeros_like(self.work.controls))
+        trial = Motion(np.zeros_like(self.work.states), np.zeros_like(self.work.controls))
         given = self.attempt._damped_arguments(first, last, self.log, last + 1, trial)
         return replay(self.source, self.sizes, "smoother", *with_rows(given))
 
@@ -499,7 +499,7 @@ def descended(
     stage = work.model.stage
     if factor != 1:
         work.model = work.model._replace(stage=with_numbers(stage, 1, 2, lambda weight: factor * weight))
-    trial = Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
+    trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
     source, sizes = compiled._with_form(form, "entry_points"), sizes_of(one)
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     for done in range(count):
@@ -619,8 +619,8 @@ class TestRareEnds:
         model, states, controls = compiled.arguments(one), np.zeros((4, 3)), np.zeros((3, 2))
         work = Descent(
             start=np.array([0.0, 0.0, 0.3]), policy=Policy(np.zeros((3, 2, 3)), np.full((3, 2), 0.2)),
-            to_go=CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4)), plan=Plan(states, controls),
-            trial=Plan(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
+            to_go=CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4)), plan=Motion(states, controls),
+            trial=Motion(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
         )  # fmt: skip
         options = KernelSettings(3, 4, 1e-9, 0.0, True, True, False, 0)
 
@@ -718,7 +718,7 @@ class TestRareEnds:
             assert replay(source, sizes, "lq_passes", 3, forward, backwards, costs, np.zeros(3), work) == wanted
 
     def test_parts_of_steps_that_are_taken_back(self) -> None:
-        plan, x_hats = Plan(np.ones((4, 3)), np.ones((3, 2))), np.arange(12.0).reshape(4, 3)
+        plan, x_hats = Motion(np.ones((4, 3)), np.ones((3, 2))), np.arange(12.0).reshape(4, 3)
         for fraction in (1.0, 0.25):
             replay(source_of(rollouts), SIZES | {"NOISY": 0}, "follow", 3, fraction, plan, x_hats)
 
@@ -966,7 +966,7 @@ class TestParts:
     def test_sums_of_costs_of_many(self) -> None:
         one = problem(constraints=[ls.Clearance(WORLD, radius=0.1)], steps=3)
         model, source = compiled.arguments(one), source_of(model_functions)
-        plans = Plan(np.tile(X, (8, 1)), np.tile(U, (6, 1)))
+        plans = Motion(np.tile(X, (8, 1)), np.tile(U, (6, 1)))
         replay(source, SIZES, "costs_of", 2, 3, plans, model, np.zeros(2))
         replay(source, SIZES, "cost_of_each", 2, 1, plans, model.stage, np.zeros(2))
         values = (np.zeros(4 * len(WORLD)),)
@@ -1043,7 +1043,7 @@ class TestInteriorPoint:
         kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState([1.4], states=("x",))]
         one = problem(steps=3, constraints=kept)
         stages, source = Stages(one), source_of(interior_point)
-        plan = Plan(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
+        plan = Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
         multipliers = rng.uniform(0.1, 1.0, size=stages.live.size)
         rows = stages._rows._replace(least=0.0, support=np.ones((len(stages.owners), 5)), multipliers=multipliers)
         begun, costates = (3, 1), rng.normal(size=(4, 3))
@@ -1056,7 +1056,7 @@ class TestInteriorPoint:
         replay(source, SIZES, "adjoint", 3, gradient, jacobian, np.zeros((4, 3)), np.zeros((3, 2)))
         policy = Policy(np.zeros((3, 2, 3)), np.zeros((3, 2)))
         to_go = CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4))
-        changes = Plan(np.zeros((4, 3)), np.zeros((3, 2)))
+        changes = Motion(np.zeros((4, 3)), np.zeros((3, 2)))
         gaps = 0.1 * rng.normal(size=(3, 3))
 
         def direction(hessian: Array, free: float = 1.0) -> int:
@@ -1069,7 +1069,7 @@ class TestInteriorPoint:
         assert direction(convex) == direction(convex, 0.0) == -1
         assert changes.states.any()
         limits = Limits(plan.controls - 0.1, plan.controls + 0.1)
-        out = Plan(np.zeros((4, 3)), np.zeros((3, 2)))
+        out = Motion(np.zeros((4, 3)), np.zeros((3, 2)))
         replay(source, SIZES, "follow", 3, 0.5, plan, policy, limits, stages._model, out)
         bent = convex.copy()
         bent[2, 3:, 3:] -= 1e4 * np.eye(2)
@@ -1087,7 +1087,7 @@ class TestActiveSet:
         rng = np.random.default_rng(0)
         kept = [ls.Clearance(WORLD, radius=0.1), ls.GoalState([1.4], states=("x",))]
         stages, source = Stages(problem(steps=3, constraints=kept)), source_of(active_set)
-        plan = Plan(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
+        plan = Motion(rng.uniform(-0.2, 0.6, size=(4, 3)), rng.uniform(-0.5, 0.5, size=(3, 2)))
         rows = len(stages.owners)
         live = stages.live.astype(np.float64).ravel()
         drawn, force = live * rng.integers(0, 2, size=live.size), live * rng.uniform(-0.1, 1.0, size=live.size)
@@ -1109,7 +1109,7 @@ class TestActiveSet:
         stages.models.convex[...] += np.eye(5)
         policy = Policy(np.zeros((3, 2, 3)), np.zeros((3, 2)))
         to_go = CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4))
-        changes = Plan(np.zeros((4, 3)), np.zeros((3, 2)))
+        changes = Motion(np.zeros((4, 3)), np.zeros((3, 2)))
 
         def pivot(share: float, free: float = 1.0) -> tuple[int, int]:
             given = 3, np.full(3, free), share, 2.0, 1e3, 0.5, stages.models, gaps, active, policy, to_go, changes
@@ -1127,7 +1127,7 @@ class TestActiveSet:
         stages.models.hessian[2, 3:, 3:] -= 1e6 * np.eye(2)
         assert pivot(0.5)[0] == 2  # the controls of that step have no least
         limits = Limits(*(np.tile(side, (3, 1)) for side in (stages.low, stages.high)))
-        motion = Plan(np.zeros((4, 3)), np.zeros((3, 2)))
+        motion = Motion(np.zeros((4, 3)), np.zeros((3, 2)))
         given = 3, 1, plan, policy, limits, active, stages._model, stages._values, motion
         replay(source, SIZES, "carry_out", *given)
 

@@ -102,14 +102,14 @@ class TestPlans:
             np.testing.assert_allclose(one.data, other.data, rtol=0, atol=1e-9)
 
 
-def ready(planner: ls.Planner) -> None:
+def ready(planner: ls.types.LiveReplanner) -> None:
     """Wait for the answer that the planner's thread is at."""
     solve = planner._solve
     while solve is not None and solve.answer is None and solve.error is None:
         time.sleep(1e-3)
 
 
-class TestReplanning:
+class TestReplanner:
     @pytest.mark.parametrize("horizon", ["moving", "shrinking"])
     def test_a_planner_takes_them_on(self, horizon: str) -> None:
         """A ball that begins to move while the robot is on its way is passed, and nothing is compiled for it.
@@ -118,10 +118,10 @@ class TestReplanning:
         """
         parked = balls((0.0, -2.0, 0.5))
         stated = problem(parked, weight=1.0)
-        planner = ls.Planner(stated, ls.smooth(stated), every=DT, deadline=DT, horizon=horizon, clock=lambda: 0.0)
+        replanner = ls.Replanner(stated, ls.smooth(stated), every=DT, deadline=DT, horizon=horizon)
         seen = balls((0.0, -2.0, 0.5), velocity=(0.0, 2.0)).moved(-0.2)  # it sets off at 0.2 s
         made, state, clearances = len(compiled_module.compilations), np.array([-2.0, 0, 0, 0]), []
-        with planner:
+        with replanner.live(clock=lambda: 0.0) as planner:
             for step in range(20):
                 if step == 2:
                     cost, clear = (

@@ -1,6 +1,7 @@
 """Output feedback: what is late, lost or beyond the limits, steady disturbances, filters that diverge, bad input."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,22 +36,22 @@ def generators(count: int) -> list[np.random.Generator]:
 def run(
     system: Linear, law: ls.OffsetFree, effects: list[Effect], *, off: Array, push: float = 0.0,
     limit: float = np.inf,
-) -> tuple[Array, Array]:  # fmt: skip
-    """States (T+1, K, n) and commands (T, K, m) of a linear system in NumPy, with lqrsim's disturbances."""
-    x, control = system.plan.states[0] + off, law.start(len(off))
+) -> tuple[Array, Array, Any]:  # fmt: skip
+    """States (T+1, K, n), commands (T, K, m) and the law's run, of a linear system in NumPy, with disturbances."""
+    x, begun = system.plan.states[0] + off, law.start(len(off))
     states, commands = [x], []
     for t in range(system.plan.steps):
         shown, command = x.copy(), None
         for effect in effects:
             shown = effect.measure(t, shown) if effect.measure else shown
-        command = control(t, shown)
+        command = begun.control(t, shown)
         commands.append(command)
         for effect in effects:
             command = effect.actuate(t, command) if effect.actuate else command
         applied = np.clip(command, -limit, limit)
         x = x @ system.A.T + applied @ system.B.T + push * system.E[:, 0]
         states.append(x)
-    return np.array(states), np.array(commands)
+    return np.array(states), np.array(commands), begun
 
 
 def plant_of() -> Plant:
@@ -67,7 +68,7 @@ def test_what_is_late_is_taken_in_where_it_belongs(latency: int, delay: int) -> 
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0)
     late = [MeasurementLatency(latency), ControlDelay(delay)]
     effects = [one.start(plant_of(), system.plan, generators(2)) for one in late]
-    states, commands = run(system, law, effects, off=np.array([[0.3, -0.2], [-0.1, 0.4]]))
+    states, commands, _ = run(system, law, effects, off=np.array([[0.3, -0.2], [-0.1, 0.4]]))
     true = np.concatenate([states, np.zeros((steps + 1, 2, 1))], axis=2)
     for step in range(latency, steps - delay):
         t = step + delay
@@ -77,7 +78,7 @@ def test_what_is_late_is_taken_in_where_it_belongs(latency: int, delay: int) -> 
     unaware = replace(uncertainty, latency=0, delay=0)
     other = ls.OffsetFree(system.problem, system.solution, unaware, tolerate=0.5, effort=2.0)
     effects = [one.start(plant_of(), system.plan, generators(2)) for one in late]
-    _, theirs = run(system, other, effects, off=np.array([[0.3, -0.2], [-0.1, 0.4]]))
+    _, theirs, _ = run(system, other, effects, off=np.array([[0.3, -0.2], [-0.1, 0.4]]))
     assert (np.abs(theirs - commands).max() > 0.1) == bool(latency + delay)
 
 
@@ -88,20 +89,18 @@ def test_lost_measurements_are_predicted() -> None:
     uncertainty = ls.Uncertainty(start=0.3, loss=0.5)
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
     dropouts = MeasurementDropouts(GilbertElliott(0.3, 0.3)).start(plant_of(), system.plan, generators(20))
-    states, _ = run(system, law, [dropouts], off=0.3 * np.random.default_rng(0).normal(size=(20, 2)))
-    assert law.estimates is not None
-    assert law.innovations is not None
-    lost = np.any(np.isnan(law.innovations[:-1]), axis=2)
+    states, _, begun = run(system, law, [dropouts], off=0.3 * np.random.default_rng(0).normal(size=(20, 2)))
+    lost = np.any(np.isnan(begun.innovations[:-1]), axis=2)
     assert 0.3 < lost.mean() < 0.7
     came_first = ~lost[0]
     assert 0 < came_first.sum() < 20
-    errors = np.abs(law.estimates[:-1, :, :2] - states[:-1])[:, came_first]
+    errors = np.abs(begun.estimates[:-1, :, :2] - states[:-1])[:, came_first]
     assert errors.max() < 1e-9
     # Until the first measurement comes, the plan's first state is shown: it is not taken for one.
     first = np.argmin(lost, axis=0)
     for k in np.flatnonzero(~came_first):
-        np.testing.assert_allclose(law.estimates[0, k], system.plan.states[0], rtol=0, atol=1e-12)
-        assert np.isnan(law.innovations[: first[k], k]).all()
+        np.testing.assert_allclose(begun.estimates[0, k], system.plan.states[0], rtol=0, atol=1e-12)
+        assert np.isnan(begun.innovations[: first[k], k]).all()
 
 
 def test_nothing_winds_up_at_the_limits() -> None:
@@ -113,9 +112,8 @@ def test_nothing_winds_up_at_the_limits() -> None:
         system = double_integrator(controls=np.zeros((steps, 1)), limits=limits)
         uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.5, measurement=0.01)
         law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.1, effort=1.0, record=True)
-        states, commands = run(system, law, [], off=far, push=push, limit=limit)
-        assert law.estimates is not None
-        estimates[name], errors[name] = law.estimates[:, 0, -1], states[:, 0, 0]
+        states, commands, begun = run(system, law, [], off=far, push=push, limit=limit)
+        estimates[name], errors[name] = begun.estimates[:, 0, -1], states[:, 0, 0]
         if name == "clipped":
             at_limit = int(np.argmax(np.abs(commands[:, 0, 0]) < limit))
     assert at_limit is not None
@@ -165,13 +163,13 @@ def test_after_the_horizon_the_last_laws_stay_in_force() -> None:
     system = double_integrator(controls=np.zeros((30, 1)))
     uncertainty = ls.Uncertainty(unknowns=[PUSH], start=0.3, measurement=0.01, latency=1)
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
-    control, x = law.start(2), np.array([[0.3, -0.2], [-0.1, 0.4]])
+    begun, x = law.start(2), np.array([[0.3, -0.2], [-0.1, 0.4]])
     late = x
     for t in range(90):
         shown, late = late, x
-        x = x @ system.A.T + control(t, shown) @ system.B.T + 0.3 * system.E[:, 0]
+        x = x @ system.A.T + begun.control(t, shown) @ system.B.T + 0.3 * system.E[:, 0]
     assert np.abs(x).max() < 0.01
-    assert law.lost() == {}
+    assert begun.estimator_diverged() == {}
 
 
 # Filters that diverge.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim.control.replanning import Replanning
+from lqrsim.control.replanner import Replanner
 from lqrsim.disturbances import ForceNoise, MeasurementNoise, Push
 from lqrsim.results.rollout import Rollout
 from lqrsim.simulation.plant import Plant
@@ -89,18 +89,18 @@ def test_a_lost_trial_is_diverged_and_counts_until_then(plant: Plant, quadrotor_
 
 
 @pytest.fixture(scope="module")
-def again(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> Replanning:
-    return Replanning(quadrotor.problem, quadrotor_solution, every=1.0)
+def again(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> Replanner:
+    return Replanner(quadrotor.problem, quadrotor_solution, every=1.0, deadline=0.0)
 
 
-class TestReplanning:
-    def test_undisturbed_it_keeps_to_the_plan(self, plant: Plant, again: Replanning, quadrotor_solution) -> None:
+class TestReplanner:
+    def test_undisturbed_it_keeps_to_the_plan(self, plant: Plant, again: Replanner, quadrotor_solution) -> None:
         """What is left of an optimum is optimal; plans stop within 1e-4 of the cost, which here is centimetres."""
         run = ls.simulate(plant, quadrotor_solution, controller=again, frames=False)
         assert run.tracking_error.max() < 0.03
         assert run.outcome == ("reached",)
 
-    def test_each_trial_gets_what_it_gets_alone(self, plant: Plant, again: Replanning, quadrotor_solution) -> None:
+    def test_each_trial_gets_what_it_gets_alone(self, plant: Plant, again: Replanner, quadrotor_solution) -> None:
         noise = [ForceNoise(0.2)]
         together = ls.simulate(plant, quadrotor_solution, controller=again, disturbances=noise, trials=3, frames=False)
         alone = ls.simulate(
@@ -108,22 +108,23 @@ class TestReplanning:
         )
         np.testing.assert_array_equal(alone.states[0], together.states[2])
 
-    def test_it_does_solve_again(self, plant: Plant, again: Replanning, quadrotor_solution) -> None:
+    def test_it_does_solve_again(self, plant: Plant, again: Replanner, quadrotor_solution) -> None:
         """A push that the first plan only fights; the controls differ from the policy's from the next solve on."""
         push = [Push((0.3, 0.0, 0.0), at=0.5)]
         policy = ls.simulate(plant, quadrotor_solution, disturbances=push, frames=False)
         solved = ls.simulate(plant, quadrotor_solution, controller=again, disturbances=push, frames=False)
         differ = np.abs(policy.commanded - solved.commanded)[0].max(axis=1) > 1e-6
         assert np.flatnonzero(differ)[0] == 30
-        assert (again.solved, again.kept) == (4, {})  # at 1, 2, 3 and 4 s
-        assert again.summary() == "solved again 4 times"
+        made = solved.controller_run
+        assert (made.log.solved, made.log.kept) == (4, {})  # at 1, 2, 3 and 4 s
+        assert made.summary() == "solved again 4 times"
 
     @pytest.mark.parametrize("name", ["differential_drive", "quadrotor"])
     def test_it_does_not_leave_for_a_worse_optimum(self, name: str, request: pytest.FixtureRequest) -> None:
         """On the same trials what was solved again costs as much as what was not, but for what the noise costs."""
         scenario: ls.Scenario = request.getfixturevalue(name)
         solution = ls.smooth(scenario.problem)
-        again = Replanning(scenario.problem, solution, every=scenario.problem.dt * 15)
+        again = Replanner(scenario.problem, solution, every=scenario.problem.dt * 15, deadline=0.0)
         plant, costs = scenario.plant(), []
         for controller in (None, again):
             run = ls.simulate(
@@ -139,18 +140,19 @@ class TestReplanning:
         self, plant: Plant, quadrotor: ls.Scenario, quadrotor_solution
     ) -> None:
         """Far outside of the cage costs are beyond numbers."""
-        again = Replanning(quadrotor.problem, quadrotor_solution, every=0.1)
+        again = Replanner(quadrotor.problem, quadrotor_solution, every=0.1, deadline=0.0)
         push = [Push((10.0, 10.0, 0.0), at=0.0)]
         run = ls.simulate(plant, quadrotor_solution, controller=again, disturbances=push, contacts=False, frames=False)
         assert run.collided.all()
         assert np.isfinite(run.commanded).all()
         # It says how often, and why.
-        assert again.solved + again.kept.total() == 49
-        assert again.kept.total() > 0
-        assert again.summary().startswith(f"solved again {again.solved} times")
-        assert f"kept the law before {again.kept.total()} times" in again.summary()
-        assert all(reason in again.summary() for reason in again.kept)
+        log = run.controller_run.log
+        assert log.solved + log.kept.total() == 49
+        assert log.kept.total() > 0
+        assert log.summary().startswith(f"solved again {log.solved} times")
+        assert f"kept the law before {log.kept.total()} times" in log.summary()
+        assert all(reason in log.summary() for reason in log.kept)
 
     def test_a_rate_beyond_the_control_rate_is_refused(self, quadrotor: ls.Scenario, quadrotor_solution) -> None:
-        with pytest.raises(ls.InputError, match=r"Replanning: every: got 0\.01, want a finite number >= 0\.033"):
-            Replanning(quadrotor.problem, quadrotor_solution, every=0.01)
+        with pytest.raises(ls.InputError, match=r"Replanner: every: got 0\.01, want a finite number >= 0\.033"):
+            Replanner(quadrotor.problem, quadrotor_solution, every=0.01)

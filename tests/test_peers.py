@@ -237,7 +237,7 @@ def test_rotorpy_asks_for_the_thrust_of_the_plan_and_its_attitude(peers: ModuleT
     """On the plan, turning as fast as it wants, it asks for the plan's thrust and no torque: 1e-9 N."""
     _, robot, solution = flight
     plan = solution.trajectory
-    control = peers.RotorPy(robot, solution, feed_drag=True).start(1)
+    control = peers.RotorPy(robot, solution, feed_drag=True).start(1).control
     yaw_rates = peers.rotorpy.flat_outputs(robot, plan, feed_drag=True)["yaw_dot"]
     for step, (state, controls) in enumerate(zip(plan.states[:-1], plan.controls, strict=True)):
         shown = np.concatenate([state[:9], [0, 0, yaw_rates[step]]])[None]
@@ -262,7 +262,7 @@ def test_rotorpy_turns_the_body_back(peers: ModuleType, flight: Any) -> None:
     """
     _, robot, solution = flight
     gains = peers.rotorpy.BEST_AT_LIGHT
-    control = peers.RotorPy(robot, replace_plan(solution, hover=robot.hover_force)).start(1)
+    control = peers.RotorPy(robot, replace_plan(solution, hover=robot.hover_force)).start(1).control
     for angle in 1e-4 * np.eye(3):
         state = np.concatenate([np.zeros(6), angle, np.zeros(3)])
         (forces,) = control(0, state[None])

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
 from lqrsim.control import law
+from lqrsim.control.controllers import Feedback
 from lqrsim.solvers import compiled
 
 
@@ -114,7 +115,7 @@ def test_digest_tells_laws_apart(drive_solution: ls.Solution) -> None:
     policy = drive_solution.policy
     parts = policy.gain, policy.offset, policy.nominal, np.array(policy.dt)
     assert policy.digest == hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()[:16]
-    assert ls.Feedback(policy).digest == policy.digest
+    assert Feedback(policy).digest == policy.digest
     others = [
         dataclasses.replace(policy, **{name: getattr(policy, name) * (1 + 1e-15)})
         for name in ("gain", "offset", "nominal", "dt")

@@ -68,7 +68,7 @@ def test_class_page_and_compiled_controller_agree_on_a_linear_system(
     law = law_of(system, **options)
     policy = ls.load(ls.save(law.policy, "policy.npz"))
     assert isinstance(policy, ls.OutputFeedbackPolicy)
-    names, control = page(), law.start(1)
+    names, control = page(), law.start(1).control
     elsewhere, z, found = names["z"], policy.start(), []
     sensors = options.get("sensors")
     chosen = np.eye(2) if sensors is None else np.array(
@@ -110,7 +110,7 @@ def test_angles_are_taken_nearest(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_lost_measurement_is_predicted(law: ls.OffsetFree) -> None:
-    policy, control = law.policy, law.start(1)
+    policy, control = law.policy, law.start(1).control
     z, shown = policy.start(), np.array([0.2, -0.1])
     for t in range(6):
         lost = t in (2, 3)

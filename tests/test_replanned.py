@@ -1,6 +1,7 @@
 """Output feedback that plans again: what its plans take for granted, how the estimates go on, bits, what fails."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,15 +35,15 @@ def replanned(system: Linear, uncertainty: ls.Uncertainty, every: float | None =
     )  # fmt: skip
 
 
-def run(system: Linear, law: ls.OffsetFree, *, push: float = 0.0, bias: float = 0.0) -> tuple[Array, Array]:
-    """What a trial is shown (T, n), with noise, and its commands (T, m), of a linear system in NumPy."""
-    rng, control = np.random.default_rng(0), law.start(1)
+def run(system: Linear, law: ls.OffsetFree, *, push: float = 0.0, bias: float = 0.0) -> tuple[Array, Array, Any]:
+    """What a trial is shown (T, n), with noise, its commands (T, m) and the law's run, of a linear system in NumPy."""
+    rng, begun = np.random.default_rng(0), law.start(1)
     x, shown, commands = system.plan.states[0] + [0.2, -0.1], [], []
     for t in range(system.plan.steps):
         shown.append(x + 0.1 * rng.normal(size=len(x)))
-        commands.append(control(t, shown[-1][None])[0])
+        commands.append(begun.control(t, shown[-1][None])[0])
         x = system.A @ x + system.B @ (commands[-1] + bias) + push * system.E[:, 0]
-    return np.array(shown), np.array(commands)
+    return np.array(shown), np.array(commands), begun
 
 
 def optimal_controls(system: Linear, x: Array, push: float, steps: int) -> Array:
@@ -55,9 +56,8 @@ def optimal_controls(system: Linear, x: Array, push: float, steps: int) -> Array
     return np.linalg.lstsq(stacked, np.concatenate([np.zeros(steps), -free]))[0]
 
 
-def recorded(law: ls.OffsetFree) -> Array:
-    assert law.estimates is not None
-    return law.estimates[:, 0]
+def recorded(begun: Any) -> Array:
+    return begun.estimates[:, 0]
 
 
 # What a plan takes for granted.
@@ -67,12 +67,12 @@ def test_new_plans_are_optimal_for_what_is_estimated() -> None:
     """By least squares, to 1e-5; and each begins with what is commanded there, for there is nothing to correct."""
     system = rocking()
     law = replanned(system, stated(PUSH))
-    _, commands = run(system, law, push=0.4)
-    assert (law.solved, law.kept) == (2, {})
-    assert law.summary() == "solved again 2 times"
-    assert list(law.plans[0]) == [AGAIN, 2 * AGAIN]
-    for step, plan in law.plans[0].items():
-        z = recorded(law)[step]
+    _, commands, begun = run(system, law, push=0.4)
+    assert (begun.log.solved, begun.log.kept) == (2, {})
+    assert begun.summary() == "solved again 2 times"
+    assert list(begun.plans[0]) == [AGAIN, 2 * AGAIN]
+    for step, plan in begun.plans[0].items():
+        z = recorded(begun)[step]
         assert abs(z[2]) > 0.1  # it matters
         wanted = optimal_controls(system, z[:2], z[2], STEPS - step)
         np.testing.assert_allclose(plan.controls[:, 0], wanted, rtol=0, atol=1e-5)
@@ -83,10 +83,10 @@ def test_so_they_are_for_a_parameter_that_has_a_value() -> None:
     """The control pushes by a third more than it was planned with."""
     system = rocking()
     law = replanned(system, stated(Unknown("b10", 0.3)))
-    _, commands = run(replace(system, inputs=system.inputs * 4 / 3), law)
-    assert (law.solved, law.kept) == (2, {})
-    for step, plan in law.plans[0].items():
-        z = recorded(law)[step]
+    _, commands, begun = run(replace(system, inputs=system.inputs * 4 / 3), law)
+    assert (begun.log.solved, begun.log.kept) == (2, {})
+    for step, plan in begun.plans[0].items():
+        z = recorded(begun)[step]
         assert abs(z[2]) > 0.03  # it matters
         true = replace(system, inputs=system.inputs * (1 + z[2]))
         np.testing.assert_allclose(
@@ -99,10 +99,10 @@ def test_what_is_no_parameter_stays_with_the_law() -> None:
     """An offset of the control: the plan knows nothing of it, and the law takes it off the command, to 1e-5."""
     system = rocking()
     law = replanned(system, stated(Unknown("offset of u0", 0.5)))
-    _, commands = run(system, law, bias=0.4)
-    assert law.solved == 2
-    for step, plan in law.plans[0].items():
-        z = recorded(law)[step]
+    _, commands, begun = run(system, law, bias=0.4)
+    assert begun.log.solved == 2
+    for step, plan in begun.plans[0].items():
+        z = recorded(begun)[step]
         assert abs(z[2]) > 0.1
         wanted = optimal_controls(system, z[:2], 0.0, STEPS - step)
         np.testing.assert_allclose(plan.controls[:, 0], wanted, rtol=0, atol=1e-5)
@@ -114,14 +114,14 @@ def test_estimates_go_on(lag: float) -> None:
     """Of a linear system one filter does for all plans: its recursion in NumPy, over both solves, to 1e-6."""
     system = rocking()
     law = replanned(system, stated(PUSH, lag=lag))
-    shown, commands = run(system, law, push=0.4)
-    assert law.solved == 2
+    shown, commands, begun = run(system, law, push=0.4)
+    assert begun.log.solved == 2
     left = np.exp(-DT / lag) if lag else 0.0
     mean = lag / DT * (1 - left)
     z = law.nominal[0].copy()
     for t in range(STEPS):
         z = z + law.filter.gain[t] @ (shown[t] - z[:2])
-        np.testing.assert_allclose(recorded(law)[t], z, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(recorded(begun)[t], z, rtol=0, atol=1e-6)
         reached = z[2:-1] if lag else commands[t]
         applied = commands[t] + mean * (reached - commands[t])
         after = commands[t] + left * (reached - commands[t])
@@ -174,12 +174,13 @@ def test_in_a_steady_wind_the_new_plan_leans_into_it(
 ) -> None:
     """Where its plan hovers, by atan(drag * wind / weight), within what the estimate is off."""
     solution, law = flown
-    rollout = ls.simulate(quadrotor.plant(), solution, controller=law, disturbances=[WIND], frames=False)
+    rollout = ls.simulate(quadrotor.plant(), controller=law, disturbances=[WIND], frames=False)
+    begun = rollout.controller_run
     assert rollout.outcome == ("reached",)
-    assert (law.solved, law.kept) == (4, {})
-    assert list(law.plans[0]) == [30, 60, 90, 120]
-    robot, plan = ls.Quadrotor(), law.plans[0][30]
-    estimated = recorded(law)[30, 12:]
+    assert (begun.log.solved, begun.log.kept) == (4, {})
+    assert list(begun.plans[0]) == [30, 60, 90, 120]
+    robot, plan = ls.Quadrotor(), begun.plans[0][30]
+    estimated = recorded(begun)[30, 12:]
     np.testing.assert_allclose(estimated, [3.0, 0.0, 0.0], rtol=0, atol=0.02)
     # It is a plan of the model with this wind: Newton's law, over each period, to second order.
     velocity = plan.states[:, 3:6]
@@ -209,15 +210,15 @@ def test_each_trial_gets_what_it_gets_alone(quadrotor: ls.Scenario, flown: tuple
     noise = [WIND, MeasurementNoise(0.003), ForceNoise(0.05)]
     plant = quadrotor.plant()
     together = ls.simulate(plant, solution, controller=law, disturbances=noise, trials=3, frames=False)
-    assert law.solved == 12
-    plans, estimates = law.plans, law.estimates
+    assert together.controller_run.log.solved == 12
+    plans, estimates = together.controller_run.plans, together.controller_run.estimates
     alone = ls.simulate(plant, solution, controller=law, disturbances=noise, first_trial=2, frames=False)
-    assert law.solved == 4
+    begun = alone.controller_run
+    assert begun.log.solved == 4
     np.testing.assert_array_equal(alone.states[0], together.states[2])
     np.testing.assert_array_equal(alone.commanded[0], together.commanded[2])
-    np.testing.assert_array_equal(law.plans[0][60].controls, plans[2][60].controls)
-    assert estimates is not None
-    np.testing.assert_array_equal(recorded(law), estimates[:, 2])
+    np.testing.assert_array_equal(begun.plans[0][60].controls, plans[2][60].controls)
+    np.testing.assert_array_equal(recorded(begun), estimates[:, 2])
     assert not np.array_equal(together.states[0], together.states[2])
 
 
@@ -230,8 +231,8 @@ def test_where_the_law_leads_to_the_goal_nothing_is_solved() -> None:
             replace(system.solution, goal=system.plan.states[-1], goal_radius=0.5), stated(PUSH), tolerate=2.0,
             effort=0.2, record=True, replan_every=AGAIN * DT,
         )  # fmt: skip
-        run(system, law, push=push)
-        assert (law.solved > 0) == some
+        _, _, begun = run(system, law, push=push)
+        assert (begun.log.solved > 0) == some
 
 
 # What fails, and what does not fit.
@@ -248,17 +249,18 @@ def test_where_no_solve_succeeds_the_law_goes_on() -> None:
     commands: list[list[Array]] = []
     for every in (AGAIN * DT, None):
         law = replanned(system, stated(PUSH), every)
-        control, rng = law.start(1), np.random.default_rng(0)
+        begun: Any = law.start(1)
+        rng = np.random.default_rng(0)
         shown = np.array([[0.5, 0.0]]) + 0.01 * rng.normal(size=(STEPS + 5, 1, 2))
-        commands.append([control(t, shown[t]) for t in range(STEPS + 5)])
-        assert law.plans == ([{}] if every else [])
-        assert law.solved == 0
+        commands.append([begun.control(t, shown[t]) for t in range(STEPS + 5)])
         if every:
-            assert law.kept.total() == 2
-            assert set(law.kept) == {"NOT_FINITE, without a better plan"}
-            assert law.summary().startswith("solved again 0 times, kept the law before 2 times: 2 times NOT_FIN")
+            assert begun.plans == [{}]
+            assert begun.log.solved == 0
+            assert begun.log.kept.total() == 2
+            assert set(begun.log.kept) == {"NOT_FINITE, without a better plan"}
+            assert begun.summary().startswith("solved again 0 times, kept the law before 2 times: 2 times NOT_FIN")
         else:
-            assert (law.kept, law.summary()) == ({}, "")
+            assert begun.summary() == ""
     np.testing.assert_array_equal(commands[0], commands[1])
 
 

@@ -14,6 +14,7 @@ from point_mass import RADIUS, Oracle, balls, problem
 
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
+from lqrsim.control.replan_rule import ActivePlan
 from lqrsim.errors import Array
 
 STEPS, DT = 20, 0.1
@@ -163,7 +164,7 @@ def anything(called: Any) -> Any:
 NOISE = [ls.disturbances.ForceNoise(0.1), ls.disturbances.ControlNoise(0.05)]
 
 
-def simulated(plant: ls.Plant, solution: ls.Solution, law: ls.Replanning, **options: Any) -> ls.Rollout:
+def simulated(plant: ls.Plant, solution: ls.Solution, law: ls.Replanner, **options: Any) -> ls.Rollout:
     return ls.simulate(plant, solution, controller=law, frames=False, contacts=False, **options)
 
 
@@ -172,15 +173,15 @@ def plant(quadrotor: ls.Scenario) -> ls.Plant:
     return quadrotor.plant()
 
 
-class TestReplanning:
+class TestReplanner:
     @pytest.mark.parametrize("computing", [1 / 30, 0.01, lambda random: random.exponential(0.02)])
     def test_each_trial_gets_what_it_gets_alone(
         self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution, computing: Any
     ) -> None:
         """To the last bit, on one thread or on several, where the delay does not come from a clock."""
-        law = ls.Replanning(quadrotor.problem, quadrotor_solution, every=0.5, computing=computing)
+        law = ls.Replanner(quadrotor.problem, quadrotor_solution, every=0.5, computing=computing)
         together = simulated(plant, quadrotor_solution, law, disturbances=NOISE, trials=3)
-        late = law.kept["not ready in time"]
+        late = together.controller_run.log.kept["not ready in time"]
         assert (late > 0) == callable(computing)
         alone = simulated(plant, quadrotor_solution, law, disturbances=NOISE, first_trial=2)
         np.testing.assert_array_equal(alone.states[0], together.states[2])
@@ -189,20 +190,23 @@ class TestReplanning:
         self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution
     ) -> None:
         """The model is MuJoCo's to 1e-6: where the solves begin is where the robot then is."""
-        law = ls.Replanning(quadrotor.problem, quadrotor_solution, every=0.5, computing=0.1)
+        law = ls.Replanner(quadrotor.problem, quadrotor_solution, every=0.5, computing=0.1)
         run = simulated(plant, quadrotor_solution, law)
-        assert law.solved == 9
-        assert {one.step for one in law.records} == {15 * i for i in range(1, 10)}
-        begun = law._replanner.task(law._replanner.start(), 15, run.states[0, 15])
+        log = run.controller_run.log
+        assert log.solved == 9
+        assert {one.step for one in log.records} == {15 * i for i in range(1, 10)}
+        first = ActivePlan(quadrotor_solution, 0)
+        begun = law.rule.request(first, 15, run.states[0, 15], quadrotor.problem)
         np.testing.assert_allclose(begun.state, run.states[0, 18], rtol=0, atol=1e-6)
 
     def test_what_is_not_ready_is_not_used(self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution) -> None:
-        law = ls.Replanning(quadrotor.problem, quadrotor_solution, every=0.5, computing=0.2, deadline=0.1)
+        law = ls.Replanner(quadrotor.problem, quadrotor_solution, every=0.5, computing=0.2, deadline=0.1)
         late = simulated(plant, quadrotor_solution, law, disturbances=NOISE)
         plain = ls.simulate(plant, quadrotor_solution, disturbances=NOISE, frames=False, contacts=False)
         np.testing.assert_array_equal(late.states, plain.states)
-        assert (law.solved, law.kept) == (0, {"not ready in time": 9})
-        assert law.summary() == "solved again 0 times, kept the law before 9 times: 9 times not ready in time"
+        log = late.controller_run.log
+        assert (log.solved, log.kept) == (0, {"not ready in time": 9})
+        assert log.summary() == "solved again 0 times, kept the law before 9 times: 9 times not ready in time"
 
     def test_the_goal_and_the_obstacles_that_are_known_by_then(
         self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution
@@ -215,19 +219,20 @@ class TestReplanning:
         def known(t: float, problem: ls.Problem) -> ls.Problem:
             return replace(problem, final_cost=later) if t >= 2 else problem
 
-        law = ls.Replanning(quadrotor.problem, quadrotor_solution, every=0.2, computing=0.033, changes=known)
+        law = ls.Replanner(quadrotor.problem, quadrotor_solution, every=0.2, computing=0.033, changes=known)
         end = simulated(plant, quadrotor_solution, law).states[0, -1, :3]
         assert np.linalg.norm(end - goal[:3]) < 0.1
         assert np.linalg.norm(end - quadrotor_solution.trajectory.states[-1, :3]) > 0.3
 
     def test_measured_it_says_how_long_it_took(self, plant: ls.Plant, quadrotor: Any, quadrotor_solution) -> None:
-        law = ls.Replanning(
+        law = ls.Replanner(
             quadrotor.problem, quadrotor_solution, every=1.0, deadline=0.5, computing="measured", horizon="moving"
         )
         run = simulated(plant, quadrotor_solution, law, disturbances=NOISE)
         assert np.isfinite(run.states).all()
-        assert law.solved + law.kept.total() == len(law.records) == 4
-        assert "ms in the median" in law.summary()
+        log = run.controller_run.log
+        assert log.solved + log.kept.total() == len(log.records) == 4
+        assert "ms in the median" in run.controller_run.summary()
 
     @pytest.mark.parametrize(
         ("wrong", "line"),
@@ -245,52 +250,58 @@ class TestReplanning:
         ],
     )
     def test_bad_input(self, quadrotor: ls.Scenario, quadrotor_solution, wrong: dict[str, Any], line: str) -> None:
-        with pytest.raises(ls.InputError, match=f"Replanning: {line}"):
-            anything(ls.Replanning)(quadrotor.problem, quadrotor_solution, **{"every": 1.0} | wrong)
+        with pytest.raises(ls.InputError, match=f"Replanner: {line}"):
+            anything(ls.Replanner)(quadrotor.problem, quadrotor_solution, **{"every": 1.0} | wrong)
 
     def test_changes_that_would_compile_are_a_failure_with_its_reason(
         self, plant: ls.Plant, quadrotor: ls.Scenario, quadrotor_solution
     ) -> None:
         problem = quadrotor.problem
         other = replace(problem, stage_cost=ls.ControlCost(np.ones(4)))
-        law = ls.Replanning(problem, quadrotor_solution, every=1.0, changes=lambda t, problem: other)
+        law = ls.Replanner(problem, quadrotor_solution, every=1.0, changes=lambda t, problem: other)
         run = simulated(plant, quadrotor_solution, law)
         assert "another structure" in run.reasons[0]
 
 
-def ready(planner: ls.Planner) -> None:
+def live(stated: ls.Problem, solution: ls.Solution, *, clock: Any, **options: Any) -> ls.types.LiveReplanner:
+    """With a horizon that moves along, if no other is asked for."""
+    chosen: dict[str, Any] = {"horizon": "moving"} | options
+    return ls.Replanner(stated, solution, **chosen).live(clock=clock)
+
+
+def ready(planner: ls.types.LiveReplanner) -> None:
     """Wait for the answer that the planner's thread is at."""
     solve = planner._solve
     while solve is not None and solve.answer is None and solve.error is None:
         time.sleep(1e-3)
 
 
-class TestPlanner:
+class TestLive:
     def test_answers_come_into_force_at_their_deadline(self, stated: ls.Problem, solution: ls.Solution) -> None:
         """The loop is ten times as fast as the plan; the robot is the point mass itself, which the model knows."""
         state, laws = solution.trajectory.states[0], []
-        with ls.Planner(stated, solution, every=2 * DT, deadline=DT, clock=lambda: 0.0) as planner:
+        with live(stated, solution, every=2 * DT, deadline=DT, clock=lambda: 0.0) as planner:
             for i in range(100):
                 t = i * DT / 10
                 control = planner.step(state, t)
                 ready(planner)
-                laws.append(planner.law.first)
-                expected = planner.law.plan.policy(state, max(t - planner.law.first * DT, 0.0))
+                laws.append(planner.active.first)
+                expected = planner.active.plan.policy(state, max(t - planner.active.first * DT, 0.0))
                 np.testing.assert_array_equal(control, expected)
                 x, h = state, DT / 10
                 state = np.concatenate([x[:2] + h * x[2:] + h**2 / 2 * control, x[2:] + h * control])
         # Solves begin at 0, 0.2, 0.4 ... s, and act 0.1 s later, for a moving horizon.
         assert laws == [max(((i // 10) - 1) // 2 * 2 + 1, 0) for i in range(100)]
-        assert planner.account.solved == 5
-        assert planner.law.plan.trajectory.steps == STEPS
+        assert planner.log.solved == 5
+        assert planner.active.plan.trajectory.steps == STEPS
         assert "solved again 5 times" in planner.summary()
 
     def test_a_state_between_two_knots_is_taken_on_to_the_next(self, stated: ls.Problem, solution: Any) -> None:
         """Where the solve begins is where the point mass is then: to rounding, for its steps are exact."""
         state, late = solution.trajectory.states[3], 0.04
-        with ls.Planner(stated, solution, every=DT, clock=lambda: 0.0) as planner:
+        with live(stated, solution, every=DT, clock=lambda: 0.0) as planner:
             control = planner.step(state, 3 * DT + late)
-            begun = planner._solve.task.state  # pyright: ignore[reportOptionalMemberAccess]
+            begun = planner._solve.request.state  # pyright: ignore[reportOptionalMemberAccess]
             h = DT - late
             there = np.concatenate([state[:2] + h * state[2:] + h**2 / 2 * control, state[2:] + h * control])
             np.testing.assert_allclose(begun, there, rtol=0, atol=1e-12)
@@ -305,27 +316,27 @@ class TestPlanner:
             return 0.0
 
         state = solution.trajectory.states[0]
-        with ls.Planner(stated, solution, every=DT, clock=clock) as planner:
+        with live(stated, solution, every=DT, clock=clock) as planner:
             planner.step(state, 0.0)
             control = planner.step(solution.trajectory.states[1], DT)
             np.testing.assert_array_equal(control, solution.policy(solution.trajectory.states[1], DT))
             held.set()
             ready(planner)
             planner.step(solution.trajectory.states[2], 2 * DT)
-            assert planner.law.first == 0
-            assert planner.account.kept == {"not ready in time": 1}
+            assert planner.active.first == 0
+            assert planner.log.kept == {"not ready in time": 1}
             ready(planner)
             planner.step(solution.trajectory.states[3], 3 * DT)
-            assert planner.law.first == 3
+            assert planner.active.first == 3
 
     def test_it_plans_for_what_is_changed(self, stated: ls.Problem, solution: ls.Solution) -> None:
-        with ls.Planner(stated, solution, every=DT, clock=lambda: 0.0) as planner:
+        with live(stated, solution, every=DT, clock=lambda: 0.0) as planner:
             planner.change(final_cost=ls.QuadraticCost([100.0] * 4, about=(2, 1.5, 0, 0)))
             for i in range(4):
                 planner.step(solution.trajectory.states[i], i * DT)
                 ready(planner)
             planner.step(solution.trajectory.states[4], 4 * DT)
-            assert np.abs(planner.law.plan.trajectory.states[-1] - (2, 1.5, 0, 0)).max() < 0.2
+            assert np.abs(planner.active.plan.trajectory.states[-1] - (2, 1.5, 0, 0)).max() < 0.2
             with pytest.raises(ls.InputError, match="problem: got one of another structure"):
                 planner.change(constraints=())
             with pytest.raises(ls.InputError, match="change: got gaol, want fields of a Problem: dynamics, dt"):
@@ -339,7 +350,7 @@ class TestPlanner:
         for level, begun in ((0.05, [8]), (0.0, [0, 4, 8, 12, 16])):
             state, when = solution.trajectory.states[0], funnel_by_hand(solution, np.eye(2), levels=[level])
             options: dict[str, Any] = {"every": 4 * DT, "deadline": DT, "horizon": "shrinking", "when": when}
-            with ls.Planner(stated, solution, clock=lambda: 0.0, **options) as planner:
+            with live(stated, solution, clock=lambda: 0.0, **options) as planner:
                 for i in range(STEPS):
                     control = planner.step(state, i * DT)
                     ready(planner)
@@ -347,8 +358,8 @@ class TestPlanner:
                     state = np.concatenate([x[:2] + DT * x[2:] + DT**2 / 2 * control, x[2:] + DT * control])
                     if i == 5:
                         state[:2] += 0.2
-            assert [one.step for one in planner.account.records] == begun
-            assert planner.account.solved == len(begun)
+            assert [one.step for one in planner.log.records] == begun
+            assert planner.log.solved == len(begun)
 
     @pytest.mark.parametrize(("share", "off", "solves"), [(1.0, 0.9, 0), (1.0, 1.1, 1), (0.5, 0.4, 0), (0.5, 0.6, 1)])
     def test_the_funnel_is_about_where_the_plan_is_between_two_knots(
@@ -364,15 +375,16 @@ class TestPlanner:
             "when": funnel_by_hand(solution, np.eye(2), levels=[level]),
             "share": share,
         }
-        with ls.Planner(stated, solution, clock=lambda: 0.0, **options) as planner:
+        with live(stated, solution, clock=lambda: 0.0, **options) as planner:
             planner.step(before + 0.4 * (after - before) + off * 0.2 * along, 3.4 * DT)
             ready(planner)
             planner.step(after, 4 * DT)
-            assert [one.step for one in planner.account.records] == [3] * solves
+            assert [one.step for one in planner.log.records] == [3] * solves
 
     def test_bad_input(self, stated: ls.Problem, solution: ls.Solution) -> None:
-        planner: Any = ls.Planner(stated, solution, every=DT)
-        with pytest.raises(ls.InputError, match="Planner: got a step without its thread"):
+        replanner = ls.Replanner(stated, solution, every=DT)
+        planner: Any = replanner.live()
+        with pytest.raises(ls.InputError, match="LiveReplanner: got a step without its thread"):
             planner.step(np.zeros(4), 0.0)
         with planner:
             refused: list[tuple[tuple[Any, Any], str]] = [
@@ -382,16 +394,90 @@ class TestPlanner:
             for wrong, line in refused:
                 with pytest.raises(ls.InputError, match=line):
                     planner.step(*wrong)
+        with pytest.raises(ls.InputError, match="LiveReplanner: got a step without its thread"):
+            planner.step(np.zeros(4), 0.0)
+        with pytest.raises(ls.InputError, match=r"Replanner\.live: interpolate: got 1"):
+            anything(replanner.live)(interpolate=1)
+        with pytest.raises(ls.InputError, match=r"Replanner\.live: clock: got 3"):
+            anything(replanner.live)(clock=3)
+        with pytest.raises(ls.InputError, match=r"Replanner\.live: deadline: got 0 s, want more"):
+            ls.Replanner(stated, solution, every=DT, deadline=0.0).live()
         when = funnel_by_hand(solution, np.eye(2))
         moved = replace(when, plan=replace(when.plan, states=when.plan.states + 1))
         for wrong, line in (
-            ({"deadline": 0.0}, "deadline: got 0"),
-            ({"interpolate": 1}, "interpolate: got 1"),
             ({"when": 1}, "when: got 1"),
             ({"share": 0.5}, "share: got 0.5 without a funnel"),
             ({"when": when, "horizon": "shrinking", "share": 1.5}, "share: got 1.5"),
-            ({"when": when}, "when: got a funnel with horizon='moving', want \"shrinking\""),
+            ({"when": when, "horizon": "moving"}, "when: got a funnel with horizon='moving', want \"shrinking\""),
             ({"when": moved, "horizon": "shrinking"}, "when: got a funnel of another plan"),
         ):
-            with pytest.raises(ls.InputError, match=f"Planner: {line}"):
-                anything(ls.Planner)(stated, solution, **{"every": DT} | wrong)
+            with pytest.raises(ls.InputError, match=f"Replanner: {line}"):
+                anything(ls.Replanner)(stated, solution, **{"every": DT} | wrong)
+
+    def test_entering_twice_is_refused(self, stated: ls.Problem, solution: ls.Solution) -> None:
+        """Within the block and after it; another run of the same re-planner begins at the first plan."""
+        replanner = ls.Replanner(stated, solution, every=DT, horizon="moving")
+        planner = replanner.live(clock=lambda: 0.0)
+        again = "LiveReplanner: got entered twice, want one `with replanner.live"
+        with planner:
+            for i in range(3):
+                planner.step(solution.trajectory.states[i], i * DT)
+                ready(planner)
+            with pytest.raises(ls.InputError, match=again), planner:
+                pass
+            planner.step(solution.trajectory.states[3], 3 * DT)  # it goes on as if nothing had been tried
+            assert planner.active.first == 3
+        with pytest.raises(ls.InputError, match=again), planner:
+            pass
+        other = replanner.live(clock=lambda: 0.0)
+        assert (other.active.plan, other.active.first, other.log.records) == (solution, 0, [])
+
+    @pytest.mark.parametrize(
+        ("parts", "line"),
+        [
+            ({"dt": 2 * DT}, r"change: dt: got 0\.2, want 0\.1: it cannot change while a re-planner runs"),
+            ({"steps": STEPS + 1}, rf"change: steps: got {STEPS + 1}, want {STEPS}: it cannot change"),
+            ({"duration": (1.0, 3.0)}, r"change: duration: got \(1\.0, 3\.0\), want None: it cannot change"),
+        ],
+    )
+    def test_what_plans_are_stepped_by_cannot_change(
+        self, stated: ls.Problem, solution: ls.Solution, parts: dict[str, Any], line: str
+    ) -> None:
+        """Nor states and controls: of a live run by `change`, of both by `changes`."""
+        changed = replace(stated, **parts)
+        with live(stated, solution, every=DT, clock=lambda: 0.0) as planner:
+            with pytest.raises(ls.InputError, match=line):
+                planner.change(**parts)
+            assert planner.problem is stated
+        replanner = ls.Replanner(stated, solution, every=DT, changes=lambda t, problem: changed)
+        with (
+            replanner.live(clock=lambda: 0.0) as planner,
+            pytest.raises(ls.InputError, match=line.replace("change:", "Replanner: changes:")),
+        ):
+            planner.step(solution.trajectory.states[0], 0.0)
+        run = replanner.start(1)
+        run.control(0, solution.trajectory.states[[0]])
+        with pytest.raises(ls.InputError, match=line.replace("change:", "Replanner: changes:")):
+            run.control(1, solution.trajectory.states[[1]])
+
+    def test_another_system_is_refused(self, stated: ls.Problem, solution: ls.Solution, quadrotor: Any) -> None:
+        names = ("dynamics", "initial", "stage_cost", "final_cost", "constraints", "control_limits")
+        parts = {name: getattr(quadrotor.problem, name) for name in names}
+        planner = live(stated, solution, every=DT, clock=lambda: 0.0)
+        with pytest.raises(ls.InputError, match=r"change: dynamics: got x, y, z, .*, want "):
+            planner.change(**parts)
+
+    def test_changes_act_in_a_live_run_too(self, stated: ls.Problem, solution: ls.Solution) -> None:
+        """To the bit what `change` does, if it says so of each time."""
+        goal = ls.QuadraticCost([100.0] * 4, about=(2, 1.5, 0, 0))
+        known = [None, lambda t, problem: replace(problem, final_cost=goal)]
+        plans = []
+        for changes in known:
+            with live(stated, solution, every=DT, clock=lambda: 0.0, changes=changes) as planner:
+                if changes is None:
+                    planner.change(final_cost=goal)
+                for i in range(3):
+                    planner.step(solution.trajectory.states[i], i * DT)
+                    ready(planner)
+                plans.append(planner.active.plan.trajectory.states)
+        np.testing.assert_array_equal(plans[0], plans[1])

@@ -246,6 +246,15 @@ class TestDataThatUsersBuild:
             line = refusal(lambda f=field, o=other: dataclasses.replace(drive_solution, **{f: o}))
             assert line.startswith("Solution: ")
 
+    def test_parts_of_several_plans(self, drive_solution: ls.Solution, quadrotor_solution: ls.Solution) -> None:
+        """What solutions and re-plans share is checked once, and named by the type that was made."""
+        shared = [field.name for field in dataclasses.fields(ls.Plan)]
+        plan = ls.Plan(**{name: getattr(drive_solution, name) for name in shared})
+        for field in ("policy", "trajectory", "cost_to_go", "goal"):
+            other = getattr(quadrotor_solution, field)
+            line = refusal(lambda f=field, o=other: dataclasses.replace(plan, **{f: o}))
+            assert line.startswith(f"Plan: {'policy' if field == 'trajectory' else field}")
+
     def test_a_rollout(self, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
         rollout = ls.simulate(differential_drive.plant(), drive_solution, frames=False)
         for field, value in (
@@ -298,7 +307,7 @@ class TestDataThatUsersBuild:
         for call in (
             lambda: lq.smooth("problem"), lambda: lq.ilqr([problem]), lambda: lq.simulate(plant, [drive_solution]),
             lambda: lq.simulate("plant", drive_solution), lambda: lq.simulate(plant, drive_solution, controller="none"),
-            lambda: lq.Feedback(drive_solution), lambda: lq.Replanning("problem", drive_solution, every=1.0),
+            lambda: lq.Replanner("problem", drive_solution, every=1.0),
             lambda: lq.view.plot_run("solution", {}, "a.png", world=differential_drive.scene.world),
             lambda: lq.report("results", "a.html"), lambda: lq.verify_run("run"),
             lambda: lq.stress.outcomes("run", plant),

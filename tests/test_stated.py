@@ -70,7 +70,7 @@ def test_trials_are_those_of_the_controllers_as_users_make_them(
     stated, wrong = ls.uncertainty_of(plant, LIGHT), [one.scaled(2.0) for one in LIGHT]
     plan = replace(drive_solution, goal_radius=differential_drive.target_radius())
     made = {
-        "track": ls.Feedback(ls.track(problem, plan, uncertainty=stated)),
+        "track": ls.track(problem, plan, uncertainty=stated),
         "offset_free": ls.OffsetFree(problem, plan, stated),
     }
     for policy, law in made.items():
@@ -157,11 +157,11 @@ def test_rare_and_break_run_them(policy: str, differential_drive: ls.Scenario, d
     severe = ls.uncertainty_of(differential_drive.plant(), ls.disturbances.preset("severe", differential_drive.plant()))
     plan = replace(drive_solution, goal_radius=differential_drive.target_radius())
     law = (
-        ls.Feedback(ls.track(differential_drive.problem, plan, uncertainty=severe))
+        ls.track(differential_drive.problem, plan, uncertainty=severe)
         if policy == "track"
         else ls.OffsetFree(differential_drive.problem, plan, severe)
     )
-    assert problem.score.controller is not None
+    assert isinstance(problem.score.controller, (ls.AffinePolicy, ls.OffsetFree))
     assert problem.score.controller.digest == law.digest
     numbers = np.random.default_rng(0).standard_normal((2, problem.score.size))
     rollout = problem.score.rollout(numbers, frames=False)
@@ -191,10 +191,10 @@ def test_simulate_runs_a_controller_by_its_name(
     light = ls.disturbances.preset("light", plant)
     stated, problem = ls.uncertainty_of(plant, light), differential_drive.problem
     law = {
-        "feedback": lambda: ls.Feedback(solution.policy),
-        "track": lambda: ls.Feedback(ls.track(problem, solution, uncertainty=stated)),
+        "feedback": lambda: solution.policy,
+        "track": lambda: ls.track(problem, solution, uncertainty=stated),
         "offset_free": lambda: ls.OffsetFree(problem, solution, stated),
-        "replan": lambda: ls.Replanning(problem, solution, every=problem.steps * problem.dt / 10),
+        "replan": lambda: ls.Replanner(problem, solution, every=problem.steps * problem.dt / 10, deadline=0.0),
     }[name]()
     wanted = ls.simulate(plant, solution, controller=law, disturbances=light, trials=3)
     found = ls.load(tmp_path / "rollout.npz", ls.Rollout)

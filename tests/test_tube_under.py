@@ -19,9 +19,9 @@ def test_what_the_linear_model_does_not_have_is_said_in_one_line(
     cases = {
         "latency": ([NOISE, MeasurementLatency(2)], None),
         "delay": ([NOISE, ControlDelay(1)], None),
-        "an OffsetFree, a Feedback or an AffinePolicy": (
+        "an OffsetFree or an AffinePolicy": (
             [NOISE],
-            ls.Replanning(problem, drive_solution, every=1.0),
+            ls.Replanner(problem, drive_solution, every=1.0),
         ),
         "told of other disturbances": (
             [NOISE],

@@ -14,6 +14,7 @@ from scipy.stats import multivariate_normal, norm
 
 import lqrsim as ls
 from lqrsim.control.collision_chance import Surroundings, both_below, collision_chance
+from lqrsim.control.controllers import Feedback
 from lqrsim.control.loop_moments import limited
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.errors import Array
@@ -186,11 +187,11 @@ def test_moments_are_those_of_a_simulated_loop(estimates: bool, limit: float, to
     problem, solution, controller = system.problem, system.solution, None
     if estimates:
         controller = ls.OffsetFree(problem, solution, STATED, tolerate={"s0": 0.1, "s1": 0.5}, effort=0.5)
-        control = controller.start(trials)
+        control = controller.start(trials).control
     else:
         policy = ls.track(problem, solution, tolerate={"s0": 0.1, "s1": 0.5}, effort=0.5)
         solution = by_hand(system.plan, policy)
-        control = ls.Feedback(policy).start(trials)
+        control = Feedback(policy).start(trials).control
     tube = ls.predict_tube(problem, solution, STATED, controller)
     states, applied = simulated(system, control, STATED, trials, np.random.default_rng(0))
     off = states - system.plan.states[:, None]

@@ -153,7 +153,7 @@ def test_a_plan_that_is_not_the_runs_is_told(case: Case) -> None:
 
 def test_a_controllers_run_is_about_the_solutions_plan(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     law = ls.track(quadrotor.problem, quadrotor_solution, tolerate={"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s": 1.0})
-    run = ls.simulate(quadrotor.plant(), quadrotor_solution, controller=ls.Feedback(law))
+    run = ls.simulate(quadrotor.plant(), quadrotor_solution, controller=law)
     told = check_plan(run, quadrotor_solution)
     assert (told.passed, told.detail.partition(";")[0]) == (None, "as the solution has it")
     tracked = dataclasses.replace(quadrotor_solution, policy=law)

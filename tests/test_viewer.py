@@ -237,7 +237,7 @@ def test_a_live_run_is_what_simulate_does(quadrotor: ls.Scenario, quadrotor_solu
 
 def test_a_live_run_takes_a_controller(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     tolerate = {"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s": 0.2}
-    law = ls.Feedback(ls.track(quadrotor.problem, quadrotor_solution, tolerate=tolerate))
+    law = ls.track(quadrotor.problem, quadrotor_solution, tolerate=tolerate)
     noise, plant = [ForceNoise(0.1)], quadrotor.plant()
     wanted = ls.simulate(plant, quadrotor_solution, controller=law, disturbances=noise, seed=3)
     screen = Recorder(150, **viewer.arguments_for_plant(plant, quadrotor_solution))

@@ -34,15 +34,15 @@ BEFORE: list[threading.Thread] = []  # those of other tests in this process
 
 @pytest.fixture(autouse=True)
 def count_from_here() -> None:
-    BEFORE[:] = [thread for thread in threading.enumerate() if thread.name == "lqrsim planner"]
+    BEFORE[:] = [thread for thread in threading.enumerate() if thread.name == "lqrsim re-planner"]
 
 
 def planning() -> list[threading.Thread]:
-    threads = [thread for thread in threading.enumerate() if thread.name == "lqrsim planner"]
+    threads = [thread for thread in threading.enumerate() if thread.name == "lqrsim re-planner"]
     return [thread for thread in threads if thread not in BEFORE]
 
 
-def wait_for(planner: ls.Planner) -> None:
+def wait_for(planner: ls.types.LiveReplanner) -> None:
     """For the answer that its thread is at."""
     solve = planner._solve
     while solve is not None and solve.answer is None and solve.error is None:
@@ -56,16 +56,19 @@ class Run:
     little how fast the machine is.
     """
 
-    def __init__(self, scenario: ls.Scenario, solution: ls.Solution, frames: int, **options: Any) -> None:
+    def __init__(
+        self, scenario: ls.Scenario, solution: ls.Solution, frames: int, clock: Any = lambda: 0.0, **options: Any
+    ) -> None:
         self.scenario, self.solution, self.plant = scenario, solution, scenario.plant()
         self.goal = MovableGoal(scenario.problem)
         self.screen = Recorder(frames, **viewer.arguments_for_plant(self.plant, solution, self.goal))
-        self.planners: list[ls.Planner] = []
+        self.planners: list[ls.types.LiveReplanner] = []
         self.lines: list[str] = []
         self.captions: list[str] = []
         self.acts: list[Callable[[float], object]] = []
         self.patient = True
-        self.options = {"every": 0.2, "deadline": 0.2, "horizon": "moving", "clock": lambda: 0.0} | options
+        self.clock = clock
+        self.options = {"every": 0.2, "deadline": 0.2, "horizon": "moving"} | options
         self.screen.act = self.act
 
     def act(self, time: float) -> None:
@@ -75,8 +78,9 @@ class Run:
         if self.patient:
             wait_for(self.planners[-1])
 
-    def planner(self) -> ls.Planner:
-        self.planners.append(ls.Planner(self.scenario.problem, self.solution, **self.options))
+    def planner(self) -> ls.types.LiveReplanner:
+        replanner = ls.Replanner(self.scenario.problem, self.solution, **self.options)
+        self.planners.append(replanner.live(clock=self.clock))
         return self.planners[-1]
 
     def go(self, **options: Any) -> "Run":
@@ -115,7 +119,7 @@ def test_the_caption_tells_solves_and_the_law(moved: Run) -> None:
     """Of the last frame: what the planner's own records say, and the law that begins at a multiple of 0.2 s."""
     (planner,) = moved.planners
     _, law, solves, *_ = moved.captions[-1].splitlines()
-    known = planner.account.records[:-1]  # the last answer came after the last frame
+    known = planner.log.records[:-1]  # the last answer came after the last frame
     took, used = [1e3 * one.seconds for one in known], sum(one.used for one in known)
     assert len(took) == 450 // 6 - 1
     begins = f"solve {took[-1]:.1f} ms, median {np.median(took):.1f} ms; {used} used"
@@ -135,7 +139,7 @@ def test_the_plan_in_force_is_drawn(moved: Run) -> None:
     moved.screen.draw_overlays(new)
     last = [geom for geom in geoms if np.allclose(geom.rgba, (*PLAN_RGB, 1.0))][-1]
     ends = last.pos + np.outer((-1, 1), last.size[2] * last.mat[:, 2])
-    planned = moved.planners[0].law.plan.trajectory.states[-1, :3]
+    planned = moved.planners[0].active.plan.trajectory.states[-1, :3]
     assert np.linalg.norm(ends - planned, axis=1).min() < 1e-6
     assert np.linalg.norm(planned - FREE) < 0.1
 
@@ -162,7 +166,7 @@ def test_a_goal_on_the_floor(differential_drive: ls.Scenario, drive_solution: ls
     )
     run.go()
     assert put[-1] == pytest.approx((1.5, 1.5, 0.0, 1, 0, 0, 0), abs=0.02)
-    assert np.linalg.norm(run.planners[0].law.plan.trajectory.states[-1, :2] - 1.5) < 0.1
+    assert np.linalg.norm(run.planners[0].active.plan.trajectory.states[-1, :2] - 1.5) < 0.1
 
 
 def test_what_is_not_ready_is_missed_and_the_run_goes_on(
@@ -188,10 +192,10 @@ def test_what_is_not_ready_is_missed_and_the_run_goes_on(
     run.go()
     still = ls.simulate(run.plant, quadrotor_solution).frames[0][1:31]
     np.testing.assert_allclose(np.array(run.screen.shown)[:30], still, rtol=0, atol=1e-9)
-    assert run.planners[0].account.kept["not ready in time"] == 1
+    assert run.planners[0].log.kept["not ready in time"] == 1
     assert "in force: first plan, 0.9 s old" in run.captions[28]
     assert "\n1 missed: 1 not ready in time" in run.captions[-1]
-    assert run.planners[0].law.first > 30
+    assert run.planners[0].active.first > 30
 
 
 @pytest.mark.parametrize("how", ["closed", "started again", "interrupted", "lost"])
@@ -325,8 +329,9 @@ def test_a_robot_without_a_position_plans_again(tmp_path: Path) -> None:
     problem, plant = arm_problem(arm), ls.Plant(arm, PlanarArm.scene(tmp_path, things=""))
     solution, made = ls.smooth(problem), []
 
-    def planner() -> ls.Planner:
-        made.append(ls.Planner(problem, solution, every=0.2, deadline=0.2, clock=lambda: 0.0))
+    def planner() -> ls.types.LiveReplanner:
+        replanner = ls.Replanner(problem, solution, every=0.2, deadline=0.2, horizon="moving")
+        made.append(replanner.live(clock=lambda: 0.0))
         return made[-1]
 
     screen = Recorder(120, **viewer.arguments_for_plant(plant, solution))
@@ -334,7 +339,7 @@ def test_a_robot_without_a_position_plans_again(tmp_path: Path) -> None:
     viewer.live(plant, solution, screen, planner=planner)
     assert screen.hold(screen.other()) == screen.robot
     (planner_made,) = made
-    law = planner_made.law
+    law = planner_made.active
     assert law.first * 0.05 > 1.0
     angles = np.cumsum(law.plan.trajectory.states[0, :3])
     end = LENGTH * np.array([np.cos(angles).sum(), np.sin(angles).sum()])

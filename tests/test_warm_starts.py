@@ -22,6 +22,18 @@ def test_from_its_own_solution_it_is_there(differential_drive, kind: Any) -> Non
     assert again.cost == pytest.approx(solution.cost, rel=1e-5)
 
 
+def test_from_a_re_plan(differential_drive) -> None:
+    problem = fixed(differential_drive.problem)
+    solution = ls.smooth(problem)
+    replan = ls.prepare(problem).solve(np.array(problem.start), solution)
+    again = ls.smooth(problem, start=replan)
+    assert again.success
+    assert len(again.iterations) <= 2
+    assert again.cost == pytest.approx(solution.cost, rel=1e-6)
+    np.testing.assert_array_equal(replan.goal, solution.goal)
+    assert replan.goal_radius == solution.goal_radius
+
+
 @pytest.mark.parametrize("steps", [1, 3, 10])
 def test_a_horizon_that_moves_along_to_another_goal(differential_drive, steps: int) -> None:
     before = ls.smooth(fixed(differential_drive.problem))

@@ -14,7 +14,7 @@ from numpy.random import Generator
 import lqrsim as ls
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
-from lqrsim.kernels.records import Plan
+from lqrsim.kernels.records import Motion
 from lqrsim.solvers.interior_point import InteriorPoint
 from paper.common import numbers
 
@@ -29,10 +29,10 @@ class Watched(InteriorPoint):
     """Which can be told to settle once more from beside its plan, and keeps the plans that it comes by."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        self._plans: list[Plan] = []
+        self._plans: list[Motion] = []
         super().__init__(*arguments, **options)
 
-    def settle_from(self, plan: Plan) -> list[Plan]:
+    def settle_from(self, plan: Motion) -> list[Motion]:
         """The plans of each step: all that it can be told to take, for nothing is good enough.
 
         It keeps its multipliers, and to begin with what it knows of the rows: which of them press.
@@ -56,7 +56,7 @@ def errors(problem: ls.Problem, solution: ls.Solution, rng: Generator) -> Array:
     From as far beside the optimum as leads back to it; empty if nothing does.
     """
     plan = solution.trajectory
-    point = Watched(problem, Plan(in_c_order(plan.states), in_c_order(plan.controls)), **NEAR)
+    point = Watched(problem, Motion(in_c_order(plan.states), in_c_order(plan.controls)), **NEAR)
     with np.errstate(all="ignore"):
         found = point.run(tolerance=1e-8, violation=1e-6, most=MOST)
     best, (of_states, of_controls, *_) = found.plan, point.sizes
@@ -69,7 +69,7 @@ def errors(problem: ls.Problem, solution: ls.Solution, rng: Generator) -> Array:
         states = best.states + aside * of_states * shifts[0]
         controls = best.controls + aside * of_controls * inside * shifts[1]
         with np.errstate(all="ignore"):
-            steps = point.settle_from(Plan(in_c_order(states), in_c_order(controls)))
+            steps = point.settle_from(Motion(in_c_order(states), in_c_order(controls)))
         if steps and _apart(steps[-1], best, of_controls) < 1e-6:
             return np.array([_apart(one, steps[-1], of_controls) for one in steps[:-1]])
     return np.array([])
@@ -93,7 +93,7 @@ def measure(planar: int) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _apart(one: Plan, other: Plan, size: Array) -> float:
+def _apart(one: Motion, other: Motion, size: Array) -> float:
     return float((np.abs(one.controls - other.controls) / size).max())
 
 

@@ -27,7 +27,7 @@ import numpy as np
 
 import lqrsim as ls
 from lqrsim import rotations
-from lqrsim.control.controllers import Control, Controller
+from lqrsim.control.controllers import Controller, ControllerRun
 from lqrsim.errors import Array
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
@@ -68,33 +68,36 @@ class RotorPy(Controller):
         self._law.g = robot.gravity
         self._law.kp_pos, self._law.kd_pos = np.array(gains.position), np.array(gains.velocity)
         self._law.kp_att, self._law.kd_att = gains.attitude, gains.rate
-        self._spaces = robot.dynamics.state_coordinates, robot.dynamics.control_coordinates
+        self._coordinates = robot.dynamics.state_coordinates, robot.dynamics.control_coordinates
         self._outputs = flat_outputs(robot, solution.trajectory, feed_drag=feed_drag)
         self._dt = solution.trajectory.dt
         self._digest = sha256(f"{robot} {self._dt} {astuple(gains)} {feed_drag}", *self._outputs.values())[:16]
 
-    def start(self, trials: int) -> Control:
-        outputs = [dict(zip(self._outputs, row, strict=True)) for row in zip(*self._outputs.values(), strict=True)]
-        low, high = np.array(self._spaces[1].low), np.array(self._spaces[1].high)
+    def start(self, trials: int) -> ControllerRun:
+        return self._Run(self)
 
-        def control(step: int, shown: Array) -> Array:
-            wanted = outputs[min(step, len(outputs) - 1)]
-            attitudes = np.roll(rotations.quaternion(shown[:, 6:9]), -1, axis=1)  # RotorPy's have the scalar last
-            forces = np.empty((trials, 4))
-            for trial, (state, attitude) in enumerate(zip(shown, attitudes, strict=True)):
+    class _Run(ControllerRun):
+        def __init__(self, of: "RotorPy") -> None:
+            self._law, self._dt, self._limits = of._law, of._dt, of.coordinates[1]
+            rows = zip(*of._outputs.values(), strict=True)
+            self._wanted = [dict(zip(of._outputs, row, strict=True)) for row in rows]
+
+        def control(self, step: int, measured: Array) -> Array:
+            wanted = self._wanted[min(step, len(self._wanted) - 1)]
+            attitudes = np.roll(rotations.quaternion(measured[:, 6:9]), -1, axis=1)  # RotorPy's have the scalar last
+            forces = np.empty((len(measured), 4))
+            for trial, (state, attitude) in enumerate(zip(measured, attitudes, strict=True)):
                 seen = {"x": state[:3], "v": state[3:6], "q": attitude, "w": state[9:12]}
                 forces[trial] = self._law.update(step * self._dt, seen, wanted)["cmd_motor_thrusts"]
-            return np.clip(forces, low, high)
-
-        return control
+            return self._limits.clip(forces)
 
     @property
     def digest(self) -> str:
         return self._digest
 
     @property
-    def spaces(self) -> tuple[Coordinates, Coordinates]:
-        return self._spaces
+    def coordinates(self) -> tuple[Coordinates, Coordinates]:
+        return self._coordinates
 
 
 def vehicle(robot: ls.Quadrotor) -> dict[str, Any]:

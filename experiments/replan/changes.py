@@ -41,7 +41,7 @@ def measure(config: Config) -> dict[str, Any]:
         def run(changes: Known | None, query: int = query, problem: ls.Problem = problem, plant: ls.Plant = plant,
                 solution: ls.Solution = solution, scenario: ls.Scenario = scenario) -> Array:  # fmt: skip
             """Where the trials went, by a law that plans again for what it knows; without any, by the first policy."""
-            law = ls.Replanning(problem, solution, every=EVERY, computing=EVERY, changes=changes) if changes else None
+            law = ls.Replanner(problem, solution, every=EVERY, computing=EVERY, changes=changes) if changes else None
             return ls.simulate(
                 plant, solution, controller=law, disturbances=scenario.disturbances, frames=False, contacts=False,
                 trials=each, first_trial=query * each, seed=config.seed,

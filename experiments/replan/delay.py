@@ -13,7 +13,7 @@ from replan.common import Config, progress, scenario_of, stated
 EVERY = 1 / 30  # s
 ROOM = 0.2  # m
 LAWS: dict[str, dict[str, Any]] = {
-    "no delay": {},
+    "no delay": {"deadline": 0.0},
     "one period, predicted": {"computing": EVERY},
     "one period, ignored": {"computing": EVERY, "predict": False},
     "3 to 30 ms, drawn": {"computing": lambda random: random.uniform(0.003, 0.030), "deadline": EVERY},
@@ -30,14 +30,15 @@ def measure(config: Config) -> dict[str, Any]:
         problem = firm(scenario)
         solution, plant = ls.smooth(problem), scenario.plant()
         for name, how in LAWS.items():
-            law = ls.Replanning(problem, solution, every=EVERY, **how)
+            law = ls.Replanner(problem, solution, every=EVERY, **how)
             rollout = ls.simulate(
                 plant, solution, controller=law, disturbances=ls.disturbances.preset("light", plant), trials=each,
                 first_trial=query * each, seed=config.seed, frames=False, contacts=False,
             )  # fmt: skip
             ended[name] += [one == "reached" for one in rollout.outcome]
-            used[name] += law.solved
-            begun[name] += len(law.records)
+            log = rollout.controller_run.log
+            used[name] += log.solved
+            begun[name] += len(log.records)
     shares = {name: share(np.array(one)) for name, one in ended.items()}
     return {
         "reached": shares, "used": {name: 100 * used[name] / begun[name] for name in LAWS},

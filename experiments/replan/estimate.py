@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 from paper.common import between, table
-from robust.common import ASKED, PRESETS, Reached, reach_exactly, reached, share
+from robust.common import ASKED, PRESETS, Reached, reach_exactly, run, share
 
 import lqrsim as ls
 from lqrsim.stress.statistics import compare
@@ -34,11 +34,13 @@ def measure(config: Config) -> dict[str, Any]:
             }
             for name, law in laws.items():
                 trials = max(each // FEWER, 1) if name == ALWAYS else each
-                ended[preset][name].append(
-                    reached(plant, safe.solution, law, disturbances, trials=trials, seed=config.seed,
-                            first=query * each)
-                )  # fmt: skip
-            solved[preset] += laws[NEEDED].solved + laws[NEEDED].kept.total()
+                rollout = run(
+                    plant, safe.solution, law, disturbances, trials=trials, seed=config.seed, first=query * each
+                )
+                ended[preset][name].append(np.array(ls.stress.outcomes(rollout).outcome) == "reached")
+                if name == NEEDED:
+                    log = rollout.controller_run.log
+                    solved[preset] += log.solved + log.kept.total()
     found: dict[str, Any] = {}
     for preset, laws in ended.items():
         if laws[KEPT]:

@@ -11,9 +11,7 @@ import peers
 from paper.common import table
 
 import lqrsim as ls
-from lqrsim.control.controllers import Control
 from lqrsim.errors import Array
-from lqrsim.results.coordinates import Coordinates
 from replan.common import Config, progress, scenario_of, stated
 
 OURS, ILQR, FDDP, FATROP = "lqrsim, prepare", "lqrsim, ilqr", "Crocoddyl, box-FDDP", "Fatrop, by CasADi"
@@ -47,39 +45,24 @@ class Contestant:
     first: Any
 
 
-class EveryPeriod(ls.Controller):
-    """The first control of a new plan in each control period, at once, however long the solve took. One trial.
+class EveryPeriod:
+    """The first control of a new plan in each control period, at once, however long the solve took. For one trial.
 
-    The plan begins at the state that is shown, so that gains have nothing to correct.
+    The plan begins at the state that is measured, so that gains have nothing to correct.
     """
 
-    def __init__(self, solution: ls.Solution, contestant: Contestant) -> None:
-        self._solution, self._contestant = solution, contestant
+    def __init__(self, contestant: Contestant) -> None:
+        self._again, self._begin = contestant.again, contestant.first
         self.seconds: list[float] = []
         self.made: list[tuple[int, bool]] = []
 
-    def start(self, trials: int) -> Control:
-        assert trials == 1
-        begin = self._contestant.first
-
-        def control(step: int, shown: Array) -> Array:
-            nonlocal begin
-            clock = time.perf_counter()
-            made = self._contestant.again(shown[0], begin)
-            self.seconds.append(time.perf_counter() - clock)
-            self.made.append((made.iterations, made.converged))
-            begin = made.following
-            return made.control[None]
-
-        return control
-
-    @property
-    def digest(self) -> str:
-        return self._solution.policy.digest
-
-    @property
-    def spaces(self) -> tuple[Coordinates, Coordinates]:
-        return self._solution.policy.state_coordinates, self._solution.policy.control_coordinates
+    def __call__(self, state: Array, t: float) -> Array:
+        clock = time.perf_counter()
+        made = self._again(state, self._begin)
+        self.seconds.append(time.perf_counter() - clock)
+        self.made.append((made.iterations, made.converged))
+        self._begin = made.following
+        return made.control
 
 
 def prepared(problem: ls.Problem, solution: ls.Solution) -> Contestant:
@@ -159,7 +142,7 @@ def flown(
     config: Config, scenario: ls.Scenario, problem: ls.Problem, whole: ls.Solution, contestant: Contestant, trial: int
 ) -> dict[str, Any]:
     """One run."""
-    law = EveryPeriod(whole, contestant)
+    law = EveryPeriod(contestant)
     rollout = ls.simulate(
         scenario.plant(), whole, controller=law, disturbances=scenario.disturbances, seed=config.seed,
         first_trial=trial, frames=False, contacts=False, threads=1,

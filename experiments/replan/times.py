@@ -43,7 +43,7 @@ def of_one(config: Config, robot: str, rate: str, way: str) -> dict[str, Any]:
             worst[solution.status.name] += 1
             continue
         deadline = min(config.deadline, FAST if problem.dt < 2 * FAST else np.inf)
-        law = ls.Replanning(
+        law = ls.Replanner(
             problem, solution, every=problem.dt, deadline=deadline, horizon="moving", computing="measured"
         )
         runs = -(-config.plans // (config.queries * (problem.steps - 1)))
@@ -56,10 +56,11 @@ def of_one(config: Config, robot: str, rate: str, way: str) -> dict[str, Any]:
             )  # fmt: skip
             collided += int(rollout.collided.sum())
             trial += 1
-            seconds.append(np.array([one.seconds for one in law.records]))
-            iterations += [one.iterations for one in law.records]
-            ended.update(one.status if one.used else one.reason for one in law.records)
-            asked += [one.cost <= one.before * (1 + 1e-9) for one in law.records if one.used]
+            records = rollout.controller_run.log.records
+            seconds.append(np.array([one.seconds for one in records]))
+            iterations += [one.iterations for one in records]
+            ended.update(one.status if one.used else one.reason for one in records)
+            asked += [one.cost <= one.before * (1 + 1e-9) for one in records if one.used]
     took = 1000 * np.concatenate(seconds) if seconds else np.array([np.nan])
     return {
         "plans": len(took), "median": float(np.median(took)), "p999": float(np.quantile(took, 0.999)),

@@ -11,7 +11,7 @@ from paper.common import Settings, fixed
 from tqdm import tqdm
 
 import lqrsim as ls
-from lqrsim.control.controllers import Controller
+from lqrsim.control.controllers import ControllerLike
 from lqrsim.disturbances import Disturbance
 from lqrsim.stress.statistics import rate
 
@@ -69,7 +69,7 @@ def safe_plan(query: int, preset: str, asked: float) -> ls.types.SafePlan:
 
 
 def reached(
-    plant: ls.Plant, solution: ls.Solution, controller: Controller | None, disturbances: Sequence[Disturbance],
+    plant: ls.Plant, solution: ls.Solution, controller: ControllerLike | None, disturbances: Sequence[Disturbance],
     *, trials: int, seed: int, first: int = 0,
 ) -> Reached:  # fmt: skip
     """Which trials reach the goal."""
@@ -78,7 +78,7 @@ def reached(
 
 
 def run(
-    plant: ls.Plant, solution: ls.Solution, controller: Controller | None, disturbances: Sequence[Disturbance],
+    plant: ls.Plant, solution: ls.Solution, controller: ControllerLike | None, disturbances: Sequence[Disturbance],
     *, trials: int, seed: int, first: int = 0,
 ) -> ls.Rollout:  # fmt: skip
     """The trials."""

@@ -34,16 +34,15 @@ def measure(config: Config) -> dict[str, Any]:
 
 def of_run(law: ls.OffsetFree, rollout: ls.Rollout, well: npt.NDArray[np.intp]) -> dict[str, Any]:
     """Of the trials that reach the goal: others end anywhere."""
-    assert law.estimates is not None
-    assert law.innovations is not None
+    run = rollout.controller_run
     n, space = rollout.states.shape[2], rollout.state_coordinates
-    knots = len(law.estimates) - 1  # at the last there is nothing to decide, and nothing measured
+    knots = len(run.estimates) - 1  # at the last there is nothing to decide, and nothing measured
     truth = rollout.states[well].transpose(1, 0, 2)[:knots]
-    errors = space.difference(law.estimates[:knots, well, :n], truth)
+    errors = space.difference(run.estimates[:knots, well, :n], truth)
     found = {}
     for name, off, covariance in (
         ("NEES", errors, law.filter.corrected[:knots, :n, :n]),
-        ("NIS", law.innovations[:knots, well], law.filter.innovation[:knots]),
+        ("NIS", run.innovations[:knots, well], law.filter.innovation[:knots]),
     ):
         size, count = off.shape[2], len(well)
         squares = np.einsum("tki,tij,tkj->tk", off, np.linalg.inv(covariance), off)  # NaN where nothing came

@@ -23,7 +23,7 @@ def measure(config: Config) -> dict[str, Any]:
         safe = ls.smooth_chance_constrained(reach_exactly(scenario.problem), stated, chance=ASKED)
         flown = {
             "smoother": (plan, None),
-            "track": (plan, ls.Feedback(ls.track(scenario.problem, plan, uncertainty=stated))),
+            "track": (plan, ls.track(scenario.problem, plan, uncertainty=stated)),
             "offset free": (plan, ls.OffsetFree(scenario.problem, plan, stated)),
             "offset free, safe plan": (safe.solution, safe.controller),
         }

@@ -8,7 +8,7 @@ from peers import RotorPy, Unavailable
 from peers.rotorpy import BEST_AT_LIGHT, BEST_AT_MODERATE
 
 import lqrsim as ls
-from lqrsim.control.controllers import Controller
+from lqrsim.control.controllers import ControllerLike
 from lqrsim.stress.statistics import compare
 from robust.common import ASKED, PRESETS, Config, Reached, progress, reached, safe_plan, share
 
@@ -55,14 +55,14 @@ def measure(config: Config) -> dict[str, Any]:
 
 def laws(
     scenario: ls.Scenario, plan: ls.Solution, safe: ls.types.SafePlan, stated: ls.Uncertainty, preset: str
-) -> dict[str, tuple[ls.Solution, Controller | None]]:
+) -> dict[str, tuple[ls.Solution, ControllerLike | None]]:
     """Name -> plan and what flies it."""
     problem = scenario.problem
-    flown: dict[str, tuple[ls.Solution, Controller | None]] = {
+    flown: dict[str, tuple[ls.Solution, ControllerLike | None]] = {
         OWN: (plan, None),
-        f"track, {PLAN}": (plan, ls.Feedback(ls.track(problem, plan, uncertainty=stated))),
+        f"track, {PLAN}": (plan, ls.track(problem, plan, uncertainty=stated)),
         f"offset free, {PLAN}": (plan, ls.OffsetFree(problem, plan, stated)),
-        f"track, {SAFE}": (safe.solution, ls.Feedback(ls.track(safe.problem, safe.solution, uncertainty=stated))),
+        f"track, {SAFE}": (safe.solution, ls.track(safe.problem, safe.solution, uncertainty=stated)),
         BEST: (safe.solution, safe.controller),
     }
     if preset == "light":

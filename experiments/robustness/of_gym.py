@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-import lqrsim as ls
 import lqrsim.gym
 from robustness.place import Place
 
@@ -39,6 +38,6 @@ def environments(place: Place) -> dict[str, tuple[Any, ...]]:
         ),
         "gym.VectorEnvironment.reset": ({"call": many.reset, **asked},),
         "gym.VectorEnvironment.step": ({"call": step_many, "actions": np.zeros((2, 2))},),
-        "gym.Expert": ({"env": made, "controller": ls.Feedback(place.solution.policy)},),
+        "gym.Expert": ({"env": made, "controller": place.solution.policy},),
         "gym.Expert.__call__": ({"call": expert, "observation": seen},),
     }  # fmt: skip

@@ -1,6 +1,7 @@
 """What laws, filters and tubes are given: see `subjects.py`."""
 
 import dataclasses
+import time
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,7 @@ def policies(place: Place) -> dict[str, tuple[Any, ...]]:
 
 def funnels(place: Place) -> dict[str, tuple[Any, ...]]:
     common = {"plant": place.plant, "solution": place.solution, "disturbances": [ControlNoise(0.01)], "threads": 1,
-              "controller": ls.Feedback(place.solution.policy), "goal_radius": 1.0, "goal_tolerance": None}  # fmt: skip
+              "controller": place.solution.policy, "goal_radius": 1.0, "goal_tolerance": None}  # fmt: skip
     asked = {"rate": 0.5, "confidence": 0.8, "knots": (0, 2), "states": ("x", "y"), "shape": None, "largest": 0.5,
              "failures": 2, "seed": 0, "progress": lambda done, of: None}  # fmt: skip
     funnel = ls.funnel(**common, **asked)
@@ -94,8 +95,8 @@ def replanning(place: Place) -> dict[str, tuple[Any, ...]]:
     replan = solver.solve(state, place.solution.shifted(1))
     record = {"step": 3, "trial": 0, "status": "CONVERGED", "iterations": 2, "seconds": 0.01, "cost": 1.0,
               "before": 1.0, "used": True, "reason": ""}  # fmt: skip
-    planner = {"problem": place.problem, "solution": place.solution, "every": 1 / 3}
-    running = ls.Planner(**planner)
+    replanner = ls.Replanner(place.problem, place.solution, every=1 / 3)
+    running = replanner.live()
     running.__enter__()  # its thread ends with the process
     parts = {field.name: getattr(replan, field.name) for field in dataclasses.fields(replan)}
     return {
@@ -104,6 +105,8 @@ def replanning(place: Place) -> dict[str, tuple[Any, ...]]:
         "PreparedSolver.solve": (
             {"self": solver, "state": state, "start": replan, "problem": place.problem, "after": 0, "time_limit": 0.01},
         ),
+        "Plan": ({field.name: parts[field.name] for field in dataclasses.fields(ls.Plan)},),
+        "Plan.shifted": ({"self": replan, "steps": 1, "horizon": "moving"},),
         "Replan": (parts,),
         "Replan.shifted": ({"self": replan, "steps": 1, "horizon": "moving"},),
         "ReplanRecord": (record,),
@@ -111,10 +114,24 @@ def replanning(place: Place) -> dict[str, tuple[Any, ...]]:
         "Problem.later": ({"self": place.problem, "seconds": 0.5},),
         "Problem.from_state": ({"self": place.problem, "state": state, "after": 1},),
         "Dynamics.period_near": ({"self": place.problem.dynamics, "dt": 0.1},),
-        "Planner": (
-            planner | {"deadline": 1 / 3, "horizon": "moving", "interpolate": True, "when": None, "share": 1.0},
+        "Replanner": (
+            {
+                "problem": place.problem,
+                "solution": place.solution,
+                "every": 1 / 3,
+                "deadline": 1 / 3,
+                "horizon": "moving",
+                "predict": True,
+                "changes": None,
+                "when": None,
+                "share": 1.0,
+                "computing": 0.0,
+                "seed": 0,
+            },
             0.3,
         ),
-        "Planner.step": ({"self": running, "state": state, "t": 0.2},),
-        "Planner.change": ({"self": running, "initial": ls.FixedState(state)},),
+        "Replanner.live": ({"self": replanner, "interpolate": True, "clock": time.perf_counter},),
+        "LiveReplanner": ({"rule": replanner.rule, "interpolate": True, "clock": time.perf_counter},),
+        "LiveReplanner.step": ({"self": running, "state": state, "t": 0.2},),
+        "LiveReplanner.change": ({"self": running, "initial": ls.FixedState(state)},),
     }

@@ -54,24 +54,34 @@ def simulate_kind(kind: Any, plant: ls.Plant, solution: ls.Solution, **settings:
 class Steering(ls.Controller):
     """A user's own controller, whose answers are spoilt."""
 
-    def __init__(self, control: Any, digest: Any, spaces: Any) -> None:
-        self._parts = control, digest, spaces
+    def __init__(self, control: Any, digest: Any, coordinates: Any) -> None:
+        self._parts = control, digest, coordinates
 
     def start(self, trials: int) -> Any:
-        return self._parts[0]
+        return SteeringRun(self._parts[0]) if callable(self._parts[0]) else self._parts[0]
 
     @property
     def digest(self) -> Any:
         return self._parts[1]
 
     @property
-    def spaces(self) -> Any:
+    def coordinates(self) -> Any:
         return self._parts[2]
 
 
-def simulate_controller(plant: ls.Plant, solution: ls.Solution, control: Any, digest: Any, spaces: Any) -> ls.Rollout:
+class SteeringRun(ls.ControllerRun):
+    def __init__(self, control: Any) -> None:
+        self._control = control
+
+    def control(self, step: int, measured: Any) -> Any:
+        return self._control(step, measured)
+
+
+def simulate_controller(
+    plant: ls.Plant, solution: ls.Solution, control: Any, digest: Any, coordinates: Any
+) -> ls.Rollout:
     """One trial of a user's own controller."""
-    return ls.simulate(plant, solution, controller=Steering(control, digest, spaces))
+    return ls.simulate(plant, solution, controller=Steering(control, digest, coordinates))
 
 
 def steering(step: int, shown: Any) -> Any:
@@ -129,10 +139,8 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
         "Plant.substeps": ({"self": plant, "period": 1 / 6},),
         "Plant.clearance": ({"self": plant, "states": np.zeros((1, 5, 3)),
                              "displaced": np.zeros((1, len(plant.world), 3))},),
-        "Feedback": ({"policy": solution.policy},),
-        "Replanning": ({"problem": place.problem, "solution": solution, "every": 1 / 3, "when": None, "share": 1.0},),
         "simulate": ({
-            "plant": plant, "solution": solution, "disturbances": [noise], "controller": ls.Feedback(solution.policy),
+            "plant": plant, "plan": solution, "disturbances": [noise], "controller": solution.policy,
             "seed": 0, "trials": 1, "first_trial": 0, "goal_radius": 0.1, "frames": True, "contacts": True,
             "threads": 1, "generators": lambda trial, stream: np.random.default_rng(trial), "progress": print_nothing,
             "watch": print_nothing,
@@ -140,7 +148,7 @@ def running(place: Place) -> dict[str, tuple[Any, ...]]:
         "simulate an Effect": ({"call": simulate_effect, "plant": plant, "solution": solution, **effect},),
         "simulate a Controller": ({
             "call": simulate_controller, "plant": plant, "solution": solution, "control": steering, "digest": "mine",
-            "spaces": (place.space, place.controls),
+            "coordinates": (place.space, place.controls),
         },),
         "outcomes": ({"rollout": rollout, "problem": place.problem, "goal_radius": 0.1},),
         "check_plant": ({

@@ -26,7 +26,7 @@ from robustness.place import Place
 # Called by lqrsim itself, with what it has checked: what one overrides to add a cost, a disturbance or a controller.
 HOOKS = {"bind", "start", "check", "describe", "blow", "fitting", "actuation", "multiply", "parts", "draw", "limits"}
 HOOKS |= {"displace", "across", "clearance_at", "middles", "world_seen", "record_of_balls", "uncertainty", "spread"}
-HOOKS |= {"solving", "check_period"}
+HOOKS |= {"solving", "check_period", "ControllerRun.control"}
 
 RAISES = {"Results.read": (Damaged,)}
 
@@ -74,7 +74,8 @@ def method_of_users(item: type, key: str) -> bool:
     if key[0] == "_" and key not in ("__call__", "__add__"):
         return False
     home = next(kind for kind in item.__mro__ if key in vars(kind))
-    return home.__module__.startswith("lqrsim.") and key not in HOOKS and not inspect.isclass(getattr(item, key))
+    hook = key in HOOKS or f"{home.__name__}.{key}" in HOOKS
+    return home.__module__.startswith("lqrsim.") and not hook and not inspect.isclass(getattr(item, key))
 
 
 def _own(item: type, key: str) -> int:

@@ -139,7 +139,7 @@ class Replay:
             console.say(f"bits can differ from the table's: got {others}")
         rollout = replay(results, cell, self.trial)
         console.say(rollout.summary())
-        if results.trials.controller is not None and (summary := results.trials.controller.summary()):
+        if summary := rollout.controller_run.summary():
             console.say(summary)
         different = differences(results, cell, self.trial, rollout)
         for one in different:

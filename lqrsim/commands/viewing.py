@@ -3,7 +3,6 @@
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,7 +12,7 @@ from lqrsim.commands.options import ControllerName, optional
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
-    from lqrsim.control.planner import Planner
+    from lqrsim.control.live_replanner import LiveReplanner
     from lqrsim.problem.problem import Problem
     from lqrsim.results.solution import Solution
     from lqrsim.view.movable_goal import MovableGoal
@@ -243,20 +242,20 @@ class View:
 
     def _planning(
         self, problem: "Problem", solution: "Solution"
-    ) -> tuple["Callable[[], Planner]", "MovableGoal | None"]:
-        """What makes a planner for each run, tried once, and the goal if it can be moved."""
+    ) -> tuple["Callable[[], LiveReplanner]", "MovableGoal | None"]:
+        """What begins a run of the re-planner, and the goal if it can be moved."""
         from lqrsim.commands import console
-        from lqrsim.control.planner import Planner
+        from lqrsim.control.replanner import Replanner
         from lqrsim.errors import InputError
         from lqrsim.view.movable_goal import MovableGoal
 
         assert self.replan is not None
         every = max(round(1 / (self.replan * problem.dt)), 1) * problem.dt
         console.say(f"plans again every {every:.4g} s, {1 / every:.4g} times a second")
-        make = partial(Planner, problem, solution, every=every, horizon="moving")
-        make()  # compiles, and says what is wrong, before anything opens
+        # It compiles, and says what is wrong, before anything opens.
+        replanner = Replanner(problem, solution, every=every, horizon="moving")
         try:
-            return make, MovableGoal(problem)
+            return replanner.live, MovableGoal(problem)
         except InputError as error:
             console.say(f"the goal cannot be moved: {error}")
-            return make, None
+            return replanner.live, None

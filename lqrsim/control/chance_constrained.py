@@ -12,7 +12,6 @@ import numpy as np
 from scipy.special import ndtri
 
 from lqrsim.control.collision_chance import Spread, Surroundings, chance_of_clearances
-from lqrsim.control.controllers import Controller, Feedback
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty
@@ -34,7 +33,7 @@ from lqrsim.solvers.smoother import smooth
 ENOUGH = 0.5
 HELD = 1e-3  # m, by how much a clearance may be larger than its margin and be so because of it
 AIM = 0.8  # of what is asked, the chance that a next plan is to have
-MakeController = Callable[[Problem, Solution], Controller | AffinePolicy]
+MakeController = Callable[[Problem, Solution], OffsetFree | AffinePolicy]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +43,7 @@ class SafePlan:
     Attributes:
       problem: with the clearances that were found as constraints.
       solution: of it.
-      controller: what runs it.
+      controller: what runs it, an OffsetFree or a policy.
       tube: where that will be; `tube.collision_chance` is the chance.
       asked: the chance that was asked for.
       rounds: clearance's smallest and largest margin in m, cost and predicted chance of each plan that was solved for.
@@ -52,16 +51,16 @@ class SafePlan:
 
     problem: Problem
     solution: Solution
-    controller: Controller
+    controller: OffsetFree | AffinePolicy
     tube: Tube
     asked: float
     rounds: tuple[tuple[float, float, float, float], ...]
 
     def __post_init__(self) -> None:
-        for name, kind in (
-            ("problem", Problem), ("solution", Solution), ("controller", Controller), ("tube", Tube)
-        ):  # fmt: skip
+        for name, kind in (("problem", Problem), ("solution", Solution), ("tube", Tube)):
             check_kind(f"SafePlan: {name}", getattr(self, name), kind, f"a {kind.__name__}")
+        kinds = (OffsetFree, AffinePolicy)
+        check_kind("SafePlan: controller", self.controller, kinds, "an OffsetFree or an AffinePolicy")
         object.__setattr__(self, "asked", check_number("SafePlan: asked", self.asked, above=0.0, below=1.0))
         rounds = check_items("SafePlan: rounds", self.rounds, tuple, "a tuple of four numbers each")
         each = tuple(tuple(check_array("SafePlan: rounds", one, (4,)).tolist()) for one in rounds)
@@ -98,7 +97,7 @@ def smooth_chance_constrained(
       problem: with obstacles in its costs or constraints.
       uncertainty: what runs meet; see `uncertainty_of`.
       chance: of collision, between 0 and 1.
-      controller: (problem, solution) -> what runs the plan, an OffsetFree, a Feedback or a policy; by default an
+      controller: (problem, solution) -> what runs the plan, an OffsetFree or an AffinePolicy; by default an
         OffsetFree for the uncertainty, with tolerances chosen for the second plan.
       rounds: plans to solve for, at most.
       progress: called with the rounds that are done, and all of them.
@@ -183,10 +182,9 @@ class _Search:
         elif not second and deviations < self.enough:  # the second plan's margins are others, and may be too large
             self.enough, self.log_of_enough = deviations, np.log(max(tube.collision_chance, 1e-300))
 
-    def _controller(self, problem: Problem, solution: Solution) -> Controller:
+    def _controller(self, problem: Problem, solution: Solution) -> OffsetFree | AffinePolicy:
         if self.make is not None:
-            made = self.make(problem, solution)
-            return Feedback(made) if isinstance(made, AffinePolicy) else made
+            return self.make(problem, solution)
         law = OffsetFree(problem, solution, self.uncertainty, tolerate=self.tolerate)
         if len(self.plans) == 1:  # one law for all later plans, so that of two the one with more room is the safer
             self.tolerate = tuple((law.weights.state**-0.5).tolist())

@@ -1,30 +1,72 @@
-"""What decides on the controls in the loop. Subclass `Controller` for another way."""
+"""What decides on the controls: a policy, a function or a `Controller`; and what one run of it remembers."""
 
 import abc
 from collections.abc import Callable, Mapping
 
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen.fingerprint import fingerprint
 from lqrsim.control.law import evaluator
-from lqrsim.errors import Array, check_kind
+from lqrsim.errors import Array, InputError, check_function, check_kind
+from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.hashing import sha256
+from lqrsim.results.output_feedback import OutputFeedbackPolicy
+from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
 
-Control = Callable[[int, Array], Array]
+ControlFunction = Callable[[Array, float], npt.ArrayLike]
+
+
+class ControllerRun(abc.ABC):
+    """One run of a controller: what it remembers of K trials, and what it records of them."""
+
+    @abc.abstractmethod
+    def control(self, step: int, measured: Array) -> Array:
+        """The controls of a control period.
+
+        Each trial gets the controls that it gets alone, to the last bit.
+
+        Args:
+          step: number of the control period; called once for each, in order.
+          measured: (K, n), the measured states.
+
+        Returns:
+          Controls (K, m) within the limits.
+        """
+
+    def estimator_diverged(self) -> Mapping[int, str]:
+        """The trials whose estimate is useless -> why, in a line. They end there, as diverged.
+
+        Asked after each control period. Controllers that estimate nothing leave it as it is.
+
+        Returns:
+          Row of the trial -> the reason.
+        """
+        return {}
+
+    def summary(self) -> str:
+        """What there is to say of the run, in a line; empty if nothing."""
+        return ""
 
 
 class Controller(abc.ABC):
-    """Base class of what decides on the controls."""
+    """What decides on the controls. Subclass it for a way of your own, unless a function of state and time will do.
+
+    Running a controller does not change it: `start` makes what a run remembers, so one controller can serve several
+    runs at once.
+    """
 
     @abc.abstractmethod
-    def start(self, trials: int) -> Control:
-        """Begin a run of K trials: (step, states that are shown (K, n)) -> controls (K, m) within the limits.
-
-        Each trial gets the controls that it gets alone, to the last bit.
+    def start(self, trials: int) -> ControllerRun:
+        """Begin a run.
 
         Args:
           trials: K, how many run at once.
 
         Returns:
-          A function (step, states shown (K, n)) -> controls (K, m).
+          The run; after `simulate` it is the rollout's `controller_run`.
         """
 
     @property
@@ -34,48 +76,149 @@ class Controller(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def spaces(self) -> tuple[Coordinates, Coordinates]:
+    def coordinates(self) -> tuple[Coordinates, Coordinates]:
         """Of the states that it wants to be shown, and of its controls."""
 
-    def lost(self) -> Mapping[int, str]:
-        """The trials of the last run whose state it has lost -> why, in a line. They end there, as diverged.
+    @property
+    def plan(self) -> Plan | None:
+        """The plan that it follows, if it has one of its own: then `simulate` needs no other."""
+        return None
 
-        Asked after each control period. It is for what estimates; what just follows measurements loses none.
-        """
-        return {}
 
-    def summary(self) -> str:
-        """What there is to say of the last run, in a line; empty if nothing."""
-        return ""
+# What `simulate` and all that runs trials take as `controller`.
+ControllerLike = Controller | AffinePolicy | OutputFeedbackPolicy | ControlFunction
+WANTED = "a policy, a Controller or a function of state (n,) and time in s that returns controls (m,)"
+
+
+def as_controller(given: ControllerLike | None, plan: Plan | None, dynamics: Dynamics) -> tuple[Controller, Plan]:
+    """The controller of a run, and the plan that the run is about.
+
+    Args:
+      given: what runs; None for the policy of the plan.
+      plan: None for the controller's own.
+      dynamics: of the robot that it runs on.
+
+    Raises:
+      InputError: what is given controls nothing, or there is no plan.
+    """
+    check_kind("plan", plan, (Plan, type(None)), "a Plan, such as smooth(problem)")
+    if plan is None and isinstance(given, Controller):
+        plan = check_kind(f"{type(given).__name__}.plan", given.plan, (Plan, type(None)), "a Plan or None")
+    if plan is None:
+        raise InputError(
+            "plan: got none, want what the run begins at and is compared with, such as smooth(problem); only"
+            " controllers with a plan of their own, such as an OffsetFree, run without"
+        )
+    match given:
+        case None:
+            return Feedback(plan.policy), plan
+        case Controller():
+            return given, plan
+        case AffinePolicy():
+            return Feedback(given), plan
+        case OutputFeedbackPolicy():
+            return OutputFeedback(given), plan
+        case _:
+            check_function("controller", given, WANTED, arguments=2)
+            return Function(given, dynamics, plan.trajectory.dt), plan
 
 
 class Feedback(Controller):
-    """A policy, or an open-loop plan, whose gains are zero.
-
-    Args:
-      policy: the feedback law, or `solution.open_loop()`.
-
-    Raises:
-      InputError: the policy is not an AffinePolicy.
-    """
+    """A policy of the measured state."""
 
     def __init__(self, policy: AffinePolicy) -> None:
-        self.policy = check_kind("Feedback: policy", policy, AffinePolicy, "an AffinePolicy, such as solution.policy")
+        self.policy = policy
 
-    def start(self, trials: int) -> Control:
-        policy = self.policy
-        evaluate = evaluator(policy.state_coordinates, policy.control_coordinates)
-
-        def control(step: int, shown: Array) -> Array:
-            t = min(step, policy.steps - 1)
-            return evaluate(shown, policy.gain[t], policy.offset[t], policy.nominal[t])
-
-        return control
+    def start(self, trials: int) -> ControllerRun:
+        return _FeedbackRun(self.policy)
 
     @property
     def digest(self) -> str:
         return self.policy.digest
 
     @property
-    def spaces(self) -> tuple[Coordinates, Coordinates]:
+    def coordinates(self) -> tuple[Coordinates, Coordinates]:
         return self.policy.state_coordinates, self.policy.control_coordinates
+
+
+class _FeedbackRun(ControllerRun):
+    def __init__(self, policy: AffinePolicy) -> None:
+        self._policy, self._evaluate = policy, evaluator(policy.state_coordinates, policy.control_coordinates)
+
+    def control(self, step: int, measured: Array) -> Array:
+        policy = self._policy
+        t = min(step, policy.steps - 1)
+        return self._evaluate(measured, policy.gain[t], policy.offset[t], policy.nominal[t])
+
+
+class OutputFeedback(Controller):
+    """An `OutputFeedbackPolicy` that measures states. A measurement that is the last one to the last bit got lost."""
+
+    def __init__(self, policy: OutputFeedbackPolicy) -> None:
+        states, names = policy.state_coordinates.names, policy.measured_coordinates.names
+        if not set(names) <= set(states):
+            raise InputError(
+                f"controller: got an OutputFeedbackPolicy that measures {', '.join(names)}, want one that measures"
+                f" states, some of {', '.join(states)}; or the OffsetFree that it was made from"
+            )
+        self.policy, self.measures = policy, [states.index(name) for name in names]
+
+    def start(self, trials: int) -> ControllerRun:
+        return _OutputFeedbackRun(self, trials)
+
+    @property
+    def digest(self) -> str:
+        return self.policy.digest
+
+    @property
+    def coordinates(self) -> tuple[Coordinates, Coordinates]:
+        return self.policy.state_coordinates, self.policy.control_coordinates
+
+
+class _OutputFeedbackRun(ControllerRun):
+    def __init__(self, law: OutputFeedback, trials: int) -> None:
+        self._policy, self._measures = law.policy, law.measures
+        self._z = np.tile(law.policy.start(), (trials, 1))
+        self._last = np.full((trials, len(law.policy.state_coordinates)), np.nan)
+
+    def control(self, step: int, measured: Array) -> Array:
+        policy, commands = self._policy, np.empty((len(measured), len(self._policy.control_coordinates)))
+        for k, (shown, last) in enumerate(zip(measured, self._last, strict=True)):
+            y = None if np.array_equal(shown, last) else shown[self._measures]
+            commands[k], self._z[k] = policy.step(self._z[k], y, step * policy.dt)
+        self._last[:] = measured
+        return commands
+
+
+class Function(Controller):
+    """A function of the measured state (n,) and the time in s. Its controls are held within the robot's limits."""
+
+    def __init__(self, function: ControlFunction, dynamics: Dynamics, dt: float) -> None:
+        self.function, self.dt = function, dt
+        self._coordinates = dynamics.state_coordinates, dynamics.control_coordinates
+
+    def start(self, trials: int) -> ControllerRun:
+        return _FunctionRun(self)
+
+    @property
+    def digest(self) -> str:
+        """Of what the function does, where that can be told, or else of its name."""
+        known = fingerprint(self.function) or f"function {getattr(self.function, '__qualname__', type(self.function))}"
+        return sha256(f"{known} {self.dt!r}")[:16]
+
+    @property
+    def coordinates(self) -> tuple[Coordinates, Coordinates]:
+        return self._coordinates
+
+
+class _FunctionRun(ControllerRun):
+    def __init__(self, of: Function) -> None:
+        self._function, self._dt, self._controls = of.function, of.dt, of.coordinates[1]
+
+    def control(self, step: int, measured: Array) -> Array:
+        t, shape = step * self._dt, (len(self._controls),)
+        found = [np.asarray(self._function(state.copy(), t), dtype=np.float64) for state in measured]
+        for one in found:
+            if one.shape != shape:
+                raise InputError(f"got controls of shape {one.shape}, want {shape}")
+        return self._controls.clip(np.array(found))

@@ -5,23 +5,20 @@ With measurements that are late by k periods the filter lives k periods ago, and
 lead from there, which is linear in both.
 """
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
+from lqrsim.control.filter_law import FilterLaw
 from lqrsim.errors import Array
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 
-if TYPE_CHECKING:
-    from lqrsim.control.offset_free import OffsetFree
 
-
-def policy_of(law: "OffsetFree") -> OutputFeedbackPolicy:
+def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
     """The recursions of a law."""
-    model, plan = law.model, law.solution.trajectory
-    latency, delay, steps, m = law.uncertainty.latency, law.uncertainty.delay, plan.steps, model.m
+    model, plan = law.model, law.model.plan
+    late, steps, m = model.uncertainty, plan.steps, model.m
+    latency, delay = late.latency, late.delay
     size, width = model.size, model.size + (latency + delay) * m
     F, G, nominal = model.F, model.G, law.nominal
     f = nominal[1:] + model.c - np.einsum("tij,tj->ti", F, nominal[:-1]) - np.einsum("tij,tj->ti", G, plan.controls)
@@ -53,7 +50,7 @@ def policy_of(law: "OffsetFree") -> OutputFeedbackPolicy:
         arrays["nominal"][t, size:] = plan.controls[places].ravel()
         _advance({name: array[t] for name, array in arrays.items()}, (F[knot], G[knot], f[knot]), size, t >= latency)
     return OutputFeedbackPolicy(
-        **arrays, dt=plan.dt, state_coordinates=law.spaces[0], control_coordinates=law.spaces[1],
+        **arrays, dt=plan.dt, state_coordinates=law.coordinates[0], control_coordinates=law.coordinates[1],
         measured_coordinates=_measured_coordinates(law),
     )  # fmt: skip
 
@@ -74,17 +71,17 @@ def _advance(now: dict[str, Array], step: tuple[Array, Array, Array], size: int,
         now["input"][-m:] = np.eye(m)
 
 
-def _expected(law: "OffsetFree") -> Array:
+def _expected(law: FilterLaw) -> Array:
     """h of y = H x + h about the plan, (T+1, Y)."""
-    model, plan = law.model, law.solution.trajectory
+    model, plan = law.model, law.model.plan
     values = np.empty((plan.steps + 1, model.sensor.size))
     model.compiled.measurements(len(values), in_c_order(plan.states), model.compiled_sensor, values)
     return values - np.einsum("tij,tj->ti", model.H, plan.states)
 
 
-def _measured_coordinates(law: "OffsetFree") -> Coordinates:
+def _measured_coordinates(law: FilterLaw) -> Coordinates:
     """What the measured numbers are: where they are states, these."""
-    space, names = law.spaces[0], law.model.sensor.names
+    space, names = law.coordinates[0], law.model.sensor.names
     if not set(names) <= set(space.names):
         return Coordinates(names=names, units=("",) * len(names))
     chosen = [space.names.index(name) for name in names]

@@ -9,15 +9,18 @@ and the lag of the actuators are no parameters of the model: all these stay with
 simulation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
+from lqrsim.control.controllers import ControllerRun
+from lqrsim.control.filter_law import FilterLaw
+from lqrsim.control.filter_run import FilterRun
+from lqrsim.control.kalman import kalman_filter
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.replanner import Replanner, Task
+from lqrsim.control.replan_rule import ReplanLog, ReplanRule, SolveRequest
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Trajectory
@@ -25,50 +28,66 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of
 from lqrsim.solvers.initial_guess import InitialGuess
 
-if TYPE_CHECKING:
-    from lqrsim.control.offset_free import _Run
 
-
-class Replanned:
+class ReplannedRun(ControllerRun):
     """A run whose trials have a law each.
 
+    Args:
+      rule: when it is looked at whether to solve.
+      law: to begin with.
+      trials: K.
+      records: as of `FilterRun`, of all trials.
+      always: whether to solve at each of these times, wherever the law leads.
+
     Attributes:
-      plans: of each trial, by the step that they begin at; without the first. lost: the trials whose estimates are
-        beyond all that a robot can be -> why, in a line.
+      plans: of each trial, by the step that they begin at; without the first.
+      log: how the solves went.
+      estimates: as of `FilterRun`.
+      innovations: likewise.
     """
 
-    def __init__(self, again: Replanner, runs: Sequence["_Run"]) -> None:
-        again.start()
-        self._again, self._runs = again, runs
-        self.plans: list[dict[int, Trajectory]] = [{} for _ in runs]
-        self.lost: dict[int, str] = {}
+    def __init__(
+        self, rule: ReplanRule, law: FilterLaw, trials: int, records: tuple[Array, Array] | None, *, always: bool
+    ) -> None:
+        self._rule, self._always = rule, always
+        self.estimates, self.innovations = records or (None, None)
+        self._runs = [
+            FilterRun(law, 1, None if records is None else (records[0][:, k : k + 1], records[1][:, k : k + 1]))
+            for k in range(trials)
+        ]
+        self.plans: list[dict[int, Trajectory]] = [{} for _ in range(trials)]
+        self.log = ReplanLog()
 
-    def control(self, step: int, shown: Array) -> Array:
+    def control(self, step: int, measured: Array) -> Array:
         commands: list[Array] = []
         for k, run in enumerate(self._runs):
-            run.take_in(step, shown[k : k + 1])
-            if self._again.due(step) and not run.lost:
+            run.take_in(step, measured[k : k + 1])
+            if self._rule.due(step) and not run.estimator_diverged():
                 self._replan(run, k, step)
             commands.append(run.command(step))
-            if run.lost:
-                self.lost.setdefault(k, run.lost[0])
         return np.concatenate(commands)
+
+    def estimator_diverged(self) -> Mapping[int, str]:
+        return {k: why for k, run in enumerate(self._runs) for why in run.estimator_diverged().values()}
+
+    def summary(self) -> str:
+        return self.log.summary()
 
     def _leads_there(self, problem: Problem, gain: Array, offset: Array, state: Array) -> bool:
         """Whether a law leads from a state (n,) to the goal, clear of obstacles, by the model."""
         states, _ = compiled.rollout(problem, gain, offset, state)
         if not np.isfinite(states).all():
             return False
-        clearance, solution = clearance_of(problem, states), self._again.solution
+        clearance, solution = clearance_of(problem, states), self._rule.solution
         target, radius = solution.target, solution.goal_radius
         if radius is None and not target.places:
             radius = target.radius(None, None, None)
         near = radius is None or bool(target.distance(states[-1]) <= radius)
         return near and (clearance is None or bool(clearance.min() >= 0))
 
-    def _replan(self, run: "_Run", trial: int, step: int) -> None:
+    def _replan(self, run: FilterRun, trial: int, step: int) -> None:
         """The law from now on is about a new plan, if there is one."""
-        law, model, z = run.law, run.model, run.estimates[0]
+        law, model, z = run.law, run.model, run.z[0]
         n, done = model.n, step - run.first
         granted = np.where(np.logical_and(in_parameters(model), constants(model)), z[n + model.lagging :], 0.0)
         changes = model.output[: len(model.parameters)] @ granted
@@ -78,9 +97,9 @@ class Replanned:
         }
         try:
             dynamics = model.dynamics.with_parameters(**values)
-            problem = replace(law.problem, dynamics=dynamics)
+            problem = replace(self._rule.problem, dynamics=dynamics)
         except InputError as error:  # an estimate is not finite
-            self._again.account.refuse(str(error))
+            self.log.refuse(str(error))
             return
         # By that model the actuators have no lag, and no gains and offsets.
         gain, reached = law.gain[done:], law.nominal[done:-1, n : n + model.lagging]
@@ -88,16 +107,18 @@ class Replanned:
         offset = law.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], rest)
         here = dynamics.state_coordinates.nearest(z[:n], law.nominal[done, :n])
         gain = in_c_order(gain[:, :, :n])
-        if not law.replan_always and self._leads_there(problem, gain, offset, here):
+        if not self._always and self._leads_there(problem, gain, offset, here):
             return
-        plan = law.solution
+        plan = law.plan
         start = InitialGuess(gain, in_c_order(offset), plan.shifted(done, horizon="shrinking").cost_to_go, None, "")
-        solution = self._again.solve(Task(step, step, here, start, problem))
-        if not self._again.account.enter(step, trial, solution):
+        solution = self._rule.solve(SolveRequest(step, step, here, start, problem))
+        if not self.log.enter(step, trial, solution):
             return
         self.plans[trial][step] = solution.trajectory
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
-        run.law, run.first = law._about(solution, about, law.filter.corrected[done], granted), step
+        # The filter begins with a measurement that is taken in already.
+        kalman = kalman_filter(about, law.filter.corrected[done])
+        run.law, run.first = FilterLaw.of(solution, about, kalman, law.weights, granted), step
 
 
 def constants(model: PlanModel) -> Array:

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from lqrsim.control.collision_chance import Surroundings, collision_chance
-from lqrsim.control.controllers import Controller, Feedback
+from lqrsim.control.controllers import ControllerLike
 from lqrsim.control.loop_moments import Loop
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanModel
@@ -97,7 +97,7 @@ class Tube:
 
 
 def predict_tube(
-    problem: Problem, solution: Solution, uncertainty: Uncertainty, controller: Controller | AffinePolicy | None = None
+    problem: Problem, solution: Solution, uncertainty: Uncertainty, controller: ControllerLike | None = None
 ) -> Tube:
     """Where a run will be about its plan, and how likely it is to collide, before any run.
 
@@ -105,7 +105,7 @@ def predict_tube(
       problem: that was solved, with the obstacles in its costs and constraints.
       solution: with the plan.
       uncertainty: what the run meets.
-      controller: what runs it: an OffsetFree, a Feedback or a policy; by default the solution's policy.
+      controller: what runs it: an OffsetFree or an AffinePolicy; by default the solution's policy.
 
     Returns:
       The Tube.
@@ -120,11 +120,8 @@ def predict_tube(
     if isinstance(controller, OffsetFree):
         loop = controller.loop()
     else:
-        asked: object = controller.policy if isinstance(controller, Feedback) else controller
-        wanted = "an OffsetFree, a Feedback or an AffinePolicy"
-        policy = (
-            solution.policy if asked is None else check_kind("predict_tube: controller", asked, AffinePolicy, wanted)
-        )
+        asked: object = solution.policy if controller is None else controller
+        policy = check_kind("predict_tube: controller", asked, AffinePolicy, "an OffsetFree or an AffinePolicy")
         model = PlanModel.of(problem.dynamics, plan, uncertainty)
         at_plan = policy.state_coordinates.nearest(plan.states[:-1], policy.nominal)
         offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lqrsim.control import law
-from lqrsim.control.controllers import Control, Controller
+from lqrsim.control.controllers import Controller, ControllerRun
 from lqrsim.errors import Array
 from lqrsim.gym.task import Flags, Task, Trials
 from lqrsim.results.coordinates import Coordinates
@@ -16,22 +16,31 @@ from lqrsim.simulation.run_settings import RunSettings
 
 
 class Commanded(Controller):
-    """What is commanded from outside: `commands` (K, m), set before each control period."""
+    """What is commanded from outside."""
 
-    def __init__(self, spaces: tuple[Coordinates, Coordinates]) -> None:
-        self._spaces = spaces
-        self.commands: Array = np.zeros((0, len(spaces[1])))
+    def __init__(self, coordinates: tuple[Coordinates, Coordinates]) -> None:
+        self._coordinates = coordinates
 
-    def start(self, trials: int) -> Control:
-        return lambda step, shown: self.commands
+    def start(self, trials: int) -> "CommandedRun":
+        return CommandedRun(np.zeros((trials, len(self._coordinates[1]))))
 
     @property
     def digest(self) -> str:
         return "commanded from outside"
 
     @property
-    def spaces(self) -> tuple[Coordinates, Coordinates]:
-        return self._spaces
+    def coordinates(self) -> tuple[Coordinates, Coordinates]:
+        return self._coordinates
+
+
+class CommandedRun(ControllerRun):
+    """Its `commands` (K, m) are set before each control period."""
+
+    def __init__(self, commands: Array) -> None:
+        self.commands = commands
+
+    def control(self, step: int, measured: Array) -> Array:
+        return self.commands
 
 
 @dataclass(frozen=True)
@@ -54,13 +63,13 @@ class Episode:
     def __init__(self, task: Task, trials: Trials, count: int, *, frames: bool, threads: int | None) -> None:
         self.task, self.trials = task, trials
         dynamics = task.plant.robot.dynamics
-        self._law = Commanded((dynamics.state_coordinates, dynamics.control_coordinates))
+        commanded = Commanded((dynamics.state_coordinates, dynamics.control_coordinates))
         settings = RunSettings(
-            plant=task.plant, solution=task.solution, disturbances=trials.disturbances, controller=self._law,
+            plant=task.plant, plan=task.solution, disturbances=trials.disturbances, controller=commanded,
             seed=trials.seed, trials=count, first_trial=trials.first, frames=frames, contacts=True, threads=threads,
             generators=None, progress=None, watch=None, **task.scenario.near_enough(),
         )  # fmt: skip
-        self._costs, self._plan = task.costs, settings.plan
+        self._costs, self._plan = task.costs, settings.trajectory
         self._loop = Loop(settings)
         self._loop.begin()
         self.ended = np.zeros(count, dtype=bool)
@@ -95,7 +104,9 @@ class Episode:
     def advance(self, controls: Array) -> Moment:
         """One control period under controls (K, m)."""
         loop, step, before = self._loop, self._loop.step, self.states
-        self._law.commands = controls
+        run = self._loop.controller_run
+        assert isinstance(run, CommandedRun)
+        run.commands = controls
         with unlogged():
             loop.period()
             if loop.step == self._plan.steps:

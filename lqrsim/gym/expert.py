@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.control.controllers import Control, Controller, Feedback
+from lqrsim.control.controllers import ControllerLike, ControllerRun, as_controller
 from lqrsim.errors import Array, InputError, check_kind, excerpt, vectors_of
 from lqrsim.gym.environment import Environment
 from lqrsim.gym.vector import VectorEnvironment
@@ -23,19 +23,18 @@ class Expert:
 
     Args:
       env: the environment, in wrappers or not; the wrappers may not change observations or actions.
-      controller: by default the policy of the environment's solution.
+      controller: as in `simulate`; by default the policy of the environment's solution.
 
     Raises:
       InputError: the environment is not one of lqrsim's, or the controller is none.
     """
 
-    def __init__(self, env: Any, controller: Controller | None = None) -> None:
+    def __init__(self, env: Any, controller: ControllerLike | None = None) -> None:
         kinds = (Environment, VectorEnvironment)
         made = check_kind("env", getattr(env, "unwrapped", env), kinds, "an environment of lqrsim.gym")
-        law = Feedback(made.solution.policy) if controller is None else controller
-        self._law = check_kind("controller", law, Controller, "a Controller, such as Feedback(policy), or None")
+        self._law, _ = as_controller(controller, made.solution, made.task.plant.robot.dynamics)
         self._task, self._steps = made.task, made.solution.trajectory.steps
-        self._control: Control | None = None
+        self._run: ControllerRun | None = None
 
     def __call__(self, observation: npt.ArrayLike) -> Array:
         """The action for an observation. Raises InputError unless it is one of the environment's."""
@@ -45,7 +44,6 @@ class Expert:
         if not ((rows[:, -1] >= 0) & (rows[:, -1] <= 1)).all():
             raise InputError(f"observation: got {excerpt(rows[:, -1])} for the time, want a share of the horizon")
         step = round(float(rows[:, -1].max()) * self._steps)
-        control = self._control
-        if step == 0 or control is None:
-            control = self._control = self._law.start(len(rows))
-        return self._task.actions_of(control(step, rows[:, :-1])).reshape(*seen.shape[:-1], -1)
+        if step == 0 or self._run is None:
+            self._run = self._law.start(len(rows))
+        return self._task.actions_of(self._run.control(step, rows[:, :-1])).reshape(*seen.shape[:-1], -1)

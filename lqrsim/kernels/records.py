@@ -85,7 +85,7 @@ class Model(NamedTuple):
     noise: Any = ()
 
 
-class Plan(NamedTuple):
+class Motion(NamedTuple):
     """States (T+1, N) and controls (T, M)."""
 
     states: Arrays
@@ -142,7 +142,7 @@ class Linearization(NamedTuple):
     control's own curvature.
     """
 
-    plan: Plan
+    plan: Motion
     guided: bool
     reach: float
     damping: float
@@ -294,9 +294,9 @@ class Workspace(NamedTuple):
     smoothing: Smoothing
     eased: Any
     prior: Prior
-    guess: Plan
-    plan: Plan
-    rollout: Plan
+    guess: Motion
+    plan: Motion
+    rollout: Motion
     kept: Policy
     certificate: Arrays
 
@@ -320,8 +320,8 @@ class Descent(NamedTuple):
     start: Arrays
     policy: Policy
     to_go: CostToGo
-    plan: Plan
-    trial: Plan
+    plan: Motion
+    trial: Motion
     damping: Arrays
     certificate: Arrays
 

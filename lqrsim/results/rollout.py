@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -77,6 +78,8 @@ class Rollout:
         disturbances, in m^2; p is 2 or 3, as the position has it. None where nobody predicted it; see `predict_tube`.
       collision_chance: (T+1,) the predicted chance of being in collision at each knot, or None.
       balls: where the robot's balls were, if it has any and was recorded for drawing; or None.
+      controller_run: the run of the controller (`ControllerRun`), with what it recorded: the estimates of an
+        `OffsetFree`, the log of a `Replanner`. In memory only: None in a rollout that was loaded, pickled or copied.
     """
 
     robot: str
@@ -113,6 +116,11 @@ class Rollout:
     tube: Array | None = None
     collision_chance: Array | None = None
     balls: BallRecord | None = None
+    controller_run: Any = field(default=None, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the controller's run, which may hold what cannot be copied."""
+        return vars(self) | {"controller_run": None}
 
     def __post_init__(self) -> None:
         check_kind("Rollout: plan", self.plan, Trajectory, "a Trajectory")

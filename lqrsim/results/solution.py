@@ -14,45 +14,34 @@ import numpy.typing as npt
 from lqrsim.errors import (
     Array,
     InputError,
-    check_count,
     check_items,
     check_kind,
-    check_name,
-    check_number,
-    check_shape,
     excerpt,
     real,
 )
 from lqrsim.results import notebook
-from lqrsim.results.goal import Target
+from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution_parts import (
-    HORIZONS,
     Candidate,
     Certificate,
     Iteration,
-    Multipliers,
-    Status,
-    Trajectory,
-    left_after,
 )
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 
 
 @dataclass(frozen=True, kw_only=True)
-class Solution:
+class Solution(Plan):
     """A locally optimal feedback policy and how it was found.
 
+    A `Plan`, with the log of the solve and what else it found. The detail also says where the safeguard had to step in,
+    and the policy and the cost-to-go are those of the last backward pass that was completed.
+
     Attributes:
-      status: how the solve ended; only CONVERGED and COST_CONVERGED are success.
-      detail: where and why, if it is not; and where the safeguard had to step in.
-      policy: the feedback law, from the last backward pass that was completed.
       inverse_policy: the law that traces the optimum backwards from a state of arrival; None from `ilqr`, and where
         states of arrival cannot be chosen freely, as after a fixed start.
-      cost_to_go: the value function of the last backward pass, a `Quadratic`; None where a pass failed.
       cost_to_come: the value function of the last forward pass, a `Quadratic` in the primal form and `Moments` in the
         dual; None where a pass failed, and from `ilqr`.
-      trajectory: the plan: the rollout of the policy under the true dynamics from its first state.
       iterations: the log.
       clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,); None
         where the problem has no obstacles.
@@ -64,20 +53,10 @@ class Solution:
       versions: of lqrsim and the libraries that the bits depend on, and the processor.
       scenario: what the command line was asked for; empty where a program called the solver.
       candidates: the starts that were tried, where there were several.
-      multipliers: of each of the problem's constraints; none where the plan keeps them all without being made to.
-      goal: (n,) the state that the final cost asks for, NaN in the states to which it gives no weight; None where it
-        names no state.
-      goal_radius: within which the plan's end counts as at the goal, in `target.unit`; None where that is not known. By
-        default the robot's radius, in metres; for goals without a position see `results/goal.py`.
     """
 
-    status: Status
-    detail: str
-    policy: AffinePolicy
     inverse_policy: AffinePolicy | None
-    cost_to_go: Quadratic | None
     cost_to_come: Quadratic | Moments | None
-    trajectory: Trajectory
     iterations: tuple[Iteration, ...]
     clearance: Array | None
     certificate: Certificate
@@ -88,9 +67,6 @@ class Solution:
     versions: Mapping[str, str]
     scenario: str = ""
     candidates: tuple[Candidate, ...] = ()
-    multipliers: tuple[Multipliers, ...] = ()
-    goal: Array | None = None
-    goal_radius: float | None = None
 
     @classmethod
     def _assembled(cls, later: Mapping[str, Callable[[], Any]], **parts: Any) -> "Solution":
@@ -117,63 +93,34 @@ class Solution:
         """With all parts made."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    @property
-    def target(self) -> Target:
-        """What a run of the policy is to reach: the goal, or the plan's end where there is none."""
-        return Target(self.policy.state_coordinates, self.goal, self.trajectory.states)
-
     def __post_init__(self) -> None:
-        check_kind("Solution: status", self.status, Status, f"a Status, one of {', '.join(Status.__members__)}")
-        check_kind("Solution: policy", self.policy, AffinePolicy, "an AffinePolicy")
-        check_kind("Solution: trajectory", self.trajectory, Trajectory, "a Trajectory")
         check_kind("Solution: inverse_policy", self.inverse_policy, (AffinePolicy, type(None)), "an AffinePolicy, None")
-        check_kind("Solution: cost_to_go", self.cost_to_go, (Quadratic, type(None)), "a Quadratic or None")
         kinds = (Quadratic, Moments, type(None))
         check_kind("Solution: cost_to_come", self.cost_to_come, kinds, "a Quadratic, Moments or None")
-        for name, kind in (("iterations", Iteration), ("candidates", Candidate), ("multipliers", Multipliers)):
+        for name, kind in (("iterations", Iteration), ("candidates", Candidate)):
             items = check_items(f"Solution: {name}", getattr(self, name), kind, f"a tuple of {kind.__name__}")
             object.__setattr__(self, name, items)
-        for name in ("detail", "solver", "problem_digest", "scenario"):
+        for name in ("solver", "problem_digest", "scenario"):
             check_kind(f"Solution: {name}", getattr(self, name), str, "text")
         for name in ("options", "versions"):
             given = check_kind(f"Solution: {name}", getattr(self, name), Mapping, "a dictionary by name")
             if not all(isinstance(key, str) for key in given):
                 raise InputError(f"Solution: {name}: got {excerpt(given)}, want a dictionary by name")
-        self._check_shapes()
+        if self.clearance is not None:
+            object.__setattr__(self, "clearance", real("Solution: clearance", self.clearance))
+        super().__post_init__()
 
-    def _check_shapes(self) -> None:
-        """Raises InputError for parts of several problems."""
-        states, steps = self.trajectory.states.shape, self.trajectory.steps
-        laws = {"policy": self.policy, "inverse_policy": self.inverse_policy}
-        arrays: dict[str, tuple[Array, tuple[int | None, ...]]] = {
-            f"{name}.gain": (law.gain, (steps, self.trajectory.controls.shape[1], states[1]))
-            for name, law in laws.items()
-            if law is not None
-        }
-        if self.cost_to_go is not None:
-            arrays["cost_to_go.gradient"] = self.cost_to_go.gradient, states
+    def _shapes(self) -> dict[str, tuple[Array, tuple[int | None, ...]]]:
+        arrays, states = super()._shapes(), self.trajectory.states.shape
+        if self.inverse_policy is not None:
+            arrays["inverse_policy.gain"] = self.inverse_policy.gain, arrays["policy.gain"][1]
         if isinstance(self.cost_to_come, Quadratic):
             arrays["cost_to_come.gradient"] = self.cost_to_come.gradient, states
         elif self.cost_to_come is not None:
             arrays["cost_to_come.mean"] = self.cost_to_come.mean, states
         if self.clearance is not None:
-            arrays["clearance"] = real("Solution: clearance", self.clearance), states[:1]
-            object.__setattr__(self, "clearance", arrays["clearance"][0])
-        if self.goal is not None:
-            arrays["goal"] = real("Solution: goal", self.goal), states[1:]
-            object.__setattr__(self, "goal", arrays["goal"][0])
-        arrays |= {f"multipliers[{i}]": (one.values, (steps + 1, None)) for i, one in enumerate(self.multipliers)}
-        for name, (array, shape) in arrays.items():
-            check_shape(f"Solution: {name}", array, shape)
-        _ = self.target  # which refuses what is no goal
-        if self.goal_radius is not None:
-            radius = check_number("Solution: goal_radius", self.goal_radius, above=0.0)
-            object.__setattr__(self, "goal_radius", radius)
-
-    @property
-    def success(self) -> bool:
-        """True for CONVERGED, and for COST_CONVERGED, where only the cost was asked for."""
-        return self.status.success
+            arrays["clearance"] = self.clearance, states[:1]
+        return arrays
 
     @property
     def cost(self) -> float:
@@ -208,45 +155,12 @@ class Solution:
             )
         return TotalCost(self.cost_to_go, self.cost_to_come)
 
-    def shifted(self, steps: int, *, horizon: str = "moving") -> "Solution":
-        """The rest of the solution after `steps` steps, to start the next solve with: `start=solution.shifted(k)`.
-
-        Of a "moving" horizon the end is filled up: the last law, value function and multipliers stay in force, as a
-        policy's last law does after its horizon, and the last control is held. A "shrinking" one has so many steps
-        less. Status, log, cost and digest stay those of the whole.
-
-        Args:
-          steps: how many steps are over, less than the solution has.
-          horizon: "moving" fills up the end, "shrinking" has fewer steps.
-
-        Returns:
-          A Solution.
-
-        Raises:
-          InputError: `steps` is not a whole number from 0 to the last step, or `horizon` is neither of the two.
-        """
-        if check_count("steps", steps, at_least=0) >= self.trajectory.steps:
-            raise InputError(f"steps: got {steps}, want less than {self.trajectory.steps}, the steps of the solution")
-        filled = check_name("horizon", horizon, HORIZONS) == "moving"
-
-        def moved(array: npt.ArrayLike) -> Array:
-            return left_after(steps, array, filled=filled)
-
-        plan, value = self.trajectory, self.cost_to_go
-        return replace(
-            self,
-            policy=self.policy.shifted(steps, horizon=horizon),
-            inverse_policy=None,
-            cost_to_go=None
-            if value is None
-            else Quadratic(moved(value.hessian), moved(value.gradient), moved(value.constant)),
-            cost_to_come=None,
-            trajectory=Trajectory(moved(plan.states), moved(plan.controls), plan.dt),
-            clearance=None if self.clearance is None else moved(self.clearance),
-            candidates=(),
-            multipliers=tuple(replace(one, values=moved(one.values)) for one in self.multipliers),
-            detail=f"the rest of a solution after {steps} steps; {self.detail}".removesuffix("; "),
-        )
+    def _shifted_parts(self, steps: int, moved: Callable[[npt.ArrayLike], Array]) -> dict[str, Any]:
+        return {
+            "inverse_policy": None, "cost_to_come": None, "candidates": (),
+            "clearance": None if self.clearance is None else moved(self.clearance),
+            "detail": f"the rest of a solution after {steps} steps; {self.detail}".removesuffix("; "),
+        }  # fmt: skip
 
     def open_loop(self) -> "Solution":
         """The same plan without feedback: its controls, whatever the state. Shows what the feedback is worth."""

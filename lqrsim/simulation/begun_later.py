@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.control.controllers import Control, Controller, Feedback
+from lqrsim.control.controllers import Controller, ControllerLike, ControllerRun, Feedback, as_controller
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind
 from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.plan import Plan
 from lqrsim.results.rollout import Rollout
-from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
@@ -26,12 +26,12 @@ from lqrsim.simulation.plant import Plant
 
 def simulate_from(
     plant: Plant,
-    solution: Solution,
+    plan: Plan,
     states: Array,
     *,
     knot: int = 0,
     disturbances: Sequence[Disturbance | Noise] = (),
-    controller: Controller | None = None,
+    controller: ControllerLike | None = None,
     **options: Any,
 ) -> Rollout:
     """One trial of what is left of a plan after `knot` periods from each of the states (K, n).
@@ -45,24 +45,24 @@ def simulate_from(
     Raises:
       InputError: as `simulate`; or the knot is not one before the plan's end.
     """
-    check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
-    whole = solution.trajectory
+    check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
+    law, plan = as_controller(controller, plan, plant.robot.dynamics)
+    whole = plan.trajectory
     if check_count("knot", knot, at_least=0) >= whole.steps:
         raise InputError(f"knot: got {knot}, want one from 0 to {whole.steps - 1}, before the plan's end")
     begun = check_array("states", states, (None, whole.states.shape[1]))
-    kinds = (Controller, type(None))
-    law = check_kind("controller", controller, kinds, "a Controller, such as Feedback(solution.policy), or None")
-    law = Feedback(solution.policy) if law is None else law
     given = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
     wrong: list[Disturbance] = [_Later(one, whole, knot) for one in given]
-    return simulate(
+    rollout = simulate(
         plant,
-        solution.shifted(knot, horizon="shrinking"),
+        plan.shifted(knot, horizon="shrinking"),
         disturbances=[*wrong, _Begin(begun)],
         controller=_LaterController(law, whole, knot) if knot else law,
         trials=len(begun),
         **options,
     )
+    run = rollout.controller_run
+    return replace(rollout, controller_run=run.of) if isinstance(run, _LaterRun) else rollout
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,26 +122,34 @@ class _Later(Disturbance):
 class _LaterController(Controller):
     """A controller of the whole plan, in a run that begins at one of its knots."""
 
-    def __init__(self, of: Controller, plan: Trajectory, knot: int) -> None:
-        self.of, self.plan, self.knot = of, plan, knot
+    def __init__(self, of: Controller, whole: Trajectory, knot: int) -> None:
+        self.of, self.whole, self.knot = of, whole, knot
 
-    def start(self, trials: int) -> Control:
-        control = self.of.start(trials)
+    def start(self, trials: int) -> ControllerRun:
+        run = self.of.start(trials)
         if not isinstance(self.of, Feedback):  # which remembers nothing
             for step in range(self.knot):
-                control(step, np.tile(self.plan.states[step], (trials, 1)))
-        return lambda step, shown: control(step + self.knot, shown)
+                run.control(step, np.tile(self.whole.states[step], (trials, 1)))
+        return _LaterRun(run, self.knot)
 
     @property
     def digest(self) -> str:
         return self.of.digest
 
     @property
-    def spaces(self) -> tuple[Coordinates, Coordinates]:
-        return self.of.spaces
+    def coordinates(self) -> tuple[Coordinates, Coordinates]:
+        return self.of.coordinates
 
-    def lost(self) -> Mapping[int, str]:
-        return self.of.lost()
+
+class _LaterRun(ControllerRun):
+    def __init__(self, of: ControllerRun, knot: int) -> None:
+        self.of, self._knot = of, knot
+
+    def control(self, step: int, measured: Array) -> Array:
+        return self.of.control(step + self._knot, measured)
+
+    def estimator_diverged(self) -> Mapping[int, str]:
+        return self.of.estimator_diverged()
 
     def summary(self) -> str:
         return self.of.summary()

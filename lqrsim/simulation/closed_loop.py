@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.control.controllers import Controller
-from lqrsim.errors import Array, InputError, check_function, excerpt, told
+from lqrsim.control.controllers import ControllerLike, ControllerRun
+from lqrsim.errors import Array, InputError, check_kind, excerpt, told
 from lqrsim.problem.noise import Noise
+from lqrsim.results.plan import Plan
 from lqrsim.results.rollout import Rollout
-from lqrsim.results.solution import Solution
 from lqrsim.scenes.scene import unlogged
 from lqrsim.simulation.collisions import Collisions
 from lqrsim.simulation.disturbances import Disturbance
@@ -31,10 +31,10 @@ from lqrsim.versions import versions
 
 def simulate(
     plant: Plant,
-    solution: Solution,
+    plan: Plan | None = None,
     *,
+    controller: ControllerLike | None = None,
     disturbances: Sequence[Disturbance | Noise] = (),
-    controller: Controller | None = None,
     seed: int = 0,
     trials: int = 1,
     first_trial: int = 0,
@@ -47,10 +47,10 @@ def simulate(
     progress: Callable[[int, int], object] | None = None,
     watch: Callable[[float, Array, npt.NDArray[np.bool_]], object] | None = None,
 ) -> Rollout:
-    """Execute the solution's policy closed-loop in MuJoCo, from the first state of its plan.
+    """Run a policy, or anything else that controls, closed-loop in MuJoCo, from the first state of a plan.
 
-    In each control period: read the true state, measure it, ask the policy, disturb its command, saturate, push, step,
-    kick.
+    In each control period: read the true state, measure it, ask the controller, disturb its command, saturate, push,
+    step, kick.
 
     A trial ends with the first collision, as `collisions.py` defines it, when it becomes unstable, when the filter of
     its controller diverges, or when the controller fails: raises an exception, which ends all the trials that it was
@@ -59,10 +59,12 @@ def simulate(
 
     Args:
       plant: robot and scene to run.
-      solution: whose policy runs, or about whose plan the controller runs.
+      plan: a solution or another plan: where the run begins, for how long it goes on, and what it is compared with. By
+        default the controller's own, if it has one, as an `OffsetFree` and a `Replanner` have.
+      controller: what decides on the controls, by default the plan's policy: another policy, with or without a filter;
+        a `Controller`; or a function of the measured state (n,) and the time in s that returns controls (m,).
       disturbances: what goes wrong, in the order in which it happens. Each has its own stream of random numbers.
         A `Noise`, with which problems are stated, is one, too.
-      controller: what decides on the controls; by default the solution's policy.
       seed: of all random numbers.
       trials: how many runs.
       first_trial: number of the first; trial `i` of a seed is the same to the last bit whatever runs beside it.
@@ -78,15 +80,15 @@ def simulate(
       watch: called with each frame as it comes: its time, MuJoCo's qpos (K, nq), and who has become unstable (K,).
 
     Returns:
-      A Rollout of the trials.
+      A Rollout of the trials. Its `controller_run` is the run of the controller, with what that recorded.
 
     Raises:
-      InputError: the policy is for another robot, or its plan is not finite; the control period is no multiple of the
-        physics step; a disturbance does not fit; or an option is out of range.
+      InputError: there is no plan, or it is not finite; plan or policy are for another robot; the control period is no
+        multiple of the physics step; a disturbance does not fit; or an option is out of range.
     """
     stated = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
     settings = RunSettings(
-        plant=plant, solution=solution, disturbances=stated, controller=controller, seed=seed, trials=trials,
+        plant=plant, plan=plan, disturbances=stated, controller=controller, seed=seed, trials=trials,
         first_trial=first_trial, goal_radius=goal_radius, goal_tolerance=goal_tolerance, frames=frames,
         contacts=contacts, threads=threads, generators=generators, progress=progress, watch=watch,
     )  # fmt: skip
@@ -104,20 +106,20 @@ class Loop:
 
     Attributes:
       step: number of the control period that comes next. shown: (K, n) what the controller is shown then.
+      controller_run: the run of the controller.
     """
 
     def __init__(self, settings: RunSettings) -> None:
         self.settings = settings
-        plant, plan, trials = settings.plant, settings.plan, settings.trials
+        plant, plan, trials = settings.plant, settings.trajectory, settings.trials
         self.effects = Effects(plant, plan, settings.disturbances, settings.numbers, settings.random_streams)
         self.physics = Physics(plant, trials, settings.substeps, contacts=settings.contacts, threads=settings.threads)
         self.physics.place(self.effects.initial_states(np.tile(plan.states[0], (trials, 1))))
         self.effects.alter_models(plant, self.physics.simulations)
         with unlogged():
             self.physics.prepare(altered=self.effects.alters_models)
-        self.control = settings.law.start(trials)
         name = f"{type(settings.law).__name__}.start"
-        check_function(name, self.control, "a function of step and states", arguments=2, optional=False)
+        self.controller_run = check_kind(name, settings.law.start(trials), ControllerRun, "a ControllerRun returned")
         self.records = Recorder(plan, trials)
         self.records.frames.append(self.physics.frame())
         self.states = self.physics.state()
@@ -128,7 +130,7 @@ class Loop:
 
     def run(self) -> None:
         """All control periods; fewer if no trial is left."""
-        settings, steps = self.settings, self.settings.plan.steps
+        settings, steps = self.settings, self.settings.trajectory.steps
         self.begin()
         while self.step < steps and self.period():
             if settings.progress is not None:
@@ -158,23 +160,23 @@ class Loop:
         self.records.lose(step, self.physics.unstable | _not_finite(shown))
         over = self.records.over(step)
         if over.any():  # these go on with the plan's state, for the others' sake
-            shown[over] = self.settings.plan.states[step]
+            shown[over] = self.settings.trajectory.states[step]
         return shown
 
     def decide(self, step: int, shown: Array) -> Array:
         """The controller's commands (K, m); where it fails, the plan's are what the actuators get."""
         shape = self.settings.trials, len(self._names)
         try:
-            commands = _checked_commands(self.control(step, shown), shape)
+            commands = _checked_commands(self.controller_run.control(step, shown), shape)
             failed = _not_finite(commands)
             reasons = [_not_a_number(row, self._names) for row in commands[failed]]
         except Exception as error:  # of a controller, whatever it is: these trials failed
             commands, failed = np.zeros(shape), np.ones(len(shown), dtype=bool)
             reasons = [told(error)] * len(shown)
-        self.records.mislead(step, self.settings.law.lost())
+        self.records.estimator_diverged(step, self.controller_run.estimator_diverged())
         self.records.fail(step, failed, reasons)
         self.records.commanded[:, step] = commands
-        return np.where(failed[:, None], self.settings.plan.controls[step], commands)
+        return np.where(failed[:, None], self.settings.trajectory.controls[step], commands)
 
     def actuate(self, step: int, commands: Array) -> Array:
         """What the actuators get (K, m): the commands as disturbed on their way, within the robot's limits."""
@@ -219,7 +221,7 @@ class Loop:
         """Contacts at the last knot, which no period comes after."""
         if not self.physics.senses_contacts:
             return
-        plan, touching = self.settings.plan, self.physics.touching_now()
+        plan, touching = self.settings.trajectory, self.physics.touching_now()
         never_lost = self.records.lost_since > plan.steps
         for row in np.flatnonzero(touching.any(axis=1) & np.isinf(self.collisions.at) & never_lost):
             self.collisions.touch(int(row), plan.horizon, touching[row])
@@ -228,7 +230,7 @@ class Loop:
         """What was recorded up to now; NaN after it, with a controller that failed. The loop can go on."""
         twin = copy.copy(self)
         twin.records = copy.deepcopy(self.records)
-        if self.step < self.settings.plan.steps:
+        if self.step < self.settings.trajectory.steps:
             trials = self.settings.trials
             twin.records.fail(self.step, np.ones(trials, dtype=bool), ["went no further"] * trials)
         return twin.rollout()
@@ -236,7 +238,7 @@ class Loop:
     def rollout(self) -> Rollout:
         """All that was recorded."""
         settings, records, collisions = self.settings, self.records, self.collisions
-        plant, plan, each = settings.plant, settings.plan, self.physics.drawn_parts
+        plant, plan, each = settings.plant, settings.trajectory, self.physics.drawn_parts
         records.turn_to_plan(settings.states)
         frames = records.stacked_frames(each, all_of_them=settings.frames)
         records.erase(frames, each)
@@ -249,7 +251,7 @@ class Loop:
             policy_digest=settings.law.digest,
             state_coordinates=settings.states,
             control_coordinates=settings.controls,
-            goal=settings.solution.goal,
+            goal=settings.followed.goal,
             goal_radius=settings.radius,
             radius=plant.robot.radius,
             states=records.states,
@@ -273,6 +275,7 @@ class Loop:
             first_trial=settings.first_trial,
             versions=versions(),
             balls=plant.record_of_balls(plan.states, records.states) if settings.frames else None,
+            controller_run=self.controller_run,
         )
 
 

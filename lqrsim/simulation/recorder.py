@@ -46,8 +46,8 @@ class Recorder:
         if rows.any():
             self.lost_since[rows] = np.minimum(self.lost_since[rows], step)
 
-    def mislead(self, step: int, reasons: Mapping[int, str]) -> None:
-        """What the controller believes of these trials means nothing from this knot on. Who is over cannot be lost."""
+    def estimator_diverged(self, step: int, reasons: Mapping[int, str]) -> None:
+        """The estimates of these trials are useless from this knot on. Trials that are over cannot diverge."""
         over = self.over(step)
         for row, reason in reasons.items():
             if not over[row]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.control.controllers import Controller, Feedback
+from lqrsim.control.controllers import Controller, ControllerLike, as_controller
 from lqrsim.errors import (
     Array,
     InputError,
@@ -21,7 +21,7 @@ from lqrsim.errors import (
 )
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.goal import Target
-from lqrsim.results.solution import Solution
+from lqrsim.results.plan import Plan
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.effects import MakeGenerator, seeded
@@ -38,7 +38,8 @@ class RunSettings:
     """The arguments of `simulate`, and what follows from them.
 
     Attributes:
-      law: the controller, by default the solution's policy.
+      law: what controls, by default the plan's policy.
+      followed: the plan that the run is about: the given one, or else the controller's own.
       states, controls: what the law's are; the controls within the robot's limits too.
       radius: within which the goal counts as reached, in `Target.unit`.
       substeps: physics steps of a control period.
@@ -48,9 +49,9 @@ class RunSettings:
     """
 
     plant: Plant
-    solution: Solution
+    plan: Plan | None
     disturbances: Sequence[Disturbance]
-    controller: Controller | None
+    controller: ControllerLike | None
     seed: int
     trials: int
     first_trial: int
@@ -63,6 +64,7 @@ class RunSettings:
     progress: Progress | None
     watch: Watch | None
     law: Controller = field(init=False)
+    followed: Plan = field(init=False)
     states: Coordinates = field(init=False)
     controls: Coordinates = field(init=False)
     radius: float = field(init=False)
@@ -70,9 +72,6 @@ class RunSettings:
 
     def __post_init__(self) -> None:
         check_kind("plant", self.plant, Plant, "a Plant, such as scenario.plant()")
-        check_kind("solution", self.solution, Solution, "a Solution, such as smooth(problem)")
-        kinds = (Controller, type(None))
-        check_kind("controller", self.controller, kinds, "a Controller, such as Feedback(solution.policy), or None")
         wanted = "disturbances, such as ControlNoise(0.05)"
         self.disturbances = check_items("disturbances", self.disturbances, Disturbance, wanted)
         self.seed, self.first_trial = check_seed("seed", self.seed), check_seed("first_trial", self.first_trial)
@@ -82,18 +81,18 @@ class RunSettings:
         check_function("generators", self.generators, wanted, arguments=2)
         check_function("progress", self.progress, "a function of how many periods are done, of how many", arguments=2)
         check_function("watch", self.watch, "a function of the time, MuJoCo's qpos and who is unstable", arguments=3)
-        self.law = Feedback(self.solution.policy) if self.controller is None else self.controller
-        self.states, self.controls = _check_spaces(self.law, self.plant)
-        _check_plan(self.solution, self.plant)
-        target = Target(self.states, self.solution.goal, self.plan.states)
+        self.law, self.followed = as_controller(self.controller, self.plan, self.plant.robot.dynamics)
+        self.states, self.controls = _check_coordinates(self.law, self.plant)
+        _check_plan(self.followed, self.plant)
+        target = Target(self.states, self.followed.goal, self.trajectory.states)
         self.radius = target.radius(self.plant.robot.radius, self.goal_radius, self.goal_tolerance)
-        self.substeps = self.plant.substeps(self.plan.dt)
-        _check_size(self.plant, self.plan, self.substeps, self.trials, frames=self.frames)
+        self.substeps = self.plant.substeps(self.trajectory.dt)
+        _check_size(self.plant, self.trajectory, self.substeps, self.trials, frames=self.frames)
 
     @property
-    def plan(self) -> Trajectory:
+    def trajectory(self) -> Trajectory:
         """What is to be followed."""
-        return self.solution.trajectory
+        return self.followed.trajectory
 
     @property
     def numbers(self) -> range:
@@ -106,25 +105,26 @@ class RunSettings:
         return self.generators or seeded(self.seed)
 
 
-def _check_spaces(controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:
+def _check_coordinates(controller: Controller, plant: Plant) -> tuple[Coordinates, Coordinates]:
     """What the controller's states and controls are. Raises InputError unless they are the plant's."""
     dynamics = plant.robot.dynamics
     wanted = dynamics.state_coordinates.names, dynamics.control_coordinates.names
     kind = type(controller).__name__
     check_text(f"{kind}.digest", controller.digest, "a hash as text")
-    spaces = check_items(f"{kind}.spaces", controller.spaces, Coordinates, "Coordinates of states and of controls")
+    wanted_kind = "Coordinates of states and of controls"
+    spaces = check_items(f"{kind}.coordinates", controller.coordinates, Coordinates, wanted_kind)
     if len(spaces) != 2:
-        raise InputError(f"{kind}.spaces: got {len(spaces)}, want two: of the states, of the controls")
+        raise InputError(f"{kind}.coordinates: got {len(spaces)}, want two: of the states, of the controls")
     for what, space, want in zip(("states", "controls"), spaces, wanted, strict=True):
         if space.names != want:
             raise InputError(
-                f"solution: got a policy with {what} {', '.join(space.names)}, want those of robot"
+                f"controller: got a policy with {what} {', '.join(space.names)}, want those of robot"
                 f" {plant.robot.name}: {', '.join(want)}"
             )
     meant, moves = spaces[0], dynamics.state_coordinates
     if (meant.position, meant.plane, meant.offset) != (moves.position, moves.plane, moves.offset):
         raise InputError(
-            f"solution: got a policy for a position {_place(meant)}, want that of robot {plant.robot.name}:"
+            f"controller: got a policy for a position {_place(meant)}, want that of robot {plant.robot.name}:"
             f" {_place(moves)}"
         )
     # A command that the robot cuts off is at a limit, whatever the policy took the limits to be.
@@ -133,22 +133,22 @@ def _check_spaces(controller: Controller, plant: Plant) -> tuple[Coordinates, Co
     return spaces[0], spaces[1].limited(low, high)
 
 
-def _check_plan(solution: Solution, plant: Plant) -> None:
+def _check_plan(given: Plan, plant: Plant) -> None:
     """Raises InputError unless the plan is finite, of the plant's states and controls."""
-    plan, dynamics = solution.trajectory, plant.robot.dynamics
+    plan, dynamics = given.trajectory, plant.robot.dynamics
     n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
     if plan.states.shape[1] != n or plan.controls.shape[1] != m:
         shapes = f"{plan.states.shape[1]} states and {plan.controls.shape[1]} controls"
-        raise InputError(f"solution: got a plan of {shapes}, want {n} and {m}")
+        raise InputError(f"plan: got one of {shapes}, want {n} and {m}")
     if not (np.isfinite(plan.states).all() and np.isfinite(plan.controls).all()):
-        raise InputError(f"solution: got a plan that is not finite ({solution.status.name}), want one that can be run")
+        raise InputError(f"plan: got one that is not finite ({given.status.name}), want one that can be run")
 
 
 def _check_size(plant: Plant, plan: Trajectory, substeps: int, trials: int, *, frames: bool) -> None:
     """Raises InputError for a run that would not end, or does not fit into memory."""
     if plan.steps * substeps > MOST_STEPS:
         raise InputError(
-            f"solution: got a plan of {plan.steps} control periods of {plan.dt:g} s, which are {plan.steps * substeps}"
+            f"plan: got one of {plan.steps} control periods of {plan.dt:g} s, which are {plan.steps * substeps}"
             f" physics steps, want at most {MOST_STEPS}"
         )
     n, m = plan.states.shape[1], plan.controls.shape[1]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lqrsim.control.controllers import Controller
+from lqrsim.control.controllers import ControllerLike
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.errors import InputError
@@ -20,7 +20,7 @@ def tube_under(
     solution: Solution,
     plant: Plant,
     disturbances: Sequence[Disturbance],
-    controller: Controller | None = None,
+    controller: ControllerLike | None = None,
 ) -> tuple[Tube | None, str]:
     """What `predict_tube` says of a run, if it can, and a line to print: why it cannot, or what it leaves out.
 

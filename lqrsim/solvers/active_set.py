@@ -17,7 +17,7 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels.active_set import AIM, CONTROL, EQUALITY, INEQUALITY, KIND, LIMIT, SIZE
-from lqrsim.kernels.records import Plan
+from lqrsim.kernels.records import Motion
 from lqrsim.solvers.common import INSIDE
 from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measures, Stages
 
@@ -43,7 +43,7 @@ class ActiveSet:
         for rows that no multiplier brings to be kept. looking: how long models of a plan took, in s.
     """
 
-    def __init__(self, stages: Stages, plan: Plan, multipliers: tuple[Array, ...], violation: float) -> None:
+    def __init__(self, stages: Stages, plan: Motion, multipliers: tuple[Array, ...], violation: float) -> None:
         self.stages, self.plan, self._violation = stages, plan, violation
         self.hopeless = False
         shape, limit, rows = stages.live.shape, stages.owners == -1, stages.active
@@ -90,7 +90,7 @@ class ActiveSet:
             ended = ended or self.hopeless
         return self._within(tolerance)
 
-    def carried_out(self) -> tuple[Plan, Array, float, list[Array]]:
+    def carried_out(self) -> tuple[Motion, Array, float, list[Array]]:
         """The motion that the plan comes to with gains about it (T, m, n); these; its cost; the constraints' numbers.
 
         The gains are those of a step with a price on missing the rows that press, and zero at limits.
@@ -102,7 +102,7 @@ class ActiveSet:
         else:
             stages.gain[...] = 0.0
         gain = stages.gain.copy()
-        plan, cost, values = stages.carry_out(Plan(self.plan.states, self.plan.controls.copy()), gain)
+        plan, cost, values = stages.carry_out(Motion(self.plan.states, self.plan.controls.copy()), gain)
         return plan, gain, cost, values
 
     def multipliers(self) -> list[tuple[Array, float]]:
@@ -136,7 +136,7 @@ class ActiveSet:
         stages = self.stages
         self.force[...] = np.where(self._equality, self._pressing, np.maximum(self._pressing, 0.0))
         self._costates = stages.to_go.gradient.copy()
-        self.plan = Plan(self.plan.states + stages.changes.states, self.plan.controls + stages.changes.controls)
+        self.plan = Motion(self.plan.states + stages.changes.states, self.plan.controls + stages.changes.controls)
         clock = time.perf_counter()
         cost = stages.look(self.plan, self._costates)
         self._convex = False

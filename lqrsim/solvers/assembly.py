@@ -74,7 +74,7 @@ def assemble(
         candidates=candidates,
         versions=versions(),
         goal=problem.weighed_goal,
-        goal_radius=_radius(problem),
+        goal_radius=goal_radius_of(problem),
     )
 
 
@@ -85,7 +85,7 @@ def _copied(value: Any) -> Any:
     return type(value)(*(np.array(getattr(value, field.name)) for field in fields(value)))
 
 
-def _radius(problem: Problem) -> float | None:
+def goal_radius_of(problem: Problem) -> float | None:
     """The robot's radius, where the goal has a position, and the problem obstacles that know it; None for a point."""
     goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
     if not position or (goal is not None and np.isnan(goal[position]).all()):

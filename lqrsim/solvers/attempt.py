@@ -8,7 +8,7 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import LOG, CostToGo, Plan, Policy, Rows, Settings
+from lqrsim.kernels.records import LOG, CostToGo, Motion, Policy, Rows, Settings
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers import compiled
@@ -198,7 +198,7 @@ class Attempt:
     ) -> AttemptResult:
         """Newton's method from the best plan so far, which took these iterations; `added` is what constraints add."""
         work, log = self.work, self._log[len(before) :]
-        last, trial = len(log), Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
+        last, trial = len(log), Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
         work.memory["merit"], work.memory["share"] = work.memory["plan_cost"] + added, -1.0
         done = iterate(
             self.problem, lambda first, to: self._loop(*self._newton_arguments(first, to, log, last, trial)), log, last,
@@ -251,7 +251,7 @@ class Attempt:
     def linearize_about_plan(self) -> float:
         """Make policy and value functions about the plan in the memory; its optimality, NaN if that fails."""
         work, log = self.work, np.full(1, np.nan, LOG)
-        trial = Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
+        trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
         work.memory["merit"] = work.memory["plan_cost"]
         self._loop(*self._damped_arguments(0, 0, log, 1, trial))
         return float(log["optimality"][0])
@@ -262,7 +262,7 @@ class Attempt:
         The arrays of the passes are written over.
         """
         work, log = self.work, np.full(1, np.nan, LOG)
-        trial, own = Plan(np.zeros_like(work.states), np.zeros_like(work.controls)), self.problem.risk
+        trial, own = Motion(np.zeros_like(work.states), np.zeros_like(work.controls)), self.problem.risk
         work.model.noise.risk[0] = risk
         *_, failed = self._loop(*self._damped_arguments(0, 0, log, 1, trial))
         work.model.noise.risk[0] = own
@@ -317,7 +317,7 @@ class Attempt:
         memory = work.memory
         memory["reach"], memory["weight"], memory["small_changes"] = 1.0, 0.0, 0.0
         memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
-        trial = Plan(np.zeros_like(work.states), np.zeros_like(work.controls))
+        trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
 
         def run(first: int, to: int) -> tuple[int, int, bool, int]:
             return self._loop(*self._damped_arguments(first, to, log, last, trial, least))
@@ -421,7 +421,7 @@ class Attempt:
         return declarations.ITERATE, first, last, options, work.model, arrays, work.memory_rows, log
 
     def _damped_arguments(
-        self, first: int, last: int, log: Rows, most: int, trial: Plan, least: tuple[float, float] = (0.0, 0.0)
+        self, first: int, last: int, log: Rows, most: int, trial: Motion, least: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[Any, ...]:
         """What it takes for damped iterations, of which there are to be `most`; `trial` is written to on the way."""
         settings, work = self.settings, self.work
@@ -429,7 +429,7 @@ class Attempt:
         arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
         return declarations.DAMP, first, last, options, work.model, arrays, work.memory_rows, log
 
-    def _newton_arguments(self, first: int, last: int, log: Rows, most: int, trial: Plan) -> tuple[Any, ...]:
+    def _newton_arguments(self, first: int, last: int, log: Rows, most: int, trial: Motion) -> tuple[Any, ...]:
         """What it takes for Newton iterations, of which there are to be `most`; `trial` is written to on the way."""
         settings, work = self.settings, self.work
         options = self._settings(most, self.final, settings.gap_tolerance)
@@ -440,7 +440,7 @@ class Attempt:
         """What it takes to certify a plan and its policy, with this cost-to-go."""
         settings, work = self.settings, self.work
         arrays = work.arrays._replace(
-            to_go=to_go, rollout=Plan(found.states, found.controls),
+            to_go=to_go, rollout=Motion(found.states, found.controls),
             kept=Policy(*found.law), certificate=certificate,
         )  # fmt: skip
         options = self._settings(0, self.final, settings.gap_tolerance)

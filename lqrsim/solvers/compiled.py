@@ -26,7 +26,7 @@ from lqrsim.kernels import (
     projection,
 )
 from lqrsim.kernels import noise as noise_kernel
-from lqrsim.kernels.records import Constraints, CostModel, DynamicsModel, Limits, Model, NoiseModel, Plan, Policy
+from lqrsim.kernels.records import Constraints, CostModel, DynamicsModel, Limits, Model, Motion, NoiseModel, Policy
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.dynamics import Dynamics
@@ -191,7 +191,7 @@ def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
     """Stage and final cost (K,) of each of K trajectories, states (K, T+1, n) and controls (K, T, m)."""
     costs = np.empty(len(states))
     flat = (in_c_order(array).reshape(-1, array.shape[2]) for array in (states, controls))
-    costs_module(problem).costs_of(len(states), problem.steps, Plan(*flat), arguments(problem), costs)
+    costs_module(problem).costs_of(len(states), problem.steps, Motion(*flat), arguments(problem), costs)
     return costs
 
 
@@ -211,7 +211,7 @@ class CostsByStep:
 
     def _each(self, t: int, states: Array, controls: Array, cost: CostModel) -> Array:
         costs = np.empty(len(states))
-        self._module.cost_of_each(len(states), t, Plan(in_c_order(states), in_c_order(controls)), cost, costs)
+        self._module.cost_of_each(len(states), t, Motion(in_c_order(states), in_c_order(controls)), cost, costs)
         return costs
 
 
@@ -227,7 +227,7 @@ def rollout(
     model = model if dt is None else model._replace(dt=float(dt))
     steps = len(gain)
     states, controls = np.empty((steps + 1, len(state))), np.empty((steps, offset.shape[1]))
-    policy, plan = Policy(in_c_order(gain), in_c_order(offset)), Plan(states, controls)
+    policy, plan = Policy(in_c_order(gain), in_c_order(offset)), Motion(states, controls)
     core(problem).rollout(steps, in_c_order(state), policy, model, plan)
     return states, controls
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import InputError
-from lqrsim.kernels.records import Plan
+from lqrsim.kernels.records import Motion
 from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.constraints import Constraint, GoalState, StateBounds, SymbolicConstraint
 from lqrsim.problem.costs import ControlCost, Cost, CostSum, ObstacleCost, QuadraticCost, SymbolicCost, terms_of
@@ -42,7 +42,7 @@ def find_duration(
     stages = Stages(freed)
     stages.free[n] = 1.0
     states = np.column_stack([begin.states, np.full(len(begin.states), problem.steps * problem.dt)])
-    plan = Plan(in_c_order(states), in_c_order(begin.controls))
+    plan = Motion(in_c_order(states), in_c_order(begin.controls))
     with np.errstate(all="ignore"):
         point = InteriorPoint(freed, plan, room=0.02, stages=stages)
         found = point.run(tolerance=tolerance, violation=violation, most=MOST, watch=watch)
@@ -51,7 +51,7 @@ def find_duration(
     # Of all that belongs to the duration nothing is left.
     rows = found.row_size[stages.owners != len(problem.constraint_terms)]
     found = dataclasses.replace(
-        found, plan=Plan(in_c_order(found.plan.states[:, :n]), found.plan.controls),
+        found, plan=Motion(in_c_order(found.plan.states[:, :n]), found.plan.controls),
         gain=in_c_order(found.gain[:, :, :n]), multipliers=found.multipliers[:-1], row_size=rows,
     )  # fmt: skip
     duration = float(np.clip(point.point.plan.states[0, n], *problem.duration))

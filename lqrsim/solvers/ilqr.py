@@ -6,7 +6,7 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_number
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Plan, Policy, Rows
+from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Motion, Policy, Rows
 from lqrsim.kernels.records import Settings as KernelSettings
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.noise import Noise
@@ -149,11 +149,11 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     check_functions(problem, start, control)
     n, steps, zeros = len(start), problem.steps, np.zeros
     policy = Policy(initial_guess.gain.copy(), initial_guess.offset.copy())
-    plan = Plan(zeros((steps + 1, n)), zeros(initial_guess.offset.shape))
+    plan = Motion(zeros((steps + 1, n)), zeros(initial_guess.offset.shape))
     states, controls = plan
     go = CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1))
     work = Descent(
-        start=start, policy=policy, to_go=go, plan=plan, trial=Plan(states.copy(), controls.copy()), damping=zeros(1),
+        start=start, policy=policy, to_go=go, plan=plan, trial=Motion(states.copy(), controls.copy()), damping=zeros(1),
         certificate=zeros(1, CERTIFICATE),
     )  # fmt: skip
     log = zeros(settings.max_iterations + 1, LOG)

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_array, check_count, check_kind, check_number, excerpt, numbers_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.hashing import sha256
+from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Iteration, Multipliers, Trajectory
 from lqrsim.results.value_functions import Quadratic
 
@@ -103,7 +103,7 @@ class InitialPrior:
 
 
 # Controls (m,) or (T, m), or what has more to say; or a function that makes one of these for a problem.
-Beginning = npt.ArrayLike | InitialPrior | AffinePolicy | Trajectory | Solution | None
+Beginning = npt.ArrayLike | InitialPrior | AffinePolicy | Trajectory | Plan | None
 StartLike = Beginning | Callable[[Problem], Beginning]
 
 
@@ -182,7 +182,7 @@ def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess
         return replace(
             controls, prior=prior, summary=_summary(start, prior.weight, prior.about, controls.offset, acting)
         )
-    if isinstance(start, Solution):
+    if isinstance(start, Plan):
         policy, value = resolve(start.policy, problem), start.cost_to_go
         if value is not None:
             hessian = check_array("start: cost_to_go.hessian", value.hessian, (steps + 1, n, n))
@@ -210,7 +210,7 @@ def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess
         got = excerpt(wanted) if given is None else f"shape {given.shape}"
         raise InputError(
             f"start: got {got}, want controls ({m},) or ({steps}, {m}), an InitialPrior, a Trajectory, an AffinePolicy"
-            " or a Solution"
+            " or a Plan, such as a Solution"
         ) from None
     controls = check_array("start", controls, (steps, m))
     summary = controls[0] if (controls == controls[0]).all() else controls

@@ -22,7 +22,7 @@ from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import active_set as active_kernel
 from lqrsim.kernels import interior_point as kernel
-from lqrsim.kernels.records import ActiveRows, ConstraintRows, CostToGo, Limits, Plan, Policy, StageModels
+from lqrsim.kernels.records import ActiveRows, ConstraintRows, CostToGo, Limits, Motion, Policy, StageModels
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Iteration
 from lqrsim.solvers import compiled
@@ -89,7 +89,7 @@ class Found:
       control_size, row_size: by how much controls (m,) and rows (R,) change. scale: the cost that is relative to.
     """
 
-    plan: Plan
+    plan: Motion
     gain: Array
     measures: Measures
     multipliers: tuple[Array, ...]
@@ -146,7 +146,7 @@ class Stages:
         arrays = (np.zeros(self.live.size) for _ in range(6))
         self.active = ActiveRows(rows, np.zeros((rows, 6)), *arrays)
         self.to_go = CostToGo(np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1))
-        self.changes = Plan(np.zeros((steps + 1, n)), np.zeros((steps, m)))
+        self.changes = Motion(np.zeros((steps + 1, n)), np.zeros((steps, m)))
 
     def _take(self, problem: Problem) -> None:
         """Take a problem's numbers, and which of its rows can act."""
@@ -189,7 +189,7 @@ class Stages:
             call = self._calls[name] = (module or self._module).lay_out(name, *arguments)
         return call(*arguments)
 
-    def values(self, plan: Plan) -> Array:
+    def values(self, plan: Motion) -> Array:
         """The rows' numbers (T+1, R); of no meaning where they do not act."""
         numbers = np.empty(self.live.shape)
         if self._values:
@@ -205,46 +205,46 @@ class Stages:
             numbers[-1, row] = numbers[-2, row]
         return numbers
 
-    def trial(self, plan: Plan) -> tuple[float, Array]:
+    def trial(self, plan: Motion) -> tuple[float, Array]:
         """The cost of a plan, and where its steps lead (T, n)."""
         arrived = np.empty((self.steps, self.n))
         return self._call("trial", self.steps, self._soft, plan, self._model, arrived), arrived
 
-    def linearize(self, plan: Plan, costates: Array, multipliers: Array, least: float) -> float:
+    def linearize(self, plan: Motion, costates: Array, multipliers: Array, least: float) -> float:
         """Make the models about a plan, with costates (T+1, n) and multipliers (T+1, R); return its cost."""
         cost = self.second_order(plan, costates, multipliers, least)
         self.convexify(plan)
         return cost
 
     def second_order(
-        self, plan: Plan, costates: Array, multipliers: Array, least: float, *, second: bool = True
+        self, plan: Motion, costates: Array, multipliers: Array, least: float, *, second: bool = True
     ) -> float:
         """The same without the projected Hessians; without `second`, nor those of the steps and constraints."""
         return self._look(plan, costates, self.active._replace(size=0), in_c_order(multipliers), least, second=second)
 
-    def convexify(self, plan: Plan) -> None:
+    def convexify(self, plan: Motion) -> None:
         """Make the projected Hessians about a plan."""
         self._call("convex_models", self.steps, self._soft, plan, self._model, self.models)
 
-    def act_at(self, plan: Plan) -> None:
+    def act_at(self, plan: Motion) -> None:
         """Find out which rows act."""
         self.live &= ~np.isposinf(self.values(plan))  # so a constraint says that it does not act at a step
 
-    def look_about(self, plan: Plan) -> None:
+    def look_about(self, plan: Motion) -> None:
         """Find out which rows act, and which entries each depends on: slopes at the plan or a little beside it tell."""
         self.act_at(plan)
         wiggle = np.sin(1.0 + np.arange(self.n + self.m))
         nowhere, none = np.zeros((self.steps + 1, self.n)), np.zeros(self.live.shape)
         for far in (1e-3, 0.0):
-            beside = Plan(plan.states + far * wiggle[: self.n], plan.controls + far * wiggle[self.n :])
+            beside = Motion(plan.states + far * wiggle[: self.n], plan.controls + far * wiggle[self.n :])
             self.linearize(beside, nowhere, none, np.inf)
 
-    def sizes(self, plan: Plan) -> Sizes:
+    def sizes(self, plan: Motion) -> Sizes:
         """By how much things change, as far as a plan and the problem tell."""
         self.look_about(plan)
         return self.sizes_of(plan, self.models.convex)
 
-    def sizes_of(self, plan: Plan, hessian: Array) -> Sizes:
+    def sizes_of(self, plan: Motion, hessian: Array) -> Sizes:
         """The same of a plan about which the models are, with the Hessians of its cost.
 
         A control without limits has the size with which it moves states by theirs.
@@ -280,9 +280,9 @@ class Stages:
         weighed = self.slopes * self.spread(rows)[:, :, None]
         return np.matmul(weighed.transpose(0, 2, 1), self.slopes)
 
-    def follow(self, plan: Plan, part: float, policy: tuple[Array, Array], limits: Limits) -> Plan:
+    def follow(self, plan: Motion, part: float, policy: tuple[Array, Array], limits: Limits) -> Motion:
         """The motion that a part of a step leads to; see the kernel's."""
-        out = Plan(np.empty((self.steps + 1, self.n)), np.empty((self.steps, self.m)))
+        out = Motion(np.empty((self.steps + 1, self.n)), np.empty((self.steps, self.m)))
         self._call("follow", self.steps, float(part), plan, Policy(*policy), limits, self._model, out)
         return out
 
@@ -303,12 +303,12 @@ class Stages:
         joined[:, : self.n], joined[:-1, self.n :] = self.changes
         return joined
 
-    def look(self, plan: Plan, costates: Array, *, own: bool = False) -> float:
+    def look(self, plan: Motion, costates: Array, *, own: bool = False) -> float:
         """Make the models about a plan, and write what rows have to spare; return its cost. See the kernel's."""
         return self._look(plan, costates, self.active, self.active.force, 0.0, own=own)
 
     def _look(
-        self, plan: Plan, costates: Array, active: ActiveRows, multipliers: Array, least: float, *,
+        self, plan: Motion, costates: Array, active: ActiveRows, multipliers: Array, least: float, *,
         second: bool = True, own: bool = False,
     ) -> float:  # fmt: skip
         rows = self._rows._replace(least=float(least), multipliers=multipliers.reshape(-1))
@@ -317,7 +317,7 @@ class Stages:
             self.models, active, module=self._active,
         )  # fmt: skip
 
-    def measure(self, plan: Plan, gaps: Array, sizes: Sizes) -> tuple[float, ...]:
+    def measure(self, plan: Motion, gaps: Array, sizes: Sizes) -> tuple[float, ...]:
         """How far the plan about which the models are is from an optimum; writes its gaps. See the kernel's."""
         of = plan, self.models, gaps, self.active, sizes.states, sizes.controls
         return self._call("measure", self.steps, *of, module=self._active)
@@ -340,12 +340,12 @@ class Stages:
         """Change which rows are held; see the kernel's."""
         self._call("change", self.steps, int(worst), self.active, module=self._active)
 
-    def carry_out(self, plan: Plan, gain: Array) -> tuple[Plan, float, list[Array]]:
+    def carry_out(self, plan: Motion, gain: Array) -> tuple[Motion, float, list[Array]]:
         """The motion that a plan comes to with gains about it, its cost, and of each constraint the numbers.
 
         Controls are put at the limits that are held; gains (T, m, n) are zero there.
         """
-        out = Plan(np.empty_like(plan.states), np.empty_like(plan.controls))
+        out = Motion(np.empty_like(plan.states), np.empty_like(plan.controls))
         limits = Limits(*(np.tile(side, (self.steps, 1)) for side in (self.low, self.high)))
         cost = self._call(
             "carry_out", self.steps, self._soft, plan, Policy(gain, self.offset), limits, self.active, self._model,
@@ -357,7 +357,7 @@ class Stages:
 class Point(NamedTuple):
     """Where the iterations stand: a plan, its cost, where its steps lead, the live rows' numbers (K,); slacks (P,)."""
 
-    plan: Plan
+    plan: Motion
     cost: float
     arrived: Array
     numbers: Array
@@ -367,7 +367,7 @@ class Point(NamedTuple):
 class Step(NamedTuple):
     """A change of plan, slacks (P,), multipliers (K,), and the costates where it leads."""
 
-    plan: Plan
+    plan: Motion
     slack: Array
     multipliers: Array
     costates: Array
@@ -389,7 +389,7 @@ class InteriorPoint:
     def __init__(
         self,
         problem: Problem,
-        plan: Plan,
+        plan: Motion,
         *,
         barrier: float = 1.0,
         room: float = 0.02,
@@ -406,8 +406,8 @@ class InteriorPoint:
             fixed = stages.free == 0
             states[0, fixed] = np.asarray(problem.start)[fixed]
         within = in_c_order(np.clip(controls, stages.low, stages.high))
-        self._begun, self._known = Plan(in_c_order(states), within), multipliers
-        plan = Plan(in_c_order(states), in_c_order(np.clip(controls, stages.low + edge, stages.high - edge)))
+        self._begun, self._known = Motion(in_c_order(states), within), multipliers
+        plan = Motion(in_c_order(states), in_c_order(np.clip(controls, stages.low + edge, stages.high - edge)))
         self.sizes = stages.sizes(plan)
         self._state_size, self._range, self._row_size, self._typical = self.sizes
         self._rows_of(plan, barrier, room, price, multipliers)
@@ -420,7 +420,7 @@ class InteriorPoint:
         self._measure()
         self._farthest = FARTHEST * max(0.05 * stages.steps, self._off(self.point))
 
-    def _rows_of(self, plan: Plan, barrier: float, room: float, price: float, multipliers: tuple[Array, ...]) -> None:
+    def _rows_of(self, plan: Motion, barrier: float, room: float, price: float, multipliers: tuple[Array, ...]) -> None:
         """Set up slacks and multipliers."""
         stages, live = self.stages, self.stages.live
         cost, arrived = stages.trial(plan)
@@ -758,7 +758,7 @@ class InteriorPoint:
         multipliers = -sigma * (moved + self._target(duals, corrections) + beyond)
         ratio = point.slack / duals
         slack = (self.parameter - corrections) / duals - point.slack - self._sign * ratio * multipliers[self._row]
-        plan = Plan(stages.changes.states.copy(), stages.changes.controls.copy())
+        plan = Motion(stages.changes.states.copy(), stages.changes.controls.copy())
         return Step(plan, slack, multipliers, stages.to_go.gradient.copy())
 
     def _predict(self, hessian: Array, sigma: Array, duals: Array, least: float) -> Array:
@@ -799,7 +799,7 @@ class InteriorPoint:
 
     def _at(self, step: Step, part: float) -> Point | None:
         """The point a part of a step further; None where it is not finite."""
-        plan = Plan(
+        plan = Motion(
             in_c_order(self.point.plan.states + part * step.plan.states),
             in_c_order(self.point.plan.controls + part * step.plan.controls),
         )

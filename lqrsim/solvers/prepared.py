@@ -8,17 +8,18 @@ import numpy.typing as npt
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array, InputError, check_array, check_kind, check_number
-from lqrsim.kernels.records import Plan
+from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
+from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.replan import Replan
-from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.active_set import ActiveSet
+from lqrsim.solvers.assembly import goal_radius_of
 from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import SmootherSettings, Stop, check_problem, raised_by
 from lqrsim.solvers.constrained import satisfy
@@ -101,7 +102,7 @@ class PreparedSolver:
         for which in range(len(self.problem.constraint_terms)):
             attempt.work.constraint_slope(which, 0, state, control, 0)
         if self.problem.constraints and attempt.newton:
-            stages, plan = Stages(self.problem), Plan(*attempt.work.plan)
+            stages, plan = Stages(self.problem), Motion(*attempt.work.plan)
             _Neighbour(attempt, stages, plan, _Best(attempt)).find()
             # What that can do without, another solve may need.
             stages.convexify(plan)
@@ -140,7 +141,7 @@ class PreparedSolver:
     def solve(
         self,
         state: npt.ArrayLike,
-        start: Solution | Replan | InitialGuess,
+        start: Plan | InitialGuess,
         *,
         problem: Problem | None = None,
         after: int = 0,
@@ -163,7 +164,7 @@ class PreparedSolver:
         """
         clock = time.perf_counter()
         problem = (self.problem if problem is None else self.check(problem)).from_state(state, after=after)
-        check_kind("start", start, (Solution, Replan, InitialGuess), "a Solution or a Replan")
+        check_kind("start", start, (Plan, InitialGuess), "a Plan, such as a Solution or a Replan")
         stop = Stop() if time_limit is None else Stop(clock + check_number("time_limit", time_limit, above=0.0))
         stop.reserve = self._pace + self._closing
         guess = start if isinstance(start, InitialGuess) else _initial_guess(start, problem)
@@ -200,16 +201,17 @@ class PreparedSolver:
             status=found.status, detail=found.detail, improved=best.improved, policy=policy,
             trajectory=Trajectory(states, controls, problem.dt), cost=best.cost, before=best.before,
             violation=best.violation, cost_to_go=value, multipliers=best.multipliers,
-            iterations=len(found.iterations), seconds=time.perf_counter() - clock, iterating=iterating,
+            goal=problem.weighed_goal, goal_radius=goal_radius_of(problem), iterations=len(found.iterations),
+            seconds=time.perf_counter() - clock, iterating=iterating,
         )  # fmt: skip
 
 
-def _plan_of(start: Solution | Replan | InitialGuess, best: "_Best") -> Plan:
+def _plan_of(start: Plan | InitialGuess, best: "_Best") -> Motion:
     """Where a law leads, but for the last state: a horizon that moves has a last step that the law was not made for.
 
     Where that misses constraints, the plan that the law belongs to, but for where it begins.
     """
-    plan = Plan(*(array.copy() for array in best.plan))
+    plan = Motion(*(array.copy() for array in best.plan))
     if isinstance(start, InitialGuess) or start.trajectory.states.shape != plan.states.shape:
         return plan
     planned = start.trajectory
@@ -219,7 +221,7 @@ def _plan_of(start: Solution | Replan | InitialGuess, best: "_Best") -> Plan:
     return plan
 
 
-def _initial_guess(start: Solution | Replan, problem: Problem) -> InitialGuess:
+def _initial_guess(start: Plan, problem: Problem) -> InitialGuess:
     """The law to begin with, and what is known of its cost-to-go and of the multipliers."""
     n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
     law = start.policy
@@ -266,7 +268,7 @@ class _Neighbour:
       ended: when the last iteration did.
     """
 
-    def __init__(self, attempt: Attempt, stages: Stages, plan: Plan, best: "_Best", closing: float = 0.0) -> None:
+    def __init__(self, attempt: Attempt, stages: Stages, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
         self._attempt, self._stages, self._plan, self._best = attempt, stages, plan, best
         self._closing = closing
         self._allowed = attempt.settings.missed(attempt.problem)
@@ -291,7 +293,7 @@ class _Neighbour:
             solved = self._run(active)
             if not (solved or active.hopeless or self._late(BEGINNING * active.looking)) and self._left:
                 point = InteriorPoint(
-                    attempt.problem, Plan(*(array.copy() for array in self._best.plan)), barrier=LITTLE[0],
+                    attempt.problem, Motion(*(array.copy() for array in self._best.plan)), barrier=LITTLE[0],
                     room=LITTLE[1], multipliers=known, stages=self._stages,
                 )  # fmt: skip
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
-from lqrsim.kernels.records import Limits, Plan
+from lqrsim.kernels.records import Limits, Motion
 from lqrsim.solvers.interior_point import MIXES, Sizes, Stages
 
 FIRST, LEAST, FALL = 1e-1, 1e-6, 0.2  # of the barrier's parameter, relative to the price; and what it falls by
@@ -32,13 +32,13 @@ class Restored:
     `settled` is whether the parameter of the barrier fell all the way.
     """
 
-    plan: Plan
+    plan: Motion
     shares: list[Array]
     settled: bool
 
 
 def restore(
-    stages: Stages, plan: Plan, sizes: Sizes, *, price: float, most: int,
+    stages: Stages, plan: Motion, sizes: Sizes, *, price: float, most: int,
     watch: Callable[[float, float, float], bool],
 ) -> Restored | None:  # fmt: skip
     """Go down from a motion (states (T+1, n), controls (T, m)).
@@ -54,7 +54,7 @@ def restore(
     highest = price * sizes.cost / size
     edge = EDGE * np.where(np.isfinite(stages.high - stages.low), stages.high - stages.low, 0.0)
     controls = np.clip(plan.controls, stages.low + edge, stages.high - edge)
-    begun = Plan(plan.states, in_c_order(controls))
+    begun = Motion(plan.states, in_c_order(controls))
     still = np.zeros((stages.steps, stages.m, stages.n)), np.zeros((stages.steps, stages.m))
     plan = stages.follow(begun, 0.0, still, _limits(stages, begun.controls))
     parameter = FIRST * price * sizes.cost / max(len(size), 1)

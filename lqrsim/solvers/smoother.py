@@ -86,9 +86,9 @@ def smooth(
         comes first, does not count. It is looked at between iterations.
       start: what to begin with, in place of a search. Controls (m,) or (T, m) to apply in the first pass, such as the
         problem's nominal control; an InitialPrior, which adds what draws the first iterations; an AffinePolicy; a
-        Trajectory, feasible or not; or a Solution of a similar problem, whose policy, cost-to-go and multipliers it
-        takes up. Or a function of the problem that returns one. Controls are cut off at their limits. With constraints
-        the answer costs no more than a feasible plan that is given.
+        Trajectory, feasible or not; or a Solution or other Plan of a similar problem, whose policy, cost-to-go and
+        multipliers it takes up. Or a function of the problem that returns one. Controls are cut off at their limits.
+        With constraints the answer costs no more than a feasible plan that is given.
       starts: how many starts to try, by default 7 where there is an ObstacleCost; 1 is the straight way to the goal.
         The candidates are in the solution.
       constraint_tolerance: the most by which constraints may be missed, each in its unit; by default 1e-6, and of

@@ -26,7 +26,7 @@ import numpy as np
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import Plan
+from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers import compiled, constrained
 from lqrsim.solvers.attempt import Attempt, AttemptResult
@@ -103,7 +103,7 @@ class Ladder:
         self._iterations: tuple[Iteration, ...] = attempt.initial_guess.log
         self._best: AttemptResult | None = None
         self._given: AttemptResult | None = None
-        self._valley: Plan | None = None
+        self._valley: Motion | None = None
         # Whether smoothing and its search have gone round obstacles, which are then to be passed on that side.
         self._guided = any(cost.weight for cost in attempt.problem.obstacle_costs)
         self._evidence: list[tuple[Evidence, AttemptResult]] = []
@@ -146,7 +146,7 @@ class Ladder:
                 break
         return self._answer(start)
 
-    def from_plan(self, iterations: tuple[Iteration, ...], plan: Plan | AttemptResult) -> AttemptResult | None:
+    def from_plan(self, iterations: tuple[Iteration, ...], plan: Motion | AttemptResult) -> AttemptResult | None:
         """From a plan, which took these iterations; None where that leads nowhere."""
         kept = self._attempt.kept()
         self._iterations = iterations
@@ -168,7 +168,7 @@ class Ladder:
         plan = attempt.work.arrays.rollout if settled else attempt.work.plan  # which is the one of least cost
         if termination is not attempt.termination or not np.isfinite(attempt.work.memory["plan_cost"]):
             return None
-        self._valley = Plan(plan.states.copy(), plan.controls.copy())
+        self._valley = Motion(plan.states.copy(), plan.controls.copy())
         if attempt.stop.due:
             return None
         if termination.outcome != declarations.IN_VALLEY or (not self._guided and termination.iterations[-1].violation):
@@ -179,7 +179,7 @@ class Ladder:
         self._iterations = found.iterations
         if found.success and found.violation == 0:
             return self._note(found)
-        bottom = Plan(found.states.copy(), found.controls.copy()) if found.success else self._valley
+        bottom = Motion(found.states.copy(), found.controls.copy()) if found.success else self._valley
         attempt.go_on(kept, termination.iterations)
         return None if attempt.stop.due else self._interior(bottom, LITTLE if self._guided else MUCH)
 
@@ -189,7 +189,7 @@ class Ladder:
         attempt.settings = replace(settings, max_iterations=min(AUGMENTED, settings.max_iterations))
         found = constrained.refine(attempt, each=self._each, callback=self._callback)
         attempt.settings, self._iterations = settings, (*self._iterations, *found.iterations)
-        plan = Plan(found.states.copy(), found.controls.copy())
+        plan = Motion(found.states.copy(), found.controls.copy())
         self._without_multipliers()
         if attempt.stop.due or not np.isfinite(found.cost) or not np.isfinite(plan.states).all():
             return None
@@ -205,13 +205,13 @@ class Ladder:
         before = replace(attempt.result(attempt.termination), iterations=self._iterations)
         found = constrained.satisfy(attempt, before, each=self._each, callback=self._callback)
         attempt.settings, self._iterations = settings, found.iterations
-        plan = Plan(found.states.copy(), found.controls.copy())
+        plan = Motion(found.states.copy(), found.controls.copy())
         self._without_multipliers()
         if attempt.stop.due or not np.isfinite(found.cost) or not np.isfinite(plan.states).all():
             return None
         return self._interior(plan, LITTLE)
 
-    def _at_a_price(self, plan: Plan | None) -> AttemptResult | None:
+    def _at_a_price(self, plan: Motion | None) -> AttemptResult | None:
         """With constraints that may be missed; and from where that leads, without."""
         if plan is None or self._attempt.settings.elastic is not None:
             return None
@@ -230,7 +230,7 @@ class Ladder:
                     return found
         return None
 
-    def _restore(self, plan: Plan, price: float) -> tuple[Restored | None, Sizes]:
+    def _restore(self, plan: Motion, price: float) -> tuple[Restored | None, Sizes]:
         """Descent at a price, with a line of the log each."""
         stop, left = self._attempt.stop, self._attempt.iterations_left(self._iterations) - 1
         before, clock, slow = np.inf, time.perf_counter(), 0
@@ -268,7 +268,7 @@ class Ladder:
         return found is not None
 
     def _interior(
-        self, plan: Plan, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()
+        self, plan: Motion, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()
     ) -> AttemptResult | None:
         """The interior point from a plan, and what becomes of it."""
         return self._answered(self._run(plan, barrier, multipliers=multipliers))
@@ -281,7 +281,7 @@ class Ladder:
             return self._note(result)
         return self._note(self._rolled_out(found.plan, found.gain))
 
-    def _run(self, plan: Plan, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()) -> Found | None:
+    def _run(self, plan: Motion, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()) -> Found | None:
         """Iterations of the interior point, with a line of the log each; None where they were interrupted."""
         stop, left = self._attempt.stop, self._attempt.iterations_left(self._iterations) - 1
         if left < 1 or stop.due:
@@ -318,10 +318,10 @@ class Ladder:
         states, controls = compiled.rollout(self._problem, guess.gain, guess.offset, work.start.copy())
         return self._result(states, controls, (guess.gain, guess.offset))
 
-    def _without_gains(self, plan: Plan) -> tuple[Array, Array]:
+    def _without_gains(self, plan: Motion) -> tuple[Array, Array]:
         return np.zeros((*plan.controls.shape, plan.states.shape[1])), plan.controls
 
-    def _rolled_out(self, plan: Plan, gain: Array) -> AttemptResult:
+    def _rolled_out(self, plan: Motion, gain: Array) -> AttemptResult:
         """Where a plan leads with gains about it; or without, if that misses less."""
         candidates = []
         for gains in (gain, np.zeros_like(gain)):
@@ -332,7 +332,7 @@ class Ladder:
 
     def _result(self, states: Array, controls: Array, law: tuple[Array, Array]) -> AttemptResult:
         """A plan that has not converged."""
-        cost, _ = self._stages.trial(Plan(in_c_order(states), in_c_order(controls)))
+        cost, _ = self._stages.trial(Motion(in_c_order(states), in_c_order(controls)))
         work = self._attempt.work
         violation = work.violation(work.constraint_values(states, controls)) if np.isfinite(states).all() else np.inf
         return AttemptResult(
@@ -368,7 +368,7 @@ class Ladder:
             acts = np.isfinite(numbers) & (term.equality | presses)
             array[declarations.HEADER :] = np.where(acts, force, 0.0).ravel()
         work.plan.states[...], work.plan.controls[...] = states, controls
-        work.memory["plan_cost"] = self._stages.trial(Plan(in_c_order(states), in_c_order(controls)))[0]
+        work.memory["plan_cost"] = self._stages.trial(Motion(in_c_order(states), in_c_order(controls)))[0]
         lagrangian, before = AugmentedLagrangian(attempt), self._iterations
         lagrangian.evaluate(*work.plan)
         result = self._descend(lagrangian)
@@ -440,5 +440,5 @@ class Ladder:
         return attempt.certified(replace(best, iterations=self._iterations))
 
 
-def _plan(of: AttemptResult | Trajectory | Plan) -> Plan:
-    return Plan(of.states.copy(), of.controls.copy())
+def _plan(of: AttemptResult | Trajectory | Motion) -> Motion:
+    return Motion(of.states.copy(), of.controls.copy())

@@ -14,7 +14,7 @@ from lqrsim.kernels.records import (
     CostModel,
     CostToCome,
     CostToGo,
-    Plan,
+    Motion,
     Policy,
     Prior,
     Smoothing,
@@ -47,8 +47,8 @@ class Workspace:
         self.memory = self.memory_rows[0]
         kept = steps if self.dual else 1  # the primal form finds its way back without
 
-        def plan() -> Plan:
-            return Plan(zeros((steps + 1, n)), zeros((steps, m)))
+        def plan() -> Motion:
+            return Motion(zeros((steps + 1, n)), zeros((steps, m)))
 
         def policy() -> Policy:
             return Policy(zeros((steps, m, n)), zeros((steps, m)))
@@ -101,7 +101,7 @@ class Workspace:
         return self.arrays.start
 
     @property
-    def plan(self) -> Plan:
+    def plan(self) -> Motion:
         """The best so far."""
         return self.arrays.plan
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.control.controllers import Controller, Feedback
+from lqrsim.control.controllers import ControllerLike, as_controller
 from lqrsim.control.tubes import Tube
 from lqrsim.errors import (
     Array,
@@ -51,7 +51,7 @@ def funnel(
     solution: Solution,
     *,
     disturbances: Sequence[Disturbance | Noise] = (),
-    controller: Controller | None = None,
+    controller: ControllerLike | None = None,
     rate: float = 0.99,
     confidence: float = CONFIDENCE,
     knots: Sequence[int] | None = None,
@@ -189,7 +189,7 @@ def check_funnel(
     solution: Solution,
     *,
     disturbances: Sequence[Disturbance | Noise] = (),
-    controller: Controller | None = None,
+    controller: ControllerLike | None = None,
     trials: int = 1000,
     between: tuple[float, float] = (0.0, 1.0),
     seed: int = 1,
@@ -258,13 +258,11 @@ class _Trials:
 
     def __init__(
         self, plant: Plant, solution: Solution, disturbances: Sequence[Disturbance | Noise],
-        controller: Controller | None, near: tuple[float | None, float | None], threads: int | None,
+        controller: ControllerLike | None, near: tuple[float | None, float | None], threads: int | None,
     ) -> None:  # fmt: skip
         self.plant = check_kind("plant", plant, Plant, "a Plant, such as scenario.plant()")
         self.solution = check_kind("solution", solution, Solution, "a Solution, such as smooth(problem)")
-        kinds = (Controller, type(None))
-        law = check_kind("controller", controller, kinds, "a Controller, such as Feedback(solution.policy), or None")
-        self.law: Controller = Feedback(solution.policy) if law is None else law
+        self.law, _ = as_controller(controller, solution, plant.robot.dynamics)
         self.disturbances = as_disturbances(disturbances, "disturbances, such as ControlNoise(0.05)")
         # A rest of the plan has another range, which goals without a position are measured by.
         self.target = Target(solution.policy.state_coordinates, solution.goal, solution.trajectory.states)

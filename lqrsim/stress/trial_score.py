@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from lqrsim.control.controllers import Controller
+from lqrsim.control.controllers import ControllerLike
 from lqrsim.errors import (
     Array,
     InputError,
@@ -175,7 +175,7 @@ class TrialScore:
     plant: Plant
     solution: Solution
     disturbances: Sequence[Disturbance]
-    controller: Controller | None = None
+    controller: ControllerLike | None = None
     failure: Callable[[Rollout], Array] = collision
     goal_radius: float | None = None
     goal_tolerance: float | None = None

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.control.controllers import Controller, Feedback
+from lqrsim.control.controllers import Controller
 from lqrsim.control.offset_free import OffsetFree
-from lqrsim.control.replanning import Replanning
+from lqrsim.control.replanner import Replanner
 from lqrsim.control.tracking import track
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import InputError, check_name, told
+from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
@@ -113,7 +114,7 @@ def controller(
     *,
     stated: Sequence[Disturbance] | None = None,
     replan_every: float | None = None,
-) -> Controller:
+) -> Controller | AffinePolicy:
     """One of CONTROLLERS, about a solution of the scenario.
 
     Args:
@@ -128,7 +129,7 @@ def controller(
     problem = scenario.problem
     match check_name("controller", name, CONTROLLERS):
         case "track":
-            return Feedback(track(problem, solution, uncertainty=stated_uncertainty(scenario, stated)))
+            return track(problem, solution, uncertainty=stated_uncertainty(scenario, stated))
         case "offset_free":
             return OffsetFree(problem, solution, stated_uncertainty(scenario, stated))
         case "replan":
@@ -138,11 +139,13 @@ def controller(
                     f" that was solved as the scenario has it, or another of {', '.join(CONTROLLERS)}"
                 )
             every = max(problem.dt, problem.steps * problem.dt / 10) if replan_every is None else replan_every
-            return Replanning(problem, solution, every=every)
-    return Feedback(solution.policy)
+            return Replanner(problem, solution, every=every, deadline=0.0)
+    return solution.policy
 
 
-def controller_by_name(name: str, scenario: Scenario, solution: Solution, stated: str | None = None) -> Controller:
+def controller_by_name(
+    name: str, scenario: Scenario, solution: Solution, stated: str | None = None
+) -> Controller | AffinePolicy:
     """The same, but that what is stated is named, as `sweep` names it.
 
     Raises:
@@ -161,32 +164,26 @@ def controller_of(
     *,
     stated: Sequence[Disturbance] | None = None,
     replan_every: float | None = None,
-) -> Controller:
+) -> Controller | AffinePolicy:
     """What runs one of POLICIES, given what `solve` has for it."""
     name = _RUN_BY.get(policy, "feedback")
     return controller(name, scenario, solution, stated=stated, replan_every=replan_every)
 
 
 class Trials:
-    """Runs trials of a campaign's cells.
-
-    Attributes:
-      controller: of the last run; None before.
-    """
+    """Runs trials of a campaign's cells."""
 
     def __init__(self, campaign: Campaign, scenario: Scenario, solutions: Mapping[str, Solution]) -> None:
         self.campaign, self.scenario, self.solutions = campaign, scenario, solutions
         self.plant = scenario.plant()
-        self.controller: Controller | None = None
-        self._made: dict[str, Controller] = {}
+        self._made: dict[str, Controller | AffinePolicy] = {}
 
     def run(self, cell: Cell, first: int, count: int = 1, *, frames: bool, contacts: bool) -> Rollout:
         """So many trials of a cell, from the first on."""
-        self.controller = self._controller(cell.policy)
         return simulate(
             self.plant,
             self.solutions[cell.policy],
-            controller=self.controller,
+            controller=self._controller(cell.policy),
             disturbances=self.campaign.disturbances(cell),
             **self.scenario.near_enough(self.campaign.goal_radius, self.campaign.goal_tolerance),
             seed=self.campaign.seed,
@@ -236,7 +233,7 @@ class Trials:
         except Exception as error:
             return failed(trial, 1, told(error))
 
-    def _controller(self, policy: str) -> Controller:
+    def _controller(self, policy: str) -> Controller | AffinePolicy:
         """Made once, for its gains take a while; a run begins it anew."""
         if policy not in self._made:
             options = {"stated": self.campaign.stated, "replan_every": self.campaign.replan_every}

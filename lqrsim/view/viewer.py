@@ -11,8 +11,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lqrsim.control.controllers import Controller
-from lqrsim.control.planner import Planner
+from lqrsim.control.controllers import ControllerLike
+from lqrsim.control.live_replanner import LiveReplanner
 from lqrsim.errors import Array, InputError
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
@@ -20,9 +20,9 @@ from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
 from lqrsim.view.browser import Browser
-from lqrsim.view.live_planner import LONGEST_RUN, LivePlanner, lengthened
 from lqrsim.view.movable_goal import MovableGoal, model_with_goal
 from lqrsim.view.recorded_model import model_of
+from lqrsim.view.viewed_replanner import LONGEST_RUN, ViewedReplanner, lengthened
 from lqrsim.view.viewer_base import PUSHES, RestartRequested, Viewer, ViewerClosed
 
 KEYS = """Arrow keys and Page Up/Down push the robot, seen from the camera. Ctrl and the right mouse button drag it.
@@ -153,8 +153,8 @@ def live(
     viewer: Viewer,
     *,
     disturbances: Sequence[Disturbance] = (),
-    controller: Controller | None = None,
-    planner: Callable[[], Planner] | None = None,
+    controller: ControllerLike | None = None,
+    planner: Callable[[], LiveReplanner] | None = None,
     goal: MovableGoal | None = None,
     seed: int = 0,
     ended: Callable[[str], object] = lambda line: None,
@@ -165,8 +165,8 @@ def live(
     large, or when the simulation becomes unstable. Run k has the random numbers of trial k of that seed.
 
     Args:
-      planner: makes what plans again as the robot goes, for each run, in place of a controller. A run then goes on
-        after the plan's horizon, for ten minutes at most.
+      planner: makes what plans again as the robot goes, for each run, in place of a controller: `replanner.live`. A run
+        then goes on after the plan's horizon, for ten minutes at most.
       goal: that a person moves, with a planner and a viewer that shows it.
       ended: called with a line on each run that has ended.
     """
@@ -183,8 +183,12 @@ def live(
         if planner is None:
             rollout = simulate(plant, solution, controller=controller, **options)
             return rollout.summary().splitlines()[-1].strip().replace("trial", "run")
-        with LivePlanner(planner(), plant, viewer, goal, ended) as law:
-            rollout = simulate(plant, lengthened(solution), controller=law, **options)
+        with planner() as replanner:
+            law = ViewedReplanner(replanner, plant, viewer, goal)
+            try:
+                rollout = simulate(plant, lengthened(solution), controller=law, **options)
+            finally:
+                ended(replanner.summary())
         return f"run {run}: {rollout.reasons[0] or f'has lasted {LONGEST_RUN:g} s'}"
 
     run, everything = 0, [*disturbances, _UserForces(viewer)]

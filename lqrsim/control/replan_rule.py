@@ -1,0 +1,327 @@
+"""Solving again as a robot goes: what is solved, when and from where, and how that went.
+
+`replanner.py` has the two ways to run it, of which `live_replanner.py` is the one on a robot, in a thread;
+`replanned.py` runs it within output feedback.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_count,
+    check_flag,
+    check_function,
+    check_kind,
+    check_name,
+    check_number,
+    excerpt,
+)
+from lqrsim.problem.problem import Problem
+from lqrsim.results.funnel import Funnel
+from lqrsim.results.plan import Plan
+from lqrsim.results.replan import Replan
+from lqrsim.results.solution_parts import HORIZONS
+from lqrsim.solvers import compiled
+from lqrsim.solvers.initial_guess import InitialGuess
+from lqrsim.solvers.prepared import prepare
+
+
+@dataclass(frozen=True)
+class ActivePlan:
+    """A plan in force, or that will be.
+
+    Attributes:
+      plan: with its law.
+      first: the control period that it begins at.
+    """
+
+    plan: Plan
+    first: int
+
+    def row(self, step: int) -> int:
+        """Which of its laws is in force at a step: after its horizon the last one.
+
+        Args:
+          step: number of the control period.
+
+        Returns:
+          A row of its gains.
+        """
+        return min(max(step - self.first, 0), self.plan.trajectory.steps - 1)
+
+
+@dataclass(frozen=True)
+class SolveRequest:
+    """What is to be solved: at a step, for a plan that begins at another, from a state (n,) and with a law."""
+
+    step: int
+    first: int
+    state: Array
+    start: Plan | InitialGuess
+    problem: Problem
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplanRecord:
+    """How one solve went.
+
+    Attributes:
+      step: the control period in which it began.
+      trial: of a simulation, else 0.
+      status: how the solve ended.
+      iterations: how many it took.
+      seconds: how long it took.
+      cost: of the new plan.
+      before: cost of continuing with the law in force.
+      used: whether its plan came into force.
+      reason: why not, or why it is no better; empty if all went well.
+    """
+
+    step: int
+    trial: int
+    status: str
+    iterations: int
+    seconds: float
+    cost: float
+    before: float
+    used: bool
+    reason: str
+
+    def __post_init__(self) -> None:
+        for name in ("step", "trial", "iterations"):
+            check_count(f"ReplanRecord: {name}", getattr(self, name), at_least=0)
+
+
+class ReplanLog:
+    """How the solves of one run went.
+
+    Attributes:
+      records: a `ReplanRecord` of each.
+      solved: how many were used, of all trials.
+      kept: why others were not, and the law before went on: reason -> how many.
+    """
+
+    def __init__(self) -> None:
+        self.records: list[ReplanRecord] = []
+        self.solved, self.kept = 0, Counter[str]()
+
+    def enter(self, step: int, trial: int, replan: Replan, *, late: bool = False) -> bool:
+        """Count a solve.
+
+        Args:
+          step: in which it began.
+          trial: of a simulation, else 0.
+          replan: its answer.
+          late: whether it came after the deadline.
+
+        Returns:
+          Whether its plan is to be used.
+        """
+        reason = "" if replan.success else replan.status.name
+        if late:
+            reason = "not ready in time"
+        elif not replan.improved and not replan.success:
+            reason = f"{replan.status.name}, without a better plan"
+        finite = np.isfinite(replan.cost)
+        used = finite and not late and (replan.success or replan.improved)
+        if not finite:
+            reason = "the law before leads to infinity by the model"
+        self.solved += used
+        if not used:
+            self.kept[reason] += 1
+        self.records.append(
+            ReplanRecord(
+                step=step, trial=trial, status=replan.status.name, iterations=replan.iterations, seconds=replan.seconds,
+                cost=replan.cost, before=replan.before, used=used, reason=reason,
+            )
+        )  # fmt: skip
+        return used
+
+    def refuse(self, reason: str) -> None:
+        """Count a solve that did not begin.
+
+        Args:
+          reason: why.
+        """
+        self.kept[reason] += 1
+
+    def summary(self, *, times: bool = False) -> str:
+        """How often it was solved, and why the law before went on where it did, in a line.
+
+        Args:
+          times: whether to say how long solves took, too.
+
+        Returns:
+          A line of text.
+        """
+        line = f"solved again {self.solved} times"
+        early = Counter(one.reason for one in self.records if one.used and one.reason)
+        if early:
+            line += f" ({', '.join(f'{count} {reason}' for reason, count in early.most_common())})"
+        if self.kept:
+            reasons = "; ".join(f"{count} times {reason}" for reason, count in self.kept.most_common())
+            line += f", kept the law before {self.kept.total()} times: {reasons}"
+        if times and self.records:
+            took = 1e3 * np.array([one.seconds for one in self.records])
+            line += f"; a solve took {np.median(took):.1f} ms in the median and {took.max():.1f} ms at most"
+        return line
+
+
+# What a plan in force is stepped by: field -> what of it has to stay.
+_FIXED: dict[str, Callable[[Problem], object]] = {
+    "dt": lambda problem: problem.dt,
+    "steps": lambda problem: problem.steps,
+    "duration": lambda problem: problem.duration,
+    "dynamics": lambda problem: ", ".join(
+        (*problem.dynamics.state_coordinates.names, *problem.dynamics.control_coordinates.names)
+    ),
+}
+
+
+class ReplanRule:
+    """What is solved, when and from where. Runs do not change it.
+
+    Args:
+      who: for messages. problem: that was solved. solution: its solution.
+      every: seconds between two solves. deadline: seconds until its answer comes into force, by default a control
+        period, or `at_least` as long. Both are rounded to control periods, the deadline up.
+      horizon: "shrinking", to the end of the first plan, or "moving", as long as that.
+      predict: whether to solve from where the law in force leads by the deadline, or from the state at the beginning.
+      when: a funnel of the solution, if solves are only for states outside it.
+      share: of the funnel's level that counts as its boundary.
+      changes: (time in s, problem) -> the problem as it is known by then.
+
+    Attributes:
+      periods: control periods between two solves. delay: until the answer comes into force.
+      solver: the prepared solver.
+
+    Raises:
+      InputError: as `Replanner`.
+    """
+
+    def __init__(
+        self,
+        who: str,
+        problem: Problem,
+        solution: Plan,
+        every: float,
+        *,
+        name: str = "every",
+        deadline: float | None = None,
+        horizon: str = "shrinking",
+        predict: bool = True,
+        when: Funnel | None = None,
+        share: float = 1.0,
+        changes: Callable[[float, Problem], Problem] | None = None,
+        at_least: float = 0.0,
+    ) -> None:
+        check_kind(f"{who}: problem", problem, Problem, "a Problem, such as scenario.problem")
+        check_kind(f"{who}: solution", solution, Plan, "its Solution, or another Plan")
+        dynamics, plan = problem.dynamics, solution.trajectory
+        spaces = solution.policy.state_coordinates.names, solution.policy.control_coordinates.names
+        if spaces != (dynamics.state_coordinates.names, dynamics.control_coordinates.names):
+            raise InputError(f"{who}: solution: got one of another system, want the problem's")
+        if (plan.steps, plan.dt) != (problem.steps, problem.dt):
+            got, want = f"{plan.steps} steps of {plan.dt:g} s", f"{problem.steps} steps of {problem.dt:g} s"
+            raise InputError(f"{who}: solution: got {got}, want the problem's: {want}")
+        self.every = check_number(f"{who}: {name}", every, at_least=0.999 * problem.dt)
+        self.periods = round(self.every / problem.dt)
+        deadline = max(problem.dt, at_least) if deadline is None else deadline
+        self.deadline = check_number(f"{who}: deadline", deadline, at_least=0.0)
+        self.delay = math.ceil(self.deadline / problem.dt - 1e-9)
+        if self.delay > self.periods:
+            raise InputError(
+                f"{who}: deadline: got {self.deadline:g} s, {self.delay} control periods, want at most"
+                f" {name}={self.every:g} s, {self.periods} control periods: one solve at a time"
+            )
+        self.horizon = check_name(f"{who}: horizon", horizon, HORIZONS)
+        self.predict = check_flag(f"{who}: predict", predict)
+        self.problem, self.solution, self.when = problem, solution, _checked_funnel(who, when, solution, horizon)
+        self.share = check_number(f"{who}: share", share, above=0.0, at_most=1.0)
+        if when is None and self.share != 1:
+            raise InputError(f"{who}: share: got {self.share:g} without a funnel, want when=... beside it")
+        check_function(f"{who}: changes", changes, "a function of the time and the problem", arguments=2)
+        self.changes, self._who = changes, who
+        self.solver = prepare(problem)
+
+    def problem_at(self, step: int, problem: Problem) -> Problem:
+        """A problem as it is known in a control period: with what `changes` makes of it."""
+        if self.changes is None:
+            return problem
+        return self.checked(f"{self._who}: changes", self.changes(step * self.problem.dt, problem))
+
+    def checked(self, who: str, problem: Problem) -> Problem:
+        """The problem. Raises InputError if it cannot take the place of the rule's own while a plan is in force."""
+        check_kind(who, problem, Problem, "a Problem")
+        for field, what in _FIXED.items():
+            got, want = what(problem), what(self.problem)
+            if got != want:
+                raise InputError(f"{who}: {field}: got {got}, want {want}: it cannot change while a re-planner runs")
+        return self.solver.check(problem)
+
+    def due(self, step: int) -> bool:
+        """Whether a solve begins at a step."""
+        left = self.horizon == "moving" or step + self.delay < self.problem.steps
+        return step > 0 and step % self.periods == 0 and left
+
+    def outside(self, active: ActivePlan, step: int, state: Array, *, late: float = 0.0) -> bool:
+        """Whether a state (n,), measured `late` seconds after a control period began, is outside the funnel.
+
+        The funnel is about the plan in force, which is interpolated between two knots. Without a funnel all is outside.
+        """
+        if self.when is None:
+            return True
+        row, dt, states = active.row(step), self.problem.dt, active.plan.trajectory.states
+        about = states[row]
+        if late > 0:
+            about = about + late / dt * self.when.state_coordinates.difference(states[row + 1], about)
+        t = step * dt + late
+        level = self.share * self.when.level(t)
+        return not (level > 0 and self.when.deviation(state, t, about=about) <= level)
+
+    def request(
+        self, active: ActivePlan, step: int, state: Array, problem: Problem, *, late: float = 0.0
+    ) -> SolveRequest:
+        """What is to be solved in a control period, of a state (n,) that was measured `late` seconds after it began."""
+        plan, first = active.plan, step + self.delay
+        row = active.row(step)
+        here = plan.policy.state_coordinates.nearest(state, plan.policy.nominal[row])
+        if self.delay and self.predict:
+            here = self._ahead(active, step, here, problem, late)
+        done = min(first - active.first, plan.trajectory.steps - 1)
+        return SolveRequest(step, first, here, plan.shifted(done, horizon=self.horizon), problem)
+
+    def _ahead(self, active: ActivePlan, step: int, state: Array, problem: Problem, late: float) -> Array:
+        """Where the law in force leads by the deadline, by the model."""
+        policy, dt = active.plan.policy, problem.dt
+        rows = [active.row(step + i) for i in range(self.delay)]
+        if late > 1e-9 * dt:
+            rest, now = problem.dynamics.period_near(dt - late), rows.pop(0)
+            if rest > 0:
+                state = compiled.rollout(problem, policy.gain[[now]], policy.offset[[now]], state, dt=rest)[0][-1]
+        if rows:
+            state = compiled.rollout(problem, policy.gain[rows], policy.offset[rows], state)[0][-1]
+        return state
+
+    def solve(self, request: SolveRequest, time_limit: float | None = None) -> Replan:
+        """The answer to a request."""
+        problem, after = request.problem, request.first
+        if self.horizon == "moving":
+            problem, after = problem.later(request.first * problem.dt), 0
+        return self.solver.solve(request.state, request.start, problem=problem, after=after, time_limit=time_limit)
+
+
+def _checked_funnel(who: str, when: Funnel | None, solution: Plan, horizon: str) -> Funnel | None:
+    """Raises InputError unless it is None, or a funnel of the solution, whose end stays where it is."""
+    check_kind(f"{who}: when", when, (Funnel, type(None)), "a Funnel, such as funnel(...) returns")
+    if when is not None and not np.array_equal(when.plan.states, solution.trajectory.states):
+        raise InputError(f"{who}: when: got a funnel of another plan, want that of the solution")
+    if when is not None and horizon != "shrinking":
+        raise InputError(f'{who}: when: got a funnel with horizon={excerpt(horizon)}, want "shrinking": it has an end')
+    return when
