@@ -63,7 +63,8 @@ class Solve:
     time_limit: Annotated[float | None, optional("SECONDS")] = None
     """Stop after this time, without compiling, with the best plan so far. By default there is no limit."""
     starts: Annotated[int | None, optional("INT")] = None
-    """Number of ways to the goal that smooth tries for a few iterations; the best continues. By default 7."""
+    """Number of ways to the goal that smooth tries for a few iterations; the best continues. By default 7, or the
+    scenario's own start."""
     paper_start: bool = False
     """Begin as in the paper instead: from the nominal control, with the scenario's prior."""
     clearance: Annotated[float | None, optional("METRES")] = None
@@ -110,11 +111,12 @@ class Solve:
             if self.solver != "smooth":
                 raise InputError(f"--starts, --paper-start: got one for {self.solver}, want them with --solver smooth")
             options["starts"] = self.starts
+        start = scenario.start if self.starts is None else None
         if self.paper_start:
             if scenario.paper_start is None:
                 raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario that the paper has")
-            options["start"] = scenario.paper_start
-        solved = console.solve(problem, self.solver, reach=scenario.target_radius(), **options)
+            start = scenario.paper_start
+        solved = console.solve(replace(scenario, problem=problem, start=start), self.solver, **options)
         solution = replace(solved, scenario=from_anywhere(self.scenario))
         console.wrote(save_load.save(solution, folder / "solution.npz"))
         console.result(solution=as_json.of_solution(solution))

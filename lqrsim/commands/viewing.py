@@ -208,7 +208,7 @@ class View:
             scenario = resolve(self.what)
             self._check_replanning(scenario.problem)
             plant = scenario.plant()
-            solution = console.solve(scenario.problem, "smooth", reach=scenario.target_radius())
+            solution = console.solve(scenario)
             planner, goal = (None, None) if self.replan is None else self._planning(scenario.problem, solution)
             shown = viewer.arguments_for_plant(plant, solution, goal)
             law = controller_by_name(self.controller, scenario, solution, self.stated)

@@ -25,10 +25,10 @@ from lqrsim.results.save_load import load
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
+from lqrsim.scenarios.solutions import solve
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.compiled import CostsByStep
-from lqrsim.solvers.smoother import smooth
 from lqrsim.stress.sweeps import sweep
 
 Actions = Literal["normalized", "controls"]
@@ -83,13 +83,13 @@ class Task:
 
     @cached_property
     def solution(self) -> Solution:
-        """The plan: as given, or what `smooth` makes of the scenario's problem.
+        """The plan: as given, or what `smooth` makes of the scenario.
 
         Raises:
           InputError: a file cannot be read.
         """
         if self._given is None:
-            return smooth(self.scenario.problem)
+            return solve(self.scenario)
         given = load(self._given, Solution) if isinstance(self._given, str | os.PathLike) else self._given
         return check_kind("solution", given, Solution, "a Solution, the path of one, or None")
 

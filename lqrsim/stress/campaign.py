@@ -25,6 +25,7 @@ from lqrsim.results.hashing import sha256
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
+from lqrsim.scenarios.solutions import digest_of_start
 from lqrsim.stress import cluster, executors
 from lqrsim.stress.lock import sole_writer
 from lqrsim.stress.manifest import NAME, digest_of_solution, read_manifest, write_manifest
@@ -178,6 +179,7 @@ def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Pat
         "campaign": json.loads(json.dumps(campaign.as_json())),
         "model": sha256(scenario.scene.xml),
         "problem": scenario.problem.digest,
+        "start": digest_of_start(scenario),
         "code": _code(campaign),
     }
     if os.path.exists(folder / NAME):
@@ -201,7 +203,7 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
             raise InputError(
                 f"{field}: got {excerpt(value)}, want {excerpt(was)}, as {folder} has it, or another folder"
             )
-    for field, what in (("model", "MJCF"), ("problem", "problem")):
+    for field, what in (("model", "MJCF"), ("problem", "problem"), ("start", "start")):
         if specification[field] != manifest[field]:
             raise InputError(f"scenario: got a {what} that is not the one {folder} was begun with, want another folder")
     for kind, digest in specification["code"].items():

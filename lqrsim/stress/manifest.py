@@ -20,7 +20,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.stress.specification import POLICIES, Campaign, Cell
 from lqrsim.stress.trial_tables import write
 
-FORMAT, VERSION, NAME = "lqrsim campaign", 4, "manifest.json"
+FORMAT, VERSION, NAME = "lqrsim campaign", 5, "manifest.json"
 _LARGEST = 1 << 26  # bytes
 
 _HASH = schema.line
@@ -42,7 +42,7 @@ _CAMPAIGN = schema.record(
 _MANIFEST = schema.record(
     {
         "format": schema.line, "version": schema.count, "campaign": _CAMPAIGN, "model": _HASH, "problem": _HASH,
-        "code": schema.mapped(schema.optional(_HASH)),
+        "start": schema.optional(_HASH), "code": schema.mapped(schema.optional(_HASH)),
         "policies": schema.mapped(schema.record({"digest": _HASH, "sha256": _HASH})),
         "cells": schema.listed(schema.row(_POLICY, schema.line, _STRENGTH)), "versions": schema.mapped(schema.line),
         "digest": _HASH, "machine": schema.line, "left_out": schema.line, "sha256": _HASH,
@@ -109,7 +109,7 @@ def _seal(manifest: Mapping[str, Any]) -> str:
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
     """Hash of all that rows depend on, and of nothing that differs where the same is begun again."""
-    lasting = {name: manifest[name] for name in ("cells", "model", "problem", "code", "versions")} | {
+    lasting = {name: manifest[name] for name in ("cells", "model", "problem", "start", "code", "versions")} | {
         "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},
         "policies": {policy: hashes["digest"] for policy, hashes in manifest["policies"].items()},
     }

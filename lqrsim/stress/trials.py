@@ -16,13 +16,12 @@ from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import InputError, check_name, told
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
+from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, preset
 from lqrsim.simulation.uncertainty_of import uncertainty_of
-from lqrsim.solvers.ilqr import ilqr
-from lqrsim.solvers.smoother import smooth
 from lqrsim.stress.outcome_table import Outcomes, outcomes
 from lqrsim.stress.specification import POLICIES, TOLD, Campaign, Cell, Shard, check_told
 from lqrsim.stress.sweeps import sweep
@@ -66,14 +65,13 @@ def solve(
     """
     solutions: dict[str, Solution] = {}
     if {*policies} - {"ilqr"}:
-        smoothed = smooth(scenario.problem)
+        smoothed = solving.solve(scenario)
         solutions |= dict.fromkeys(("smooth", "replan", *TOLD), smoothed) | {"open_loop": smoothed.open_loop()}
     if "ilqr" in policies:
-        solutions["ilqr"] = ilqr(scenario.problem)
+        solutions["ilqr"] = solving.solve(scenario, "ilqr")
     for policy in policies:
         if not np.isfinite(solutions[policy].trajectory.states).all():
             raise InputError(f"policies: got {policy}, whose plan is not finite ({solutions[policy].status.name})")
-        solutions[policy] = replace(solutions[policy], goal_radius=scenario.target_radius())
         if not solutions[policy].success:
             _log.warning("%s did not converge (%s); its plan is run as it is", policy, solutions[policy].status.name)
     if "track" in policies:
