@@ -40,6 +40,10 @@ def along(side: float = -1.0, bulge: float = 1.2) -> ls.Scenario:
     return dataclasses.replace(given, name="along", start=prior)
 
 
+def short() -> ls.Scenario:
+    return dataclasses.replace(given, name="short", problem=dataclasses.replace(given.problem, steps=120))
+
+
 def by_function(side: float = -1.0) -> ls.Scenario:
     return dataclasses.replace(given, name="by_function", start=lambda problem: along(side).start)
 """
@@ -132,6 +136,74 @@ def test_ilqr_has_no_prior_and_begins_with_its_controls(own: Path) -> None:
 def test_a_start_that_does_not_fit_is_refused(start: Any, says: str, differential_drive: ls.Scenario) -> None:
     with pytest.raises(ls.InputError, match=says):
         dataclasses.replace(differential_drive, start=start)
+
+
+# From a file.
+
+
+@pytest.fixture(scope="module")
+def left(own: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the solution along the left wall, its policy, a run of it, and a funnel."""
+    folder, scenario = tmp_path_factory.mktemp("left"), resolve(f"{own}:along")
+    solution, plant = solutions.solve(scenario), scenario.plant()
+    ls.save(solution, folder / "solution.npz")
+    ls.save(solution.policy, folder / "policy.npz")
+    ls.save(ls.simulate(plant, solution, seed=0), folder / "rollout.npz")
+    options: Any = {"rate": 0.5, "confidence": 0.5, "knots": (149,), "failures": 0}
+    ls.save(ls.funnel(plant, solution, **options), folder / "funnel.npz")
+    return folder
+
+
+@pytest.mark.parametrize("name", ["solution", "policy", "rollout", "funnel"])
+@pytest.mark.parametrize("solver", ["smooth", "ilqr"])
+def test_a_solve_begins_with_what_was_stored(
+    name: str, solver: str, left: Path, tmp_path: Path, differential_drive: ls.Scenario
+) -> None:
+    solution = ls.load(left / "solution.npz", ls.Solution)
+    start = {"solution": solution, "policy": solution.policy}.get(name, solution.trajectory)
+    words = ["--solver", solver, "--max-iterations", "4", "--start", str(left / f"{name}.npz")]
+    main(["solve", "differential_drive", *words, "--out", str(tmp_path)])
+    found = ls.load(tmp_path / "solution.npz", ls.Solution)
+    call: Any = {"smooth": ls.smooth, "ilqr": ls.ilqr}[solver]
+    wanted = call(differential_drive.problem, start=start, max_iterations=4)
+    np.testing.assert_array_equal(found.trajectory.states, wanted.trajectory.states)
+    assert found.options["start"] == wanted.options["start"]
+    if name != "policy" and solver == "smooth":  # which knows nothing of the cost that follows it
+        assert found.success
+        assert keeps_left(found.trajectory)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("quadrotor --start {left}/solution.npz", ["start: got", "with the states x, y, heading, want x, y, z,"]),
+        ("{own}:short --start {left}/solution.npz", ["of 150 steps, want 120, as short has them"]),
+        ("{own}:short --start {left}/policy.npz", ["of 150 steps, want 120"]),
+        ("{own}:short --start {left}/rollout.npz", ["of 150 steps, want 120"]),
+        ("quadrotor --start {left}/funnel.npz", ["states x, y, heading, want"]),
+        ("quadrotor --start {left}/nothing.npz", ["nothing.npz"]),
+        ("quadrotor --start {own}", ["own.py"]),
+        ("quadrotor --start {left}", ["a folder"]),
+        ("differential_drive --start {left}/filter.npz", ["start: got", "estimates", "want a solution, a policy of"]),
+        ("differential_drive --start {left}/policy.npz --paper-start", ["--start, --paper-start: got 2 of them"]),
+        ("differential_drive --start {left}/policy.npz --starts 5", ["--start, --starts: got 2 of them"]),
+        ("{own}:along --paper-start --starts 5", ["--paper-start, --starts: got 2 of them"]),
+    ],
+)
+def test_what_cannot_be_begun_with_is_one_line(
+    words: str, says: list[str], left: Path, own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if "filter" in words:
+        scenario, plan = resolve(f"{own}:along"), ls.load(left / "solution.npz", ls.Solution)
+        calm = ls.uncertainty_of(scenario.plant(), ls.disturbances.preset("calm", scenario.plant()))
+        ls.save(ls.OffsetFree(scenario.problem, plan, calm).policy, left / "filter.npz")
+    out = tmp_path / "out"
+    assert main(["solve", *words.format(left=left, own=own).split(), "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("lqrsim: error: ")
+    assert error.count("\n") == 1
+    assert all(part in error for part in says), error
+    assert not out.exists()
 
 
 # In a campaign.
