@@ -1,11 +1,13 @@
-"""Solutions of scenarios: one way to solve, which begins as the scenario says, or with what was stored."""
+"""Solutions of scenarios: one way to solve, what was stored to begin with, and what is given in place of a solve."""
 
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from lqrsim.errors import InputError
+import numpy as np
+
+from lqrsim.errors import InputError, check_kind
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.output_feedback import OutputFeedbackPolicy
 from lqrsim.results.policy import AffinePolicy
@@ -68,6 +70,52 @@ def stored_start(scenario: Scenario, path: str | os.PathLike[str]) -> Solution |
     plan = found.plan
     _check_fits("start", path, scenario, found.state_coordinates, found.control_coordinates, plan.steps)
     return plan
+
+
+def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> Solution:
+    """A solution in place of a solve of the scenario. It need not have converged, or be of the very problem: `remarks`.
+
+    Args:
+      scenario: in which it is to run.
+      solution: as it is, or the path of one.
+
+    Returns:
+      The solution, with the scenario's goal radius.
+
+    Raises:
+      InputError: it cannot be read, is of another system, number of steps, control period or goal, or its plan is not
+        finite.
+    """
+    stored = isinstance(solution, str | os.PathLike)
+    what = str(solution) if stored else "one"
+    found = load(solution, Solution) if stored else solution
+    check_kind("solution", found, Solution, "a Solution, or the path of one")
+    law, plan, problem = found.policy, found.trajectory, scenario.problem
+    _check_fits("solution", what, scenario, law.state_coordinates, law.control_coordinates, plan.steps)
+    if plan.dt != problem.dt and problem.duration is None:
+        raise InputError(f"solution: got {what} with a control period of {plan.dt:g} s, want {problem.dt:g} s")
+    goal, wanted = found.goal, problem.weighed_goal
+    same = goal is wanted if goal is None or wanted is None else np.array_equal(goal, wanted, equal_nan=True)
+    if not same:
+        got, want = ("none" if one is None else str(one.tolist()) for one in (goal, wanted))
+        raise InputError(f"solution: got {what} with the goal {got}, want {want}, as {scenario.name} has it")
+    if not np.isfinite(plan.states).all():
+        raise InputError(
+            f"solution: got {what}, whose plan is not finite ({found.status.name}), want one that can be run"
+        )
+    return replace(found, goal_radius=scenario.target_radius())
+
+
+def remarks(scenario: Scenario, solution: Solution) -> list[str]:
+    """What is to be said of a solution that is run in a scenario, in lines; none if it is a success of its problem."""
+    lines: list[str] = []
+    if not solution.success:
+        lines.append(f"did not converge ({solution.status.name}); its plan is run as it is")
+    # A free duration is settled by the solve, in a problem of its own.
+    if scenario.problem.duration is None and solution.problem_digest != scenario.problem.digest:
+        solved = f" (solved as {solution.scenario})" if solution.scenario else ""
+        lines.append(f"is of another problem than that of {scenario.name}{solved}; its plan is run as it is")
+    return lines
 
 
 def _check_fits(
