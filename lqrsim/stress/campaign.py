@@ -39,6 +39,7 @@ from lqrsim.stress.specification import Cell as Cell
 from lqrsim.stress.trial_tables import Damaged, write
 from lqrsim.stress.trials import (
     Job,
+    Trials,
     check_has_use,
     controller_of,
     impossible_policies,
@@ -103,6 +104,9 @@ def run_campaign(
         stack.enter_context(sole_writer(folder))
         _write_or_check_manifest(campaign, scenario, folder, given)
         results = Results(folder, scenario=campaign.scenario)
+        # Of the scenario that was checked: a user's function may make another when it is called again.
+        solutions = {policy: results.solution(policy) for policy in campaign.policies}
+        results.trials = Trials(campaign, scenario, solutions)
         unfinished = _unfinished(results)
         if unfinished:
             _check_versions(results)
@@ -117,7 +121,7 @@ def run_campaign(
         elif workers:
             work = executors.run_in_processes(job, unfinished, min(workers, len(unfinished)), campaign.time_limit)
         else:
-            work = executors.run_here(job, unfinished)
+            work = executors.run_here(job, unfinished, results.trials)
         for shard, contents in stack.enter_context(contextlib.closing(work)):
             write(contents, results.path(shard))
             done += shard.count

@@ -280,9 +280,9 @@ def failed(first: int, count: int, reason: str) -> Table:
     return columns | {"obstacle": np.full(count, ""), "reason": np.full(count, reason)}
 
 
-def work(job: Job, shard: Shard) -> bytes:
-    """The file of a shard, made in this process."""
-    return pack(prepare(job).table(shard, job.batch), shard, job.digest)
+def work(job: Job, shard: Shard, trials: Trials | None = None) -> bytes:
+    """The file of a shard, made in this process, by the trials that are there already if there are some."""
+    return pack((trials or prepare(job)).table(shard, job.batch), shard, job.digest)
 
 
 def failed_work(job: Job, shard: Shard, reason: str) -> bytes:
