@@ -94,11 +94,15 @@ def given(scenario: Scenario, solution: Solution | str | os.PathLike[str]) -> So
     _check_fits("solution", what, scenario, law.state_coordinates, law.control_coordinates, plan.steps)
     if plan.dt != problem.dt and problem.duration is None:
         raise InputError(f"solution: got {what} with a control period of {plan.dt:g} s, want {problem.dt:g} s")
-    goal, wanted = found.goal, problem.weighed_goal
-    same = goal is wanted if goal is None or wanted is None else np.array_equal(goal, wanted, equal_nan=True)
-    if not same:
-        got, want = ("none" if one is None else str(one.tolist()) for one in (goal, wanted))
-        raise InputError(f"solution: got {what} with the goal {got}, want {want}, as {scenario.name} has it")
+    names = law.state_coordinates.names
+    none = np.full(len(names), np.nan)
+    goals = zip(*(none if one is None else one for one in (found.goal, problem.weighed_goal)), strict=True)
+    for name, (got, want) in zip(names, goals, strict=True):
+        if got != want and not (np.isnan(got) and np.isnan(want)):
+            raise InputError(
+                f"solution: got {what} with the goal {name} = {got:.9g}, want {want:.9g} (nan: none), as"
+                f" {scenario.name} has it"
+            )
     if not np.isfinite(plan.states).all():
         raise InputError(
             f"solution: got {what}, whose plan is not finite ({found.status.name}), want one that can be run"
