@@ -271,6 +271,22 @@ def test_a_lost_scheduler_is_one_line_and_what_is_done_stays(
     same_bits(tmp_path / "run", reference)
 
 
+def test_the_scenario_is_made_once(own: Path, tmp_path: Path) -> None:
+    """What is checked is what runs, also where a function makes something else each time."""
+    counted = tmp_path / "counted.py"
+    lines = [
+        "def counted() -> ls.Scenario:",
+        f"    with open({str(tmp_path / 'calls')!r}, 'a') as file:",
+        "        print('made', file=file)",
+        "    return troubled('none')",
+    ]
+    counted.write_text("\n".join([OWN, *lines, ""]), encoding="utf-8")
+    campaign = replace(troubled(own, "none"), scenario=f"{counted}:counted", sweeps=CAMPAIGN.sweeps, trials=2)
+    results = run_campaign(campaign, tmp_path / "out", workers=0)
+    assert replay(results, results.cells[0], 1).trials == 1
+    assert (tmp_path / "calls").read_text(encoding="utf-8") == "made\n"
+
+
 # What goes wrong in trials.
 
 

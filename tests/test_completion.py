@@ -9,6 +9,7 @@ import pytest
 from lqrsim.cli import main
 from lqrsim.commands import COMMANDS
 
+GIVEN = ("stress", "rare", "break", "funnel", "view")  # which run a stored solution
 BASH = shutil.which("bash")
 
 
@@ -31,6 +32,7 @@ def script(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
         (["lqrsim", "solve", "quadrotor", "--so"], {"--solver"}),
         (["lqrsim", "solve", "quadrotor", "--solver", ""], {"smooth", "ilqr"}),
         (["lqrsim", "simulate", "x.npz", "--js"], {"--json"}),
+        *((["lqrsim", name, "quadrotor", "--solu"], {"--solution"}) for name in GIVEN),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

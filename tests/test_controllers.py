@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
+from lqrsim.disturbances import ControlNoise, MeasurementDropouts, MeasurementNoise
 from lqrsim.errors import Array
 
-NOISE = [ls.disturbances.ControlNoise(0.05), ls.disturbances.MeasurementNoise(0.01)]
+NOISE = [ControlNoise(0.05), MeasurementNoise(0.01)]
 STATED = ls.Uncertainty(measurement=0.01, start=0.01, control=0.05)
 TOLERATE = {"m": 0.05, "rad": 0.1}
 
@@ -129,7 +130,7 @@ def test_a_policy_with_a_filter_is_run_on_what_it_measures(
     plant: ls.Plant, differential_drive: ls.Scenario, drive_solution: ls.Solution
 ) -> None:
     """Its recursion by hand on the recorded measurements gives each command to the bit; a repeated one is lost."""
-    noise = [*NOISE, ls.disturbances.MeasurementDropouts(0.3)]
+    noise = [*NOISE, MeasurementDropouts(0.3)]
     for sensors, chosen in ((None, [0, 1, 2]), (("heading", "x", "y"), [2, 0, 1])):
         law = ls.OffsetFree(differential_drive.problem, drive_solution, STATED, tolerate=TOLERATE, sensors=sensors)
         policy = law.policy

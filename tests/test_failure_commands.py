@@ -23,7 +23,7 @@ import dataclasses
 import numpy as np
 
 import lqrsim as ls
-from lqrsim.simulation.disturbances import Effect
+from lqrsim.disturbances import Disturbance, Effect, ForceNoise, Push
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,9 +166,30 @@ def test_python_and_the_commands_give_the_same(own: str, tmp_path: Path, capsys:
     same_files(command, python, "break.json")
 
 
+def test_a_given_solution_is_what_fails(own: str, tmp_path: Path) -> None:
+    """A plan that is given without its feedback fails as the policy open_loop does, to the last digit."""
+    reference, given = f"{own}:shifted", tmp_path / "solution.npz"
+    still = ls.smooth(resolve(reference).problem).open_loop()
+    ls.save(still, given)
+    few = ["--particles", "20", "--repetitions", "2", "--shown", "2", "--strength", "2"]
+    for name, words in {"solved": OPEN, "given": ["--solution", str(given)]}.items():
+        assert main(["rare", reference, *few, *words, "--out", str(tmp_path / name)]) == 0
+    written = {name: found(tmp_path / name / "rare.json") for name in ("solved", "given")}
+    assert written["given"]["found"] == written["solved"]["found"]
+    assert written["given"]["policy"] == written["solved"]["policy"]
+    assert written["solved"]["asked"]["solution"] is None
+    # The same in Python, of the solution itself.
+    problem = ls.stress.ReliabilityProblem(reference, strength=2, solution=still)
+    problem.rare_failures(particles=20, repetitions=2).save(tmp_path / "python", shown=2)
+    same_files(tmp_path / "given", tmp_path / "python", "rare.json")
+    assert main(["break", reference, "--rounds", "1", *few[-2:], "--solution", str(given), "--out", str(tmp_path)]) == 0
+    assert found(tmp_path / "break.json")["policy"] == written["given"]["policy"]
+
+
 @pytest.mark.parametrize(
     ("asked", "says"),
     [
+        ({"solution": 3}, "solution: got 3, want a Solution, the path of one"),
         ({"scenario": 3}, "scenario: got 3"),
         ({"sweep": ""}, "sweep: got"),
         ({"strength": 0.0}, "strength: got 0"),

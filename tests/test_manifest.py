@@ -52,7 +52,9 @@ def edit(folder: Path, change: Callable[[dict[str, Any]], object], *, seals: tup
     manifest = json.loads(path.read_text(encoding="utf-8"))
     change(manifest)
     if "digest" in seals:
-        lasting = {name: manifest[name] for name in ("cells", "model", "problem", "code", "versions")}
+        lasting = {
+            name: manifest[name] for name in ("cells", "model", "problem", "start", "solution", "code", "versions")
+        }
         lasting["campaign"] = {name: one for name, one in manifest["campaign"].items() if name != "time_limit"}
         lasting["policies"] = {name: hashes["digest"] for name, hashes in manifest["policies"].items()}
         manifest["digest"] = hashlib.sha256(canonical(lasting)).hexdigest()

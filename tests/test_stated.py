@@ -3,18 +3,20 @@
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 
 import lqrsim as ls
 from lqrsim.cli import main
+from lqrsim.commands.options import ControllerName, Policy
 from lqrsim.disturbances import AxleMismatch, ControlNoise, MeasurementNoise, MotorLag
 from lqrsim.errors import InputError
 from lqrsim.reports.curves import COLOURS, LINES, MARKERS
 from lqrsim.stress.campaign import _code
 from lqrsim.stress.manifest import read_manifest
-from lqrsim.stress.specification import POLICIES, TOLD, USUAL
+from lqrsim.stress.specification import KINDS, POLICIES, TOLD, USUAL
 from lqrsim.stress.trials import CONTROLLERS, controller, controller_of, solve
 
 LIGHT = (
@@ -126,6 +128,9 @@ def test_the_file_of_a_stated_disturbance_of_ones_own_is_hashed_too() -> None:
 def test_the_usual_four_are_run_unless_others_are_asked_for() -> None:
     assert ls.stress.Campaign(scenario="quadrotor", sweeps={"own": LIGHT}).policies == USUAL == POLICIES[:4]
     assert len({*COLOURS}) == len({*LINES}) == len({*MARKERS}) == len(POLICIES)
+    assert get_args(Policy) == POLICIES
+    assert get_args(ControllerName) == CONTROLLERS
+    assert {kind.controller for kind in KINDS.values()} <= {*CONTROLLERS}
 
 
 @pytest.mark.parametrize(

@@ -193,7 +193,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
         "Cell.named": ({"text": "0", "cells": results.cells},),
         "run_campaign": ({
             "campaign": campaign, "folder": place.folder / "campaign", "workers": 0, "batch": 4, "scheduler": None,
-            "progress": print_nothing,
+            "solution": None, "progress": print_nothing,
         }, 0.1),
         "Results": ({"folder": place.folder / "campaign", "scenario": reference},),
         "replay": ({"results": results, "cell": cell, "trial": 0, "frames": False, "contacts": True},),
@@ -225,7 +225,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
         },),
         "ReliabilityProblem": ({
             "scenario": reference, "sweep": "light", "strength": 1.0, "policy": "smooth", "failure": "miss",
-            "goal_radius": 0.1, "goal_tolerance": None, "stated": None,
+            "goal_radius": 0.1, "goal_tolerance": None, "stated": None, "solution": None,
         },),
         **{
             f"ReliabilityProblem.{name}": ({

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Folder, Json, Policy, optional
+from lqrsim.commands.options import Folder, Json, Policy, SolutionFile, optional
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,7 +15,7 @@ class Funnel:
 
     Prints, for some knots of the plan, the largest ellipsoid about it from which runs under disturbances reach the goal
     at the wished rate, and the fresh trials that certify it. Writes funnel.npz, and funnel.png where the robot has a
-    position. Solves the scenario first.
+    position. Solves the scenario first, unless a solution is given.
 
       lqrsim funnel quadrotor --disturbances light --rate 0.9
       lqrsim funnel differential_drive --states x y --knots 0 50 100
@@ -33,6 +33,7 @@ class Funnel:
     """As in `lqrsim stress`."""
     stated: Annotated[str | None, optional("NAME")] = None
     """Disturbances for which track or offset_free is designed, as in `lqrsim stress`. By default moderate."""
+    solution: SolutionFile = None
     rate: float = 0.99
     """Wished share of runs that reach the goal."""
     confidence: float = 0.95
@@ -59,6 +60,7 @@ class Funnel:
         from lqrsim.commands import as_json, console
         from lqrsim.results import save_load
         from lqrsim.scenarios.references import folder_name, resolve
+        from lqrsim.scenarios.solutions import given
         from lqrsim.stress.funnels import funnel
         from lqrsim.stress.sweeps import sweep
         from lqrsim.stress.trials import controller_of, solve
@@ -69,7 +71,8 @@ class Funnel:
         console.check_output("--out", folder)
         wrong = [one.scaled(self.strength) for name in self.disturbances for one in sweep(name, scenario)]
         stated = None if self.stated is None else sweep(self.stated, scenario)
-        solution = solve((self.policy,), scenario, stated)[self.policy]
+        solution = None if self.solution is None else given(scenario, self.solution)
+        solution = solve((self.policy,), scenario, stated, solution)[self.policy]
         with console.long_progress("looking", "knot") as progress:
             found = funnel(
                 scenario.plant(),

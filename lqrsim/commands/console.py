@@ -7,7 +7,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -17,9 +16,9 @@ from lqrsim.errors import InputError
 from lqrsim.results.archive import excerpt_of
 
 if TYPE_CHECKING:
-    from lqrsim.problem.problem import Problem
     from lqrsim.results.solution import Solution
     from lqrsim.results.solution_parts import Iteration
+    from lqrsim.scenarios.packaged import Scenario
 
 # What the command that runs has to print with `--json`; None without.
 _RESULT: ContextVar[dict[str, Any] | None] = ContextVar("result", default=None)
@@ -109,15 +108,10 @@ def check_output(field: str, folder: Path, name: str = "") -> None:
         raise InputError(f"{field}: got {place}, want a {what} that can be written ({reason})") from None
 
 
-def solve(problem: "Problem", solver: str, *, reach: float | None = None, **options: object) -> "Solution":
-    """Call `lqrsim.smooth` or `lqrsim.ilqr`; print each iteration as it ends, then the status.
-
-    Args:
-      reach: the solution's `goal_radius`.
-    """
+def solve(scenario: "Scenario", solver: str = "smooth", **options: object) -> "Solution":
+    """Solve a scenario; print each iteration as it ends, then the status. The options are those of the solver."""
     from lqrsim.results.solution_parts import Iteration
-    from lqrsim.solvers.ilqr import ilqr
-    from lqrsim.solvers.smoother import smooth
+    from lqrsim.scenarios import solutions
 
     count = 0
 
@@ -127,8 +121,7 @@ def solve(problem: "Problem", solver: str, *, reach: float | None = None, **opti
         say(iteration.row(count))
 
     say(Iteration.HEADER)
-    solution = {"smooth": smooth, "ilqr": ilqr}[solver](problem, callback=show, **options)
-    solution = solution if reach is None else replace(solution, goal_radius=reach)
+    solution = solutions.solve(scenario, solver, callback=show, **options)
     say(solution.summary())
     return solution
 

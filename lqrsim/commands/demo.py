@@ -52,7 +52,7 @@ def demo(references: Sequence[str], *, out: Path, seed: int, video: bool, quick:
     for reference, scenario in scenarios.items():
         folder = out / folder_name(scenario)
         console.say(f"\n== {reference}: {scenario.summary}")
-        solved = console.solve(scenario.problem, "smooth", reach=scenario.target_radius())
+        solved = console.solve(scenario)
         solution = replace(solved, scenario=from_anywhere(reference))
         console.wrote(save_load.save(solution, folder / "solution.npz"))
         tube, remark = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Folder, Json, Policy, optional
+from lqrsim.commands.options import Folder, Json, Policy, SolutionFile, optional
 
 if TYPE_CHECKING:
     from lqrsim.results.rollout import Rollout
@@ -28,6 +28,7 @@ class Search:
     """As in `lqrsim stress`."""
     stated: Annotated[str | None, optional("NAME")] = None
     """Disturbances for which track or offset_free is designed, as in `lqrsim stress`. By default moderate."""
+    solution: SolutionFile = None
     failure: Literal["collision", "miss"] = "collision"
     """collision: with an obstacle, or the robot is lost. miss: any trial that does not reach its goal."""
     goal_radius: Annotated[float | None, optional("METRES")] = None
@@ -48,6 +49,7 @@ class Search:
             strength=self.strength,
             policy=self.policy,
             stated=self.stated,
+            solution=self.solution,
             failure=self.failure,
             goal_radius=self.goal_radius,
             goal_tolerance=self.goal_tolerance,

@@ -13,5 +13,14 @@ def optional(metavar: str) -> object:
 
 Policy = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
 ControllerName = Literal["feedback", "track", "offset_free", "replan"]
+SolutionFile = Annotated[
+    Path | None,
+    arg(
+        metavar="FILE.npz",
+        help_behavior_hint="",
+        help="Run this solution, from `lqrsim solve`, instead of solving the scenario. It must be of the scenario's"
+        " robot, horizon and goal.",
+    ),
+]
 Json = FlagCreatePairsOff[bool]
 Folder = Annotated[Path | None, optional("FOLDER")]

@@ -9,7 +9,9 @@ from tyro.conf import Positional, arg
 from lqrsim.commands.options import ControllerName, Folder, Json, optional
 
 if TYPE_CHECKING:
+    from lqrsim.scenarios.packaged import Scenario
     from lqrsim.simulation.disturbances import Disturbance
+    from lqrsim.solvers.initial_guess import StartLike
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,9 +65,13 @@ class Solve:
     time_limit: Annotated[float | None, optional("SECONDS")] = None
     """Stop after this time, without compiling, with the best plan so far. By default there is no limit."""
     starts: Annotated[int | None, optional("INT")] = None
-    """Number of ways to the goal that smooth tries for a few iterations; the best continues. By default 7."""
+    """Number of ways to the goal that smooth tries for a few iterations; the best continues. By default 7,
+    where there is no start."""
+    start: Annotated[Path | None, optional("FILE.npz")] = None
+    """Begin with what is stored there: a solution, a policy, or the plan of a rollout or a funnel, of the same robot
+    and with as many steps. By default the scenario's own start, or a search."""
     paper_start: bool = False
-    """Begin as in the paper instead: from the nominal control, with the scenario's prior."""
+    """Begin as in the paper: from the nominal control, with the scenario's prior."""
     clearance: Annotated[float | None, optional("METRES")] = None
     """Constrain the distance to all obstacles to at least this, at the steps. By default obstacles only add cost."""
     control_limits: Annotated[tuple[float, float] | None, optional("LOWEST HIGHEST")] = None
@@ -106,15 +112,12 @@ class Solve:
             options["max_iterations"] = self.max_iterations
         if self.time_limit is not None:
             options["time_limit"] = self.time_limit
-        if self.starts is not None or self.paper_start:
-            if self.solver != "smooth":
-                raise InputError(f"--starts, --paper-start: got one for {self.solver}, want them with --solver smooth")
+        if (self.starts is not None or self.paper_start) and self.solver != "smooth":
+            raise InputError(f"--starts, --paper-start: got one for {self.solver}, want them with --solver smooth")
+        if self.starts is not None:
             options["starts"] = self.starts
-        if self.paper_start:
-            if scenario.paper_start is None:
-                raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario that the paper has")
-            options["start"] = scenario.paper_start
-        solved = console.solve(problem, self.solver, reach=scenario.target_radius(), **options)
+        scenario = replace(scenario, problem=problem, start=self._start(scenario))
+        solved = console.solve(scenario, self.solver, **options)
         solution = replace(solved, scenario=from_anywhere(self.scenario))
         console.wrote(save_load.save(solution, folder / "solution.npz"))
         console.result(solution=as_json.of_solution(solution))
@@ -128,6 +131,23 @@ class Solve:
             world, radius = scenario.scene.world, scenario.robot.radius
             console.wrote(plot_policy(solution, self.figure, world=world, radius=radius, tube=tube))
         return 0 if solution.success else 1
+
+    def _start(self, scenario: "Scenario") -> "StartLike":
+        """What to begin with. Raises InputError for a start that there is not, or several."""
+        from lqrsim.errors import InputError
+        from lqrsim.scenarios.solutions import stored_start
+
+        given = {"--start": self.start is not None, "--paper-start": self.paper_start, "--starts": self.starts}
+        named = [name for name, one in given.items() if one]
+        if len(named) > 1:
+            raise InputError(f"{', '.join(named)}: got {len(named)} of them, want one: each says where to begin")
+        if self.start is not None:
+            return stored_start(scenario, self.start)
+        if self.paper_start:
+            if scenario.paper_start is None:
+                raise InputError(f"--paper-start: got it for {scenario.name}, want a scenario that the paper has")
+            return scenario.paper_start
+        return None if self.starts is not None else scenario.start
 
 
 @dataclass(frozen=True, kw_only=True)

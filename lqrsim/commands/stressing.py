@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import Folder, Json, Policy, optional
+from lqrsim.commands.options import Folder, Json, Policy, SolutionFile, optional
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +35,7 @@ class Stress:
     stated: Annotated[str | None, optional("NAME")] = None
     """Disturbances for which track and offset_free are designed, named as above, at all strengths. By default
     moderate."""
+    solution: SolutionFile = None
     trials: int = 200
     """Number of trials for each sweep, strength and policy."""
     seed: int = 0
@@ -66,21 +67,27 @@ class Stress:
         """Run the command. Returns the exit code."""
         from lqrsim.commands import as_json, console
         from lqrsim.scenarios.references import folder_name, resolve
+        from lqrsim.scenarios.solutions import given
         from lqrsim.stress.campaign import USUAL, Campaign, run_campaign
         from lqrsim.stress.results import Results
         from lqrsim.stress.sweeps import sweep
-        from lqrsim.stress.trials import possible_policies
+        from lqrsim.stress.trials import impossible_policies
 
         scenario = resolve(self.scenario)
         folder = self.out or Path("runs/stress") / folder_name(scenario)
+        solution = None if self.solution is None else given(scenario, self.solution)
         if self.resume:
-            campaign = Results(folder, scenario=self.scenario).campaign
+            begun = Results(folder, scenario=self.scenario)
+            campaign, solution = begun.campaign, solution or begun.given
         else:
+            impossible = impossible_policies(scenario, solution)
             campaign = Campaign(
                 scenario=self.scenario,
                 sweeps={name: sweep(name, scenario) for name in self.sweep},
                 strengths=self.strengths,
-                policies=possible_policies(scenario, USUAL) if self.policies is None else self.policies,
+                policies=tuple(policy for policy in USUAL if policy not in impossible)
+                if self.policies is None
+                else self.policies,
                 stated=None if self.stated is None else sweep(self.stated, scenario),
                 trials=self.trials,
                 seed=self.seed,
@@ -90,7 +97,7 @@ class Stress:
                 shard=self.shard,
                 time_limit=self.time_limit,
             )
-        options = {"workers": self.workers, "batch": self.batch, "scheduler": self.scheduler}
+        options = {"workers": self.workers, "batch": self.batch, "scheduler": self.scheduler, "solution": solution}
         with console.long_progress("stressing", "trial") as progress:
             results = run_campaign(campaign, folder, progress=progress, **options)
         console.say(results.summary())

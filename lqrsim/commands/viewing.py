@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import ControllerName, optional
+from lqrsim.commands.options import ControllerName, SolutionFile, optional
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
     from lqrsim.control.live_replanner import LiveReplanner
     from lqrsim.problem.problem import Problem
     from lqrsim.results.solution import Solution
+    from lqrsim.scenarios.packaged import Scenario
     from lqrsim.view.movable_goal import MovableGoal
     from lqrsim.view.viewer_base import Viewer
 
@@ -164,6 +165,7 @@ class View:
     """Adds the scenario's disturbances to a live run, scaled by this factor."""
     seed: int = 0
     """Seed of their random numbers."""
+    solution: SolutionFile = None
     controller: ControllerName = "feedback"
     """Controller of a live run, as in `lqrsim simulate`."""
     stated: Annotated[str | None, optional("NAME")] = None
@@ -196,6 +198,8 @@ class View:
         if self.what.endswith(".npz"):
             if self.controller != "feedback" or self.stated is not None:
                 raise InputError(f"--controller, --stated: got one with {self.what}, want them with a SCENARIO")
+            if self.solution is not None:
+                raise InputError(f"--solution: got {self.solution} with {self.what}, want it with a SCENARIO")
             if self.replan is not None:
                 raise InputError(f"--replan: got {self.replan:g} with {self.what}, want it with a SCENARIO")
             rollout = save_load.load(self.what, Rollout)
@@ -207,7 +211,7 @@ class View:
             scenario = resolve(self.what)
             self._check_replanning(scenario.problem)
             plant = scenario.plant()
-            solution = console.solve(scenario.problem, "smooth", reach=scenario.target_radius())
+            solution = console.solve(scenario) if self.solution is None else self._given(scenario, self.solution)
             planner, goal = (None, None) if self.replan is None else self._planning(scenario.problem, solution)
             shown = viewer.arguments_for_plant(plant, solution, goal)
             law = controller_by_name(self.controller, scenario, solution, self.stated)
@@ -223,6 +227,18 @@ class View:
             with contextlib.suppress(KeyboardInterrupt):
                 go(screen)
         return 0
+
+    @staticmethod
+    def _given(scenario: "Scenario", path: Path) -> "Solution":
+        """The solution in that file. Raises InputError for one that cannot be run in the scenario."""
+        from lqrsim.commands import console
+        from lqrsim.scenarios.solutions import given, remarks
+
+        solution = given(scenario, path)
+        console.say(solution.summary())
+        for remark in remarks(scenario, solution):
+            console.say(f"{path} {remark}")
+        return solution
 
     def _check_replanning(self, problem: "Problem") -> None:
         """Raises InputError for a rate that does not fit the problem, or options that do not go with it."""

@@ -1,5 +1,6 @@
 """What an environment is about: the scenario, its plan, what disturbs it, and what actions and observations mean."""
 
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,15 +22,16 @@ from lqrsim.errors import (
     excerpt,
     shaped,
 )
-from lqrsim.results.save_load import load
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
+from lqrsim.scenarios.solutions import given, remarks, solve
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.compiled import CostsByStep
-from lqrsim.solvers.smoother import smooth
 from lqrsim.stress.sweeps import sweep
+
+_log = logging.getLogger("lqrsim")
 
 Actions = Literal["normalized", "controls"]
 Disturbances = str | Sequence[str | Disturbance]
@@ -71,7 +73,10 @@ class Task:
             scenario = resolve(check_kind("scenario", scenario, str, kinds))
         self.scenario, self.plant = scenario, _plant_of(scenario)
         check_name("actions", actions, ACTIONS)
-        self._actions, self._given = actions, solution
+        self._actions = actions
+        self._given = None if solution is None else given(self.scenario, solution)
+        for remark in [] if self._given is None else remarks(self.scenario, self._given):
+            _log.warning("the given solution %s", remark)
         space = self.plant.robot.dynamics.control_coordinates
         self.low, self.high = np.array(space.low), np.array(space.high)
         for name, low, high in zip(space.names, space.low, space.high, strict=True):
@@ -83,15 +88,8 @@ class Task:
 
     @cached_property
     def solution(self) -> Solution:
-        """The plan: as given, or what `smooth` makes of the scenario's problem.
-
-        Raises:
-          InputError: a file cannot be read.
-        """
-        if self._given is None:
-            return smooth(self.scenario.problem)
-        given = load(self._given, Solution) if isinstance(self._given, str | os.PathLike) else self._given
-        return check_kind("solution", given, Solution, "a Solution, the path of one, or None")
+        """The plan: as given, or what `smooth` makes of the scenario."""
+        return solve(self.scenario) if self._given is None else self._given
 
     @cached_property
     def costs(self) -> CostsByStep:

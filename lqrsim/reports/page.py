@@ -147,7 +147,11 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
             f"{name}: {_describe(disturbances, scenario)}" for name, disturbances in campaign.sweeps.items()
         ],
         "Strengths": [", ".join(f"{strength:g}" for strength in sorted({cell.strength for cell in table}))],
-        "Policies": [", ".join(tables.policies(table)), *([manifest["left_out"]] if manifest.get("left_out") else [])],
+        "Policies": [
+            ", ".join(tables.policies(table)),
+            *([manifest["left_out"]] if manifest.get("left_out") else []),
+            *manifest["remarks"],
+        ],
         "Plans": results.plans(),
         "Trials": [
             f"{campaign.trials} of each combination, {sum(map(len, table.values()))} in all, with the same random"

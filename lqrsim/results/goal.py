@@ -105,14 +105,15 @@ class Target:
         if self.places:
             if goal_tolerance is not None:
                 raise InputError(
-                    f"goal_tolerance: got {goal_tolerance}, want goal_radius, in metres: the {self.name} has a position"
+                    f"goal_tolerance: got {excerpt(goal_tolerance)}, want goal_radius, in metres: the {self.name}"
+                    " has a position"
                 )
             return check_number("goal_radius", robot_radius if goal_radius is None else goal_radius, above=0.0)
         if goal_radius is not None:
             names = ", ".join(self.space.names)
             raise InputError(
-                f"goal_radius: got {goal_radius}, want goal_tolerance, relative to the plan's range: the {self.name}"
-                f" has no position among {names}"
+                f"goal_radius: got {excerpt(goal_radius)}, want goal_tolerance, relative to the plan's range: the"
+                f" {self.name} has no position among {names}"
             )
         return check_number("goal_tolerance", TOLERANCE if goal_tolerance is None else goal_tolerance, above=0.0)
 

@@ -18,7 +18,7 @@ from lqrsim.robots.quadrotor import Quadrotor
 from lqrsim.scenes.scene import Scene, load_scene
 from lqrsim.simulation.disturbances import ControlNoise, Disturbance, ForceNoise, MeasurementNoise, Push
 from lqrsim.simulation.plant import Plant
-from lqrsim.solvers.initial_guess import InitialPrior
+from lqrsim.solvers.initial_guess import InitialPrior, StartLike, is_function, resolve
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,9 @@ class Scenario:
       problem: what to solve; ready to change with `dataclasses.replace(scenario.problem, ...)`.
       tracking_bound: how far in metres an undisturbed run may be from its plan, at any time.
       disturbances: what the demo's disturbed run meets: plain to see, and no more than the policy copes with.
-      paper_start: how the paper begins, for `smooth(problem, start=...)`; by default several starts are tried.
+      start: what to begin with, as in `smooth`, wherever the scenario is solved by its name; by default several starts
+        are tried.
+      paper_start: how the paper begins, for `smooth(problem, start=...)`, or to become the `start`.
       goal_radius: how near the goal counts as having reached it, in metres; by default the robot's radius.
       goal_tolerance: the same for goals without a position; both as in `simulate`.
     """
@@ -45,6 +47,7 @@ class Scenario:
     problem: Problem
     tracking_bound: float
     disturbances: tuple[Disturbance, ...] = ()
+    start: StartLike = None
     paper_start: InitialPrior | None = None
     goal_radius: float | None = None
     goal_tolerance: float | None = None
@@ -93,6 +96,8 @@ class Scenario:
         wanted = "disturbances, such as ControlNoise(0.05)"
         found = check_items("Scenario: disturbances", self.disturbances, Disturbance, wanted)
         object.__setattr__(self, "disturbances", found)
+        if not is_function(self.start):  # which is called when it is solved
+            resolve(self.start, self.problem)
         check_kind("Scenario: paper_start", self.paper_start, (InitialPrior, type(None)), "an InitialPrior or None")
 
     def plant(self) -> Plant:

@@ -28,11 +28,10 @@ from lqrsim.machine import processors
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import Problem
-from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.solvers import compiled
-from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
+from lqrsim.solvers.initial_guess import InitialGuess, StartLike, is_function, resolve
 
 Callback = Callable[[Iteration], object]
 
@@ -80,7 +79,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_name("stop", self.stop, ("optimal", "cost"))
-        if callable(self.start) and not isinstance(self.start, AffinePolicy):
+        if is_function(self.start):
             check_function("start", self.start, "a function of a Problem, or what it returns", arguments=1)
         # What is kept is plain Python's: NumPy's numbers would be other types for the compiler, and not for JSON.
         if self.tolerance is not None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -131,6 +131,21 @@ class InitialGuess:
     found: "Found | None" = None
     log: tuple[Iteration, ...] = ()
 
+    @property
+    def digest(self) -> str:
+        """Hash of all that the first pass begins with."""
+        parts: dict[str, object] = {"gain": self.gain, "offset": self.offset}
+        for name, one in (("cost_to_go", self.cost_to_go), ("trajectory", self.trajectory)):
+            parts |= {} if one is None else {f"{name}.{part}": value for part, value in vars(one).items()}
+        if self.prior is not None:
+            prior = self.prior
+            parts |= {"weight": prior.weight, "about": prior.about}
+            parts |= {"iterations": prior.iterations, "obstacles": prior.obstacles}
+        for number, one in enumerate(self.multipliers):
+            parts |= {f"multipliers.{number}": one.values, f"penalty.{number}": one.penalty}
+        arrays = ((name, np.asarray(value, dtype=np.float64)) for name, value in parts.items())
+        return sha256(*(part for name, array in arrays for part in (f"{name} {array.shape}", array)))
+
     def rolled_out(self, problem: Problem, x: Array) -> "InitialGuess":
         """With the trajectory of the policy from a state (n,): what a backward pass that comes first is about.
 
@@ -165,6 +180,11 @@ class InitialGuess:
         return replace(self, multipliers=tuple(Multipliers(one, penalty) for one in values))
 
 
+def is_function(start: object) -> TypeGuard[Callable[[Problem], Beginning]]:
+    """Whether it makes a start for a problem. An AffinePolicy can be called, too, but is a start."""
+    return callable(start) and not isinstance(start, AffinePolicy)
+
+
 def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess:
     """The beginning that a caller asked for; by default the problem's nominal control, held.
 
@@ -174,7 +194,7 @@ def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess
     n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
     if isinstance(start, InitialGuess):
         return start
-    if callable(start) and not isinstance(start, AffinePolicy):
+    if is_function(start):
         start = start(problem)
     if isinstance(start, InitialPrior):
         prior, controls = start.fitting(problem), resolve(start.controls, problem)

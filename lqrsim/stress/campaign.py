@@ -22,12 +22,14 @@ from lqrsim.errors import InputError, check_count, check_function, check_kind, c
 from lqrsim.machine import description, processors
 from lqrsim.results import save_load
 from lqrsim.results.hashing import sha256
+from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
+from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.stress import cluster, executors
 from lqrsim.stress.lock import sole_writer
-from lqrsim.stress.manifest import NAME, digest_of_solution, read_manifest, write_manifest
+from lqrsim.stress.manifest import GIVEN, NAME, digest_of_solution, read_manifest, write_manifest
 from lqrsim.stress.results import Results
 from lqrsim.stress.specification import POLICIES as POLICIES
 from lqrsim.stress.specification import TOLD, Shard
@@ -37,9 +39,11 @@ from lqrsim.stress.specification import Cell as Cell
 from lqrsim.stress.trial_tables import Damaged, write
 from lqrsim.stress.trials import (
     Job,
+    Trials,
+    check_has_use,
     controller_of,
+    impossible_policies,
     left_out,
-    possible_policies,
     solve,
     stated_uncertainty,
     without_diagnostics,
@@ -49,7 +53,7 @@ from lqrsim.versions import changed, versions
 _log = logging.getLogger("lqrsim")
 
 MOST_WORKERS = 1024
-_CAMPAIGN_FILES = {NAME, "campaign.lock", "policies", "shards", "damaged"}
+_CAMPAIGN_FILES = {NAME, GIVEN, "campaign.lock", "policies", "shards", "damaged"}
 
 
 def run_campaign(
@@ -58,6 +62,7 @@ def run_campaign(
     *,
     workers: int | None = None,
     batch: int = 256,
+    solution: Solution | str | os.PathLike[str] | None = None,
     scheduler: str | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Results:
@@ -68,6 +73,8 @@ def run_campaign(
       folder: takes everything.
       workers: processes on this machine; by default one a processor. 0: do it in this process.
       batch: how many trials a worker simulates together; changes nothing but time and memory.
+      solution: runs in place of what its solver would find for the scenario: of a Solution of `smooth`, or the path of
+        one, all policies but "ilqr"; of one of `ilqr`, that one. It is kept in the folder.
       scheduler: address of a dask cluster that does the work in place of processes on this machine.
       progress: called with the number of trials that there are and of all: first, and after each shard.
 
@@ -75,7 +82,8 @@ def run_campaign(
       The Results.
 
     Raises:
-      InputError: something that is asked cannot be run; the folder is another campaign's, no campaign's, being
+      InputError: something that is asked cannot be run; the solution is not of the scenario's robot, horizon and goal;
+        the folder is another campaign's, no campaign's, being
         written, or on a full disk; the cluster cannot be reached; or a script calls this with workers, and not under
         `if __name__ == "__main__":`, so that each of them would call it again.
     """
@@ -88,13 +96,17 @@ def run_campaign(
         check_text("scheduler", scheduler, "an address, such as tcp://host:8786")
     check_function("progress", progress, "a function of how many trials are done, of how many", arguments=2)
     scenario = resolve(campaign.scenario)
-    _check_runnable(campaign, scenario)
+    given = None if solution is None else solving.given(scenario, solution)
+    _check_runnable(campaign, scenario, given)
     _check_folder(folder)
     with contextlib.ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(cluster.connected(scheduler))
         stack.enter_context(sole_writer(folder))
-        _write_or_check_manifest(campaign, scenario, folder)
+        _write_or_check_manifest(campaign, scenario, folder, given)
         results = Results(folder, scenario=campaign.scenario)
+        # Of the scenario that was checked: a user's function may make another when it is called again.
+        solutions = {policy: results.solution(policy) for policy in campaign.policies}
+        results.trials = Trials(campaign, scenario, solutions)
         unfinished = _unfinished(results)
         if unfinished:
             _check_versions(results)
@@ -109,7 +121,7 @@ def run_campaign(
         elif workers:
             work = executors.run_in_processes(job, unfinished, min(workers, len(unfinished)), campaign.time_limit)
         else:
-            work = executors.run_here(job, unfinished)
+            work = executors.run_here(job, unfinished, results.trials)
         for shard, contents in stack.enter_context(contextlib.closing(work)):
             write(contents, results.path(shard))
             done += shard.count
@@ -134,15 +146,15 @@ def _check_versions(results: Results) -> None:
         )
 
 
-def _check_runnable(campaign: Campaign, scenario: Scenario) -> None:
+def _check_runnable(campaign: Campaign, scenario: Scenario, given: Solution | None) -> None:
     """Raise InputError now for what every trial would raise it for, before anything is solved or written."""
     problem, plant = scenario.problem, scenario.plant()
+    impossible = impossible_policies(scenario, given)
     for policy in campaign.policies:
-        if policy not in possible_policies(scenario):
-            those = ", ".join(possible_policies(scenario))
-            raise InputError(
-                f"policies: got {policy}, which cannot keep the scenario's constraints, want some of {those}"
-            )
+        if policy in impossible:
+            those = ", ".join(one for one in POLICIES if one not in impossible)
+            raise InputError(f"policies: got {policy}, {impossible[policy]}, want some of {those}")
+    check_has_use(given, campaign.policies)
     n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
     start = np.zeros(n) if problem.start is None else problem.start
     standing = Trajectory(np.tile(start, (problem.steps + 1, 1)), np.zeros((problem.steps, m)), problem.dt)
@@ -172,24 +184,30 @@ def _check_folder(folder: Path) -> None:
             raise InputError(f"folder: got {folder}, which has {excerpt(others)}, want an empty one or a campaign's")
 
 
-def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Path) -> None:
+def _write_or_check_manifest(campaign: Campaign, scenario: Scenario, folder: Path, given: Solution | None) -> None:
     """Solve and write the policies, and then the manifest; or see that it is the same campaign that was begun."""
     specification = {
         "campaign": json.loads(json.dumps(campaign.as_json())),
         "model": sha256(scenario.scene.xml),
         "problem": scenario.problem.digest,
+        "start": solving.digest_of_start(scenario),
+        "solution": None if given is None else digest_of_solution(given),
         "code": _code(campaign),
     }
     if os.path.exists(folder / NAME):
         _check_same_campaign(specification, read_manifest(folder), folder)
         return
-    policies, solutions = {}, solve(campaign.policies, scenario, campaign.stated)
+    policies, solutions = {}, solve(campaign.policies, scenario, campaign.stated, given)
     for policy in {*TOLD} & {*campaign.policies}:  # what cannot be made is not begun
         controller_of(policy, scenario, solutions[policy], stated=campaign.stated)
     for policy, solution in solutions.items():
         path = save_load.save(solution, folder / "policies" / f"{policy}.npz")
         policies[policy] = {"digest": digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
-    about = {"versions": versions(), "machine": description(), "left_out": left_out(campaign.policies, scenario)}
+    if given is not None:
+        save_load.save(given, folder / GIVEN)
+    remarks = [f"{policy} {remark}" for policy, one in solutions.items() for remark in solving.remarks(scenario, one)]
+    missing = left_out(campaign.policies, impossible_policies(scenario, given))
+    about = {"versions": versions(), "machine": description(), "left_out": missing, "remarks": remarks}
     write_manifest(folder, specification | {"policies": policies} | about)
 
 
@@ -201,9 +219,13 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
             raise InputError(
                 f"{field}: got {excerpt(value)}, want {excerpt(was)}, as {folder} has it, or another folder"
             )
-    for field, what in (("model", "MJCF"), ("problem", "problem")):
+    for field, what in (("model", "MJCF"), ("problem", "problem"), ("start", "start")):
         if specification[field] != manifest[field]:
             raise InputError(f"scenario: got a {what} that is not the one {folder} was begun with, want another folder")
+    if specification["solution"] != manifest["solution"]:
+        got = "none" if specification["solution"] is None else "another"
+        want = "none" if manifest["solution"] is None else folder / GIVEN
+        raise InputError(f"solution: got {got}, want {want}, as {folder} was begun with, or another folder")
     for kind, digest in specification["code"].items():
         if digest != manifest["code"].get(kind):
             raise InputError(f"{kind}: got a file that has changed since {folder} was begun, want it as it was then")

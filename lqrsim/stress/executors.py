@@ -22,7 +22,7 @@ from multiprocessing.connection import Connection, wait
 from lqrsim import process
 from lqrsim.errors import InputError
 from lqrsim.stress.specification import Shard
-from lqrsim.stress.trials import Job, failed_work, prepare, work
+from lqrsim.stress.trials import Job, Trials, failed_work, prepare, work
 
 FinishedShards = Generator[tuple[Shard, bytes]]
 
@@ -36,10 +36,10 @@ _GUARD = 'run_campaign() called under `if __name__ == "__main__":`, or workers=0
 _serving = False  # whether this process is a worker that has imported the caller's script
 
 
-def run_here(job: Job, shards: Iterable[Shard]) -> FinishedShards:
+def run_here(job: Job, shards: Iterable[Shard], trials: Trials) -> FinishedShards:
     """This process does the work; what ends it ends the campaign, until it is resumed."""
     for shard in shards:
-        yield shard, work(job, shard)
+        yield shard, work(job, shard, trials)
 
 
 def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: float) -> FinishedShards:

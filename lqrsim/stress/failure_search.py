@@ -20,6 +20,7 @@ from lqrsim.errors import (
     InputError,
     check_count,
     check_function,
+    check_kind,
     check_name,
     check_number,
     check_path,
@@ -30,6 +31,8 @@ from lqrsim.machine import description
 from lqrsim.results import save_load
 from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
+from lqrsim.results.solution import Solution
+from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import Disturbance
@@ -61,6 +64,7 @@ class ReliabilityProblem:
       failure: "collision", with an obstacle, or lost; "miss", any trial that does not reach its goal.
       goal_radius: in metres, within which the goal counts as reached, as in `simulate`; by default the scenario's.
       goal_tolerance: the same as a scaled error, for robots without a position; by default the scenario's.
+      solution: a Solution, or the path of one, that runs in place of what its solver would find, as in `run_campaign`.
 
     Raises:
       InputError: something is not as described.
@@ -75,6 +79,7 @@ class ReliabilityProblem:
     goal_radius: float | None = None
     goal_tolerance: float | None = None
     stated: str | None = None
+    solution: Solution | str | os.PathLike[str] | None = None
 
     def __post_init__(self) -> None:
         check_text("scenario", self.scenario, "a reference, such as 'quadrotor'", at_most=4000)
@@ -85,6 +90,8 @@ class ReliabilityProblem:
             check_told("stated", (self.policy,))
             check_text("stated", self.stated, "a name, such as 'light'")
         check_name("failure", self.failure, FAILURES)
+        kinds = (Solution, str, os.PathLike, type(None))
+        check_kind("solution", self.solution, kinds, "a Solution, the path of one, or None")
         for field in ("goal_radius", "goal_tolerance"):
             if (value := getattr(self, field)) is not None:
                 object.__setattr__(self, field, check_number(field, value, above=0.0))
@@ -99,7 +106,7 @@ class ReliabilityProblem:
                 f"failure: got 'collision' for {self.scenario}, where nothing measures how near it is, want 'miss'"
             )
         stated = None if self.stated is None else sweep(self.stated, scenario)
-        solution = solve((self.policy,), scenario, stated)[self.policy]
+        solution = solve((self.policy,), scenario, stated, self.given)[self.policy]
         score = TrialScore(
             plant,
             solution,
@@ -116,6 +123,11 @@ class ReliabilityProblem:
     def resolved(self) -> Scenario:
         """The scenario that the reference names. Raises InputError if there is none."""
         return resolve(self.scenario)
+
+    @cached_property
+    def given(self) -> Solution | None:
+        """The solution that runs in place of a solve, if there is one. Raises InputError where it does not fit."""
+        return None if self.solution is None else solving.given(self.resolved, self.solution)
 
     @cached_property
     def disturbances(self) -> list[Disturbance]:
@@ -369,10 +381,12 @@ def _write(
     """Write trials with these numbers as rollout.npz, and what was asked and found as NAME.json; returns the trials."""
     # As they look: stopped by what they run into, up to which they are the same to the bit.
     rollout = replace(problem.score, contacts=True).rollout(numbers)
+    asked = {field.name: getattr(problem, field.name) for field in fields(problem)} | dict(options)
+    asked["solution"] = None if problem.given is None else digest_of_solution(problem.given)
     contents = {
         "format": f"lqrsim {name}",
         "version": 1,
-        "asked": {field.name: getattr(problem, field.name) for field in fields(problem)} | dict(options),
+        "asked": asked,
         "disturbances": [disturbance_as_json(one) for one in problem.disturbances],
         "model": sha256(problem.resolved.scene.xml),
         "problem": problem.resolved.problem.digest,

@@ -20,7 +20,8 @@ from lqrsim.results.solution import Solution
 from lqrsim.stress.specification import POLICIES, Campaign, Cell
 from lqrsim.stress.trial_tables import write
 
-FORMAT, VERSION, NAME = "lqrsim campaign", 4, "manifest.json"
+FORMAT, VERSION, NAME = "lqrsim campaign", 5, "manifest.json"
+GIVEN = "solution.npz"  # beside it: what was given in place of a solve, whose hash is `solution`
 _LARGEST = 1 << 26  # bytes
 
 _HASH = schema.line
@@ -42,10 +43,12 @@ _CAMPAIGN = schema.record(
 _MANIFEST = schema.record(
     {
         "format": schema.line, "version": schema.count, "campaign": _CAMPAIGN, "model": _HASH, "problem": _HASH,
+        "start": schema.optional(_HASH), "solution": schema.optional(_HASH),
         "code": schema.mapped(schema.optional(_HASH)),
         "policies": schema.mapped(schema.record({"digest": _HASH, "sha256": _HASH})),
         "cells": schema.listed(schema.row(_POLICY, schema.line, _STRENGTH)), "versions": schema.mapped(schema.line),
-        "digest": _HASH, "machine": schema.line, "left_out": schema.line, "sha256": _HASH,
+        "digest": _HASH, "machine": schema.line, "left_out": schema.line,
+        "remarks": schema.listed(schema.line), "sha256": _HASH,
     }
 )  # fmt: skip
 
@@ -109,7 +112,9 @@ def _seal(manifest: Mapping[str, Any]) -> str:
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
     """Hash of all that rows depend on, and of nothing that differs where the same is begun again."""
-    lasting = {name: manifest[name] for name in ("cells", "model", "problem", "code", "versions")} | {
+    lasting = {
+        name: manifest[name] for name in ("cells", "model", "problem", "start", "solution", "code", "versions")
+    } | {
         "campaign": {name: value for name, value in manifest["campaign"].items() if name != "time_limit"},
         "policies": {policy: hashes["digest"] for policy, hashes in manifest["policies"].items()},
     }
@@ -120,5 +125,8 @@ def digest_of_solution(solution: Solution) -> str:
     """Hash of what running it depends on: not of how long it took to find."""
     plan, policy = solution.trajectory, solution.policy
     goal = np.zeros(0) if solution.goal is None else solution.goal
-    arrays = plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt]), goal
+    arrays = [plan.states, plan.controls, policy.gain, policy.offset, policy.nominal, np.array([plan.dt]), goal]
+    if solution.cost_to_go is not None:  # which solving again begins with, and with the multipliers
+        arrays += [np.asarray(part) for part in vars(solution.cost_to_go).values()]
+    arrays += [one.values for one in solution.multipliers]
     return sha256(*(part for array in arrays for part in (f"{array.shape}", array)))

@@ -17,7 +17,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.references import from_anywhere, resolve
 from lqrsim.stress.analysis import alike
-from lqrsim.stress.manifest import cells_of, digest_of_solution, read_manifest
+from lqrsim.stress.manifest import GIVEN, cells_of, digest_of_solution, read_manifest
 from lqrsim.stress.outcome_table import OUTCOMES, Outcomes
 from lqrsim.stress.specification import Campaign, Cell, Shard, shards_of
 from lqrsim.stress.statistics import CONFIDENCE, rate
@@ -65,6 +65,11 @@ class Results:
         scenario = resolve(self.manifest["campaign"]["scenario"], registered_only=self._scenario is None)
         campaign = Campaign.from_json(self.manifest["campaign"])
         return Trials(campaign, scenario, {policy: self.solution(policy) for policy in campaign.policies})
+
+    @property
+    def given(self) -> Path | None:
+        """The file of the solution that was given in place of a solve; None if there was none."""
+        return None if self.manifest["solution"] is None else self.folder / GIVEN
 
     @property
     def complete(self) -> bool:
@@ -135,6 +140,7 @@ class Results:
             line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {share:>33}"
             lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
         lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
+        lines += self.manifest["remarks"]
         lines += self.plans()
         return "\n".join(lines + self.came_to_nothing())
 

@@ -6,7 +6,7 @@ import itertools
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,9 +25,33 @@ from lqrsim.scenarios.references import from_anywhere
 from lqrsim.simulation.disturbances import Disturbance
 
 _FILES = 1_000_000  # of shards in a folder
-POLICIES = ("smooth", "ilqr", "open_loop", "replan", "track", "offset_free")
-TOLD = ("track", "offset_free")  # which are made for stated disturbances
-USUAL = tuple(policy for policy in POLICIES if policy not in TOLD)  # which are run unless others are asked for
+
+
+class PolicyKind(NamedTuple):
+    """How a policy is made.
+
+    Attributes:
+      solver: finds its plan.
+      controller: runs it, one of `trials.CONTROLLERS`.
+      told: whether it is made for stated disturbances.
+    """
+
+    solver: str = "smooth"
+    controller: str = "feedback"
+    told: bool = False
+
+
+KINDS = {
+    "smooth": PolicyKind(),
+    "ilqr": PolicyKind(solver="ilqr"),
+    "open_loop": PolicyKind(),
+    "replan": PolicyKind(controller="replan"),
+    "track": PolicyKind(told=True),  # its law is the policy of its solution
+    "offset_free": PolicyKind(controller="offset_free", told=True),
+}
+POLICIES = tuple(KINDS)
+TOLD = tuple(policy for policy, kind in KINDS.items() if kind.told)
+USUAL = tuple(policy for policy, kind in KINDS.items() if not kind.told)  # which are run unless others are asked for
 
 
 @dataclass(frozen=True)

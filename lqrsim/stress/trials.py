@@ -17,22 +17,20 @@ from lqrsim.errors import InputError, check_name, told
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
+from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, preset
 from lqrsim.simulation.uncertainty_of import uncertainty_of
-from lqrsim.solvers.ilqr import ilqr
-from lqrsim.solvers.smoother import smooth
 from lqrsim.stress.outcome_table import Outcomes, outcomes
-from lqrsim.stress.specification import POLICIES, TOLD, Campaign, Cell, Shard, check_told
+from lqrsim.stress.specification import KINDS, Campaign, Cell, Shard, check_told
 from lqrsim.stress.sweeps import sweep
 from lqrsim.stress.trial_tables import Table, pack
 
 _log = logging.getLogger("lqrsim")
 
 CONTROLLERS = ("feedback", "track", "offset_free", "replan")
-_RUN_BY = {"replan": "replan", "offset_free": "offset_free"}  # the other policies are those of their solutions
 _STATED = "moderate"  # the preset that is stated by default
 
 
@@ -59,28 +57,54 @@ def without_diagnostics(solution: Solution) -> Solution:
 
 
 def solve(
-    policies: tuple[str, ...], scenario: Scenario, stated: Sequence[Disturbance] | None = None
+    policies: Sequence[str],
+    scenario: Scenario,
+    stated: Sequence[Disturbance] | None = None,
+    given: Solution | None = None,
 ) -> dict[str, Solution]:
-    """The solution behind each policy, those made for what is stated included. Raises InputError if one cannot be run.
+    """The solution behind each policy, those made for what is stated included.
 
     That of "track" has its law; that of "offset_free" is the plan that it keeps to, with the policy of "smooth".
+
+    Args:
+      given: from `solutions.given`, in place of what its solver would find.
+
+    Raises:
+      InputError: a policy cannot be run, or none is about the given solution.
     """
+    plans = {} if given is None else {solver_of(given): given}
+    check_has_use(given, policies)
     solutions: dict[str, Solution] = {}
-    if {*policies} - {"ilqr"}:
-        smoothed = smooth(scenario.problem)
-        solutions |= dict.fromkeys(("smooth", "replan", *TOLD), smoothed) | {"open_loop": smoothed.open_loop()}
-    if "ilqr" in policies:
-        solutions["ilqr"] = ilqr(scenario.problem)
     for policy in policies:
-        if not np.isfinite(solutions[policy].trajectory.states).all():
-            raise InputError(f"policies: got {policy}, whose plan is not finite ({solutions[policy].status.name})")
-        solutions[policy] = replace(solutions[policy], goal_radius=scenario.target_radius())
-        if not solutions[policy].success:
-            _log.warning("%s did not converge (%s); its plan is run as it is", policy, solutions[policy].status.name)
+        solver = KINDS[policy].solver
+        if solver not in plans:
+            plans[solver] = solving.solve(scenario, solver)
+        solutions[policy] = plans[solver].open_loop() if policy == "open_loop" else plans[solver]
+    for solver, plan in plans.items():
+        if not np.isfinite(plan.trajectory.states).all():
+            raise InputError(f"policies: got those of {solver}, whose plan is not finite ({plan.status.name})")
+        for remark in solving.remarks(scenario, plan):
+            _log.warning("the solution of %s %s", solver, remark)
     if "track" in policies:
         law = track(scenario.problem, solutions["track"], uncertainty=stated_uncertainty(scenario, stated))
         solutions["track"] = replace(solutions["track"], policy=law)
-    return {policy: solutions[policy] for policy in policies}
+    return solutions
+
+
+def solver_of(solution: Solution) -> str:
+    """Whose place a given solution takes."""
+    return "ilqr" if solution.solver == "ilqr" else "smooth"
+
+
+def check_has_use(given: Solution | None, policies: Sequence[str]) -> None:
+    """Raise InputError unless one of the policies is about the plan of a given solution."""
+    if given is None:
+        return
+    own = [policy for policy, kind in KINDS.items() if kind.solver == solver_of(given)]
+    if not {*own} & {*policies}:
+        raise InputError(
+            f"solution: got one of {given.solver} with {', '.join(policies)}, want it with one of {', '.join(own)}"
+        )
 
 
 def stated_disturbances(scenario: Scenario, stated: Sequence[Disturbance] | None = None) -> Sequence[Disturbance]:
@@ -96,15 +120,21 @@ def stated_uncertainty(scenario: Scenario, stated: Sequence[Disturbance] | None 
         raise InputError(f"stated: {error}") from None
 
 
-def possible_policies(scenario: Scenario, among: Sequence[str] = POLICIES) -> tuple[str, ...]:
-    """Those of the policies that the scenario can have: all, but for those that cannot keep its constraints."""
-    return tuple(policy for policy in among if not (policy == "ilqr" and scenario.problem.constraints))
+def impossible_policies(scenario: Scenario, given: Solution | None = None) -> dict[str, str]:
+    """The policies that the scenario cannot have, with the given solution if there is one, and why."""
+    found: dict[str, str] = {}
+    if scenario.problem.constraints:
+        found["ilqr"] = "which cannot keep the scenario's constraints"
+    replanned = given if given is not None and solver_of(given) == KINDS["replan"].solver else None
+    if replanned is not None and replanned.problem_digest != scenario.problem.digest:
+        found["replan"] = "which solves the scenario's problem again, of which the solution is not"
+    return found
 
 
-def left_out(policies: Sequence[str], scenario: Scenario) -> str:
+def left_out(policies: Sequence[str], impossible: Mapping[str, str]) -> str:
     """Which policies are not among these for what they cannot do, in a line; empty if there is none."""
-    missing = [policy for policy in POLICIES if policy not in {*policies, *possible_policies(scenario)}]
-    return f"left out: {', '.join(missing)}, which cannot keep the scenario's constraints" if missing else ""
+    missing = [f"{policy}, {why}" for policy, why in impossible.items() if policy not in policies]
+    return f"left out: {'; '.join(missing)}" if missing else ""
 
 
 def controller(
@@ -166,8 +196,7 @@ def controller_of(
     replan_every: float | None = None,
 ) -> Controller | AffinePolicy:
     """What runs one of POLICIES, given what `solve` has for it."""
-    name = _RUN_BY.get(policy, "feedback")
-    return controller(name, scenario, solution, stated=stated, replan_every=replan_every)
+    return controller(KINDS[policy].controller, scenario, solution, stated=stated, replan_every=replan_every)
 
 
 class Trials:
@@ -248,9 +277,9 @@ def failed(first: int, count: int, reason: str) -> Table:
     return columns | {"obstacle": np.full(count, ""), "reason": np.full(count, reason)}
 
 
-def work(job: Job, shard: Shard) -> bytes:
-    """The file of a shard, made in this process."""
-    return pack(prepare(job).table(shard, job.batch), shard, job.digest)
+def work(job: Job, shard: Shard, trials: Trials | None = None) -> bytes:
+    """The file of a shard, made in this process, by the trials that are there already if there are some."""
+    return pack((trials or prepare(job)).table(shard, job.batch), shard, job.digest)
 
 
 def failed_work(job: Job, shard: Shard, reason: str) -> bytes:

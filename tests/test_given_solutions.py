@@ -1,0 +1,285 @@
+"""A solution that is given in place of a solve: it is what runs, it stays with what was run, and it has to fit."""
+
+import dataclasses
+import json
+import logging
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lqrsim as ls
+import lqrsim.gym
+from lqrsim.cli import main
+from lqrsim.commands.failures import Break, Rare
+from lqrsim.stress.trials import solve
+from lqrsim.view import viewer
+
+DRIVE, LIGHT = "differential_drive", (ls.disturbances.ControlNoise(0.02), ls.disturbances.MeasurementNoise(0.01))
+CAMPAIGN = ls.stress.Campaign(
+    scenario=DRIVE, sweeps={"light": LIGHT}, strengths=(1.0,),
+    policies=("smooth", "ilqr", "open_loop", "replan", "track", "offset_free"), replan_every=12.0, trials=4, shard=2,
+    stated=LIGHT,
+)  # fmt: skip
+FEW = ["--sweep", "scenario", "--strengths", "1", "--trials", "2", "--workers", "0"]
+
+
+@pytest.fixture(scope="module")
+def left(differential_drive: ls.Scenario) -> ls.Solution:
+    """Another optimum of the scenario's problem than the search finds: along the left wall."""
+    problem = differential_drive.problem
+    about = np.zeros((problem.steps + 1, 3))
+    about[:, 0] = -1.2 * np.sin(np.linspace(0, np.pi, problem.steps + 1))
+    about[:, 1] = np.linspace(-2.5, 2.5, problem.steps + 1)
+    solution = ls.smooth(problem, start=ls.InitialPrior((10, 10, 0), about=about, obstacles=(0, 0.1, 0.4, 0.7)))
+    assert solution.success
+    return solution
+
+
+@pytest.fixture(scope="module")
+def stored(left: ls.Solution, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return ls.save(left, tmp_path_factory.mktemp("left") / "left.npz")
+
+
+@pytest.fixture(scope="module")
+def results(left: ls.Solution, tmp_path_factory: pytest.TempPathFactory) -> ls.stress.Results:
+    return ls.stress.run_campaign(CAMPAIGN, tmp_path_factory.mktemp("given") / "here", workers=0, solution=left)
+
+
+def shards(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((folder / "shards").iterdir())}
+
+
+def one_line(capsys: pytest.CaptureFixture[str]) -> str:
+    error = capsys.readouterr().err
+    assert error.startswith("lqrsim: error: ")
+    assert error.count("\n") == 1
+    return error
+
+
+# What runs.
+
+
+def test_the_trials_of_a_campaign_are_those_of_the_given_solution(
+    results: ls.stress.Results, left: ls.Solution, differential_drive: ls.Scenario
+) -> None:
+    problem, plant = differential_drive.problem, differential_drive.plant()
+    stated = ls.uncertainty_of(plant, LIGHT)
+    laws = {
+        "smooth": left.policy,
+        "ilqr": None,
+        "open_loop": left.open_loop().policy,
+        "replan": ls.Replanner(problem, left, every=12.0, deadline=0.0),
+        "track": ls.track(problem, left, uncertainty=stated),
+        "offset_free": ls.OffsetFree(problem, left, stated),
+    }
+    assert laws.keys() == {*CAMPAIGN.policies}
+    for policy, law in laws.items():
+        plan = left if law else ls.ilqr(problem)  # which is the baseline, from its own plan
+        rollout = ls.simulate(plant, plan, controller=law, disturbances=LIGHT, trials=4, contacts=False)
+        wanted, rows = ls.stress.outcomes(rollout, problem), results.outcomes(ls.stress.Cell(policy, "light", 1.0))
+        np.testing.assert_array_equal(rows.clearance, wanted.clearance, err_msg=policy)
+        np.testing.assert_array_equal(rows.outcome, wanted.outcome)
+        np.testing.assert_array_equal(rows.cost, wanted.cost)
+
+
+def test_a_path_and_other_processes_give_the_same_bits(
+    results: ls.stress.Results, stored: Path, tmp_path: Path
+) -> None:
+    again = ls.stress.run_campaign(CAMPAIGN, tmp_path, workers=1, batch=3, solution=stored)
+    assert again.manifest["digest"] == results.manifest["digest"]
+    assert shards(tmp_path) == shards(results.folder)
+
+
+def test_the_other_commands_run_it_too(
+    stored: Path, left: ls.Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[ls.Trajectory] = []
+
+    def opened(kind: str, port: int, *, title: str, **options: Any) -> None:
+        shown.append(options["plan"])
+        raise ls.InputError("viewer: none here")
+
+    for kind in (Rare, Break):
+        problem = kind(scenario=DRIVE, solution=stored, policy="track")._problem()
+        shown.append(problem.score.solution.trajectory)
+    monkeypatch.setattr(viewer, "open_viewer", opened)
+    assert main(["view", DRIVE, "--solution", str(stored)]) == 2
+    few = ["--rate", "0.5", "--confidence", "0.5", "--knots", "149", "--failures", "0", "--out", str(tmp_path)]
+    main(["funnel", DRIVE, "--solution", str(stored), *few])
+    shown.append(ls.load(tmp_path / "funnel.npz", ls.Funnel).plan)
+    for solution in (left, str(stored)):
+        shown.append(lqrsim.gym.Environment(DRIVE, solution=solution).solution.trajectory)
+    assert len(shown) == 6
+    for plan in shown:
+        np.testing.assert_array_equal(plan.states, left.trajectory.states)
+
+
+def test_a_solution_of_ilqr_is_that_of_the_policy_ilqr(differential_drive: ls.Scenario) -> None:
+    begun = ls.ilqr(differential_drive.problem, max_iterations=3)
+    found = solve(("smooth", "ilqr"), differential_drive, given=begun)
+    np.testing.assert_array_equal(found["ilqr"].trajectory.states, begun.trajectory.states)
+    np.testing.assert_array_equal(
+        found["smooth"].trajectory.states, ls.smooth(differential_drive.problem).trajectory.states
+    )
+
+
+# What stays.
+
+
+def test_the_folder_has_all_that_it_takes_to_replay_and_to_go_on(
+    stored: Path, left: ls.Solution, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine, folder = tmp_path / "mine.npz", tmp_path / "out"
+    shutil.copy(stored, mine)
+    words = [*FEW, "--policies", "open_loop", "track", "--out", str(folder)]
+    assert main(["stress", DRIVE, *words, "--solution", str(mine)]) == 0
+    mine.unlink()
+    whole = shards(folder)
+    kept = ls.load(folder / "solution.npz", ls.Solution)
+    np.testing.assert_array_equal(kept.trajectory.states, left.trajectory.states)
+    for cell in ("0", "1"):
+        replayed = ["--cell", cell, "--trial", "1", "--out", str(tmp_path / "trial.npz")]
+        assert main(["replay", str(folder), *replayed]) == 0
+        assert "identical to the table" in capsys.readouterr().out
+    (folder / "shards" / "0001-000000000.parquet").unlink()
+    assert main(["stress", DRIVE, "--resume", "--workers", "0", "--out", str(folder)]) == 0
+    assert shards(folder) == whole
+    # The same command without it, or with another, is another campaign.
+    capsys.readouterr()
+    assert main(["stress", DRIVE, *words]) == 2
+    assert f"solution: got none, want {folder / 'solution.npz'}, as {folder} was begun with" in one_line(capsys)
+    other = ls.save(dataclasses.replace(left, policy=left.open_loop().policy), tmp_path / "other.npz")
+    for resume in ([], ["--resume"]):
+        assert main(["stress", DRIVE, *words, *resume, "--solution", str(other)]) == 2
+        assert "solution: got another, want " in one_line(capsys)
+    assert shards(folder) == whole
+
+
+def test_a_campaign_that_solves_does_not_go_on_with_a_solution(left: ls.Solution, tmp_path: Path) -> None:
+    campaign = dataclasses.replace(CAMPAIGN, policies=("smooth",), stated=None, trials=1)
+    solved = ls.stress.run_campaign(campaign, tmp_path / "solved", workers=0)
+    assert solved.given is None
+    with pytest.raises(ls.InputError, match=r"^solution: got another, want none, as .*solved was begun with"):
+        ls.stress.run_campaign(campaign, solved.folder, workers=0, solution=left)
+    # Even that which it would find itself is something else that was asked for.
+    found = solved.solution("smooth")
+    given = ls.stress.run_campaign(campaign, tmp_path / "given", workers=0, solution=found)
+    assert given.given == tmp_path / "given" / "solution.npz"
+    assert given.manifest["policies"]["smooth"]["digest"] == solved.manifest["policies"]["smooth"]["digest"]
+    assert given.manifest["digest"] != solved.manifest["digest"]
+
+
+def test_the_hash_is_of_all_that_solving_again_begins_with(left: ls.Solution, tmp_path: Path) -> None:
+    """Plans and policies of the same numbers are planned again in another way with another cost-to-go."""
+    campaign = dataclasses.replace(CAMPAIGN, policies=("replan",), stated=None, trials=1)
+    assert left.cost_to_go is not None
+    steeper = dataclasses.replace(left.cost_to_go, hessian=2 * left.cost_to_go.hessian)
+    digests = {
+        ls.stress.run_campaign(campaign, tmp_path / str(number), workers=0, solution=one).manifest["digest"]
+        for number, one in enumerate((left, dataclasses.replace(left, cost_to_go=steeper)))
+    }
+    assert len(digests) == 2
+
+
+# What is said.
+
+
+def test_a_plan_that_did_not_converge_is_run_and_said_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["solve", DRIVE, "--max-iterations", "2", "--out", str(tmp_path)]) == 1
+    path, says = str(tmp_path / "solution.npz"), "did not converge (MAX_ITERATIONS); its plan is run as it is"
+    out = tmp_path / "out"
+    with caplog.at_level(logging.WARNING, logger="lqrsim"):
+        words = [*FEW, "--policies", "smooth", "open_loop", "--out", str(out)]
+        assert main(["stress", DRIVE, *words, "--solution", path]) == 0
+    assert [record.getMessage() for record in caplog.records].count(f"the solution of smooth {says}") == 1
+    assert f"\nsmooth {says}\nopen_loop {says}\n" in capsys.readouterr().out
+    assert json.loads((out / "manifest.json").read_text())["remarks"] == [f"smooth {says}", f"open_loop {says}"]
+    assert main(["report", str(out), "--videos", "0"]) == 0
+    assert f"open_loop {says}" in (out / "report.html").read_text(encoding="utf-8")
+    caplog.clear()
+    with caplog.at_level(logging.WARNING, logger="lqrsim"):
+        lqrsim.gym.Environment(DRIVE, solution=path)
+    assert [record.getMessage() for record in caplog.records] == [f"the given solution {says}"]
+
+
+def test_a_plan_of_another_problem_is_run_but_not_planned_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["solve", DRIVE, "--clearance", "0.05", "--out", str(tmp_path)]) == 0
+    path, out = str(tmp_path / "solution.npz"), tmp_path / "out"
+    capsys.readouterr()
+    assert main(["stress", DRIVE, *FEW, "--solution", path, "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    says = f"is of another problem than that of {DRIVE} (solved as {DRIVE}); its plan is run as it is"
+    why = "replan, which solves the scenario's problem again, of which the solution is not"
+    assert f"\nsmooth {says}\n" in printed
+    assert f"\nleft out: {why}\n" in printed
+    assert ls.stress.Results(out).campaign.policies == ("smooth", "ilqr", "open_loop")
+    again = [*FEW, "--solution", path, "--policies", "replan", "--out", str(tmp_path / "new")]
+    assert main(["stress", DRIVE, *again]) == 2
+    assert f"policies: got {why}, want some of smooth, ilqr, open_loop, track" in one_line(capsys)
+    assert not (tmp_path / "new").exists()
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize("command", ["stress", "rare", "break", "funnel", "view"])
+def test_a_solution_of_another_system_is_refused_by_every_command(
+    command: str, stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main([command, "quadrotor", "--solution", str(stored)]) == 2
+    says = f"solution: got {stored} with the states x, y, heading, want x, y, z, vx,"
+    assert says in one_line(capsys)
+    assert not any(tmp_path.iterdir())
+
+
+def test_what_does_not_fit_is_refused_by_name(
+    left: ls.Solution, stored: Path, differential_drive: ls.Scenario, tmp_path: Path
+) -> None:
+    problem = differential_drive.problem
+    goal = dataclasses.replace(problem, final_cost=ls.QuadraticCost((5000.0, 5000.0, 50.0), about=(0.0, 2.4, np.pi)))
+    broken = left.trajectory.states.copy()
+    broken[7] = np.nan
+    unfit: dict[str, Any] = {
+        "of 100 steps, want 150, as differential_drive": ls.smooth(
+            dataclasses.replace(problem, steps=100), max_iterations=1
+        ),
+        "with a control period of 0.2 s, want 0.166667 s": ls.smooth(
+            dataclasses.replace(problem, dt=0.2), max_iterations=1
+        ),
+        r"with the goal y = 2.4, want 2.5 \(nan: none\)": ls.smooth(goal, max_iterations=1),
+        r"whose plan is not finite \(CONVERGED\)": dataclasses.replace(
+            left, trajectory=dataclasses.replace(left.trajectory, states=broken)
+        ),
+        "3, want a Solution": 3,
+        "nothing.npz, want a file that exists": tmp_path / "nothing.npz",
+    }
+    campaign = dataclasses.replace(CAMPAIGN, policies=("smooth",), stated=None)
+    for says, solution in unfit.items():
+        with pytest.raises(ls.InputError, match=f"^solution: .*({says})"):
+            ls.stress.run_campaign(campaign, tmp_path / "out", workers=0, solution=solution)
+        with pytest.raises(ls.InputError, match=f"^solution: .*({says})"):
+            lqrsim.gym.Environment(DRIVE, solution=solution)
+        with pytest.raises(ls.InputError, match=f"^solution: .*({says})"):
+            _ = ls.stress.ReliabilityProblem(DRIVE, solution=solution).score
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(ls.InputError, match=r"^solution: got one of smooth with ilqr, want it with one of smooth"):
+        ls.stress.run_campaign(
+            dataclasses.replace(campaign, policies=("ilqr",)), tmp_path / "out", workers=0, solution=stored
+        )
+    baseline = ls.ilqr(problem, max_iterations=1)
+    with pytest.raises(ls.InputError, match=r"^solution: got one of ilqr with smooth, want it with one of ilqr"):
+        _ = ls.stress.ReliabilityProblem(DRIVE, solution=baseline).score
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_recorded_run_has_its_own(stored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["view", str(tmp_path / "rollout.npz"), "--solution", str(stored)]) == 2
+    assert "--solution: got" in one_line(capsys)
