@@ -192,6 +192,9 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             "call": check_functions, "f": rate, "jacobian": jacobian, "function": bowl, "derivatives": slope,
             "depends_on": ("x", "force"), "formula": bowl, "parameters": {"mass": 1.0},
         },),
+        "Problem.with_costs": ({
+            "self": place.problem, "stage_cost": place.problem.stage_cost, "final_cost": place.problem.final_cost,
+        },),
         "Problem.terms": ({"self": place.problem, "which": "initial"},),
         "Obstacle": ({
             "name": "box", "kind": "box", "position": np.zeros(3), "rotation": np.eye(3), "size": np.ones(3)
