@@ -197,7 +197,7 @@ def test_wrong_environments_are_refused(drive_solution: ls.Solution, quadrotor_s
         with pytest.raises(InputError) as caught:
             wrong(**options)
         assert str(caught.value).startswith(line)
-    with pytest.raises(InputError, match=r"^plan: got "):
+    with pytest.raises(InputError, match=r"^solution: got "):
         wrong("quadrotor", solution=drive_solution).reset()
     many: Any = lqrsim.gym.VectorEnvironment("quadrotor", num_envs=2, solution=quadrotor_solution)
     for reset, line in (

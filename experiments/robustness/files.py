@@ -271,11 +271,10 @@ def refusal(error: Exception | Hang) -> tuple[str, str]:
 
 
 def same(a: object, b: object) -> bool:
-    """Equal in every field and of the same types, arrays to the bit."""
+    """Equal in every field that is compared and of the same types, arrays to the bit."""
     if dataclasses.is_dataclass(a) and not isinstance(a, type):
-        return type(a) is type(b) and all(
-            same(getattr(a, field.name), getattr(b, field.name)) for field in dataclasses.fields(a)
-        )
+        names = [field.name for field in dataclasses.fields(a) if field.compare]
+        return type(a) is type(b) and all(same(getattr(a, name), getattr(b, name)) for name in names)
     if isinstance(a, np.ndarray):
         alike = isinstance(b, np.ndarray) and a.dtype == b.dtype and a.shape == b.shape
         return alike and np.ascontiguousarray(a).tobytes() == np.ascontiguousarray(b).tobytes()

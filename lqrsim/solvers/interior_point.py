@@ -32,8 +32,8 @@ INTERIOR = "interior point"  # what its iterations are called
 MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # shares of the projected Hessian, tried in turn
 WEIGHTS = (1e-6, 1e-3, 1.0, 1e3)  # on changes of controls, where not even that has a minimum; relative to the cost
 REGULARISATION = 1e-8  # of equalities, relative
-# Of rows that press, at the end. Where a row couples controls, what is across it must not look like rounding beside its
-# weight, of which the kernel takes a share of 1e-9 for nothing.
+# Of rows that press, in the first step at the end. Where a row couples controls, what is across it must not look like
+# rounding beside its weight, of which the kernel takes a share of 1e-9 for nothing.
 CROSSING = 1e-6
 LONG = 0.3  # the part of a step from which the next one takes Mehrotra's rule
 BOUNDARY = 0.99  # of the way to where a slack is zero, how much is taken at least
@@ -561,9 +561,10 @@ class InteriorPoint:
         paid = np.isfinite(highest) & (missed > 1 - np.abs(self._force) / highest)
         presses = ~paid & (equality | (self._force * size / self._scale > numbers / size))
         right = False
-        for _ in range(CROSSINGS):
+        for k in range(CROSSINGS):
             numbers = self.point.numbers - aim
-            sigma = np.where(presses, self._scale / (CROSSING * size**2), 0.0)
+            # The first step may be long, and rounding spoils it with a weight as large as makes the others Newton's.
+            sigma = np.where(presses, self._scale / ((REGULARISATION if k else CROSSING) * size**2), 0.0)
             self._force = np.where(presses, self._force, np.where(paid, np.sign(self._force) * highest, 0.0))
             stages.linearize(self.point.plan, self._costates, self.stages.spread(self._force), 0.0)
             gaps = stages.models.arrived - self.point.plan.states[1:]
