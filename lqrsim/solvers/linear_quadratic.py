@@ -87,7 +87,13 @@ def smooth_lq(
         clearance=None,
         # The plan is the rollout just made.
         certificate=Certificate(
-            cost=value, start=0.0, motion=0.0, law=0.0, limits=0.0, violation=0.0, optimality=optimality
+            cost=value,
+            start=0.0,
+            dynamics_residual=0.0,
+            policy_residual=0.0,
+            limits=0.0,
+            violation=0.0,
+            optimality=optimality,
         ),
         gap=gap,
         solver="smooth_lq",
