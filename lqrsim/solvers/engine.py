@@ -20,12 +20,12 @@ from lqrsim.kernels.records import (
     CostModel,
     CostToCome,
     CostToGo,
+    IterationSettings,
     Motion,
     Policy,
     Prior,
-    Rows,
-    Settings,
-    Smoothing,
+    SmootherGains,
+    StructuredArray,
 )
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.derivative_check import check_start, functions_of
@@ -125,7 +125,7 @@ class Ending:
 def iterate(
     problem: Problem,
     run: Callable[[int, int], tuple[int, int, bool, int]],
-    rows: Rows,
+    rows: StructuredArray,
     *,
     first: int,
     last: int,
@@ -330,7 +330,7 @@ class SolveRun:
         if self.ending.outcome == declarations.TIMED_OUT and not self._row:
             self.roll_out()
 
-    def smooth_with_constraints(self, rows: Rows, first: int, last: int) -> Ending:
+    def smooth_with_constraints(self, rows: StructuredArray, first: int, last: int) -> Ending:
         """More iterations, in rows of their own; a prior acts no longer."""
         self.work.memory["watched"] = 0.0  # with constraints the least cost is no measure
         begin = len(self.budget.log)
@@ -569,9 +569,9 @@ class SolveRun:
             return True
         self.roll_out()  # before the start is forgotten
         work = self.work
-        arrays, eased = work.arrays, work.model._replace(stage=work.eased(self._obstacle_share(0)))
+        arrays, homotopy_scaled = work.arrays, work.model._replace(stage=work.homotopy_scaled(self._obstacle_share(0)))
         failed, good = work.core.opening_pass(
-            self.problem.steps, self.initial_guess.trajectory is not None, arrays.guess, work.prior, eased,
+            self.problem.steps, self.initial_guess.trajectory is not None, arrays.guess, work.prior, homotopy_scaled,
             arrays.policy, arrays.to_go,
         )  # fmt: skip
         if failed >= 0:
@@ -579,7 +579,7 @@ class SolveRun:
             self.ending = Ending(outcome, failed=failed, backward=True)
         return failed < 0
 
-    def _arguments(self, first: int, last: int, rows: Rows, *, again: bool = False) -> tuple[Any, ...]:
+    def _arguments(self, first: int, last: int, rows: StructuredArray, *, again: bool = False) -> tuple[Any, ...]:
         """What the loop takes, for the iterations from `first` up to `last`, or fewer: of a continuation, one."""
         settings, work = self.settings, self.work
         share = 1.0 if again else self._obstacle_share(first)
@@ -592,11 +592,17 @@ class SolveRun:
         options = self._settings(len(rows), tolerance, settings.gap_tolerance)._replace(
             guided=guided, prior_iterations=count, valley=valley
         )
-        arrays = work.arrays._replace(eased=work.eased(share), prior=prior)
+        arrays = work.arrays._replace(homotopy_scaled=work.homotopy_scaled(share), prior=prior)
         return declarations.ITERATE, first, last, options, work.model, arrays, work.memory_rows, rows
 
     def _damped_arguments(
-        self, first: int, last: int, rows: Rows, most: int, trial: Motion, least: tuple[float, float] = (0.0, 0.0)
+        self,
+        first: int,
+        last: int,
+        rows: StructuredArray,
+        most: int,
+        trial: Motion,
+        least: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[Any, ...]:
         """What it takes for damped iterations, of which there are to be `most`; `trial` is written to on the way."""
         settings, work = self.settings, self.work
@@ -604,14 +610,18 @@ class SolveRun:
         arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
         return declarations.DAMP, first, last, options, work.model, arrays, work.memory_rows, rows
 
-    def _newton_arguments(self, first: int, last: int, rows: Rows, most: int, trial: Motion) -> tuple[Any, ...]:
+    def _newton_arguments(
+        self, first: int, last: int, rows: StructuredArray, most: int, trial: Motion
+    ) -> tuple[Any, ...]:
         """What it takes for Newton iterations, of which there are to be `most`; `trial` is written to on the way."""
         settings, work = self.settings, self.work
         options = self._settings(most, self.final, settings.gap_tolerance)
         arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
         return declarations.FINISH, first, last, options, work.model, arrays, work.memory_rows, rows
 
-    def _check_arguments(self, task: int, found: RunResult, to_go: CostToGo, certificate: Rows) -> tuple[Any, ...]:
+    def _check_arguments(
+        self, task: int, found: RunResult, to_go: CostToGo, certificate: StructuredArray
+    ) -> tuple[Any, ...]:
         """What it takes to certify a plan and its policy, with this cost-to-go."""
         settings, work = self.settings, self.work
         arrays = work.arrays._replace(
@@ -621,9 +631,9 @@ class SolveRun:
         options = self._settings(0, self.final, settings.gap_tolerance)
         return task, 0, 0, options, work.model, arrays, work.memory_rows, self._rows
 
-    def _settings(self, most: int, tolerance: float, gap_tolerance: float) -> Settings:
+    def _settings(self, most: int, tolerance: float, gap_tolerance: float) -> IterationSettings:
         """What the iterations go by, of which there are to be `most`."""
-        return Settings(
+        return IterationSettings(
             steps=self.problem.steps, max_iterations=most, tolerance=float(tolerance),
             gap_tolerance=float(gap_tolerance), optimal=self.settings.stop == "optimal", fixed=self.work.fixed,
             guided=False, prior_iterations=0,
@@ -644,7 +654,7 @@ class Workspace:
     """The memory of a run: what its iterations read and write.
 
     Attributes:
-      arrays: what is in `records.Workspace`. model: the problem's numbers.
+      arrays: what is in `records.SmootherArrays`. model: the problem's numbers.
       memory: what one iteration of the safeguard leaves to the next, a row of `MEMORY`; memory_rows: (1,) that row.
       multipliers: of each constraint, as `augmented_lagrangian.py` has them; changes act at once.
       core: the compiled iterations. fixed: whether the start is given exactly. dual: which form it is.
@@ -667,12 +677,12 @@ class Workspace:
             return Policy(zeros((steps, m, n)), zeros((steps, m)))
 
         self.multipliers: list[Array] = []
-        self.arrays = records.Workspace(
+        self.arrays = records.SmootherArrays(
             start=zeros(n), x_hat=zeros(n), x_hats=zeros((steps + 1, n)), policy=policy(),
             to_go=CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
             to_come=CostToCome(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
-            smoothing=Smoothing(zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))),
-            eased=None, prior=self.no_prior, guess=plan(), plan=plan(), rollout=plan(), kept=policy(),
+            smoothing=SmootherGains(zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))),
+            homotopy_scaled=None, prior=self.no_prior, guess=plan(), plan=plan(), rollout=plan(), kept=policy(),
             certificate=zeros(1, CERTIFICATE),
         )  # fmt: skip
         self.begin(problem, settings, initial_guess, start)
@@ -693,7 +703,7 @@ class Workspace:
             array[0], array[declarations.HEADER :] = known.penalty, known.values.ravel()
         self.multipliers = multipliers
         self.model = compiled.arguments(problem, multipliers=multipliers, second_order=settings.second_order(problem))
-        arrays = self.arrays = self.arrays._replace(eased=self.model.stage, prior=self.prior)
+        arrays = self.arrays = self.arrays._replace(homotopy_scaled=self.model.stage, prior=self.prior)
         # All else is written before it is read.
         self.memory_rows[...] = 0.0
         arrays.start[...] = arrays.x_hat[...] = start
@@ -744,8 +754,8 @@ class Workspace:
                 law = gain, inverse[1] - np.einsum("tij,tj->ti", gain, mean[1:])
         return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_law": law}
 
-    def eased(self, share: float) -> CostModel:
-        """The stage cost with that share of what may be eased; see `CostTerm.factor`."""
+    def homotopy_scaled(self, share: float) -> CostModel:
+        """The stage cost with that share of what the homotopy scales; see `CostTerm.factor`."""
         if share == 1:
             return self.model.stage
         data = list(self.model.stage.data)
