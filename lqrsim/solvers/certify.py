@@ -11,7 +11,7 @@ import numpy as np
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import CERTIFICATE, CostToGo, Rows
+from lqrsim.kernels.records import CERTIFICATE, CostToGo, StructuredArray
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Certificate
 from lqrsim.results.value_functions import Quadratic
@@ -26,7 +26,7 @@ REST = 1e-13
 SLACK = 2.0
 
 
-Work = Callable[[int, CostToGo, Rows], object]
+Work = Callable[[int, CostToGo, StructuredArray], object]
 
 
 def certified(
