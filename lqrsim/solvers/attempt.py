@@ -48,10 +48,10 @@ class AttemptResult:
     final: bool = False
 
     @property
-    def rank(self) -> tuple[bool, float, bool, float]:
-        """The smaller, the better: success first, then constraints, then what is known of why not, then the cost."""
+    def rank(self) -> tuple[bool, bool, float, float]:
+        """The smaller, the better: success first, then what is known of why not, then constraints, then the cost."""
         missed = 0.0 if self.success else float(f"{self.violation:.2g}")
-        return not self.success, missed, self.status is not Status.INFEASIBLE, self.cost
+        return not self.success, self.status is not Status.INFEASIBLE, missed, self.cost
 
     @property
     def success(self) -> bool:

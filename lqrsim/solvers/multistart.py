@@ -17,12 +17,12 @@ from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, ter
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
-from lqrsim.results.solution_parts import Candidate
+from lqrsim.results.solution_parts import Candidate, Status
 from lqrsim.solvers.assembly import clearance_of
 from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import Callback, SmootherSettings, Stop, workers
 from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, resolve
-from lqrsim.solvers.strategy import finish, refine
+from lqrsim.solvers.strategy import Known, finish, refine
 
 # `python experiments/benchmark_quality.py --sections ingredients` shows what each of these choices brings.
 STARTS = 7
@@ -182,7 +182,7 @@ class Search:
 
     def __init__(self, names: Sequence[str], attempts: Sequence[Attempt], *, each: bool, callback: Callback | None):
         self._named = list(zip(names, attempts, strict=True))
-        self._each, self._callback = each, callback
+        self._each, self._callback, self._known = each, callback, Known()
         self._finished: list[tuple[Attempt, AttemptResult]] = []
 
     @property
@@ -200,7 +200,8 @@ class Search:
                 best = self.best[1]
                 if attempt.stop.due or best.final or (best.success and not attempt.cost < best.cost):
                     break
-                self._finish(attempt)
+                if self._finish(attempt).final and best.status is Status.INFEASIBLE:
+                    break
 
     def poor(self, problem: Problem) -> bool:
         """Whether the best plan so far is one that nobody would want: far from the goal, or through an obstacle.
@@ -213,7 +214,7 @@ class Search:
             return self._idle(problem)
         (attempt, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
         if not found.success:
-            return attempt.iterations_left(found.iterations) > 0
+            return attempt.iterations_left(found.iterations) > 0 and found.status is not Status.INFEASIBLE
         if space.position:
             place = list(space.position)
             arrived = np.linalg.norm(found.states[-1, place] - problem.goal[place]) <= max(radius, 1e-3)
@@ -257,7 +258,8 @@ class Search:
             )
             attempt = Attempt(problem, settings, initial_guess, start, stop)
             self._named.append((f"a plan for {times:g} times the weight of obstacles and goal", attempt))
-            found, best = refine(attempt, each=self._each, callback=self._callback), self.best[1]
+            found = refine(attempt, each=self._each, callback=self._callback, known=self._known)
+            best = self.best[1]
             # The same optimum once more, a little different within the tolerances, is no other way.
             other = found.rank < best.rank and (not best.success or found.cost < best.cost - 1e-3 * abs(best.cost))
             self._finished.insert(0 if other else len(self._finished), (attempt, found))
@@ -290,7 +292,7 @@ class Search:
     def _advance(self, attempt: Attempt, *, last: int) -> None:
         attempt.run(last, each=self._each)
 
-    def _finish(self, attempt: Attempt) -> None:
+    def _finish(self, attempt: Attempt) -> AttemptResult:
         if self._callback is not None:
             for iteration in attempt.termination.iterations:
                 try:
@@ -298,8 +300,10 @@ class Search:
                 except BaseException as error:
                     attempt.stop.error = error
                     break
-        self._finished.append((attempt, finish(attempt, each=self._each, callback=self._callback)))
+        found = finish(attempt, each=self._each, callback=self._callback, known=self._known)
+        self._finished.append((attempt, found))
         self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equals, the first
+        return found
 
 
 def choose(attempts: Sequence[Attempt], advance: Callable[..., None], threads: int) -> list[Attempt]:

@@ -19,7 +19,7 @@ Problems with noise and constraints, those of an MJCF, and `finish=None` have th
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from lqrsim.solvers.multipliers import AugmentedLagrangian
 from lqrsim.solvers.restoration import Restored, restore
 
 FAR = 100.0  # times what may be missed: then the price is too low, or there is no way to keep all
-STARTS = 2  # from which what is missed has to be stationary, before that is called infeasible
+STARTS, SURE = 2, 4  # from which what is missed has to be stationary, to be called infeasible; and not to try others
 AUGMENTED = 100  # iterations of the augmented Lagrangian
 OPENING, GUIDED = 10, 60  # iterations of smoothing at most before constraints come in; and with an ObstacleCost
 MOST, RESTORED = 300, 150  # of the interior point from one plan; and of a descent at one price
@@ -51,22 +51,38 @@ ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
 AT_LIMIT = 1e-9  # of its range, within which a control that presses against its limit is put there
 
 
-def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
-    """Run an attempt to its end, certified."""
+@dataclass
+class Known:
+    """What the ladders of one search know of each other's.
+
+    Attributes:
+      evidence: plans about which no change lessens what is missed. from_start: whether the start itself was tried.
+    """
+
+    evidence: list[tuple[Evidence, AttemptResult]] = field(default_factory=list)
+    from_start: bool = False
+
+
+def finish(
+    attempt: Attempt, *, each: bool, callback: Callback | None = None, known: Known | None = None
+) -> AttemptResult:
+    """Run an attempt to its end, certified; `known` is what other attempts at the same problem came to."""
     if attempt.initial_guess.found is not None:
         return Ladder(attempt, each=each, callback=callback).climb()
     if not attempt.problem.constraints:
         return attempt.certified(_without_constraints(attempt, each=each, callback=callback))
     if not attempt.newton:
         return constrained.finish(attempt, each=each, callback=callback)
-    return Ladder(attempt, each=each, callback=callback).climb()
+    return Ladder(attempt, each=each, callback=callback, known=known).climb()
 
 
-def refine(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
+def refine(
+    attempt: Attempt, *, each: bool, callback: Callback | None = None, known: Known | None = None
+) -> AttemptResult:
     """Run an attempt to its end from where its first policy leads, and stay on that way round; certified."""
     if not (attempt.problem.constraints and attempt.newton):
         return constrained.refine(attempt, each=each, callback=callback)
-    return Ladder(attempt, each=each, callback=callback).climb(stay=True)
+    return Ladder(attempt, each=each, callback=callback, known=known).climb(stay=True)
 
 
 def _without_constraints(attempt: Attempt, *, each: bool, callback: Callback | None) -> AttemptResult:
@@ -94,7 +110,7 @@ def _without_constraints(attempt: Attempt, *, each: bool, callback: Callback | N
 class Ladder:
     """The ways to a plan that keeps constraints, one after the other."""
 
-    def __init__(self, attempt: Attempt, *, each: bool, callback: Callback | None) -> None:
+    def __init__(self, attempt: Attempt, *, each: bool, callback: Callback | None, known: Known | None = None) -> None:
         self._attempt, self._problem, self._each, self._callback = attempt, attempt.problem, each, callback
         self._allowed = attempt.settings.missed(attempt.problem)
         clock = time.perf_counter()
@@ -106,7 +122,7 @@ class Ladder:
         self._valley: Motion | None = None
         # Whether smoothing and its search have gone round obstacles, which are then to be passed on that side.
         self._guided = any(cost.weight for cost in attempt.problem.obstacle_costs)
-        self._evidence: list[tuple[Evidence, AttemptResult]] = []
+        self._known = Known() if known is None else known
         if attempt.settings.penalty is None:
             self._without_multipliers()
 
@@ -135,7 +151,8 @@ class Ladder:
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
             rungs += [self._from_valley, self._augmented, lambda: self._at_a_price(self._valley)]
-        rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._at_a_price(_plan(start))]
+        if stay or not self._known.from_start:  # all attempts of a search have the same start
+            rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._from_start(start)]
         for rung in rungs:
             found = rung()
             if found is not None and found.success:
@@ -155,6 +172,10 @@ class Ladder:
             return replace(found, iterations=self._iterations)
         self._attempt.go_on(kept, self._iterations)
         return None
+
+    def _from_start(self, start: AttemptResult) -> AttemptResult | None:
+        self._known.from_start = True
+        return self._at_a_price(_plan(start))
 
     def _from_valley(self) -> AttemptResult | None:
         attempt = self._attempt
@@ -216,21 +237,20 @@ class Ladder:
         if plan is None or self._attempt.settings.elastic is not None:
             return None
         for price in PRICES:
-            priced, sizes = self._restore(plan, price)
+            priced = self._restore(plan, price)
             if priced is None:
                 return None
             plan = priced.plan
-            there = self._note(self._result(plan.states, plan.controls, self._without_gains(plan)))
-            missed = there.violation > FAR * self._allowed
-            if missed and price == PRICES[-1] and priced.settled and self._look_for_evidence(priced, there, sizes):
+            self._note(self._result(plan.states, plan.controls, self._without_gains(plan)))
+            if priced.settled:
                 return None
-            if not missed or price == PRICES[-1]:
+            if priced.near or price == PRICES[-1]:
                 found = self._interior(plan, MUCH)
                 if found is not None and found.success:
                     return found
         return None
 
-    def _restore(self, plan: Motion, price: float) -> tuple[Restored | None, Sizes]:
+    def _restore(self, plan: Motion, price: float) -> Restored | None:
         """Descent at a price, with a line of the log each."""
         stop, left = self._attempt.stop, self._attempt.iterations_left(self._iterations) - 1
         before, clock, slow = np.inf, time.perf_counter(), 0
@@ -248,23 +268,29 @@ class Ladder:
 
         sizes = self._stages.sizes(plan)
         if left < 1 or stop.due:
-            return None, sizes
+            return None
         try:
             with np.errstate(all="ignore"):
-                return restore(self._stages, plan, sizes, price=price, most=min(RESTORED, left), watch=watch), sizes
+                return restore(
+                    self._stages, plan, sizes, price=price, most=min(RESTORED, left), watch=watch,
+                    stationary=lambda plan, shares: self._look_for_evidence(plan, shares, sizes),
+                )  # fmt: skip
         except BaseException as error:  # as above
             stop.error = error
-            return None, sizes
+            return None
 
-    def _look_for_evidence(self, priced: Restored, there: AttemptResult, sizes: Sizes) -> bool:
+    def _look_for_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
         """Whether what is missed there is stationary; if so it is kept."""
-        rows = [sizes.rows[self._stages.owners == k] for k in range(len(priced.shares))]
+        there = self._result(plan.states, plan.controls, self._without_gains(plan))
+        if not there.violation > FAR * self._allowed:
+            return False
+        rows = [sizes.rows[self._stages.owners == k] for k in range(len(shares))]
         found = evidence(
-            self._problem, self._attempt.work, there.states, there.controls, shares=priced.shares, sizes=rows,
+            self._problem, self._attempt.work, there.states, there.controls, shares=shares, sizes=rows,
             allowed=self._allowed, control_size=sizes.controls, state_size=sizes.states,
         )  # fmt: skip
         if found is not None:
-            self._evidence.append((found, there))
+            self._known.evidence.append((found, there))
         return found is not None
 
     def _interior(
@@ -430,13 +456,15 @@ class Ladder:
             lagrangian = AugmentedLagrangian(attempt)
             lagrangian.evaluate(best.states, best.controls)
             status, detail = Status.MAX_ITERATIONS, lagrangian.worst()
-            if len(self._evidence) >= STARTS and best.violation > self._allowed:
-                least, best = min(self._evidence, key=lambda pair: pair[0].missed)
+            if len(self._known.evidence) >= STARTS and best.violation > self._allowed:
+                least, best = min(self._known.evidence, key=lambda pair: pair[0].missed)
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()
                 status = Status.INFEASIBLE
                 detail += f"; against it stand {least.against}" if least.against else ""
-            best = replace(best, status=Status.TIME_LIMIT if attempt.stop.due else status, detail=detail)
+            status = Status.TIME_LIMIT if attempt.stop.due else status
+            sure = status is Status.INFEASIBLE and len(self._known.evidence) >= SURE
+            best = replace(best, status=status, detail=detail, final=sure)
         return attempt.certified(replace(best, iterations=self._iterations))
 
 
