@@ -1,4 +1,4 @@
-"""Every script in experiments/ runs, and says what it is there to say."""
+"""Every script in experiments/ and tests/tools/ runs, and reports what it is for."""
 
 import itertools
 import json
@@ -17,18 +17,18 @@ import pytest
 import lqrsim as ls
 from lqrsim.disturbances import MassMismatch, MeasurementDropouts, MeasurementLatency
 
-FOLDER = Path(__file__).parent.parent / "experiments"
-SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if "__main__" in path.read_text(encoding="utf-8"))
+FOLDER, TOOLS = Path(__file__).parent.parent / "experiments", Path(__file__).parent / "tools"
+FILES = sorted([*FOLDER.glob("*.py"), *TOOLS.glob("*.py")])
+SCRIPTS = [path for path in FILES if "__main__" in path.read_text(encoding="utf-8")]
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_scripts_explain_themselves(
-    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    script: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    script = str(FOLDER / f"{name}.py")
-    monkeypatch.setattr(sys, "argv", [script, "--help"])
+    monkeypatch.setattr(sys, "argv", [str(script), "--help"])
     with pytest.raises(SystemExit) as ended:
-        runpy.run_path(script, run_name="__main__")
+        runpy.run_path(str(script), run_name="__main__")
     assert not ended.value.code
     assert "--quick" in capsys.readouterr().out
 

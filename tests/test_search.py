@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from comparing import same
-from whole_problems import kkt
+from oracle import kkt
 
 import lqrsim as ls
 from lqrsim.errors import Array

@@ -16,7 +16,7 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.errors import Array
 
 
-class Moments(NamedTuple):
+class LoopMoments(NamedTuple):
     """Of a closed loop about its plan, X as above.
 
     Attributes:
@@ -51,7 +51,7 @@ class Loop:
     low: Array
     high: Array
 
-    def moments(self) -> Moments:
+    def moments(self) -> LoopMoments:
         """What is predicted of it, from the start to the plan's end."""
         model, steps, n, size = self.model, self.model.plan.steps, self.model.n, self.model.size
         estimates = self.filter_gain is not None
@@ -88,7 +88,7 @@ class Loop:
             mean[t + 1, :size] += model.c[t]
             if estimates:
                 mean[t + 1, size:] += model.c[t]
-        return Moments(mean, covariance, across, std, saturation)
+        return LoopMoments(mean, covariance, across, std, saturation)
 
     def _seen(self, t: int) -> tuple[Array, Array]:
         """What the law is told, as a matrix times X, and the covariance of the noise on that."""

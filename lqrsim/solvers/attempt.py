@@ -8,7 +8,7 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import LOG, CostToGo, Motion, Policy, Rows, Settings
+from lqrsim.kernels.records import LOG, CostToGo, IterationSettings, Motion, Policy, StructuredArray
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
 from lqrsim.solvers import compiled
@@ -145,7 +145,7 @@ class Attempt:
             self.roll_out()
 
     def run_on(
-        self, log: Rows, last: int, *, done: tuple[Iteration, ...], each: bool, callback: Callback | None
+        self, log: StructuredArray, last: int, *, done: tuple[Iteration, ...], each: bool, callback: Callback | None
     ) -> Termination:
         """More iterations of the same kind, with a log of their own; the prior has had its time."""
         self.work.memory["watched"] = 0.0  # with constraints the least cost is no measure
@@ -394,9 +394,9 @@ class Attempt:
             return True
         self.roll_out()  # before the start is forgotten
         work = self.work
-        arrays, eased = work.arrays, work.model._replace(stage=work.eased(self._obstacle_share(0)))
+        arrays, homotopy_scaled = work.arrays, work.model._replace(stage=work.homotopy_scaled(self._obstacle_share(0)))
         failed, good = work.core.opening_pass(
-            self.problem.steps, self.initial_guess.trajectory is not None, arrays.guess, work.prior, eased,
+            self.problem.steps, self.initial_guess.trajectory is not None, arrays.guess, work.prior, homotopy_scaled,
             arrays.policy, arrays.to_go,
         )  # fmt: skip
         if failed >= 0:
@@ -404,7 +404,7 @@ class Attempt:
             self.termination = Termination((), outcome, True, failed, "")
         return failed < 0
 
-    def _arguments(self, first: int, last: int, log: Rows, *, again: bool = False) -> tuple[Any, ...]:
+    def _arguments(self, first: int, last: int, log: StructuredArray, *, again: bool = False) -> tuple[Any, ...]:
         """What the loop takes, for the iterations from `first` up to `last`, or fewer: of a continuation, one."""
         settings, work = self.settings, self.work
         share = 1.0 if again else self._obstacle_share(first)
@@ -417,11 +417,17 @@ class Attempt:
         options = self._settings(len(log), tolerance, settings.gap_tolerance)._replace(
             guided=guided, prior_iterations=count, valley=valley
         )
-        arrays = work.arrays._replace(eased=work.eased(share), prior=prior)
+        arrays = work.arrays._replace(homotopy_scaled=work.homotopy_scaled(share), prior=prior)
         return declarations.ITERATE, first, last, options, work.model, arrays, work.memory_rows, log
 
     def _damped_arguments(
-        self, first: int, last: int, log: Rows, most: int, trial: Motion, least: tuple[float, float] = (0.0, 0.0)
+        self,
+        first: int,
+        last: int,
+        log: StructuredArray,
+        most: int,
+        trial: Motion,
+        least: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[Any, ...]:
         """What it takes for damped iterations, of which there are to be `most`; `trial` is written to on the way."""
         settings, work = self.settings, self.work
@@ -429,14 +435,18 @@ class Attempt:
         arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
         return declarations.DAMP, first, last, options, work.model, arrays, work.memory_rows, log
 
-    def _newton_arguments(self, first: int, last: int, log: Rows, most: int, trial: Motion) -> tuple[Any, ...]:
+    def _newton_arguments(
+        self, first: int, last: int, log: StructuredArray, most: int, trial: Motion
+    ) -> tuple[Any, ...]:
         """What it takes for Newton iterations, of which there are to be `most`; `trial` is written to on the way."""
         settings, work = self.settings, self.work
         options = self._settings(most, self.final, settings.gap_tolerance)
         arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
         return declarations.FINISH, first, last, options, work.model, arrays, work.memory_rows, log
 
-    def _check_arguments(self, task: int, found: AttemptResult, to_go: CostToGo, certificate: Rows) -> tuple[Any, ...]:
+    def _check_arguments(
+        self, task: int, found: AttemptResult, to_go: CostToGo, certificate: StructuredArray
+    ) -> tuple[Any, ...]:
         """What it takes to certify a plan and its policy, with this cost-to-go."""
         settings, work = self.settings, self.work
         arrays = work.arrays._replace(
@@ -446,9 +456,9 @@ class Attempt:
         options = self._settings(0, self.final, settings.gap_tolerance)
         return task, 0, 0, options, work.model, arrays, work.memory_rows, self._log
 
-    def _settings(self, most: int, tolerance: float, gap_tolerance: float) -> Settings:
+    def _settings(self, most: int, tolerance: float, gap_tolerance: float) -> IterationSettings:
         """What the iterations go by, of which there are to be `most`."""
-        return Settings(
+        return IterationSettings(
             steps=self.problem.steps, max_iterations=most, tolerance=float(tolerance),
             gap_tolerance=float(gap_tolerance), optimal=self.settings.stop == "optimal", fixed=self.work.fixed,
             guided=False, prior_iterations=0,

@@ -23,7 +23,7 @@ from lqrsim.errors import (
     check_number,
 )
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import Rows
+from lqrsim.kernels.records import StructuredArray
 from lqrsim.machine import processors
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.noise import Noise
@@ -250,7 +250,7 @@ class Termination:
 def iterate(
     problem: Problem,
     run: Callable[[int, int], tuple[int, int, bool, int]],
-    log: Rows,
+    log: StructuredArray,
     last: int,
     *,
     done: tuple[Iteration, ...] = (),

@@ -6,8 +6,16 @@ import numpy as np
 
 from lqrsim.errors import InputError, check_number
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Motion, Policy, Rows
-from lqrsim.kernels.records import Settings as KernelSettings
+from lqrsim.kernels.records import (
+    CERTIFICATE,
+    LOG,
+    CostToGo,
+    IlqrArrays,
+    IterationSettings,
+    Motion,
+    Policy,
+    StructuredArray,
+)
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import Problem
@@ -152,12 +160,12 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     plan = Motion(zeros((steps + 1, n)), zeros(initial_guess.offset.shape))
     states, controls = plan
     go = CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1))
-    work = Descent(
+    work = IlqrArrays(
         start=start, policy=policy, to_go=go, plan=plan, trial=Motion(states.copy(), controls.copy()), damping=zeros(1),
         certificate=zeros(1, CERTIFICATE),
     )  # fmt: skip
     log = zeros(settings.max_iterations + 1, LOG)
-    options = KernelSettings(
+    options = IterationSettings(
         steps=steps, max_iterations=settings.max_iterations, tolerance=settings.tolerance, gap_tolerance=0.0,
         optimal=settings.stop == "optimal", fixed=True, guided=False, prior_iterations=0,
     )  # fmt: skip
@@ -182,7 +190,7 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
     offset = controls - np.einsum("tij,tj->ti", policy.gain, states[:-1]) if whole else controls.copy()
     status, detail = termination.status, termination.detail(problem.steps)
 
-    def check(task: int, to_go: CostToGo, out: Rows) -> None:
+    def check(task: int, to_go: CostToGo, out: StructuredArray) -> None:
         checked = work._replace(policy=Policy(policy.gain, offset), to_go=to_go, certificate=out)
         loop(task, 0, 0, options, model, checked, log)
 

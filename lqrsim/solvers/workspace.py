@@ -17,7 +17,7 @@ from lqrsim.kernels.records import (
     Motion,
     Policy,
     Prior,
-    Smoothing,
+    SmootherGains,
 )
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.problem import FixedState, Problem
@@ -31,7 +31,7 @@ class Workspace:
     """What the iterations read and write.
 
     Attributes:
-      arrays: what is in `records.Workspace`. model: the problem's numbers.
+      arrays: what is in `records.SmootherArrays`. model: the problem's numbers.
       memory: what one iteration of the safeguard leaves to the next, a row of `MEMORY`; memory_rows: (1,) that row.
       multipliers: of each constraint, as `augmented_lagrangian.py` has them; changes act at once.
       core: the compiled iterations. fixed: whether the start is given exactly. dual: which form it is.
@@ -54,12 +54,12 @@ class Workspace:
             return Policy(zeros((steps, m, n)), zeros((steps, m)))
 
         self.multipliers: list[Array] = []
-        self.arrays = records.Workspace(
+        self.arrays = records.SmootherArrays(
             start=zeros(n), x_hat=zeros(n), x_hats=zeros((steps + 1, n)), policy=policy(),
             to_go=CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
             to_come=CostToCome(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
-            smoothing=Smoothing(zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))),
-            eased=None, prior=self.no_prior, guess=plan(), plan=plan(), rollout=plan(), kept=policy(),
+            smoothing=SmootherGains(zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))),
+            homotopy_scaled=None, prior=self.no_prior, guess=plan(), plan=plan(), rollout=plan(), kept=policy(),
             certificate=zeros(1, CERTIFICATE),
         )  # fmt: skip
         self.begin(problem, settings, initial_guess, start)
@@ -80,7 +80,7 @@ class Workspace:
             array[0], array[declarations.HEADER :] = known.penalty, known.values.ravel()
         self.multipliers = multipliers
         self.model = compiled.arguments(problem, multipliers=multipliers, second_order=settings.newton(problem))
-        arrays = self.arrays = self.arrays._replace(eased=self.model.stage, prior=self.prior)
+        arrays = self.arrays = self.arrays._replace(homotopy_scaled=self.model.stage, prior=self.prior)
         # All else is written before it is read.
         self.memory_rows[...] = 0.0
         arrays.start[...] = arrays.x_hat[...] = start
@@ -131,8 +131,8 @@ class Workspace:
                 law = gain, inverse[1] - np.einsum("tij,tj->ti", gain, mean[1:])
         return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_law": law}
 
-    def eased(self, share: float) -> CostModel:
-        """The stage cost with that share of what may be eased; see `CostTerm.factor`."""
+    def homotopy_scaled(self, share: float) -> CostModel:
+        """The stage cost with that share of what the homotopy scales; see `CostTerm.factor`."""
         if share == 1:
             return self.model.stage
         data = list(self.model.stage.data)

@@ -1,8 +1,8 @@
 """How lqrsim takes hostile input: calls with what nobody should pass, and files that are damaged or made up.
 
-    python experiments/benchmark_robustness.py                    # everything, some minutes
-    python experiments/benchmark_robustness.py --sections files   # some of it
-    python experiments/benchmark_robustness.py --quick            # a fiftieth
+    python tests/tools/benchmark_robustness.py                    # everything, some minutes
+    python tests/tools/benchmark_robustness.py --sections files   # some of it
+    python tests/tools/benchmark_robustness.py --quick            # a fiftieth
 
 All of it is to be accepted, or refused by one clear line of InputError. Exits with 1 if anything else is raised, hangs,
 or ends the process.

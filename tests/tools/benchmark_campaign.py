@@ -1,7 +1,7 @@
 """Whether a campaign that is killed again and again comes to the same bits: `lqrsim stress`, SIGKILL, the same command.
 
-    python experiments/benchmark_campaign.py            # 20 kills
-    python experiments/benchmark_campaign.py --quick    # 3
+    python tests/tools/benchmark_campaign.py            # 20 kills
+    python tests/tools/benchmark_campaign.py --quick    # 3
 
 Exits with 1 if a table differs from those of a campaign that was left alone, or a row is missing or there twice.
 """

@@ -1,8 +1,8 @@
 """Whether what solutions claim is so, on whole problems drawn at random, and on one person's own robot.
 
-    python experiments/benchmark_claims.py                         # 10,000 problems, some 6 minutes on two cores
-    python experiments/benchmark_claims.py --sections planar       # some of it
-    python experiments/benchmark_claims.py --quick                 # bounded, and too few to trust
+    python tests/tools/benchmark_claims.py                         # 10,000 problems, some 6 minutes on two cores
+    python tests/tools/benchmark_claims.py --sections planar       # some of it
+    python tests/tools/benchmark_claims.py --quick                 # bounded, and too few to trust
 
 Every claim is held against the problem alone, by whole_problems/claims.py, which shares nothing with the solvers.
 
@@ -15,25 +15,31 @@ certificate  What the certificate costs of a solve, on the paper's queries and o
 import dataclasses
 import json
 import statistics
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 import tyro
 from tqdm import tqdm
-from whole_problems import known, planar_quadrotor
-from whole_problems.claims import contradictions
-from whole_problems.draws import KINDS, draw, solve
 
 import lqrsim as ls
 from lqrsim.machine import processors
 from lqrsim.solvers.attempt import Attempt
 from lqrsim.versions import versions
+
+sys.path.append(str(Path(__file__).parents[2] / "experiments"))  # has the systems and the independent judge
+
+from oracle import planar_quadrotor
+from whole_problems import known
+from whole_problems.claims import contradictions
+from whole_problems.draws import KINDS, draw, solve
 
 Section = Literal["drawn", "planar", "known", "certificate"]
 
