@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.trial_outcome import OUTCOMES
+from lqrsim.results.goal import OUTCOMES
 from lqrsim.stress.statistics import rate
 from lqrsim.view import obstacle_plots
 from lqrsim.view.style import MARGIN, PLAN, RUNS, SOLID

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -10,21 +11,16 @@ import numpy.typing as npt
 from lqrsim.errors import (
     Array,
     InputError,
-    check_array,
     check_count,
-    check_items,
     check_kind,
     check_name,
     check_number,
-    check_seed,
-    check_shape,
-    check_text,
     excerpt,
-    numbers_of,
     shaped,
     vectors_of,
 )
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution_parts import Trajectory
@@ -72,79 +68,58 @@ class Funnel:
     """
 
     plan: Trajectory
-    state_coordinates: Coordinates
-    control_coordinates: Coordinates
-    states: tuple[str, ...]
-    shape: Array
-    family: str
-    knots: npt.NDArray[np.int64]
-    levels: Array
-    trials: npt.NDArray[np.int64]
-    successes: npt.NDArray[np.int64]
-    reasons: tuple[str, ...]
-    rate: float
-    confidence: float
+    state_coordinates: Annotated[Coordinates, "n"]
+    control_coordinates: Annotated[Coordinates, "m"]
+    states: Annotated[tuple[Line, ...], "d"]
+    shape: Annotated[Array, "T+1 d d", Bounds()]
+    family: Line
+    knots: Annotated[npt.NDArray[np.int64], "k"]
+    levels: Annotated[Array, "k", Bounds(at_least=0.0)]
+    trials: Annotated[npt.NDArray[np.int64], "k"]
+    successes: Annotated[npt.NDArray[np.int64], "k"]
+    reasons: Annotated[tuple[Line, ...], "k"]
+    rate: Annotated[float, Bounds(above=0.0, below=1.0)]
+    confidence: Annotated[float, Bounds(above=0.0, below=1.0)]
     simulated: int
-    policy_digest: str
-    goal_radius: float
-    disturbances: tuple[str, ...]
+    policy_digest: Line
+    goal_radius: Annotated[float, Bounds(above=0.0)]
+    disturbances: tuple[Line, ...]
     seed: int
     options: Mapping[str, object] = field(default_factory=dict)
-    versions: Mapping[str, str] = field(default_factory=dict)
+    versions: Mapping[str, Line] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        plan = check_kind("Funnel: plan", self.plan, Trajectory, "a Trajectory")
-        for name, size in (("state_coordinates", plan.states), ("control_coordinates", plan.controls)):
-            space = check_kind(f"Funnel: {name}", getattr(self, name), Coordinates, "Coordinates")
-            check_shape(f"Funnel: plan of {name}", size, (None, len(space)))
-        for name in ("states", "reasons", "disturbances"):
-            texts = check_items(f"Funnel: {name}", getattr(self, name), str, "a tuple of texts")
-            object.__setattr__(self, name, texts)
+        check_fields(self)
+        check_name("Funnel: family", self.family, FAMILIES)
+        if not self.plan.finite:
+            raise InputError("Funnel: plan: got NaN or infinity, want finite states and controls")
         if not self.states or len(set(self.states)) < len(self.states):
             raise InputError(f"Funnel: states: got {excerpt(self.states)}, want different names, at least one")
         for name in self.states:
             check_name("Funnel: states", name, self.state_coordinates.names)
-        d = len(self.states)
-        shape = check_array("Funnel: shape", self.shape, (plan.steps + 1, d, d))
-        scale = np.maximum(np.abs(shape).max(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
-        if np.abs(shape - shape.transpose(0, 2, 1)).max(initial=0.0) > 1e-9 * scale.max():
-            raise InputError("Funnel: shape: got a matrix that is not symmetric, want symmetric ones")
-        object.__setattr__(self, "shape", shape)
-        check_name("Funnel: family", self.family, FAMILIES)
-        self._check_levels()
-        for name in ("rate", "confidence"):
-            number = check_number(f"Funnel: {name}", getattr(self, name), above=0.0, below=1.0)
-            object.__setattr__(self, name, number)
-        check_count("Funnel: simulated", self.simulated, at_least=0)
-        check_text("Funnel: policy_digest", self.policy_digest, "a hash", empty=True)
-        radius = check_number("Funnel: goal_radius", self.goal_radius, above=0.0)
-        object.__setattr__(self, "goal_radius", radius)
-        object.__setattr__(self, "seed", check_seed("Funnel: seed", self.seed))
-        for name in ("options", "versions"):
-            given = check_kind(f"Funnel: {name}", getattr(self, name), Mapping, "a dictionary by name")
-            if not all(isinstance(key, str) for key in given):
-                raise InputError(f"Funnel: {name}: got {excerpt(given)}, want a dictionary by name")
-
-    def _check_levels(self) -> None:
-        """Raises InputError unless there is a level for each knot, with its trials."""
+        skew = np.abs(self.shape - self.shape.transpose(0, 2, 1)).max(initial=0.0)
+        if skew > 1e-9 * max(np.abs(self.shape).max(initial=0.0), np.finfo(float).tiny):
+            raise InputError("Funnel: shape: got a matrix that is not symmetric, want symmetric matrices")
         last = self.plan.steps - 1
-        knots = _counts("knots", self.knots, None)
-        count = len(knots)
-        if not count or (np.diff(knots) <= 0).any() or knots[-1] > last:
-            raise InputError(f"Funnel: knots: got {excerpt(knots.tolist())}, want some of 0 to {last}, in order")
-        levels = check_array("Funnel: levels", self.levels, (count,))
-        trials, successes = (_counts(name, getattr(self, name), count) for name in ("trials", "successes"))
+        if not len(self.knots) or (np.diff(self.knots) <= 0).any() or self.knots[-1] > last:
+            raise InputError(f"Funnel: knots: got {excerpt(self.knots.tolist())}, want some of 0 to {last}, in order")
         for name, wrong, want in (
-            ("levels", levels < 0, "numbers >= 0"),
-            ("successes", successes > trials, "no more than the trials"),
-            ("trials", (trials == 0) != (levels == 0), "some where there is a level, and none elsewhere"),
+            ("successes", self.successes > self.trials, "no more than the trials"),
+            ("trials", (self.trials == 0) != (self.levels == 0), "some where there is a level, and none elsewhere"),
         ):
             if wrong.any():
                 raise InputError(f"Funnel: {name}: got {excerpt(getattr(self, name))}, want {want}")
-        if len(self.reasons) != count:
-            raise InputError(f"Funnel: reasons: got {len(self.reasons)}, want one for each of the {count} knots")
-        for name, array in (("knots", knots), ("levels", levels), ("trials", trials), ("successes", successes)):
-            object.__setattr__(self, name, array)
+        self._check_certified()
+
+    def _check_certified(self) -> None:
+        """Raises InputError where the fresh trials do not certify their level, whatever a file says."""
+        doubt = (1 - self.confidence) / len(self.knots)  # of each knot, so that all are right with the confidence
+        for trials, successes in zip(self.trials.tolist(), self.successes.tolist(), strict=True):
+            if trials and _chance_of_so_few(trials - successes, trials, self.rate) > doubt * (1 + 1e-6):
+                raise InputError(
+                    f"Funnel: successes: got {successes} of {trials} trials, which do not show a rate of {self.rate:g}"
+                    f" with confidence {self.confidence:g} at {len(self.knots)} knots, want more"
+                )
 
     @cached_property
     def chosen(self) -> list[int]:
@@ -330,10 +305,10 @@ def flat(shape: Array) -> bool:
     return bool(np.linalg.eigvalsh(shape / np.outer(size, size))[0] < FLAT)
 
 
-def _counts(name: str, value: object, size: int | None) -> npt.NDArray[np.int64]:
-    """Whole numbers (size,) that are not negative. Raises InputError for others."""
-    numbers = numbers_of(f"Funnel: {name}", value)
-    check_shape(f"Funnel: {name}", numbers, (size,))
-    if not ((numbers >= 0) & (numbers == np.floor(numbers)) & (numbers < 2**53)).all():
-        raise InputError(f"Funnel: {name}: got {excerpt(numbers.tolist())}, want whole numbers >= 0")
-    return numbers.astype(np.int64)
+def _chance_of_so_few(failures: int, trials: int, rate: float) -> float:
+    """The chance of at most so many failures in trials that succeed at this rate, which are independent."""
+    i = np.arange(failures)
+    ratios = (
+        np.log((trials - i) / (i + 1)) + np.log1p(-rate) - np.log(rate)
+    )  # of each term of the sum to the one before
+    return float(np.exp(trials * np.log(rate) + np.concatenate([[0.0], np.cumsum(ratios)])).sum())

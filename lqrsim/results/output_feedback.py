@@ -5,19 +5,15 @@ products of small matrices is left. `tests/test_policy_files.py` holds one again
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_kind, check_number, excerpt, shaped, vectors_of
+from lqrsim.errors import Array, InputError, check_number, excerpt, vectors_of
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.fields import Bounds, check_fields
 from lqrsim.results.hashing import sha256
-
-# Shapes in letters: T steps, n states, m controls, Y measured numbers, Z numbers in the state of the filter.
-SHAPES = {
-    "gain": "T m Z", "offset": "T m", "correction": "T Z Y", "sensor": "T Y n", "sensor_offset": "T Y",
-    "transition": "T Z Z", "input": "T Z m", "drift": "T Z", "nominal": "T Z",
-}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,35 +48,27 @@ class OutputFeedbackPolicy:
       InputError: arrays that do not fit together, or numbers that are not finite.
     """
 
-    gain: Array
-    offset: Array
-    correction: Array
-    sensor: Array
-    sensor_offset: Array
-    transition: Array
-    input: Array
-    drift: Array
-    nominal: Array
-    dt: float
-    state_coordinates: Coordinates
-    control_coordinates: Coordinates
-    measured_coordinates: Coordinates
+    gain: Annotated[Array, "T m Z", Bounds()]
+    offset: Annotated[Array, "T m", Bounds()]
+    correction: Annotated[Array, "T Z Y", Bounds()]
+    sensor: Annotated[Array, "T Y n", Bounds()]
+    sensor_offset: Annotated[Array, "T Y", Bounds()]
+    transition: Annotated[Array, "T Z Z", Bounds()]
+    input: Annotated[Array, "T Z m", Bounds()]
+    drift: Annotated[Array, "T Z", Bounds()]
+    nominal: Annotated[Array, "T Z", Bounds()]
+    dt: Annotated[float, Bounds(above=0.0)]
+    state_coordinates: Annotated[Coordinates, "n"]
+    control_coordinates: Annotated[Coordinates, "m"]
+    measured_coordinates: Annotated[Coordinates, "Y"]
 
     def __post_init__(self) -> None:
-        who = "OutputFeedbackPolicy"
-        for name in ("state_coordinates", "control_coordinates", "measured_coordinates"):
-            check_kind(f"{who}: {name}", getattr(self, name), Coordinates, "Coordinates")
-        nominal = shaped(f"{who}: nominal", self.nominal, (None, None))
-        n, m = len(self.state_coordinates), len(self.control_coordinates)
-        sizes = {"T": len(nominal), "n": n, "m": m, "Y": len(self.measured_coordinates), "Z": nominal.shape[1]}
-        if sizes["T"] < 1 or sizes["Z"] < n:
-            raise InputError(f"{who}: nominal: got shape {nominal.shape}, want at least one row, of {n} states or more")
-        for name, letters in SHAPES.items():
-            array = shaped(f"{who}: {name}", getattr(self, name), tuple(sizes[letter] for letter in letters.split()))
-            if not np.isfinite(array).all():
-                raise InputError(f"{who}: {name}: got numbers that are not finite, want finite numbers")
-            object.__setattr__(self, name, array)
-        object.__setattr__(self, "dt", check_number(f"{who}: dt", self.dt, above=0.0))
+        sizes = check_fields(self)
+        if not sizes["T"] or sizes["Z"] < sizes["n"]:
+            raise InputError(
+                f"OutputFeedbackPolicy: nominal: got shape {self.nominal.shape}, want at least one row, of"
+                f" {sizes['n']} states or more"
+            )
 
     @property
     def steps(self) -> int:
@@ -90,7 +78,8 @@ class OutputFeedbackPolicy:
     @property
     def digest(self) -> str:
         """Hash of the recursions and their times, 16 hexadecimal digits."""
-        return sha256(*(getattr(self, name) for name in SHAPES), np.float64(self.dt))[:16]
+        recursions = (value for value in vars(self).values() if isinstance(value, np.ndarray))
+        return sha256(*recursions, np.float64(self.dt))[:16]
 
     def start(self) -> Array:
         """The state of the filter before the first measurement, (Z,)."""

@@ -2,21 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy.typing as npt
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_count,
-    check_items,
-    check_kind,
-    check_name,
-    check_number,
-    check_shape,
-    real,
-)
+from lqrsim.errors import Array, InputError, check_count, check_name, check_shape
+from lqrsim.results.fields import LINE, Bounds, check_fields
 from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution_parts import HORIZONS, Multipliers, Status, Trajectory, left_after
@@ -42,42 +33,24 @@ class Plan:
     """
 
     status: Status
-    detail: str
+    detail: Annotated[str, 10 * LINE]
     policy: AffinePolicy
     trajectory: Trajectory
     cost_to_go: Quadratic | None
     multipliers: tuple[Multipliers, ...] = ()
-    goal: Array | None = None
-    goal_radius: float | None = None
+    goal: Annotated[Array, "n"] | None = None
+    goal_radius: Annotated[float, Bounds(above=0.0)] | None = None
 
     def __post_init__(self) -> None:
         who = type(self).__name__
-        check_kind(f"{who}: status", self.status, Status, f"a Status, one of {', '.join(Status.__members__)}")
-        check_kind(f"{who}: detail", self.detail, str, "text")
-        check_kind(f"{who}: policy", self.policy, AffinePolicy, "an AffinePolicy")
-        check_kind(f"{who}: trajectory", self.trajectory, Trajectory, "a Trajectory")
-        check_kind(f"{who}: cost_to_go", self.cost_to_go, (Quadratic, type(None)), "a Quadratic or None")
-        multipliers = check_items(f"{who}: multipliers", self.multipliers, Multipliers, "a tuple of Multipliers")
-        object.__setattr__(self, "multipliers", multipliers)
-        if self.goal is not None:
-            object.__setattr__(self, "goal", real(f"{who}: goal", self.goal))
-        for name, (array, shape) in self._shapes().items():  # which refuses parts of several problems
-            check_shape(f"{who}: {name}", array, shape)
-        _ = self.target  # which refuses what is no goal
-        if self.goal_radius is not None:
-            radius = check_number(f"{who}: goal_radius", self.goal_radius, above=0.0)
-            object.__setattr__(self, "goal_radius", radius)
-
-    def _shapes(self) -> dict[str, tuple[Array, tuple[int | None, ...]]]:
-        """Arrays by name, each with the shape that fits the trajectory."""
-        states, steps = self.trajectory.states.shape, self.trajectory.steps
-        gain = steps, self.trajectory.controls.shape[1], states[1]
-        arrays: dict[str, tuple[Array, tuple[int | None, ...]]] = {"policy.gain": (self.policy.gain, gain)}
+        check_fields(self)
         if self.cost_to_go is not None:
-            arrays["cost_to_go.gradient"] = self.cost_to_go.gradient, states
-        if self.goal is not None:
-            arrays["goal"] = self.goal, states[1:]
-        return arrays | {f"multipliers[{i}]": (one.values, (steps + 1, None)) for i, one in enumerate(self.multipliers)}
+            check_shape(f"{who}: cost_to_go.gradient", self.cost_to_go.gradient, self.trajectory.states.shape)
+        _ = self.target  # which refuses what is no goal
+        if self.status.success and not self.trajectory.finite:
+            raise InputError(
+                f"{who}: trajectory: got NaN or infinity in a plan that is {self.status.name}, want numbers"
+            )
 
     @property
     def success(self) -> bool:
@@ -127,3 +100,31 @@ class Plan:
     def _shifted_parts(self, steps: int, moved: Callable[[npt.ArrayLike], Array]) -> dict[str, Any]:
         """What else `shifted` changes: field -> new value. `moved` takes an array to what is left of it."""
         return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replan(Plan):
+    """A plan from a given state that is no worse than where the law led that the solve began with.
+
+    No worse means: it keeps the constraints if that did, misses them by no more if that did not, and of two plans that
+    keep them it is not the more expensive one. It can be used whatever its status, unless `cost` is not finite. What it
+    shares with a `Solution` is in `Plan`.
+
+    Attributes:
+      improved: whether there is a new plan; else this is where the law leads that the solve began with.
+      cost: of the plan, start and end included.
+      before: of where the law led that the solve began with.
+      violation: by how much the worst constraint is missed at the steps; 0 where none is.
+      iterations: how many there were.
+      seconds: how long the solve took.
+      iterating: how much of that, in seconds, the iterations took, and to see where the law leads that the solve began
+        with.
+    """
+
+    improved: bool
+    cost: float
+    before: float
+    violation: float
+    iterations: int
+    seconds: float
+    iterating: float

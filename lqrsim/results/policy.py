@@ -6,23 +6,14 @@ need be no compiler. `tests/test_policy.py` holds one against the other.
 """
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_count,
-    check_flag,
-    check_kind,
-    check_name,
-    check_number,
-    excerpt,
-    shaped,
-    vectors_of,
-)
+from lqrsim.errors import Array, InputError, check_count, check_flag, check_name, check_number, excerpt, vectors_of
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.fields import Bounds, check_fields
 from lqrsim.results.hashing import sha256
 from lqrsim.results.solution_parts import HORIZONS, left_after
 
@@ -42,25 +33,16 @@ class AffinePolicy:
       control_coordinates: names and units of the controls, and the limits that the actuators keep.
     """
 
-    gain: Array
-    offset: Array
-    nominal: Array
-    dt: float
-    state_coordinates: Coordinates
-    control_coordinates: Coordinates
+    gain: Annotated[Array, "T m n"]
+    offset: Annotated[Array, "T m"]
+    nominal: Annotated[Array, "T n"]
+    dt: Annotated[float, Bounds(above=0.0)]
+    state_coordinates: Annotated[Coordinates, "n"]
+    control_coordinates: Annotated[Coordinates, "m"]
 
     def __post_init__(self) -> None:
-        for name in ("state_coordinates", "control_coordinates"):
-            check_kind(f"AffinePolicy: {name}", getattr(self, name), Coordinates, "Coordinates")
-        n, m = len(self.state_coordinates), len(self.control_coordinates)
-        for name, shape in (("gain", (m, n)), ("offset", (m,)), ("nominal", (n,))):
-            array = shaped(
-                f"AffinePolicy: {name}", getattr(self, name), (self.steps if name != "gain" else None, *shape)
-            )
-            if not len(array):
-                raise InputError(f"AffinePolicy: {name}: got none, want one a step, at least one")
-            object.__setattr__(self, name, array)
-        object.__setattr__(self, "dt", check_number("AffinePolicy: dt", self.dt, above=0.0))
+        if not check_fields(self)["T"]:
+            raise InputError("AffinePolicy: got no law, want one for each step, at least one")
 
     @property
     def steps(self) -> int:

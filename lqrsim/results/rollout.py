@@ -3,33 +3,53 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_count,
-    check_items,
-    check_kind,
-    check_number,
-    check_seed,
-    check_shape,
-    check_text,
-    excerpt,
-    numbers_of,
-    shaped,
-    vectors_of,
-)
+from lqrsim.errors import Array, InputError, check_count, excerpt, vectors_of
 from lqrsim.results import notebook
-from lqrsim.results.ball_record import BallRecord
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.goal import Target, tracking_error, tracking_unit
+from lqrsim.results.fields import Bounds, Line, check_fields
+from lqrsim.results.goal import Target, endings, tracking_error, tracking_unit
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.results.trial_outcome import endings
+
+
+@dataclass(frozen=True, kw_only=True)
+class BallRecord:
+    """Where the balls of a robot were in its runs, and where they should have been: what pictures of it need.
+
+    K trials of T control periods, B balls; the last ball stands for a robot without a position.
+
+    Attributes:
+      driven: (K, T+1, B, 3) centres in the world, in metres; NaN where the states are.
+      planned: (T+1, B, 3) the same of the plan.
+      radii: (B,) in metres.
+      anchors: (B, 4) number of the MJCF's body that a ball is fixed to, and its place in the body's axes in metres; NaN
+        for a ball that names no site.
+    """
+
+    driven: Annotated[Array, "K T+1 B 3"]
+    planned: Annotated[Array, "T+1 B 3", Bounds()]
+    radii: Annotated[Array, "B", Bounds(at_least=0.0)]
+    anchors: Annotated[Array, "B 4"]
+
+    def __post_init__(self) -> None:
+        if not check_fields(self)["B"]:
+            raise InputError("BallRecord: radii: got none, want at least one ball")
+
+    @property
+    def tracked(self) -> tuple[int, Array]:
+        """The body that the last ball is fixed to, and its place on it, (3,).
+
+        Raises:
+          InputError: the last ball names no site.
+        """
+        body, *place = self.anchors[-1].tolist()
+        if not np.isfinite(body):
+            raise InputError("balls: got no site for the last of them, want one among the sites= of CollisionSpheres")
+        return int(body), np.array(place)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,39 +102,39 @@ class Rollout:
         `OffsetFree`, the log of a `Replanner`. In memory only: None in a rollout that was loaded, pickled or copied.
     """
 
-    robot: str
-    body: str
-    scene: str
+    robot: Line
+    body: Line
+    scene: Line
     model: str
     plan: Trajectory
-    policy_digest: str
-    state_coordinates: Coordinates
-    control_coordinates: Coordinates
-    goal: Array | None
-    goal_radius: float
-    radius: float
-    states: Array
-    measured: Array
-    commanded: Array
-    applied: Array
-    forces: Array
-    torques: Array
-    displaced: Array
-    clearance: Array
-    contacts: npt.NDArray[np.int64]
-    collided_at: Array
-    obstacles: tuple[str, ...]
-    diverged_at: Array
-    failed_at: Array
-    reasons: tuple[str, ...]
-    frame_times: Array
-    frames: Array
-    disturbances: tuple[str, ...]
+    policy_digest: Line
+    state_coordinates: Annotated[Coordinates, "n"]
+    control_coordinates: Annotated[Coordinates, "m"]
+    goal: Annotated[Array, "n"] | None
+    goal_radius: Annotated[float, Bounds(above=0.0)]
+    radius: Annotated[float, Bounds(at_least=0.0)]
+    states: Annotated[Array, "K T+1 n"]
+    measured: Annotated[Array, "K T+1 n"]
+    commanded: Annotated[Array, "K T m"]
+    applied: Annotated[Array, "K T m"]
+    forces: Annotated[Array, "K T 3"]
+    torques: Annotated[Array, "K T 3"]
+    displaced: Annotated[Array, "K obstacles 3"]
+    clearance: Annotated[Array, "K T+1"]
+    contacts: Annotated[npt.NDArray[np.int64], "K"]
+    collided_at: Annotated[Array, "K"]
+    obstacles: Annotated[tuple[Line, ...], "K"]
+    diverged_at: Annotated[Array, "K"]
+    failed_at: Annotated[Array, "K"]
+    reasons: Annotated[tuple[Line, ...], "K"]
+    frame_times: Annotated[Array, "F", Bounds()]
+    frames: Annotated[Array, "K F nq"]
+    disturbances: tuple[Line, ...]
     seed: int
     first_trial: int = 0
-    versions: Mapping[str, str] = field(default_factory=dict)
-    tube: Array | None = None
-    collision_chance: Array | None = None
+    versions: Mapping[str, Line] = field(default_factory=dict)
+    tube: Annotated[Array, "T+1 p p", Bounds()] | None = None
+    collision_chance: Annotated[Array, "T+1", Bounds(at_least=0.0, at_most=1.0)] | None = None
     balls: BallRecord | None = None
     controller_run: Any = field(default=None, repr=False, compare=False)
 
@@ -123,103 +143,56 @@ class Rollout:
         return vars(self) | {"controller_run": None}
 
     def __post_init__(self) -> None:
-        check_kind("Rollout: plan", self.plan, Trajectory, "a Trajectory")
-        for name in ("state_coordinates", "control_coordinates"):
-            check_kind(f"Rollout: {name}", getattr(self, name), Coordinates, "Coordinates")
-        for name in ("robot", "body", "scene", "policy_digest"):
-            check_text(f"Rollout: {name}", getattr(self, name), "a name", empty=True)
-        check_kind("Rollout: model", self.model, str, "the MJCF as text")
-        said = check_items("Rollout: disturbances", self.disturbances, str, "a description of each, as text")
-        object.__setattr__(self, "disturbances", said)
-        for name, above in (("radius", None), ("goal_radius", 0.0)):
-            least = 0.0 if above is None else None
-            number = check_number(f"Rollout: {name}", getattr(self, name), above=above, at_least=least)
-            object.__setattr__(self, name, number)
-        for name in ("seed", "first_trial"):
-            object.__setattr__(self, name, check_seed(f"Rollout: {name}", getattr(self, name)))
-        given = check_kind("Rollout: versions", self.versions, Mapping, "a dictionary of name: version")
-        if not all(isinstance(one, str) for item in given.items() for one in item):
-            raise InputError(f"Rollout: versions: got {excerpt(given)}, want a dictionary of name: version")
-        self._check_shapes()
-        self._check_prediction()
-        if self.balls is not None:
-            check_kind("Rollout: balls", self.balls, BallRecord, "a BallRecord, or None")
-            check_shape("Rollout: balls.driven", self.balls.driven, (self.trials, self.plan.steps + 1, None, 3))
-
-    def _check_shapes(self) -> None:
-        """Raises InputError for arrays that do not fit together."""
-        n, m, steps = len(self.state_coordinates), len(self.control_coordinates), self.plan.steps
-        check_shape("Rollout: plan.states", self.plan.states, (steps + 1, n))
-        check_shape("Rollout: plan.controls", self.plan.controls, (steps, m))
-        states = shaped("Rollout: states", self.states, (None, steps + 1, n))
-        trials, times = len(states), shaped("Rollout: frame_times", self.frame_times, (None,))
-        if not trials:
+        sizes = check_fields(self)
+        if not sizes["K"]:
             raise InputError("Rollout: states: got no trial, want at least one")
-        shapes: dict[str, tuple[int | None, ...]] = {
-            "states": states.shape, "measured": states.shape, "commanded": (trials, steps, m),
-            "applied": (trials, steps, m), "forces": (trials, steps, 3), "torques": (trials, steps, 3),
-            "displaced": (trials, None, 3), "clearance": (trials, steps + 1), "frame_times": (None,),
-            "frames": (trials, len(times), None),
-        }  # fmt: skip
-        for name, shape in shapes.items():
-            object.__setattr__(self, name, shaped(f"Rollout: {name}", getattr(self, name), shape))
-        numbers = numbers_of("Rollout: contacts", self.contacts)
-        check_shape("Rollout: contacts", numbers, (trials,))
-        if not ((numbers >= 0) & (numbers <= steps) & (numbers == np.floor(numbers))).all():
-            raise InputError(
-                f"Rollout: contacts: got {excerpt(numbers.tolist())}, want whole numbers from 0 to {steps}"
-            )
-        object.__setattr__(self, "contacts", numbers.astype(np.int64))
-        self._check_endings(trials)
-        if self.goal is not None:
-            object.__setattr__(self, "goal", shaped("Rollout: goal", self.goal, (n,)))
+        if not self.plan.finite:
+            raise InputError("Rollout: plan: got NaN or infinity, want finite states and controls")
+        if (self.contacts > self.plan.steps).any():
+            raise InputError(f"Rollout: contacts: got {self.contacts.max()}, want at most {self.plan.steps}, the steps")
+        if not (np.diff(self.frame_times) > 0).all():
+            raise InputError("Rollout: frame_times: got times that are not in order, want increasing times")
         _ = self.target  # which refuses what is no goal
+        self._check_tube()
+        self._check_endings()
 
-    def _check_prediction(self) -> None:
-        """Raises InputError unless what was predicted is covariances of the position, and chances."""
-        steps, size = self.plan.steps, len(self.state_coordinates.position)
+    def _check_tube(self) -> None:
+        """Raises InputError unless a predicted tube is covariances of the position."""
         if self.tube is not None:
-            if not size:
-                raise InputError("Rollout: tube: got one of a robot without a position, want None")
-            tube = check_array("Rollout: tube", self.tube, (steps + 1, size, size))
-            scale = np.abs(tube).max(axis=(1, 2), keepdims=True)
-            relative = tube / np.where(scale > 0, scale, 1.0)
-            # What is summed up in another order differs in the last digits.
+            size = len(self.state_coordinates.position)
+            if self.tube.shape[1] != size or not size:
+                wanted = (
+                    f"{size} by {size} matrices, as the position has entries" if size else "None without a position"
+                )
+                raise InputError(f"Rollout: tube: got shape {self.tube.shape}, want {wanted}")
+            scale = np.abs(self.tube).max(axis=(1, 2), keepdims=True)
+            relative = self.tube / np.where(scale > 0, scale, 1.0)
+            # Sums that were taken in another order differ in the last digits.
             skewed = np.abs(relative - relative.transpose(0, 2, 1)).max(axis=(1, 2)) > 1e-9
             negative = np.linalg.eigvalsh(relative)[:, 0] < -1e-9
             for wrong, want in ((skewed, "a symmetric matrix"), (negative, "no negative variance")):
                 if wrong.any():
                     at = int(np.argmax(wrong))
-                    raise InputError(f"Rollout: tube: got {excerpt(tube[at].tolist())} at knot {at}, want {want}")
-            object.__setattr__(self, "tube", tube)
-        if self.collision_chance is not None:
-            chance = check_array("Rollout: collision_chance", self.collision_chance, (steps + 1,))
-            if not ((chance >= 0) & (chance <= 1)).all():
-                raise InputError(f"Rollout: collision_chance: got {excerpt(chance.tolist())}, want chances from 0 to 1")
-            object.__setattr__(self, "collision_chance", chance)
+                    raise InputError(f"Rollout: tube: got {excerpt(self.tube[at].tolist())} at knot {at}, want {want}")
 
-    def _check_endings(self, trials: int) -> None:
-        """Raises InputError unless what ended trials has its time within the run, and its words."""
+    def _check_endings(self) -> None:
+        """Raises InputError unless trials ended within the run, and what ended them is named."""
         horizon = self.plan.horizon
-        for name, words in (("collided_at", "obstacles"), ("diverged_at", ""), ("failed_at", "reasons")):
-            times = shaped(f"Rollout: {name}", getattr(self, name), (trials,))
+        for name in ("collided_at", "diverged_at", "failed_at"):
+            times = getattr(self, name)
             if not (((times >= 0) & (times <= horizon)) | (times == np.inf)).all():
                 wanted = f"seconds from 0 to {horizon:g}, infinite where it did not happen"
                 raise InputError(f"Rollout: {name}: got {excerpt(times.tolist())}, want {wanted}")
-            object.__setattr__(self, name, times)
-            if not words:
-                continue
-            said = check_items(f"Rollout: {words}", getattr(self, words), str, "a text for each trial")
-            if len(said) != trials:
-                raise InputError(f"Rollout: {words}: got {len(said)}, want one for each of the {trials} trials")
-            may_say = np.isfinite(times)
-            if words == "reasons":  # of a filter, too
-                may_say |= np.isfinite(self.diverged_at)
-            for text, time, may in zip(said, times.tolist(), may_say, strict=True):
-                if bool(text) != np.isfinite(time) and not (text and may):
-                    wanted = "a text where it is finite, and none elsewhere"
-                    raise InputError(f"Rollout: {words}: got {excerpt(text)} at {name} {time:g}, want {wanted}")
-            object.__setattr__(self, words, said)
+        collided, failed = np.isfinite(self.collided_at), np.isfinite(self.failed_at)
+        for name, must, may in (
+            ("obstacles", collided, collided),
+            ("reasons", failed, failed | np.isfinite(self.diverged_at)),  # of a filter that diverged, too
+        ):
+            texts = np.array([bool(text) for text in getattr(self, name)])
+            if (wrong := (must & ~texts) | (texts & ~may)).any():
+                k = int(np.argmax(wrong))
+                ended = "ended that way" if must[k] else "did not end that way"
+                raise InputError(f"Rollout: {name}: got {excerpt(getattr(self, name)[k])} for trial {k}, which {ended}")
 
     @property
     def trials(self) -> int:

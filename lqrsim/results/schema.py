@@ -15,8 +15,11 @@ _DEPTH = 6  # of lists and objects in each other, where they may be anything
 
 
 def parse(text: str | bytes) -> Any:
-    """What a JSON text says. Raises ValueError or RecursionError for what is none, or has a name twice."""
-    return json.loads(text, object_pairs_hook=_unique)
+    """What a JSON text says. Raises ValueError for what is none, is nested too deeply, or has a name twice."""
+    try:
+        return json.loads(text, object_pairs_hook=_unique)
+    except RecursionError:
+        raise ValueError("lists or objects too deep within each other") from None
 
 
 def canonical(value: Any) -> str:

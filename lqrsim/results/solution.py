@@ -6,27 +6,17 @@ functions. `save_load.py` writes a `Solution` to disk and reads it back; `rollou
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_items,
-    check_kind,
-    excerpt,
-    real,
-)
+from lqrsim.errors import Array, InputError, check_shape
 from lqrsim.results import notebook
+from lqrsim.results.fields import Line
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution_parts import (
-    Candidate,
-    Certificate,
-    Iteration,
-)
+from lqrsim.results.solution_parts import Candidate, Certificate, Iteration
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 
 
@@ -58,14 +48,14 @@ class Solution(Plan):
     inverse_policy: AffinePolicy | None
     cost_to_come: Quadratic | Moments | None
     iterations: tuple[Iteration, ...]
-    clearance: Array | None
+    clearance: Annotated[Array, "T+1"] | None
     certificate: Certificate
     gap: float
-    solver: str
+    solver: Line
     options: Mapping[str, object]
-    problem_digest: str
-    versions: Mapping[str, str]
-    scenario: str = ""
+    problem_digest: Line
+    versions: Mapping[str, Line]
+    scenario: Line = ""
     candidates: tuple[Candidate, ...] = ()
 
     @classmethod
@@ -94,33 +84,13 @@ class Solution(Plan):
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def __post_init__(self) -> None:
-        check_kind("Solution: inverse_policy", self.inverse_policy, (AffinePolicy, type(None)), "an AffinePolicy, None")
-        kinds = (Quadratic, Moments, type(None))
-        check_kind("Solution: cost_to_come", self.cost_to_come, kinds, "a Quadratic, Moments or None")
-        for name, kind in (("iterations", Iteration), ("candidates", Candidate)):
-            items = check_items(f"Solution: {name}", getattr(self, name), kind, f"a tuple of {kind.__name__}")
-            object.__setattr__(self, name, items)
-        for name in ("solver", "problem_digest", "scenario"):
-            check_kind(f"Solution: {name}", getattr(self, name), str, "text")
-        for name in ("options", "versions"):
-            given = check_kind(f"Solution: {name}", getattr(self, name), Mapping, "a dictionary by name")
-            if not all(isinstance(key, str) for key in given):
-                raise InputError(f"Solution: {name}: got {excerpt(given)}, want a dictionary by name")
-        if self.clearance is not None:
-            object.__setattr__(self, "clearance", real("Solution: clearance", self.clearance))
         super().__post_init__()
-
-    def _shapes(self) -> dict[str, tuple[Array, tuple[int | None, ...]]]:
-        arrays, states = super()._shapes(), self.trajectory.states.shape
-        if self.inverse_policy is not None:
-            arrays["inverse_policy.gain"] = self.inverse_policy.gain, arrays["policy.gain"][1]
-        if isinstance(self.cost_to_come, Quadratic):
-            arrays["cost_to_come.gradient"] = self.cost_to_come.gradient, states
-        elif self.cost_to_come is not None:
-            arrays["cost_to_come.mean"] = self.cost_to_come.mean, states
-        if self.clearance is not None:
-            arrays["clearance"] = self.clearance, states[:1]
-        return arrays
+        come = self.cost_to_come
+        if come is not None:
+            mean = come.gradient if isinstance(come, Quadratic) else come.mean
+            check_shape("Solution: cost_to_come", mean, self.trajectory.states.shape)
+        if self.candidates and all(one.status is None for one in self.candidates):
+            raise InputError("Solution: candidates: got none that ended, want at least one, or no candidates")
 
     @property
     def cost(self) -> float:

@@ -1,12 +1,14 @@
 """What a `Solution` is made of: trajectory, status, log, certificate, multipliers, candidates. NumPy only."""
 
 import enum
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, check_text, shaped
+from lqrsim.errors import Array, InputError, check_count
+from lqrsim.results.fields import Bounds, Line, check_fields
 
 # How a horizon goes on: it moves along with the robot, or its end stays where it is.
 HORIZONS = ("moving", "shrinking")
@@ -32,25 +34,24 @@ class Trajectory:
       InputError: they do not fit together, there is no step, or dt is not above 0. NaN is what a failed solve has.
     """
 
-    states: Array
-    controls: Array
-    dt: float
+    states: Annotated[Array, "T+1 n"]
+    controls: Annotated[Array, "T m"]
+    dt: Annotated[float, Bounds(above=0.0)]
 
     def __post_init__(self) -> None:
-        controls = shaped("Trajectory: controls", self.controls, (None, None))
-        if not controls.size:
-            raise InputError(f"Trajectory: controls: got shape {controls.shape}, want (T, m), at least one of each")
-        states = shaped("Trajectory: states", self.states, (len(controls) + 1, None))
-        if not states.size:
-            raise InputError(f"Trajectory: states: got shape {states.shape}, want ({len(states)}, n), at least one n")
-        object.__setattr__(self, "states", states)
-        object.__setattr__(self, "controls", controls)
-        object.__setattr__(self, "dt", check_number("Trajectory: dt", self.dt, above=0.0))
+        sizes = check_fields(self)
+        if not min(sizes.values()):
+            raise InputError(f"Trajectory: got {sizes}, want at least one step, state and control")
 
     @property
     def steps(self) -> int:
         """T, the number of control periods."""
         return len(self.controls)
+
+    @property
+    def finite(self) -> bool:
+        """Whether all states and controls are finite."""
+        return bool(np.isfinite(self.states).all() and np.isfinite(self.controls).all())
 
     @property
     def horizon(self) -> float:
@@ -138,9 +139,6 @@ _STATUS_TEXT = {
 }
 
 
-ITERATION_NUMBERS = ("cost", "improvement", "gap", "optimality", "dynamics_residual", "violation", "seconds")
-
-
 @dataclass(frozen=True)
 class Iteration:
     """One line of the log.
@@ -177,13 +175,10 @@ class Iteration:
     dynamics_residual: float
     violation: float
     seconds: float
-    method: str
+    method: Line
 
     def __post_init__(self) -> None:
-        for name in ITERATION_NUMBERS:
-            if type(value := getattr(self, name)) is not float:
-                object.__setattr__(self, name, float(shaped(f"Iteration: {name}", value, ())))
-        check_kind("Iteration: method", self.method, str, "text")
+        check_fields(self)
 
     HEADER = (
         f"{'iteration':>9} {'cost':>14} {'improvement':>12} {'gap':>10} {'optimality':>11} {'violation':>10} {'ms':>8}"
@@ -240,9 +235,7 @@ class Certificate:
     optimality: float
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = float(shaped(f"Certificate: {field.name}", getattr(self, field.name), ()))
-            object.__setattr__(self, field.name, value)
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -254,15 +247,11 @@ class Multipliers:
       penalty: mu of the augmented Lagrangian, which holds the policy to the constraint.
     """
 
-    values: Array
-    penalty: float
+    values: Annotated[Array, "T+1 _"]
+    penalty: Annotated[float, Bounds(at_least=0.0)]
 
     def __post_init__(self) -> None:
-        values = shaped("Multipliers: values", self.values, (None, None))
-        if not len(values):
-            raise InputError(f"Multipliers: values: got shape {values.shape}, want (T+1, rows)")
-        object.__setattr__(self, "values", values)
-        object.__setattr__(self, "penalty", check_number("Multipliers: penalty", self.penalty, at_least=0.0))
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -278,17 +267,13 @@ class Candidate:
       trajectory: that plan.
     """
 
-    start: str
+    start: Line
     cost: float
     iterations: int
     status: Status | None
     trajectory: Trajectory
 
     def __post_init__(self) -> None:
-        check_text("Candidate: start", self.start, "what it was", at_most=1000, empty=True)
-        if np.isnan(cost := float(shaped("Candidate: cost", self.cost, ()))):
+        check_fields(self)
+        if np.isnan(self.cost):
             raise InputError("Candidate: cost: got nan, want a number, infinite where there is none")
-        object.__setattr__(self, "cost", cost)
-        check_count("Candidate: iterations", self.iterations, at_least=0)
-        check_kind("Candidate: status", self.status, (Status, type(None)), "a Status or None")
-        check_kind("Candidate: trajectory", self.trajectory, Trajectory, "a Trajectory")

@@ -3,21 +3,19 @@
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_kind, check_shape, real, shaped, vectors_of
+from lqrsim.errors import Array, InputError, check_kind, check_shape, vectors_of
+from lqrsim.results.fields import check_fields
 
 
-def _fit(value: object, names: tuple[str, str, str]) -> None:
-    """Keep a matrix, a vector and a number, or all of them along the same axes, as arrays. Raises InputError."""
-    kind = type(value).__name__
-    vector = real(f"{kind}: {names[1]}", getattr(value, names[1]))
-    if not vector.ndim or not vector.shape[-1]:
-        raise InputError(f"{kind}: {names[1]}: got shape {vector.shape}, want (..., n), of at least one state")
-    for name, shape in zip(names, ((*vector.shape, vector.shape[-1]), vector.shape, vector.shape[:-1]), strict=True):
-        object.__setattr__(value, name, shaped(f"{kind}: {name}", getattr(value, name), shape))
+def _check(value: object) -> None:
+    """Check the fields of a quadratic function. Raises InputError, also where it is of no state."""
+    if not check_fields(value)["n"]:
+        raise InputError(f"{type(value).__name__}: got no state, want at least one")
 
 
 @contextlib.contextmanager
@@ -41,12 +39,12 @@ class Quadratic:
       constant: (T+1,), or a number; s, sbar.
     """
 
-    hessian: Array
-    gradient: Array
-    constant: Array | float
+    hessian: Annotated[Array, "... n n"]
+    gradient: Annotated[Array, "... n"]
+    constant: Annotated[Array, "..."]
 
     def __post_init__(self) -> None:
-        _fit(self, ("hessian", "gradient", "constant"))
+        _check(self)
 
     def __add__(self, other: "Quadratic") -> "Quadratic":
         check_kind("other", other, Quadratic, "a Quadratic")
@@ -97,12 +95,12 @@ class Moments:
       constant: (T+1,), the least cost.
     """
 
-    covariance: Array
-    mean: Array
-    constant: Array
+    covariance: Annotated[Array, "... n n"]
+    mean: Annotated[Array, "... n"]
+    constant: Annotated[Array, "..."]
 
     def __post_init__(self) -> None:
-        _fit(self, ("covariance", "mean", "constant"))
+        _check(self)
 
     def quadratic(self) -> Quadratic:
         """The same functions by their coefficients. Raises InputError where a covariance is singular."""
@@ -134,8 +132,7 @@ class TotalCost:
     cost_to_come: Quadratic | Moments
 
     def __post_init__(self) -> None:
-        check_kind("TotalCost: cost_to_go", self.cost_to_go, Quadratic, "a Quadratic")
-        check_kind("TotalCost: cost_to_come", self.cost_to_come, (Quadratic, Moments), "a Quadratic or Moments")
+        check_fields(self)
         come = self.cost_to_come.gradient if isinstance(self.cost_to_come, Quadratic) else self.cost_to_come.mean
         check_shape("TotalCost: cost_to_come", come, self.cost_to_go.gradient.shape)
 

@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 
 from lqrsim.errors import Array, InputError, check_count, check_kind
-from lqrsim.results.ball_record import BallRecord
-from lqrsim.results.rollout import Rollout
+from lqrsim.results.rollout import BallRecord, Rollout
 from lqrsim.scenes.scene import model_from_xml
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError
-from lqrsim.results.ball_record import BallRecord
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.rollout import BallRecord
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.view.decorative_geoms import PLAN_RGB, decorate
 from lqrsim.view.recorded_model import floor_below, place_of, robot_body
