@@ -7,6 +7,7 @@ import io
 import json
 import os
 import pickle
+import time
 import tracemalloc
 import warnings
 import zipfile
@@ -17,6 +18,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from funnels_by_hand import funnel_by_hand
+from scipy import stats
 from spoiling import content_hash, contents, rewrite
 
 import lqrsim as ls
@@ -72,7 +75,7 @@ def test_only_regular_files_are_written_to(drive_solution: ls.Solution, tmp_path
     os.mkfifo(pipe)
     folder.mkdir()
     for path, what in ((pipe, "neither a file nor a folder"), (folder, "a folder")):
-        with pytest.raises(ls.InputError, match=f"output: got .*, which is {what}, want the name of a file"):
+        with pytest.raises(ls.InputError, match=f"output: got .*, which is {what}, want the name of a regular file"):
             ls.save(drive_solution, path)
     assert pipe.is_fifo()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["folder.npz", "pipe.npz"]
@@ -199,13 +202,13 @@ def skewed(tube: np.ndarray) -> np.ndarray:
         ({"tube": lambda a: a[:-1]}, r"tube: got shape \(150, 2, 2\), want \(T\+1, p, p\)"),
         ({"tube": lambda a: a[:, :1, :1].copy()}, r"tube: got shape \(151, 1, 1\), want 2 by 2 matrices"),
         ({"tube": lambda a: a.astype(np.int64)}, "tube: got numbers of type <i8, want <f8"),
-        ({"tube": lambda a: a * np.nan}, r"tube: got nan at index \[0, 0, 0\], want finite numbers"),
-        ({"tube": lambda a: a + np.inf}, "tube: got inf at index"),
+        ({"tube": lambda a: a * np.nan}, r"tube\[0, 0, 0\]: got nan, want a finite number"),
+        ({"tube": lambda a: a + np.inf}, r"tube\[0, 0, 0\]: got inf"),
         ({"tube": skewed}, "tube: got .* at knot 7, want a symmetric matrix"),
         ({"tube": lambda a: -a}, "tube: got .* at knot 0, want no negative variance"),
-        ({"collision_chance": lambda a: a + 0.5}, "collision_chance: got .*, want chances from 0 to 1"),
+        ({"collision_chance": lambda a: a + 0.5}, r"collision_chance\[76\]: got .*, want a finite number >= 0 <= 1"),
         ({"collision_chance": lambda a: a[1:]}, r"collision_chance: got shape \(150,\), want \(T\+1\)"),
-        ({"collision_chance": lambda a: a * np.nan}, "collision_chance: got nan at index"),
+        ({"collision_chance": lambda a: a * np.nan}, r"collision_chance\[0\]: got nan"),
     ],
 )
 def test_a_damaged_tube_gets_one_line(
@@ -263,7 +266,7 @@ def test_a_sample_of_what_a_fuzzer_makes(monkeypatch: pytest.MonkeyPatch) -> Non
     ("changes", "message"),
     [
         # Arrays that have the hash that belongs to them.
-        ({"states": lambda a: a.astype(np.float32)}, "'states': got no array of numbers as lqrsim writes them"),
+        ({"states": lambda a: a.astype(np.float32)}, "'states': got no array as lqrsim writes it"),
         ({"frames": lambda a: a.astype(np.float16)}, "which is damaged"),
         ({"clearance": lambda a: a.astype(int)}, "clearance: got numbers of type <i8, want <f8"),
         ({"clearance": lambda a: a > 0}, r"clearance: got numbers of type \|b1, want <f8"),
@@ -277,6 +280,8 @@ def test_a_sample_of_what_a_fuzzer_makes(monkeypatch: pytest.MonkeyPatch) -> Non
         ({"goal": lambda a: a + np.inf}, "goal: got .* want finite numbers"),
         ({"goal": lambda a: a * np.nan}, "goal: got NaN for every state"),
         ({"obstacles": ["", "", ""]}, "obstacles: got 3 entries, want 2"),
+        ({"reasons": ["", "\x1b[2J"]}, r"reasons\[1\]: got .*, want one printable line"),
+        ({"plan.states": lambda a: a * np.nan}, "plan: got NaN or infinity, want finite states and controls"),
         ({"reasons": ["", 1]}, r"reasons\[1\]: got 1, want text"),
         ({"forces": lambda a: a.transpose(0, 2, 1).copy()}, r"forces: got shape \(2, 3, 150\), want \(K, T, 3\)"),
         ({"frames": lambda a: a[..., :0]}, None),
@@ -285,7 +290,7 @@ def test_a_sample_of_what_a_fuzzer_makes(monkeypatch: pytest.MonkeyPatch) -> Non
         ({"contacts": lambda a: a - 10**6}, r"contacts: got .*, want whole numbers >= 0"),
         ({"states": lambda a: np.array(1.0)}, "states: got shape"),
         ({"torques": None}, "torques: got none, want it"),
-        ({"bomb": np.zeros(3)}, "'bomb': got it, want only what belongs to this rollout"),
+        ({"bomb": np.zeros(3)}, "'bomb': got an unknown array, want only those of its format"),
         # Text of another type or range.
         *(({name: 7}, f"{name}: got 7, want text") for name in ("robot", "scene", "model", "policy_digest")),
         *(({name: "7"}, f"{name}: got '7', want a finite number") for name in ("radius", "goal_radius")),
@@ -340,14 +345,17 @@ STATES = "policy.state_coordinates"
         ({"candidates.0.iterations": np.inf}, r"candidates.0: Candidate: iterations: got inf"),
         ({"candidates.0.cost": np.nan}, r"candidates.0: Candidate: cost: got nan"),
         ({"candidates": lambda one: [row | {"status": None} for row in one]}, "candidates: got none that ended"),
-        ({"candidates": lambda one: one[:-1]}, r"candidates.\d+.trajectory.controls: got it, and none in meta"),
-        ({"candidates": []}, "candidates.0.trajectory.controls: got it, and none in meta"),
+        (
+            {"candidates": lambda one: one[:-1]},
+            r"candidates.\d+.trajectory.controls: got an array",
+        ),
+        ({"candidates": []}, "candidates.0.trajectory.controls: got an array that meta does not mention"),
         ({"iterations": lambda one: [row | {"method": 3} for row in one]}, "iterations.0: Iteration: method: got 3"),
         ({"multipliers": [{"penalty": 1.0}]}, "multipliers.0.values: got none, want it"),
         ({"trajectory.states": lambda a: a * np.nan}, "trajectory: got NaN or infinity in a plan that is CONV"),
         ({"detail": "\x1b[31mred"}, "detail: got .*, want one printable line"),
         ({"status": None}, "status: got None, want one of: converged"),
-        ({"options": {"a": [[[[[[[[1]]]]]]]]}}, "options.*got lists or objects within each other, want at most 6"),
+        ({"options": {"a": [[[[[[[[1]]]]]]]]}}, "options.*got more nested lists or objects, want at most 6"),
         ({"scenario": ["quadrotor"]}, "scenario: got .*, want text"),
         ({"version": 4.5}, "of version 4.5, want version 6"),
         ({"cost_to_go.gradient": None}, "cost_to_go.gradient: got none, want it"),
@@ -382,7 +390,7 @@ def test_another_number_is_not_taken_for_what_was_saved(saved: Path) -> None:
     for change in changes:
         saved.write_bytes(original)
         rewrite(saved, sealed=False, **change)
-        with pytest.raises(ls.InputError, match="sha256: got another than that of the content"):
+        with pytest.raises(ls.InputError, match="sha256: got another hash than that of the content"):
             ls.load(saved, ls.Solution)
 
 
@@ -403,10 +411,10 @@ def npy(array: np.ndarray) -> bytes:
     [
         ("policy.gain.npy", npy(np.zeros((150, 2, 3))), "'policy.gain': got it twice, want it once"),
         ("meta.npy", npy(np.array("{}")), "'meta': got it twice"),
-        ("readme.txt", b"hello", "'readme.txt': got a part of that name, want arrays alone"),
-        ("multipliers.0.values.npy", b"hello", "'multipliers.0.values': got no array of numbers"),
+        ("readme.txt", b"hello", "'readme.txt': got a part of that name, want arrays only"),
+        ("multipliers.0.values.npy", b"hello", "'multipliers.0.values': got no array"),
         ("multipliers.0.values.npy", b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16, "'multipliers.0.values': got no array"),
-        ("multipliers.0.values.npy", npy(np.zeros((151, 1))), "sha256: got another than that of the content"),
+        ("multipliers.0.values.npy", npy(np.zeros((151, 1))), "sha256: got another hash than that of the content"),
         ("clearance ", b"", "got a part of that name"),
     ],
 )
@@ -576,6 +584,46 @@ def test_a_failed_write_leaves_nothing_and_keeps_the_old_file(tmp_path: Path, dr
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(ls.InputError, match=r"output: got .*, want a file that can be written"):
         ls.save(drive_solution, tmp_path / "file" / "solution.npz")
+
+
+def test_what_a_killed_process_left_is_removed_after_a_day(tmp_path: Path, drive_solution: ls.Solution) -> None:
+    """By the next that writes into the folder; files of others, and what may still be written to, stay."""
+    names = [f".unfinished-{i:016x}.npz" for i in range(3)] + [".unfinished-mine.npz", "plan.npz"]
+    for age, name in zip((90_000, 80_000, 0, 90_000, 90_000), names, strict=True):
+        (tmp_path / name).write_text("half")
+        now = time.time()
+        os.utime(tmp_path / name, (now - age, now - age))
+    ls.save(drive_solution, tmp_path / "solution.npz")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names[1:], "solution.npz"])
+
+
+def test_a_funnel_that_its_trials_do_not_show_is_refused(tmp_path: Path, drive_solution: ls.Solution) -> None:
+    """The least that certifies a rate, by SciPy's Clopper-Pearson bound; one success less does not."""
+    funnel = funnel_by_hand(drive_solution, np.eye(2), knots=(0, 50), levels=(1.0, 2.0))
+    least = next(k for k in range(1001) if stats.beta.ppf(0.05 / 2, k, 1001 - k) >= funnel.rate)
+    assert least > 900
+    path = ls.save(dataclasses.replace(funnel, successes=np.array([least, 1000])), tmp_path / "funnel.npz")
+    assert ls.load(path, ls.Funnel).successes[0] == least
+    for successes in (least - 1, 0):
+        rewrite(path, successes=np.array([successes, 1000]))
+        with pytest.raises(
+            ls.InputError, match=rf"successes: got {successes} of 1000 trials, which do not show"
+        ):
+            ls.load(path)
+
+
+def test_a_solution_prints_as_a_summary_of_fifteen_lines_at_most(drive_solution: ls.Solution) -> None:
+    many = tuple(dataclasses.replace(drive_solution.candidates[0], start=f"start {i}") for i in range(40))
+    beyond = dataclasses.replace(
+        drive_solution.trajectory, controls=1e3 * np.ones_like(drive_solution.trajectory.controls)
+    )
+    failed = dataclasses.replace(
+        drive_solution, status=ls.Status.DIVERGED, detail="why", candidates=many, trajectory=beyond
+    )
+    for solution in (drive_solution, failed):
+        assert 4 <= len(str(solution).splitlines()) <= 15
+    assert "and 37 more" in str(failed)
+    assert len(failed.iteration_table().splitlines()) == 1 + len(failed.iterations)
 
 
 def test_files_are_ordinary_zip_archives(saved: Path) -> None:

@@ -1,7 +1,7 @@
-"""A filter and the law that follows its estimates, as recursions that run on a robot. NumPy only.
+"""A filter with its feedback law, as recursions that a robot can run. NumPy only.
 
-`OffsetFree` predicts with the dynamics themselves, compiled; here they are linear about the plan, so that nothing but
-products of small matrices is left. `tests/test_policy_files.py` holds one against the other.
+`OffsetFree` predicts with the compiled nonlinear dynamics. Here the dynamics are linear about the plan, so that
+products of small matrices suffice. `tests/test_policy_files.py` compares the two.
 """
 
 from dataclasses import dataclass
@@ -18,15 +18,16 @@ from lqrsim.results.hashing import sha256
 
 @dataclass(frozen=True, kw_only=True)
 class OutputFeedbackPolicy:
-    """Output feedback about a plan: what is measured goes in, controls come out, and what it knows is one vector z.
+    """Output feedback about a plan, from measurements to controls; its whole state is one vector z.
 
-    In each control period t, with x the first n numbers of z and y what is measured,
+    In each control period t, with x the first n numbers of z and y the measurement,
 
         z = z + correction_t (y - sensor_t x - sensor_offset_t)
         u = clip(gain_t z + offset_t)
         z = transition_t z + input_t u + drift_t
 
-    Angles of x are taken nearest to the nominal before, those of y nearest to what is expected. z begins as nominal_0.
+    Before, angles of x are taken nearest to the nominal ones, and angles of y nearest to the expected ones. z begins as
+    nominal_0.
 
     Attributes:
       gain: (T, m, Z); u = clip(gain z + offset).
@@ -37,15 +38,15 @@ class OutputFeedbackPolicy:
       transition: (T, Z, Z), to the next control period: z = transition z + input u + drift.
       input: (T, Z, m).
       drift: (T, Z).
-      nominal: (T, Z), what z is in an undisturbed run: the state, what the actuators have reached if they lag, the
-        states of what disturbs the robot; and, where commands or measurements are late, the commands under way.
+      nominal: (T, Z), z in an undisturbed run: the state, the actuator outputs if they lag, the states of the
+        disturbances, and the pending commands if commands or measurements are late.
       dt: seconds of a control period.
       state_coordinates: names and units of the states, and which of them wrap.
-      control_coordinates: names and units of the controls, and the limits that the actuators keep.
+      control_coordinates: names, units and limits of the controls.
       measured_coordinates: names and units of the measured numbers, and which of them wrap.
 
     Raises:
-      InputError: arrays that do not fit together, or numbers that are not finite.
+      InputError: the arrays do not fit together, or a number is not finite.
     """
 
     gain: Annotated[Array, "T m Z", Bounds()]
@@ -86,20 +87,20 @@ class OutputFeedbackPolicy:
         return self.nominal[0].copy()
 
     def step(self, z: npt.ArrayLike, measurement: npt.ArrayLike | None, t: float) -> tuple[Array, Array]:
-        """The control (..., m) of a control period, and z (..., Z) for the next; call it once in each.
+        """Controls (..., m) of this control period, and z (..., Z) for the next; to be called once in each period.
 
-        After the horizon the last recursions stay in force.
+        After the horizon the last recursion holds.
 
         Args:
-          z: (..., Z), from `start` or the call before; it is not changed.
-          measurement: (..., Y), angles in any representative; None where it got lost: then it is predicted.
+          z: (..., Z), from `start` or the previous call; it is not changed.
+          measurement: (..., Y), angles in any representative; None if it was lost, for a prediction alone.
           t: seconds since the start.
 
         Returns:
           Controls (..., m), and z (..., Z) for the next period.
 
         Raises:
-          InputError: `t` is negative or not finite, or the others are not finite or of another length.
+          InputError: `t` is negative or not finite, or an array is not finite or has another length.
         """
         z, t = vectors_of("z", z, self.nominal.shape[1]), check_number("t", t, at_least=0.0)
         k, n = int(min(t / self.dt + 1e-9, self.steps - 1)), len(self.state_coordinates)
@@ -109,7 +110,7 @@ class OutputFeedbackPolicy:
         if measurement is not None:
             y = vectors_of("measurement", measurement, len(self.measured_coordinates))
             if not np.isfinite(y).all():
-                raise InputError(f"measurement: got {excerpt(y)}, want finite numbers, or None where it got lost")
+                raise InputError(f"measurement: got {excerpt(y)}, want finite numbers, or None if it was lost")
             expected = z[..., :n] @ self.sensor[k].T + self.sensor_offset[k]
             z = z + self.measured_coordinates.difference(y, expected) @ self.correction[k].T
         control = self.control_coordinates.clip(z @ self.gain[k].T + self.offset[k])

@@ -1,4 +1,4 @@
-"""A plan with the feedback law along it: what every solve returns, and what every run can follow. NumPy only."""
+"""A plan with its feedback law: the result of every solve. NumPy only."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,20 +16,20 @@ from lqrsim.results.value_functions import Quadratic
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """A plan with the feedback law along it, and what a next solve begins with.
+    """A plan with its feedback law, and all that a next solve can begin with.
 
-    A `Solution` and a `Replan` are plans; both have a `cost` and a `violation` too.
+    A `Solution` and a `Replan` are plans with a `cost` and a `violation`.
 
     Attributes:
       status: how the solve ended; see `Status`.
-      detail: where and why, if it is not a success.
+      detail: where and why it failed; for solutions also remarks.
       policy: the feedback law.
       trajectory: the plan: the rollout of the policy by the model from its first state.
-      cost_to_go: the value function of the law, a `Quadratic`; None where it is not known, and of re-plans with
+      cost_to_go: the value function of the law, a `Quadratic`; None where it is unknown, and for re-plans with
         constraints, which do not need it.
-      multipliers: of each of the problem's constraints; none where the plan keeps them all without being made to.
-      goal: (n,) the state that the problem asks for, NaN in states that do not matter; None where it names no state.
-      goal_radius: within which the plan's end counts as at the goal, in `target.unit`; None where that is not known.
+      multipliers: one for each constraint of the problem; none where no constraint is active.
+      goal: (n,) the goal state of the problem, NaN in states that do not matter; None where it has none.
+      goal_radius: distance from the goal, in `target.unit`, within which the plan reaches it; None where it is unknown.
     """
 
     status: Status
@@ -54,24 +54,23 @@ class Plan:
 
     @property
     def success(self) -> bool:
-        """Whether the solve converged: CONVERGED, or COST_CONVERGED where only the cost was asked for."""
+        """Whether the solve converged: CONVERGED, or COST_CONVERGED where only the cost was tested."""
         return self.status.success
 
     @property
     def target(self) -> Target:
-        """What a run of the policy is to reach: the goal, or the plan's end where there is none."""
+        """The goal of a run, or the end of the plan where there is none."""
         return Target(self.policy.state_coordinates, self.goal, self.trajectory.states)
 
     def shifted(self, steps: int, *, horizon: str = "moving") -> Self:
-        """The rest of it after `steps` steps, to begin the next solve with: `start=solution.shifted(k)`.
+        """The rest of the plan after `steps` steps, to begin the next solve with: `start=solution.shifted(k)`.
 
-        Of a "moving" horizon the end is filled up: the last law, value function and multipliers stay in force, as a
-        policy's last law does after its horizon, and the last control is held. A "shrinking" one has so many steps
-        less. Status, log, cost and digest stay those of the whole.
+        A "moving" horizon keeps its length: the last law, value function, multipliers and control are repeated at the
+        end. A "shrinking" one has fewer steps. Status, log, cost and digest stay those of the whole plan.
 
         Args:
-          steps: how many steps are over, less than the plan has.
-          horizon: "moving" fills up the end, "shrinking" has fewer steps.
+          steps: steps that are over, fewer than the plan has.
+          horizon: "moving" or "shrinking".
 
         Returns:
           A plan of the same type.
@@ -98,27 +97,25 @@ class Plan:
         return replace(self, **parts, **self._shifted_parts(steps, moved))
 
     def _shifted_parts(self, steps: int, moved: Callable[[npt.ArrayLike], Array]) -> dict[str, Any]:
-        """What else `shifted` changes: field -> new value. `moved` takes an array to what is left of it."""
+        """Further fields that `shifted` changes, with their new values; `moved` shifts an array."""
         return {}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Replan(Plan):
-    """A plan from a given state that is no worse than where the law led that the solve began with.
+    """The result of a prepared solver: a plan from a given state, no worse than the rollout of the law it began with.
 
-    No worse means: it keeps the constraints if that did, misses them by no more if that did not, and of two plans that
-    keep them it is not the more expensive one. It can be used whatever its status, unless `cost` is not finite. What it
-    shares with a `Solution` is in `Plan`.
+    No worse means: its violation is no larger, and if both keep the constraints, its cost is no higher. It can be used
+    whatever its status, unless `cost` is not finite.
 
     Attributes:
-      improved: whether there is a new plan; else this is where the law leads that the solve began with.
+      improved: whether there is a new plan; otherwise this is the rollout of the law that the solve began with.
       cost: of the plan, start and end included.
-      before: of where the law led that the solve began with.
-      violation: by how much the worst constraint is missed at the steps; 0 where none is.
-      iterations: how many there were.
-      seconds: how long the solve took.
-      iterating: how much of that, in seconds, the iterations took, and to see where the law leads that the solve began
-        with.
+      before: cost of the rollout of the law that the solve began with.
+      violation: of the worst constraint at the steps; 0 where all are kept.
+      iterations: number of iterations.
+      seconds: time that the solve took.
+      iterating: part of `seconds` in iterations and in the first rollout.
     """
 
     improved: bool

@@ -1,4 +1,4 @@
-"""What comes out of running a policy: a `Rollout`. NumPy only; `save_load.py` writes it to disk and reads it back."""
+"""Runs of a controller: a `Rollout`. NumPy only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -54,52 +54,54 @@ class BallRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class Rollout:
-    """Closed-loop runs of one policy in MuJoCo, with everything that a picture of them needs.
+    """Closed-loop runs of one controller in MuJoCo, with everything that a picture of them needs.
 
-    K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, to the last bit
-    on equal processors.
+    K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, bit for bit on
+    equal processors.
 
     Attributes:
-      robot: its name.
-      body: the robot's in the MJCF.
-      scene: its name.
+      robot: name of the robot.
+      body: name of the robot's body in the MJCF.
+      scene: name of the scene.
       model: the MJCF that was run, as text.
-      plan: what the policy meant to do.
-      policy_digest: hash of the policy.
+      plan: the nominal states and controls.
+      policy_digest: hash of the controller.
       state_coordinates: names and units of the states, and which of them wrap.
       control_coordinates: names and units of the controls, and their limits.
-      goal: (n,) the state that the plan was to reach, NaN in states that do not count; None where it is the plan's end.
+      goal: (n,) the goal state, NaN in states that do not count; None if the goal is the end of the plan.
       goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: metres, or of the
         scaled error where the goal has no position.
       radius: of the robot's collision circle or sphere, in metres.
       states: (K, T+1, n) true states; angles in the representative nearest the plan.
-      measured: (K, T+1, n) the states that the policy was shown.
-      commanded: (K, T, m) what the policy asked for.
-      applied: (K, T, m) what the actuators got, within the robot's limits.
+      measured: (K, T+1, n) states as measured, which the controller gets.
+      commanded: (K, T, m) the controller's commands.
+      applied: (K, T, m) what the actuators applied, within the robot's limits.
       forces: (K, T, 3) disturbing force at the robot's centre of mass in N, world axes.
-      torques: the same in N m.
-      displaced: (K, obstacles, 3) by how much each obstacle is away from where the plan believes it, in metres.
-      clearance: (K, T+1) signed distance to the nearest obstacle minus the radius in metres; infinite without any.
-      contacts: (K,) control periods from the collision on in which MuJoCo reported a contact of the robot with an
-        obstacle; 0 where the robot goes through them.
+      torques: (K, T, 3) disturbing torque in N m, world axes.
+      displaced: (K, obstacles, 3) displacement of each obstacle from its place in the plan, in metres.
+      clearance: (K, T+1) signed distance to the nearest obstacle minus the radius, in metres; infinite without
+        obstacles.
+      contacts: (K,) control periods, from the collision on, in which MuJoCo reported a contact of the robot with an
+        obstacle; 0 where the robot passes through obstacles.
       collided_at: (K,) seconds to the first collision, at a knot or between two; infinite where there was none.
-      obstacles: (K) names of what they collided with; empty where there was none.
-      diverged_at: (K,) seconds to the knot from which on the simulation was unstable, or what the policy was shown was
-        not finite, or its filter had diverged; infinite where nothing was. The states are NaN from there on.
-      failed_at: (K,) seconds to the knot at which the controller failed; infinite where it did not. From there on, too.
-      reasons: (K) why it failed, or what of its filter diverged; empty where neither was so.
+      obstacles: (K) name of the obstacle of that collision; empty where there was none.
+      diverged_at: (K,) seconds to the knot at which the simulation became unstable, a measurement was not finite, or
+        the controller's filter had diverged; infinite where nothing did. The states are NaN from that knot on.
+      failed_at: (K,) seconds to the knot at which the controller failed; infinite where it did not. The states are NaN
+        from that knot on.
+      reasons: (K) why the controller failed or its filter diverged; empty otherwise.
       frame_times: (F,) seconds.
-      frames: (K, F, nq) MuJoCo's qpos then, for drawing.
-      disturbances: one description each.
-      seed: from which the random numbers were drawn.
-      first_trial: number of the first trial, from which its random numbers were drawn.
-      versions: of lqrsim and the libraries that the bits depend on, and the processor.
-      tube: (T+1, p, p) covariance of the position about the plan that was predicted for the controller and the
-        disturbances, in m^2; p is 2 or 3, as the position has it. None where nobody predicted it; see `predict_tube`.
-      collision_chance: (T+1,) the predicted chance of being in collision at each knot, or None.
-      balls: where the robot's balls were, if it has any and was recorded for drawing; or None.
-      controller_run: the run of the controller (`ControllerRun`), with what it recorded: the estimates of an
-        `OffsetFree`, the log of a `Replanner`. In memory only: None in a rollout that was loaded, pickled or copied.
+      frames: (K, F, nq) MuJoCo's qpos at these times, for drawing.
+      disturbances: a description of each.
+      seed: of the random numbers.
+      first_trial: number of the first trial; a trial's random numbers depend on the seed and its number.
+      versions: of lqrsim and of the libraries that the bits depend on, and the processor.
+      tube: (T+1, p, p) predicted covariance of the position about the plan, for this controller and these disturbances,
+        in m^2; p is 2 or 3, the size of the position. None if it was not predicted; see `predict_tube`.
+      collision_chance: (T+1,) predicted chance of being in collision at each knot, or None.
+      balls: places of the robot's balls, if it has any and frames were recorded; or None.
+      controller_run: the controller's run (`ControllerRun`), with what it recorded: the estimates of an `OffsetFree`,
+        the log of a `Replanner`. In memory only: None in a rollout that was loaded, pickled or copied.
     """
 
     robot: Line
@@ -139,7 +141,7 @@ class Rollout:
     controller_run: Any = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the controller's run, which may hold what cannot be copied."""
+        """Without the controller's run, which may not be copyable."""
         return vars(self) | {"controller_run": None}
 
     def __post_init__(self) -> None:
@@ -152,7 +154,7 @@ class Rollout:
             raise InputError(f"Rollout: contacts: got {self.contacts.max()}, want at most {self.plan.steps}, the steps")
         if not (np.diff(self.frame_times) > 0).all():
             raise InputError("Rollout: frame_times: got times that are not in order, want increasing times")
-        _ = self.target  # which refuses what is no goal
+        _ = self.target  # which checks the goal
         self._check_tube()
         self._check_endings()
 
@@ -167,7 +169,7 @@ class Rollout:
                 raise InputError(f"Rollout: tube: got shape {self.tube.shape}, want {wanted}")
             scale = np.abs(self.tube).max(axis=(1, 2), keepdims=True)
             relative = self.tube / np.where(scale > 0, scale, 1.0)
-            # Sums that were taken in another order differ in the last digits.
+            # Rounding may leave the last digits asymmetric.
             skewed = np.abs(relative - relative.transpose(0, 2, 1)).max(axis=(1, 2)) > 1e-9
             negative = np.linalg.eigvalsh(relative)[:, 0] < -1e-9
             for wrong, want in ((skewed, "a symmetric matrix"), (negative, "no negative variance")):
@@ -206,16 +208,16 @@ class Rollout:
 
     @property
     def target(self) -> Target:
-        """What the trials were to reach."""
+        """The goal of the trials."""
         return Target(self.state_coordinates, self.goal, self.plan.states)
 
     @property
     def plane(self) -> str:
-        """The axes of the world that `places` are along; of a robot without a position, of its last ball."""
+        """The axes of the world that `places` are along; for a robot without a position, those of its last ball."""
         return self.state_coordinates.plane or ("xyz" if self.balls is not None else "")
 
     def places(self, trial: int) -> Array:
-        """Places of the robot in a trial: its position, or its last ball.
+        """Places of the robot in a trial: its position, or that of its last ball.
 
         Args:
           trial: row of the rollout.
@@ -234,17 +236,17 @@ class Rollout:
 
     @property
     def planned_places(self) -> Array:
-        """Where it should have been, (T+1, 2 or 3)."""
+        """The planned places, (T+1, 2 or 3)."""
         if self.state_coordinates.position or self.balls is None:
             return self.plan.states[:, list(self.state_coordinates.position)]
         return self.balls.planned[:, -1]
 
     def in_world(self, places: npt.ArrayLike, *, height: float = 0.0) -> Array:
-        """Points (..., 3) in the world of places (..., 2 or 3); height in metres is that of those seen from above.
+        """Points (..., 3) in the world of places (..., 2 or 3).
 
         Args:
           places: (..., 2 or 3), in metres.
-          height: in metres, of places that are seen from above.
+          height: in metres, of places in a horizontal plane that has no height of its own.
 
         Returns:
           Points (..., 3).
@@ -268,22 +270,22 @@ class Rollout:
 
     @property
     def goal_distance(self) -> Array:
-        """Distance from the target at the end, (K,), in `target.unit`."""
+        """Distance from the goal at the end, (K,), in `target.unit`."""
         return self.target.distance(self.states[:, -1])
 
     @cached_property
     def tracking_error(self) -> Array:
-        """Distance from the plan's position in metres, (K, T+1); for robots without one see `tracking_unit`."""
+        """Distance from the plan, (K, T+1), in `tracking_unit`."""
         return tracking_error(self.state_coordinates, self.states, self.plan.states)
 
     @property
     def tracking_unit(self) -> str:
-        """Of `tracking_error`: m; or of the scaled error that `goal.py` describes, for robots without a position."""
+        """Unit of `tracking_error`: m, or that of the scaled error (`goal.py`) for robots without a position."""
         return tracking_unit(self.state_coordinates)
 
     @property
     def saturated(self) -> npt.NDArray[np.bool_]:
-        """Whether a command stood at a limit, (K, T)."""
+        """Whether a command was at a limit, (K, T)."""
         low, high = np.array(self.control_coordinates.low), np.array(self.control_coordinates.high)
         return np.any((self.commanded <= low) | (self.commanded >= high), axis=-1)
 
@@ -300,19 +302,20 @@ class Rollout:
 
     @property
     def outcome(self) -> tuple[str, ...]:
-        """`reached`, `timed out`, `collided`, `diverged` or `error` for each trial: the first event ends it."""
+        """`reached`, `timed out`, `collided`, `diverged` or `error` for each trial, by its first event."""
         return tuple(self._endings[0].tolist())
 
     @property
     def ended(self) -> Array:
-        """When each trial ended, (K,), in seconds; the horizon where nothing ended it before."""
+        """When each trial ended, (K,), in seconds; the horizon if no event ended it."""
         return self._endings[1]
 
     @property
     def counts(self) -> npt.NDArray[np.bool_]:
-        """Which knots count, (K, T+1): those before a trial ended, the last one if nothing ended it, the first always.
+        """Which knots count, (K, T+1): those before the trial ended, the last if no event ended it, and always the
+        first.
 
-        They are the same whether obstacles stop the robot or not.
+        They do not depend on whether obstacles stop the robot.
         """
         ran = ~np.isin(self._endings[0], ("collided", "diverged", "error"))
         counted = (self.times < self.ended[:, None]) | ran[:, None]
@@ -326,25 +329,25 @@ class Rollout:
 
     @property
     def diverged(self) -> npt.NDArray[np.bool_]:
-        """Whether a trial ended as its simulation became unstable, or its filter diverged, (K,)."""
+        """Whether an unstable simulation or filter ended a trial, (K,)."""
         return self._endings[0] == "diverged"
 
     @property
     def reached(self) -> npt.NDArray[np.bool_]:
-        """Whether a trial ran to its end, and that is within `goal_radius` of the goal, (K,)."""
+        """Whether a trial ran to the end of its plan and ended within `goal_radius` of the goal, (K,)."""
         return self._endings[0] == "reached"
 
     def least_clearance(self) -> Array:
-        """The least clearance of each trial until it ended, (K,), in metres: not above 0 where it collided."""
+        """The least clearance of each trial until it ended, (K,), in metres; at most 0 where it collided."""
         least = np.where(self.counts, self.clearance, np.inf).min(axis=1)
         return np.where(self.collided, np.minimum(least, 0.0), least)
 
     def tally(self) -> str:
-        """How many of the trials reached the target, in a line."""
+        """How many trials reached the goal, as a line."""
         return f"{self.reached.sum()} of {self.trials} trials reached the {self.target.name}"
 
     def summary(self) -> str:
-        """One line a trial: outcome, tracking error, clearance, saturation; before that, where the plan ends."""
+        """Disturbances, the end of the plan, and for each trial outcome, tracking error, clearance and saturation."""
         what = "; ".join(self.disturbances) or "undisturbed"
         lines = [f"{self.robot} in {self.scene}, {what}, seed {self.seed}"]
         lines += [f"  {line}" for line in self.target.of_plan(self.goal_radius)]

@@ -1,7 +1,8 @@
-"""Results on disk: arrays under the paths of their fields, and everything else as JSON in the shape of the record.
+"""Results on disk: arrays under the paths of their fields, and everything else as JSON with the structure of the
+record.
 
-`docs/file_format.md` describes the files, and loads a policy elsewhere with NumPy alone. What may be in a file follows
-from the annotations of the records; see `fields.py`. What is saved and what is loaded is held to them.
+`docs/file_format.md` describes the files, and loads a policy with NumPy alone. The annotations of the records say what
+a file may hold; see `fields.py`. `save` and `load` check it.
 """
 
 import enum
@@ -36,7 +37,7 @@ FORMATS: dict[type, tuple[str, int]] = {
     Funnel: ("funnel", 2),
 }
 VERSIONS = dict(FORMATS.values())
-DEEPEST = 6  # lists and objects within each other, where a field may hold anything
+DEEPEST = 6  # nested lists and objects, in a field that may hold anything
 
 
 def save(result: Saved, path: str | os.PathLike[str]) -> Path:
@@ -106,12 +107,12 @@ def load(path: str | os.PathLike[str], kind: type[Saved] | None = None) -> Saved
         arrays, tree = archive.arrays(), {name: one for name, one in archive.meta.items() if name not in outside}
         record = _record(kind, tree, "", arrays)
         if arrays:
-            raise InputError(f"{min(arrays)}: got it, and none in meta, want both or neither")
+            raise InputError(f"{min(arrays)}: got an array that meta does not mention, want both or neither")
         return record
 
 
 def _tree(value: Any, path: str, arrays: Arrays) -> Any:
-    """What JSON says of a value; its arrays go into `arrays`, each under the path of its field."""
+    """The JSON tree of a value; its arrays go into `arrays`, each under the path of its field."""
     if is_dataclass(value):
         tree = {}
         for name in declarations(type(value)):
@@ -132,14 +133,14 @@ def _check_arrays(kind: type, headers: Mapping[str, Header]) -> None:
     for name, header in headers.items():
         said = _declared_at(kind, name)
         if said is None or said.dtype is None:
-            raise InputError(f"{excerpt(name)}: got it, want only what belongs to this {FORMATS[kind][0]}")
+            raise InputError(f"{excerpt(name)}: got an unknown array, want only those of its format")
         if header.dtype != (dtype := np.dtype(said.dtype).str):
             raise InputError(f"{name}: got numbers of type {header.dtype}, want {dtype}")
         check_sizes(name, header.shape, said.letters, {} if said.letters.startswith("...") else sizes)
 
 
 def _declared_at(kind: type, path: str) -> Declared | None:
-    """What is declared at that path of a record; None where there is nothing."""
+    """The declaration at a path of fields of a record; None if there is none."""
     found, kinds = None, (kind,)
     for name in path.split("."):
         if name.isascii() and name.isdigit():
@@ -152,7 +153,7 @@ def _declared_at(kind: type, path: str) -> Declared | None:
 
 
 def _record(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
-    """The record of this kind of a file, whose arrays are taken out of `arrays`. Raises InputError for what is none."""
+    """Build a record of this kind from a file, taking its arrays out of `arrays`. Raises InputError if it cannot."""
     if not isinstance(tree, dict):
         raise InputError(f"{path}: got {excerpt(tree)}, want an object")
     known = declarations(kind)
@@ -176,7 +177,7 @@ def _record(kind: Any, tree: Any, path: str, arrays: Arrays) -> Any:
 
 
 def _value(said: Declared, tree: Any, path: str, arrays: Arrays) -> Any:
-    """The value of a field. The record that it is for checks what is not checked here."""
+    """Build the value of a field; the constructor of its record checks the rest."""
     if tree is None and said.optional:
         return None
     kind = said.kinds[0]
@@ -197,13 +198,13 @@ def _value(said: Declared, tree: Any, path: str, arrays: Arrays) -> Any:
 
 
 def _anything(field: str, value: Any, depth: int = DEEPEST) -> Any:
-    """Whatever JSON can say, in at most so many lists and objects within each other."""
+    """Any JSON value, with a limit to nested lists and objects."""
     if isinstance(value, str):
         return check_string(field, value)
     if not isinstance(value, list | dict):
         return value
     if depth == 0:
-        raise InputError(f"{field}: got lists or objects within each other, want at most {DEEPEST} of them")
+        raise InputError(f"{field}: got more nested lists or objects, want at most {DEEPEST}")
     if isinstance(value, list):
         return [_anything(f"{field}[{i}]", one, depth - 1) for i, one in enumerate(value)]
     return {check_string(f"{field}: a name", k): _anything(f"{field}.{k}", one, depth - 1) for k, one in value.items()}

@@ -1,4 +1,4 @@
-"""What a `Solution` is made of: trajectory, status, log, certificate, multipliers, candidates. NumPy only."""
+"""Parts of a `Solution`: trajectory, status, log, certificate, multipliers, candidates. NumPy only."""
 
 import enum
 from dataclasses import dataclass
@@ -10,12 +10,12 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_count
 from lqrsim.results.fields import Bounds, Line, check_fields
 
-# How a horizon goes on: it moves along with the robot, or its end stays where it is.
+# The end of a horizon moves along with the robot, or stays where it is.
 HORIZONS = ("moving", "shrinking")
 
 
 def left_after(steps: int, array: npt.ArrayLike, *, filled: bool) -> Array:
-    """What is left of an array (T, ...) after so many steps; `filled` up with the last to the same length."""
+    """An array (T, ...) without its first steps; with `filled` the last entry is repeated to keep the length."""
     array = np.asarray(array)
     rest = array[steps:]
     return np.concatenate([rest, np.repeat(array[-1:], steps, axis=0)]) if filled and steps else rest
@@ -31,7 +31,7 @@ class Trajectory:
       dt: seconds between two states.
 
     Raises:
-      InputError: they do not fit together, there is no step, or dt is not above 0. NaN is what a failed solve has.
+      InputError: the shapes do not fit, there is no step, or dt is not above 0. NaN is allowed: a failed solve has it.
     """
 
     states: Annotated[Array, "T+1 n"]
@@ -55,7 +55,7 @@ class Trajectory:
 
     @property
     def horizon(self) -> float:
-        """Duration in seconds; the paper's l."""
+        """Duration in seconds; l in the paper."""
         return self.steps * self.dt
 
     @property
@@ -65,7 +65,7 @@ class Trajectory:
 
 
 class Status(enum.StrEnum):
-    """How a solve ended. `meaning` says it in words, `remedy` what to try."""
+    """How a solve ended; `meaning` explains it, `remedy` says what to try."""
 
     CONVERGED = "converged"
     COST_CONVERGED = "cost converged"
@@ -81,7 +81,7 @@ class Status(enum.StrEnum):
 
     @property
     def success(self) -> bool:
-        """True for CONVERGED, and for COST_CONVERGED, where only the cost was asked for."""
+        """True for CONVERGED, and for COST_CONVERGED, where only the cost was tested."""
         return self in (Status.CONVERGED, Status.COST_CONVERGED)
 
     @property
@@ -90,31 +90,31 @@ class Status(enum.StrEnum):
 
     @property
     def remedy(self) -> str:
-        """What to try; empty where nothing needs to be."""
+        """What to try; empty for a success."""
         return _STATUS_TEXT[self][1]
 
 
 _STATUS_TEXT = {
     Status.CONVERGED: ("optimality and, with a cost-to-come, the gap are within tolerance", ""),
     Status.COST_CONVERGED: (
-        "the change of cost is within tolerance; gap and optimality were not asked for",
-        'look at the gap, or solve with stop="optimal"',
+        "the change of cost is within tolerance; gap and optimality were not tested",
+        'check the gap, or solve with stop="optimal"',
     ),
     Status.MAX_ITERATIONS: (
-        "the iteration limit came first, or no step lowered the cost any more",
-        "raise max_iterations if the improvements still shrink; if they do not, try another start",
+        "the iteration limit was reached, or no step lowered the cost any more",
+        "raise max_iterations while the improvements shrink; otherwise try another start",
     ),
     Status.TIME_LIMIT: (
-        "the time limit came first; the plan is the best so far",
-        "raise time_limit, or begin nearer: start=solution of a similar problem",
+        "the time limit was reached; the plan is the best so far",
+        "raise time_limit, or start nearer: start=solution of a similar problem",
     ),
     Status.INTERRUPTED: (
-        "the callback raised, or Ctrl-C; the plan is the best so far",
+        "the callback raised an exception, or Ctrl-C was pressed; the plan is the best so far",
         "solve again, from start=solution",
     ),
     Status.INFEASIBLE: (
-        "the constraints cannot be met, at least not near the plan that misses them least",
-        "relax the constraint that is named, give more time, or try another start",
+        "the constraints cannot be met, at least near the plan with the least violation",
+        "relax the constraint that is named, allow more time, or try another start",
     ),
     Status.DIVERGED: (
         "the cost of the policy grew beyond all bounds",
@@ -129,12 +129,12 @@ _STATUS_TEXT = {
         "raise the control weight, start with an InitialPrior, shorten dt, or try the other solver",
     ),
     Status.RISK_TOO_HIGH: (
-        "the expectation of exp(risk * cost) does not exist: the noise is too strong for so much risk aversion",
-        "lower the risk, below the largest that is named, or the noise; or begin with start=solution of a lower risk",
+        "the expectation of exp(risk * cost) is infinite: the noise is too strong for this risk",
+        "lower the risk below the largest that is named, or lower the noise; or start from a solution of a lower risk",
     ),
     Status.NOT_CERTIFIED: (
-        "the method converged, but its plan, checked against the problem, is not what it claims",
-        "try another start or form; and please report it, for it is a fault of lqrsim",
+        "the method converged, but a check of its plan against the problem failed",
+        "try another start or form, and please report it: this is a bug in lqrsim",
     ),
 }
 
@@ -144,28 +144,28 @@ class Iteration:
     """One line of the log.
 
     Attributes:
-      cost: true cost of rolling the policy out under the true dynamics, with noise that which is expected; NaN where it
-        was only to keep the constraints.
-      improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration. Of damped iterations with
-        constraints it is of the cost with the augmented Lagrangian, and so is the optimality.
-      gap: largest difference between the minimal-total-cost states and that rollout, each state relative to its
-        range along the rollout (at least 1 unit). Where the safeguard went part of the way, they are taken there; 0 for
-        steps of iLQR, Newton's method and restoration, which have none. Of the interior point it is the largest between
-        two steps of its plan, which need not obey the dynamics until the end.
+      cost: of the policy's rollout under the true dynamics, with noise its expectation; NaN while only the constraints
+        are to be met.
+      improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration. In damped iterations with
+        constraints this and the optimality refer to the augmented Lagrangian.
+      gap: largest difference between the states of minimal total cost and the rollout, each state relative to its
+        range along the rollout (at least 1 unit); after a partial step of the safeguard, the states of that step. 0
+        for steps of iLQR, Newton's method and restoration. In the interior point method it is the largest defect of
+        the dynamics between two steps of its plan, which is zero only at the end.
       optimality: the decrease that a linear-quadratic model about the rollout still predicts, relative to the cost; NaN
-        where it was not evaluated (it is once the other tests pass, and after the last iteration). Of the interior
-        point it is what is left of the optimality conditions: the slope of the Lagrangian in a control, times the
-        control's range, or the product of a multiplier and its slack, the larger one, relative to the cost.
-      dynamics_residual: how far one step of the true dynamics takes a minimal-total-cost state from the next one, at
-        most; relative as the gap is, and evaluated where the optimality is. The plan itself is a rollout, and has none.
-        Of the interior point it is the gap.
-      violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all inequalities are
-        kept and there are no equalities, which are off by rounding at least; NaN where it was not evaluated.
-      seconds: time this iteration took.
+        where it was not evaluated (it is once the other tests pass, and after the last iteration). In the interior
+        point method it is the residual of the optimality conditions, relative to the cost: the larger of the gradient
+        of the Lagrangian in a control times the control's range, and the product of a multiplier and its slack.
+      dynamics_residual: largest defect of the dynamics between two states of minimal total cost, relative as the gap
+        is, and evaluated where the optimality is. The plan itself is a rollout and has no defect. In the interior point
+        method it equals the gap.
+      violation: of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there are no
+        equalities, which have rounding errors at least; NaN where it was not evaluated.
+      seconds: time that this iteration took.
       method: "smooth", the paper's; "newton", at the end; with constraints or limits "interior point", and
-        "restoration", a descent in which constraints may be missed at a price; of the safeguard's "damped", or "ilqr"
-        where its step is that of iLQR; of Newton's method and the safeguard "rejected" (it would have cost more, or a
-        pass failed; cost is that of the plan that was kept).
+        "restoration", a descent on cost and penalised violation; in the safeguard "damped", or "ilqr" where its step is
+        that of iLQR; in Newton's method and the safeguard "rejected" (the cost would have risen, or a pass failed; the
+        cost is that of the plan that was kept).
     """
 
     cost: float
@@ -186,7 +186,7 @@ class Iteration:
     )
 
     def row(self, number: int) -> str:
-        """This iteration as a line under `HEADER`.
+        """This iteration as a line of the table under `HEADER`.
 
         Args:
           number: of the iteration, from 1.
@@ -207,9 +207,9 @@ class Iteration:
 
 @dataclass(frozen=True, kw_only=True)
 class Certificate:
-    """What the plan is, recomputed from the problem after the solve, on a path that the solvers do not use.
+    """Measures of a plan, recomputed from the problem after the solve by code that the solvers do not use.
 
-    A solution that says CONVERGED has passed: optimality and violation are within tolerance, the rest within rounding.
+    For a CONVERGED solution optimality and violation are within tolerance, the other residuals within rounding.
 
     Attributes:
       cost: of the plan; see `Solution.cost`.
@@ -219,11 +219,11 @@ class Certificate:
       policy_residual: largest difference between a control and the policy's at that state, relative to the terms of
         `L x + l`.
       limits: how far a control is beyond its limits, in its unit.
-      violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all inequalities are
-        kept and there are no equalities. Of a converged plan it is at most `constraint_tolerance`, of equalities at
-        most 1e-6, unless constraints are elastic.
-      optimality: the decrease of cost that the slopes of the cost in the policy's offsets (and in a start that is not
-        fixed) still promise, relative to the cost; infinite where there is no cost-to-go to weigh them with.
+      violation: of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there are no
+        equalities. For a converged plan it is at most `constraint_tolerance`, for equalities at most 1e-6, unless
+        constraints are elastic.
+      optimality: the decrease of cost that the gradient in the policy's offsets (and in a free start) still predicts,
+        relative to the cost; infinite without a cost-to-go, which is needed to weigh the gradient.
     """
 
     cost: float
@@ -240,11 +240,11 @@ class Certificate:
 
 @dataclass(frozen=True)
 class Multipliers:
-    """What a constraint presses with, at each step: zero where an inequality is kept with room to spare.
+    """The multipliers of a constraint, one for each row at each step; zero where an inequality is inactive.
 
     Attributes:
-      values: (T+1, rows): what a unit more of the constraint would cost; of an inequality not negative.
-      penalty: mu of the augmented Lagrangian, which holds the policy to the constraint.
+      values: (T+1, rows): the change of cost with a unit of the constraint; not negative for an inequality.
+      penalty: weight mu of the augmented Lagrangian.
     """
 
     values: Annotated[Array, "T+1 _"]
@@ -259,12 +259,11 @@ class Candidate:
     """One of several starts that a search tried.
 
     Attributes:
-      start: what it was.
-      cost: true cost of the last plan that it led to; infinite if a pass failed, or the plan is only to keep the
-        constraints.
-      iterations: how many it took until then.
+      start: its name.
+      cost: of its last plan; infinite if a pass failed, or if the plan was only to meet the constraints.
+      iterations: number of iterations.
       status: how it ended; None where it was dropped after a few iterations.
-      trajectory: that plan.
+      trajectory: its last plan.
     """
 
     start: Line
