@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from whole_problems import planar_quadrotor
+from oracle import planar_quadrotor
 from whole_problems.claims import contradictions
 
 import lqrsim as ls

@@ -254,7 +254,7 @@ def test_every_flipped_bit_is_harmless(saved: Path, drive_solution: ls.Solution)
 
 
 def test_a_sample_of_what_a_fuzzer_makes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Some of what `experiments/benchmark_robustness.py` tries by the ten thousand; half have a hash that fits."""
+    """Some of what `tests/tools/benchmark_robustness.py` tries by the ten thousand; half have a hash that fits."""
     monkeypatch.setattr(fuzzer, "PATIENCE", 300.0)  # what hangs is found, and what a slow machine takes is no fault
     found = list(fuzzer.verdicts(250, seed=3))
     assert [verdict for verdict in found if verdict.kind in fuzzer.FAILURES] == []
@@ -606,9 +606,7 @@ def test_a_funnel_that_its_trials_do_not_show_is_refused(tmp_path: Path, drive_s
     assert ls.load(path, ls.Funnel).successes[0] == least
     for successes in (least - 1, 0):
         rewrite(path, successes=np.array([successes, 1000]))
-        with pytest.raises(
-            ls.InputError, match=rf"successes: got {successes} of 1000 trials, which do not show"
-        ):
+        with pytest.raises(ls.InputError, match=rf"successes: got {successes} of 1000 trials, which do not show"):
             ls.load(path)
 
 

@@ -22,7 +22,7 @@ from lqrsim.control.sensors import Sensor, sensor_of
 from lqrsim.control.uncertainty import GAIN, OFFSET, Uncertainty, Unknown, per_entry, shaping_filter
 from lqrsim.errors import Array
 from lqrsim.kernels import estimation
-from lqrsim.kernels.records import DynamicsModel, Predictor, SensorModel, Turning
+from lqrsim.kernels.records import AngularStates, DynamicsModel, Predictor, SensorModel
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers.compiled import dynamics_model
@@ -184,7 +184,7 @@ class PlanModel:
         return SensorModel(measure, slope, self.sensor.data)
 
     @cached_property
-    def turning(self) -> Turning:
+    def turning(self) -> AngularStates:
         """Which states are angles."""
         return turning_of(self.dynamics.state_coordinates)
 

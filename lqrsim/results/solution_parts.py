@@ -70,6 +70,7 @@ class Status(enum.StrEnum):
     CONVERGED = "converged"
     COST_CONVERGED = "cost converged"
     MAX_ITERATIONS = "max iterations"
+    STALLED = "stalled"
     TIME_LIMIT = "time limit"
     INTERRUPTED = "interrupted"
     INFEASIBLE = "infeasible"
@@ -101,8 +102,12 @@ _STATUS_TEXT = {
         'check the gap, or solve with stop="optimal"',
     ),
     Status.MAX_ITERATIONS: (
-        "the iteration limit was reached, or no step lowered the cost any more",
+        "the iteration limit was reached",
         "raise max_iterations while the improvements shrink; otherwise try another start",
+    ),
+    Status.STALLED: (
+        "no step makes the plan better, though it is not within tolerance",
+        "try another start; scale states, controls and costs to similar sizes; or accept a larger tolerance",
     ),
     Status.TIME_LIMIT: (
         "the time limit was reached; the plan is the best so far",
