@@ -8,20 +8,24 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim import rotations
-from lqrsim.errors import Array, InputError, check_flag, check_name, check_number, excerpt, vectors_of
+from lqrsim.errors import Array, InputError, check_array, check_flag, check_name, check_number, excerpt, vectors_of
 from lqrsim.problem.constraints import StateBounds
+from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost
+from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.robots.base import Robot
 from lqrsim.robots.mjcf_balls import MjcfBalls
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.robots.mjcf_geoms import MjcfGeoms
 from lqrsim.scenes import mjcf_joints
+from lqrsim.scenes.mjcf_holding import Holding, efforts, holding
 from lqrsim.scenes.mjcf_obstacles import in_the_way
 from lqrsim.scenes.mjcf_outline import outline_of
 from lqrsim.scenes.scene import Choice, Scene, checked_model, chosen_geoms, obstacle_geoms, read_mjcf, scene_of
 from lqrsim.scenes.world import KINDS, OTHER_KINDS
 
 _AXES = "xyz"
+_PERIOD = 0.02  # s, of the control, or the whole number of physics steps that is nearest to it
 _WIDTH = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # in qpos and in qvel
 
 
@@ -182,6 +186,93 @@ class MjcfRobot(Robot):
         model = checked_model(changed.xml, self.name)
         scene = scene_of(changed.xml, self.name, model, self.scene.geoms, (*KINDS, *OTHER_KINDS))
         return MjcfRobot(scene, **self._stated)
+
+    def hold(self, state: npt.ArrayLike) -> Array:
+        """The controls that hold the robot still, by MuJoCo's inverse dynamics: torques, or the targets of servos.
+
+        Args:
+          state: (n,), whose velocities do not count.
+
+        Returns:
+          (m,), within their limits; where nothing holds it, what comes nearest, by the sum of squared forces.
+        """
+        return self._held(vectors_of("state", state, len(self.dynamics.state_coordinates))).controls
+
+    def _held(self, state: Array) -> Holding:
+        model = self.dynamics.physics.model
+        numbers = np.array([model.actuator(name).id for name in self.actuators], dtype=np.intp)
+        return holding(model, self.configuration(state)[0], state[2 * model.nv :], numbers)
+
+    def problem(
+        self,
+        start: npt.ArrayLike,
+        goal: npt.ArrayLike,
+        *,
+        steps: int = 150,
+        dt: float | None = None,
+        weights: npt.ArrayLike = 100.0,
+        effort: npt.ArrayLike | None = None,
+        damping: float = 1e-3,
+    ) -> Problem:
+        """From one state to another, within the actuators' limits, and clear of obstacles by an ObstacleCost.
+
+        Controls cost what they differ from those that hold the robot: at the start, or between start and goal if it can
+        be held at both. Solvers begin with these.
+
+        Args:
+          start: (n,). goal: (n,). steps: of dt. dt: seconds, about 0.02 by default.
+          weights: of what misses the goal at the end, for all states or (n,).
+          effort: of the controls, (m,); by default 1 for a control at its limit, or that of its force, or at 1.
+          damping: of the velocities of hinges, slides and ball joints at each step.
+
+        Returns:
+          The Problem.
+
+        Raises:
+          InputError: as `Problem` does.
+        """
+        dynamics, model = self.dynamics, self.dynamics.physics.model
+        n, controls = len(dynamics.state_coordinates), dynamics.control_coordinates
+        start, goal = check_array("start", start, (n,)), check_array("goal", goal, (n,))
+        first, last = self._held(start), self._held(goal)
+        about = (first.controls + last.controls) / 2 if first.held and last.held else first.controls
+        if effort is None:
+            numbers = np.array([model.actuator(name).id for name in self.actuators], dtype=np.intp)
+            effort = efforts(model, numbers) ** -2.0
+        cost: Cost = ControlCost(effort, about=about)
+        moves = np.zeros(n)
+        for one in self._joints:
+            if one.kind != "free":
+                moves[model.nv + one.dof : model.nv + one.dof + _WIDTH[one.kind][1]] = check_number(
+                    "damping", damping, at_least=0.0
+                )
+        if moves.any():
+            cost = cost + QuadraticCost(moves, about=np.zeros(n))
+        if len(self.scene.world):
+            cost = cost + ObstacleCost(self.scene.world, geoms=self.geoms)
+        return Problem(
+            dynamics=dynamics, dt=dynamics.period_near(_PERIOD) or float(model.opt.timestep) if dt is None else dt,
+            steps=steps, initial=FixedState(start), stage_cost=cost,
+            final_cost=QuadraticCost(np.broadcast_to(weights, (n,)), about=goal),
+            control_limits=(controls.low, controls.high),
+        )  # fmt: skip
+
+    def __str__(self) -> str:
+        space, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
+        held, names = self._held(self.at()), self.scene.world.names
+        told = ", ".join(f"{name} {value:.4g}" for name, value in zip(controls.names, held.controls, strict=True))
+        short = "" if held.held else f", {held.missed:.3g} short of it"
+        lines = [
+            f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self._timestep:g} s",
+            f"  states: {excerpt(', '.join(space.names))}",
+            f"  held at rest by: {told}{short}",
+            f"  obstacles: {excerpt(', '.join(names)) if names else 'none'}",
+        ]
+        return "\n".join(lines)
+
+    @property
+    def _timestep(self) -> float:
+        return float(self.scene.model.opt.timestep)
 
     @property
     def joint_limits(self) -> StateBounds:

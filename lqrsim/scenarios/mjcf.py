@@ -3,17 +3,10 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from lqrsim.control.uncertainty import PerEntry, per_entry
 from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt
-from lqrsim.problem.costs import ControlCost, Cost, ObstacleCost, QuadraticCost
-from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.robots.mjcf import MjcfRobot
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.simulation.plant import Plant
-
-PERIOD = 0.02  # s, of the control, or the physics step that is nearest to it
 
 Place = str | Mapping[str, float] | None
 
@@ -41,7 +34,8 @@ def mjcf(
       goal: likewise.
       weights: of what misses the goal at the end: of all states, by name, or by unit, as {"m": 100, "rad": 100}; what
         is not named then has none.
-      effort: of the controls, a number, by name or by unit; by default 1 for a control at its limit, or at 1.
+      effort: of the controls, a number, by name or by unit, about those that hold the robot still; by default as in
+        `MjcfRobot.problem`.
       dt: seconds of a control period, by default about 0.02.
       steps: how many.
       body: as in `MjcfRobot`.
@@ -60,23 +54,11 @@ def mjcf(
     if given:
         names = check_items("parameters", list(given), str, "names and numbers: {'mass': 0.6}")
         robot = robot.with_parameters(**{name: given[name] for name in names})
-    plant, timestep = Plant(robot, robot.scene), float(robot.scene.model.opt.timestep)
-    dynamics = robot.dynamics
-    space, controls = dynamics.state_coordinates, dynamics.control_coordinates
-    ends = per_entry("weights", weights, space)
-    if effort is None:
-        largest = np.maximum(np.abs(controls.low), np.abs(controls.high))
-        efforts = np.where(np.isfinite(largest) & (largest > 0), largest, 1.0) ** -2.0
-    else:
-        efforts = per_entry("effort", effort, controls, above=0.0)
-    cost: Cost = ControlCost(efforts)
-    if len(plant.world):
-        cost = cost + ObstacleCost(plant.world, geoms=robot.geoms)
-    problem = Problem(
-        dynamics=dynamics, dt=max(1, round(PERIOD / timestep)) * timestep if dt is None else dt, steps=steps,
-        initial=FixedState(_state(robot, "start", start)), stage_cost=cost,
-        final_cost=QuadraticCost(ends, about=_state(robot, "goal", goal)),
-        control_limits=(controls.low, controls.high),
+    space, controls = robot.dynamics.state_coordinates, robot.dynamics.control_coordinates
+    problem = robot.problem(
+        _state(robot, "start", start), _state(robot, "goal", goal), steps=steps, dt=dt,
+        weights=per_entry("weights", weights, space),
+        effort=None if effort is None else per_entry("effort", effort, controls, above=0.0),
     )  # fmt: skip
     return Scenario(
         name=Path(path).stem, summary=f"{robot.name}, by MuJoCo's own steps", robot=robot, scene=robot.scene,
