@@ -357,7 +357,7 @@ def test_texts_that_are_refused(construct: str) -> None:
     "text", ["def f(a):\n    return " + "(" * 5000 + "a" + ")" * 5000, "def f(a):\n    return a\0"]
 )
 def test_texts_that_python_does_not_read(text: str) -> None:
-    assert "which is no Python" in refusal(text, 1.5)
+    assert "which is not valid Python" in refusal(text, 1.5)
 
 
 def test_too_deep_a_nesting_is_refused() -> None:

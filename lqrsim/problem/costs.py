@@ -28,8 +28,8 @@ from lqrsim.errors import (
     check_weight,
     excerpt,
 )
-from lqrsim.kernels import ball_cost, cost_differences, function_cost, obstacle_cost, quadratic_cost
-from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters, bind_outline, check_outline
+from lqrsim.kernels import differences, obstacle_cost, quadratic_cost, user_functions
+from lqrsim.problem.collision_spheres import CollisionSpheres, bind_outline, check_outline
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
 
@@ -232,17 +232,13 @@ class ObstacleCost(Cost):
     def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
         places, world = bind_outline("ObstacleCost", self.balls, dynamics, self.world)
         tables = world.tables(times)
-        if self.balls is not None and places is not None:
-            return self._bind_balls(self.balls, places, tables)
-        position = dynamics.state_coordinates.position
-        first = [self.radius, self.sharpness, self.weight, len(world), len(tables)]
-        data = np.concatenate([first, tables.ravel()])
-        return CostTerm(source_of(obstacle_cost, AXES=position), data, nonconvex_in=position, factor=2)
-
-    def _bind_balls(self, balls: CollisionSpheres, places: SphereCenters, tables: Array) -> CostTerm:
-        own = np.concatenate([[self.sharpness, self.weight, tables.shape[1], len(tables)], balls.radii, tables.ravel()])
-        count, axes = len(balls), places.depends_on
-        kernel = source_of(ball_cost, AT=places.numbers, BALLS=count, PLACES=3 * count, AXES=axes)
+        radii = [self.radius] if self.balls is None else self.balls.radii
+        own = np.concatenate([[self.sharpness, self.weight, len(world), len(tables)], radii, tables.ravel()])
+        if self.balls is None or places is None:
+            position = dynamics.state_coordinates.position
+            return CostTerm(source_of(obstacle_cost, AXES=position), own, nonconvex_in=position, factor=1)
+        axes = places.depends_on
+        kernel = source_of(obstacle_cost, AT=places.numbers, BALLS=len(self.balls), AXES=axes)
         return CostTerm(
             kernel.filled(places=places.code, places_jacobian=places.code),
             np.concatenate([places.data, own]),
@@ -379,9 +375,9 @@ class FunctionCost(Cost):
         functions = (UserFunction(function=self.function, values=1, unused=unused, **rest),)
         if self.derivatives is not None:
             functions += (UserFunction(function=self.derivatives, writes=((n + m,), (n + m, n + m)), **rest),)
-        source = source_of(function_cost)
+        source = source_of(user_functions)
         if self.derivatives is None:
-            source = source_of(cost_differences, AXES=axes)
+            source = source_of(differences, AXES=axes).filled(value=source)
         return CostTerm(
             source,
             np.array(list(self.parameters.values()), dtype=np.float64),

@@ -674,7 +674,7 @@ from math import comb
 def f(a):
     return comb(a)
 
-## no Python: which is no Python
+## no Python: which is not valid Python
 def f(a:
     return a
 """
