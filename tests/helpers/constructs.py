@@ -254,7 +254,7 @@ a + 1  ->  an expression that is not used
 ...  ->  an expression that is not used
 b: float  ->  a name without a value
 break  ->  `break` outside of a loop
-return a + nothing  ->  the name nothing, which nothing has
+return a + nothing  ->  the name nothing, which is not defined
 return nothing(a)  ->  a call of nothing
 print(a)  ->  a call of print
 return np.sin(a)  ->  `np.sin(a)`
