@@ -59,7 +59,7 @@ class Loop:
         mean, covariance = np.zeros((steps + 1, width)), np.zeros((steps + 1, width, width))
         across, std = np.empty((steps, n, n)), np.empty((steps, model.m))
         saturation = np.empty((steps, model.m))
-        covariance[0, :size, :size] = model.start
+        covariance[0, :size, :size] = model.start_root @ model.start_root.T
         for t in range(steps):
             seen, noise = self._seen(t)
             law = self.gain[t] @ seen  # of X
@@ -94,14 +94,15 @@ class Loop:
         """What the law is told, as a matrix times X, and the covariance of the noise on that."""
         model, n, size = self.model, self.model.n, self.model.size
         if self.filter_gain is None:
-            return np.eye(n, size), np.diag(model.shown_noise)
+            return np.eye(n, size), np.diag(model.shown_std**2)
         received = 1 - model.uncertainty.loss
         K = received * self.filter_gain[t]
         seen = np.zeros((size, 2 * size))
         seen[:, size:] = np.eye(size)
         seen[:, :n] += K @ model.H[t]
         seen[:, size : size + n] -= K @ model.H[t]
-        return seen, K @ model.measurement_noise[t] @ K.T / max(received, 1e-12)
+        noise = K @ model.measurement_root[t]
+        return seen, noise @ noise.T / max(received, 1e-12)
 
 
 def limited(centre: Array, std: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:

@@ -68,7 +68,7 @@ def choose_tolerances(
     for periods in PERIODS:
         if periods > max(model.plan.steps // 2, PERIODS[0]):
             break
-        tolerate = _of_units(model.dynamics.state_coordinates.units, reach[periods])
+        tolerate = unit_means(model.dynamics.state_coordinates.units, reach[periods])
         weights = Weights.of(tuple(tolerate.tolist()), effort, model.dynamics, at_end=at_end)
         found.append(Choice(tolerate, periods * model.plan.dt, weights, predicted(weights)))
     # What is a thousandth of the plan's extent is narrow enough.
@@ -95,7 +95,7 @@ def reach_of(model: PlanModel, effort: Array, periods: int) -> dict[int, Array]:
     return reach
 
 
-def _of_units(units: tuple[str, ...], numbers: Array) -> Array:
+def unit_means(units: tuple[str, ...], numbers: Array) -> Array:
     """The same for all states of a unit: the rms of theirs."""
     squares = {unit: [number**2 for number, own in zip(numbers, units, strict=True) if own == unit] for unit in units}
     return np.array([np.sqrt(np.mean(squares[unit])) for unit in units])
