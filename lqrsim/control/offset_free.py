@@ -137,7 +137,7 @@ class OffsetFree(Controller):
         low, high = np.array(controls.low), np.array(controls.high)
         surroundings = Surroundings.of(self.problem, self.uncertainty.obstacles)
 
-        def predicted(tried: Weights) -> Prediction:
+        def predicted(tried: Weights) -> list[Prediction]:
             radius = self.solution.goal_radius
             return with_filter(self.model, self.filter, tried, (low, high), surroundings, radius)
 
