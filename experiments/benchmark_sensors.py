@@ -15,12 +15,10 @@ test. Of so many tests 5 % have p below 5 % by chance alone if noise made no dif
 the number of tests (Bonferroni).
 """
 
-import contextlib
 import dataclasses
-import json
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -28,8 +26,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import tyro
 from mjcf.files import CART_POLE
+from runner import Settings, at_most, opening, run
 from scipy import stats
 from tqdm import tqdm
 
@@ -37,7 +35,6 @@ import lqrsim as ls
 from lqrsim.disturbances import Disturbance, MeasurementNoise
 from lqrsim.machine import processors
 from lqrsim.templates.my_robot import my_robot
-from lqrsim.versions import versions
 
 SCALES = (1.0, 1e-3, 1e-9, 0.0)
 PRESETS = ("light", "moderate", "severe")
@@ -45,7 +42,7 @@ ROBOTS = ("quadrotor", "differential drive", "my_robot", "cart-pole")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     subsets: int = 240
     """How many: those of the numbers below."""
     only: tuple[int, ...] = ()
@@ -56,24 +53,18 @@ class Config:
     """Of the subsets and of the disturbances."""
     workers: int | None = None
     """How many processes; by default as many as there are processors."""
-    quick: bool = False
-    """Four subsets of 10 trials, in this process."""
-    json: bool = False
-    """Print the result as JSON instead of the table."""
 
 
 def main(config: Config) -> dict[str, Any]:
     if config.quick:
-        config = dataclasses.replace(
-            config, subsets=min(config.subsets, len(ROBOTS)), trials=min(config.trials, 10), workers=1
-        )
+        config = dataclasses.replace(at_most(config, subsets=len(ROBOTS), trials=10), workers=1)
     numbers = config.only or tuple(range(config.subsets))
     with tqdm(total=len(numbers), desc="subsets", disable=None) as bar:
         rows = []
         for row in _measured(config, numbers):
             rows.append(row)
             bar.update()
-    return {"config": asdict(config), "versions": versions(), "rows": rows, "summary": summary(rows)}
+    return opening(config) | {"rows": rows, "summary": summary(rows)}
 
 
 def _measured(config: Config, numbers: tuple[int, ...]) -> Iterator[dict[str, Any]]:
@@ -92,10 +83,10 @@ def measure(number: int, *, trials: int, seed: int) -> dict[str, Any]:
     problem, plan, plant = planned(robot)
     reached = []
     for scale in SCALES:
-        run = [one for one in (_scaled(one, scale) for one in disturbances) if one is not None]
-        law = ls.OffsetFree(problem, plan, ls.uncertainty_of(plant, run))
+        met = [one for one in (_scaled(one, scale) for one in disturbances) if one is not None]
+        law = ls.OffsetFree(problem, plan, ls.uncertainty_of(plant, met))
         rollout = ls.simulate(
-            plant, plan, controller=law, disturbances=run, trials=trials, seed=seed, first_trial=1000 * number,
+            plant, plan, controller=law, disturbances=met, trials=trials, seed=seed, first_trial=1000 * number,
             frames=False, contacts=False,
         )  # fmt: skip
         reached.append(np.array(ls.stress.outcomes(rollout).outcome) == "reached")
@@ -192,7 +183,4 @@ def report(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    given = tyro.cli(Config, description=__doc__)
-    found = main(given)
-    with contextlib.suppress(BrokenPipeError):
-        print(json.dumps(found) if given.json else report(found))
+    run(Config, main, report, __doc__, failures=lambda result: [result] if result["summary"]["harm"] else [])

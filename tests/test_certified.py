@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from whole_problems import planar_quadrotor
+from oracle import planar_quadrotor
 from whole_problems.claims import contradictions
 
 import lqrsim as ls
@@ -17,7 +17,9 @@ from lqrsim.solvers.certify import faults
 
 pytestmark = pytest.mark.timeout(900)  # what is not cached is compiled first
 
-GOOD = Certificate(cost=36.0, start=0.0, motion=1e-15, law=1e-15, limits=0.0, violation=0.0, optimality=1e-6)
+GOOD = Certificate(
+    cost=36.0, start=0.0, dynamics_residual=1e-15, policy_residual=1e-15, limits=0.0, violation=0.0, optimality=1e-6
+)
 
 
 class TestCertificate:
@@ -25,13 +27,13 @@ class TestCertificate:
         ("field", "value", "says"),
         [
             ("start", 1e-15, "begins 1e-15 off the fixed start"),
-            ("motion", 1e-7, "1e-07 off the dynamics"),
-            ("law", 1e-10, "1e-10 off the policy's"),
+            ("dynamics_residual", 1e-7, "1e-07 off the dynamics"),
+            ("policy_residual", 1e-10, "1e-10 off the policy's"),
             ("limits", 1e-15, "1e-15 beyond its limit"),
             ("violation", 1e-15, "a constraint is missed by 1e-15"),
             ("cost", 36.00001, "it costs 36.00001, not 36"),
             ("optimality", 3e-4, "its optimality is 0.0003, not below 0.0001"),
-            ("motion", float("nan"), "nan off the dynamics"),
+            ("dynamics_residual", float("nan"), "nan off the dynamics"),
             ("optimality", float("nan"), "its optimality is nan"),
         ],
     )
@@ -49,7 +51,7 @@ class TestCertificate:
         honest = certify.certificate_of
 
         def spoilt(*arguments: Any, **named: Any) -> Certificate:
-            return dataclasses.replace(honest(*arguments, **named), law=1e-6)
+            return dataclasses.replace(honest(*arguments, **named), policy_residual=1e-6)
 
         monkeypatch.setattr(certify, "certificate_of", spoilt)
         solution = solver(drive)
@@ -64,7 +66,7 @@ class TestCertificate:
         plan = solution.trajectory
         steps = [drive.dynamics.step(x, u, drive.dt) for x, u in zip(plan.states[:-1], plan.controls, strict=True)]
         np.testing.assert_allclose(steps, plan.states[1:], atol=1e-12)
-        assert solution.certificate.motion < 1e-12
+        assert solution.certificate.dynamics_residual < 1e-12
         assert solution.certificate.optimality == pytest.approx(solution.iterations[-1].optimality, rel=0.05)
         assert contradictions(drive, solution) == []
 

@@ -1,4 +1,4 @@
-"""Every script in experiments/ runs, and says what it is there to say."""
+"""Every script in experiments/ and tests/tools/ runs, and reports what it is for."""
 
 import itertools
 import json
@@ -17,18 +17,18 @@ import pytest
 import lqrsim as ls
 from lqrsim.disturbances import MassMismatch, MeasurementDropouts, MeasurementLatency
 
-FOLDER = Path(__file__).parent.parent / "experiments"
-SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if "__main__" in path.read_text(encoding="utf-8"))
+FOLDER, TOOLS = Path(__file__).parent.parent / "experiments", Path(__file__).parent / "tools"
+FILES = sorted([*FOLDER.glob("*.py"), *TOOLS.glob("*.py")])
+SCRIPTS = [path for path in FILES if "__main__" in path.read_text(encoding="utf-8")]
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_scripts_explain_themselves(
-    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    script: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    script = str(FOLDER / f"{name}.py")
-    monkeypatch.setattr(sys, "argv", [script, "--help"])
+    monkeypatch.setattr(sys, "argv", [str(script), "--help"])
     with pytest.raises(SystemExit) as ended:
-        runpy.run_path(script, run_name="__main__")
+        runpy.run_path(str(script), run_name="__main__")
     assert not ended.value.code
     assert "--quick" in capsys.readouterr().out
 
@@ -40,7 +40,7 @@ def benchmark(*arguments: str) -> dict[str, Any]:
         [sys.executable, script, "--quick", "--json", *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return json.loads(done.stdout)["result"]
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def test_benchmark_of_scaling_and_startup(results: dict[str, Any]) -> None:
 
 def test_benchmark_says_what_it_skips(tmp_path: Path) -> None:
     script = import_module("benchmark_solver")
-    with pytest.raises(script.Unavailable, match="name its folder with --reference"):
+    with pytest.raises(script.peers.Unavailable, match="name its folder with --reference"):
         script.speed.load_reference(script.Config(reference=tmp_path))
     assert script.report({"peers": {"skipped": "no such thing"}}) == "peers: skipped: no such thing"
 

@@ -64,29 +64,30 @@ from lqrsim.kernels.records import (
     CostModel,
     CostToCome,
     CostToGo,
-    Descent,
+    IlqrArrays,
+    IterationSettings,
     Limits,
-    Measured,
+    LinearStep,
+    Measurements,
     Motion,
-    Passes,
     Policy,
     Predictor,
-    Smoothing,
-    Stage,
-    Step,
+    QuadraticStage,
+    RiccatiArrays,
+    SmootherGains,
 )
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
-from lqrsim.kernels.records import Settings as KernelSettings
 from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.noise import numbers_of
 from lqrsim.results.hashing import sha256
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import compiled
-from lqrsim.solvers.attempt import Attempt
-from lqrsim.solvers.common import SmootherSettings, Stop
+from lqrsim.solvers.budget import Budget
+from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import resolve
 from lqrsim.solvers.interior_point import Stages
+from lqrsim.solvers.settings import SmootherSettings
 
 MEMORY = 1 << 20  # numbers from which an array is memory at an address, which has no end
 MADE: dict[Any, Entry] = {}  # what was compiled, by all that it depends on
@@ -113,8 +114,8 @@ DIVIDED = {
 # Kernels that are little more than calls of others, and take long to compile with all of these. They are compared where
 # there is no noise, in the dual form; elsewhere the entry that leads to them is.
 DRIVERS = (
-    "smoother_iterations", "damped_iterations", "damped_step", "relinearize", "model_come_to", "newton_iterations",
-    "newton_pass", "come_to_plan", "value_functions", "optimality", "keep_rollout",
+    "smoother_iterations", "damped_iterations", "damped_step", "relinearize", "value_functions_at_plan",
+    "newton_iterations", "newton_pass", "finish_at_plan", "value_functions", "optimality", "roll_out_and_keep",
 )  # fmt: skip
 
 
@@ -323,8 +324,8 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
     """
     wanted = settings_of(form=form)
     begin = np.zeros(3) if one.start is None else one.start
-    attempt = Attempt(one, wanted, resolve(start, one), begin, Stop())
-    work, log = attempt.work, np.zeros(3, LOG)
+    run = SolveRun(one, wanted, resolve(start, one), begin, Budget(wanted.max_iterations))
+    work, log = run.work, np.zeros(3, LOG)
     for array in work.multipliers:
         array[0] = penalty
         array[declarations.HEADER :] = 0.5
@@ -337,18 +338,18 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
         return
     for done in range(len(log)):
         work.memory["plan_cost"] = np.inf  # or rounding decides which plan is the best, of two that are as good
-        replay(source, sizes, "smoother", *with_rows(attempt._arguments(done, done + 1, log)), but=but)
-    attempt.roll_out()
+        replay(source, sizes, "smoother", *with_rows(run._arguments(done, done + 1, log)), but=but)
+    run.roll_out()
     work.memory["merit"] = work.memory["plan_cost"]
     work.memory["reach"], work.memory["ilqr_next"] = (1.0, 2.0) if task != "reach" else (0.0, 2.0)
     trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
     log = np.zeros(2, LOG)
     for done in range(2 if task else 0):
-        arguments = attempt._damped_arguments(done, done + 1, log, 2, trial)
+        arguments = run._damped_arguments(done, done + 1, log, 2, trial)
         replay(source, sizes, "smoother", *with_rows(arguments), but=but)
-    found = attempt.result(replace(attempt.termination, outcome=declarations.MAX_ITERATIONS))
+    found = run.result(replace(run.ending, outcome=declarations.MAX_ITERATIONS))
     for check in (declarations.CERTIFY, declarations.EVALUATE) if task else ():
-        arguments = attempt._check_arguments(check, found, work.arrays.to_go, np.zeros(1, CERTIFICATE))
+        arguments = run._check_arguments(check, found, work.arrays.to_go, np.zeros(1, CERTIFICATE))
         replay(source, sizes, "smoother", *with_rows(arguments))
 
 
@@ -417,12 +418,12 @@ class TestSolvers:
         one = problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=5)
         states, controls = np.zeros((6, 3)), np.zeros((5, 2))
         states[0] = (0.0, 0.0, 0.3)
-        work = Descent(
+        work = IlqrArrays(
             start=states[0].copy(), policy=Policy(np.zeros((5, 2, 3)), np.full((5, 2), 0.2)),
             to_go=CostToGo(np.zeros((6, 3, 3)), np.zeros((6, 3)), np.zeros(6)), plan=Motion(states, controls),
             trial=Motion(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
         )  # fmt: skip
-        options = KernelSettings(5, 3, 1e-4, 0.0, True, True, False, 0)
+        options = IterationSettings(5, 3, 1e-4, 0.0, True, True, False, 0)
         source, sizes = compiled._with_form("dual", "entry_points"), sizes_of(one)
         for task in (declarations.ITERATE, declarations.CERTIFY):
             given = task, 0, 3, options, compiled.arguments(one), work, np.zeros(4, LOG)
@@ -443,15 +444,15 @@ class TestSolvers:
     def test_linear_quadratic_passes(self, form: str) -> None:
         rng, n, m, steps = np.random.default_rng(0), 3, 2, 4
         root = rng.normal(size=(steps, 5, 5))
-        costs = Stage(root @ root.transpose(0, 2, 1), rng.normal(size=(steps, 5)))
+        costs = QuadraticStage(root @ root.transpose(0, 2, 1), rng.normal(size=(steps, 5)))
         jacobian = np.concatenate([np.eye(3) + 0.1 * rng.normal(size=(steps, 3, 3)), rng.normal(size=(steps, 3, 2))], 2)
-        forward = Step(jacobian, rng.normal(size=(steps, 3)))
+        forward = LinearStep(jacobian, rng.normal(size=(steps, 3)))
         value = np.zeros((steps + 1, n, n)), np.zeros((steps + 1, n)), np.zeros(steps + 1)
         go, come = (tuple(array.copy() for array in value) for _ in range(2))
         go[0][-1] = come[0][0] = np.eye(3)
-        work = Passes(
+        work = RiccatiArrays(
             Policy(np.zeros((steps, m, n)), np.zeros((steps, m))), CostToGo(*go), CostToCome(*come),
-            Smoothing(np.zeros((steps, n, n)), np.zeros((steps, n)), np.zeros((steps, m, n)), np.zeros((steps, m))),
+            SmootherGains(np.zeros((steps, n, n)), np.zeros((steps, n)), np.zeros((steps, m, n)), np.zeros((steps, m))),
             np.zeros((steps + 1, n)),
         )  # fmt: skip
         source = compiled._with_form(form, "linear_quadratic_passes")
@@ -464,12 +465,13 @@ class Begun:
 
     def __init__(self, one: ls.Problem, form: str = "dual", start: Any = None, **changed: Any) -> None:
         begin = np.zeros(3) if one.start is None else one.start
-        self.attempt = Attempt(one, settings_of(form=form, **changed), resolve(start, one), begin, Stop())
-        self.work, self.log = self.attempt.work, np.zeros(20, LOG)
+        settings = settings_of(form=form, **changed)
+        self.run = SolveRun(one, settings, resolve(start, one), begin, Budget(settings.max_iterations))
+        self.work, self.log = self.run.work, np.zeros(20, LOG)
         self.source, self.sizes = compiled._with_form(form, "entry_points"), sizes_of(one)
 
     def iterate(self, first: int, last: int, **changed: Any) -> tuple[Any, ...]:
-        given = list(self.attempt._arguments(first, last, self.log))
+        given = list(self.run._arguments(first, last, self.log))
         given[3] = given[3]._replace(**changed)
         return replay(self.source, self.sizes, "smoother", *with_rows(tuple(given)))
 
@@ -477,7 +479,7 @@ class Begun:
         for name, number in memory.items():
             self.work.memory[name] = number
         trial = Motion(np.zeros_like(self.work.states), np.zeros_like(self.work.controls))
-        given = self.attempt._damped_arguments(first, last, self.log, last + 1, trial)
+        given = self.run._damped_arguments(first, last, self.log, last + 1, trial)
         return replay(self.source, self.sizes, "smoother", *with_rows(given))
 
 
@@ -490,9 +492,9 @@ def descended(
     """
     settings = settings_of(form=form, finish="newton", tolerance=tolerance)
     begin = np.zeros(3) if one.start is None else one.start
-    attempt = Attempt(one, settings, resolve(None, one), begin, Stop())
-    attempt.run(1, each=False)
-    work, log, outcome = attempt.work, np.zeros(count, LOG), declarations.RUNNING
+    run = SolveRun(one, settings, resolve(None, one), begin, Budget(settings.max_iterations))
+    run.smooth(1)
+    work, log, outcome = run.work, np.zeros(count, LOG), declarations.RUNNING
     work.memory["merit"], work.memory["share"] = work.memory["plan_cost"], -1.0
     for name, number in memory.items():
         work.memory[name] = number
@@ -504,7 +506,7 @@ def descended(
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     for done in range(count):
         if outcome == declarations.RUNNING:
-            arguments = attempt._newton_arguments(done, done + 1, log, count, trial)
+            arguments = run._newton_arguments(done, done + 1, log, count, trial)
             _, outcome, _, _ = replay(source, sizes, "smoother", *with_rows(arguments), but=but)
     return outcome
 
@@ -564,9 +566,9 @@ class TestRareEnds:
     def test_iterations_that_get_nowhere(self) -> None:
         """The plan has converged; with a tolerance of zero it never settles."""
         one = Begun(problem(), max_iterations=20)
-        *given, log = one.attempt._arguments(0, 19, one.log)
+        *given, log = one.run._arguments(0, 19, one.log)
         given[3] = given[3]._replace(tolerance=0.0)
-        done, outcome, *_ = one.attempt._loop(*given, log)
+        done, outcome, *_ = one.run._loop(*given, log)
         assert outcome == declarations.CYCLING
         one.work.memory["plan_cost"] = 0.0  # or rounding would decide which plan is the best
         assert one.iterate(done, done + 1, tolerance=0.0)[1] == declarations.CYCLING
@@ -596,7 +598,7 @@ class TestRareEnds:
     def test_damped_iterations_that_are_rejected(self) -> None:
         """A merit that no step can have; then with a weight, which grows, and falls again."""
         one = Begun(problem())
-        one.attempt._loop(*one.attempt._arguments(0, 2, one.log))
+        one.run._loop(*one.run._arguments(0, 2, one.log))
         begin = {"reach": 1.0, "ilqr_next": 2.0, "plan_cost": float(one.work.memory["plan_cost"])}
         assert one.damped(0, 3, merit=-1e9, **begin)[1] == declarations.RUNNING
         assert one.log["method"][:3].tolist() == [declarations.REJECTED] * 3
@@ -617,12 +619,12 @@ class TestRareEnds:
         one = problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=3, **given)
         source, sizes, log = compiled._with_form("dual", "entry_points"), sizes_of(one), np.zeros(5, LOG)
         model, states, controls = compiled.arguments(one), np.zeros((4, 3)), np.zeros((3, 2))
-        work = Descent(
+        work = IlqrArrays(
             start=np.array([0.0, 0.0, 0.3]), policy=Policy(np.zeros((3, 2, 3)), np.full((3, 2), 0.2)),
             to_go=CostToGo(np.zeros((4, 3, 3)), np.zeros((4, 3)), np.zeros(4)), plan=Motion(states, controls),
             trial=Motion(states.copy(), controls.copy()), damping=np.zeros(1), certificate=np.zeros(1, CERTIFICATE),
         )  # fmt: skip
-        options = KernelSettings(3, 4, 1e-9, 0.0, True, True, False, 0)
+        options = IterationSettings(3, 4, 1e-9, 0.0, True, True, False, 0)
 
         def iterate(first: int, last: int) -> Any:
             given = declarations.ITERATE, first, last, options, model, work, log
@@ -668,10 +670,10 @@ class TestRareEnds:
         zero, eye = np.zeros((3, 3)), np.eye(3)
         of_certificate, dual = source_of(certificate), source_of(cost_to_come_dual)
         box = np.array([1.0, -2.0]), np.full(2, -1.0), np.full(2, 1.0), np.zeros(2)
-        assert np.isnan(replay(of_certificate, SIZES, "within_box", -np.eye(2), *box))
-        stage = Stage(np.zeros((5, 5)), np.zeros(5))
-        assert replay(of_certificate, SIZES, "promised_of_start", stage, zero, np.zeros(3)) == 0
-        assert replay(of_certificate, SIZES, "promised_of_start", stage, -eye, np.ones(3)) == 3e300
+        assert np.isnan(replay(of_certificate, SIZES, "box_decrease", -np.eye(2), *box))
+        stage = QuadraticStage(np.zeros((5, 5)), np.zeros(5))
+        assert replay(of_certificate, SIZES, "start_decrease", stage, zero, np.zeros(3)) == 0
+        assert replay(of_certificate, SIZES, "start_decrease", stage, -eye, np.ones(3)) == 3e300
         assert replay(source_of(linear_algebra), SIZES, "finite", eye.copy(), 3, 3)
         for V, Q, size, good in (
             (eye, np.diag([1.0, 2.0, 3.0]), np.ones(3), True), (1e6 * eye, np.ones((3, 3)), np.ones(3), True),
@@ -683,7 +685,7 @@ class TestRareEnds:
             to_go = CostToGo(S[None].copy(), np.ones((1, 3)), np.zeros(1))
             to_come = CostToCome(V[None].copy(), np.ones((1, 3)), np.zeros(1))
             for form in (dual, source_of(cost_to_come_primal)):
-                replay(form, SIZES, "minimizer", 0, to_go, to_come, np.zeros(3), np.zeros(3))
+                replay(form, SIZES, "smoothed_state", 0, to_go, to_come, np.zeros(3), np.zeros(3))
         for Q, S in ((eye, zero), (zero, zero), (np.diag([1.0, 0.0, 0.0]), eye), (-eye, zero)):
             to_go = CostToGo(S[None].copy(), np.ones((1, 3)), np.zeros(1))
             to_come = CostToCome(zero[None].copy(), np.zeros((1, 3)), np.zeros(1))
@@ -695,11 +697,11 @@ class TestRareEnds:
         """Backward, forward, and of their sum; what is returned tells which."""
         eye = np.eye(3, 5)
         for form, spoil, wanted in (
-            ("dual", "nothing", (-1, 0)), ("dual", "backward", (2, 0)), ("dual", "forward", (0, 1)),
+            ("dual", "negligible", (-1, 0)), ("dual", "backward", (2, 0)), ("dual", "forward", (0, 1)),
             ("primal", "sum", (0, 2)),
         ):  # fmt: skip
-            costs = Stage(np.tile(np.eye(5), (3, 1, 1)), np.ones((3, 5)))
-            forward = Step(np.tile(eye + np.eye(3, 5, k=3), (3, 1, 1)), np.zeros((3, 3)))
+            costs = QuadraticStage(np.tile(np.eye(5), (3, 1, 1)), np.ones((3, 5)))
+            forward = LinearStep(np.tile(eye + np.eye(3, 5, k=3), (3, 1, 1)), np.zeros((3, 3)))
             values = [(np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3)), np.zeros(4)) for _ in range(2)]
             backwards = forward
             if spoil == "backward":
@@ -707,10 +709,10 @@ class TestRareEnds:
             if spoil == "forward":  # the cost-to-go makes up for it
                 costs.hessian[:, 3:, 3:] = -0.1 * np.eye(2)
             if spoil == "sum":
-                backwards, values[1][0][0] = Step(np.tile(eye, (3, 1, 1)), np.zeros((3, 3))), -100 * np.eye(3)
-            work = Passes(
+                backwards, values[1][0][0] = LinearStep(np.tile(eye, (3, 1, 1)), np.zeros((3, 3))), -100 * np.eye(3)
+            work = RiccatiArrays(
                 Policy(np.zeros((3, 2, 3)), np.zeros((3, 2))), CostToGo(*values[0]), CostToCome(*values[1]),
-                Smoothing(np.zeros((3, 3, 3)), np.zeros((3, 3)), np.zeros((3, 2, 3)), np.zeros((3, 2))),
+                SmootherGains(np.zeros((3, 3, 3)), np.zeros((3, 3)), np.zeros((3, 2, 3)), np.zeros((3, 2))),
                 np.zeros((4, 3)),
             )  # fmt: skip
             source = compiled._with_form(form, "linear_quadratic_passes")
@@ -720,7 +722,7 @@ class TestRareEnds:
     def test_parts_of_steps_that_are_taken_back(self) -> None:
         plan, x_hats = Motion(np.ones((4, 3)), np.ones((3, 2))), np.arange(12.0).reshape(4, 3)
         for fraction in (1.0, 0.25):
-            replay(source_of(rollouts), SIZES | {"NOISY": 0}, "follow", 3, fraction, plan, x_hats)
+            replay(source_of(rollouts), SIZES | {"NOISY": 0}, "shorten_step", 3, fraction, plan, x_hats)
 
     def test_where_mujoco_can_not_go(self) -> None:
         """From no number, backwards in time, and beyond all numbers; and rotations that are whole turns."""
@@ -877,11 +879,11 @@ class TestParts:
             policy, costs = Policy(np.zeros((3, 2, 3)), np.full((3, 2), 0.1)), np.zeros(2)
             draws = np.random.default_rng(0).normal(size=(6, 2))
             replay(source, SIZES, "noisy_costs", 2, 3, X.copy(), policy, compiled.arguments(one), draws, costs)
-            from lqrsim.kernels.records import Ahead
+            from lqrsim.kernels.records import NextStep
 
-            ahead = Ahead(np.eye(3, 5), X, 2 * np.eye(3), -X)
+            ahead = NextStep(np.eye(3, 5), X, 2 * np.eye(3), -X)
             for risk in (0.0, 0.1, -0.3, 1e6):
-                stage, risky = Stage(np.zeros((5, 5)), np.zeros(5)), np.array([risk, 0.0])
+                stage, risky = QuadraticStage(np.zeros((5, 5)), np.zeros(5)), np.array([risk, 0.0])
                 replay(source, SIZES, "noise_quadratic", X, U, numbers_of(term), risky, ahead, 0, stage)
                 replay(source, SIZES, "noise_value", X, U, numbers_of(term), risky, ahead)
 
@@ -986,8 +988,8 @@ class TestControl:
         near, law = 5 * rng.normal(size=(3, 4)), Policy(rng.normal(size=(2, 4)), rng.normal(size=2))
         near[0, 1:] = 0.0
         limits, turning = Limits(np.full(2, -1.0), np.full(2, 1.0)), turning_of(space)
-        replay(source, sizes, "apply_law", 3, near, law, rng.normal(size=4), turning, limits, np.zeros((3, 2)))
-        replay(source, sizes, "turn_all", 2, 2, 5 * rng.normal(size=(4, 4)), rng.normal(size=(2, 4)), turning)
+        replay(source, sizes, "apply_policy", 3, near, law, rng.normal(size=4), turning, limits, np.zeros((3, 2)))
+        replay(source, sizes, "all_to_nearest", 2, 2, 5 * rng.normal(size=(4, 4)), rng.normal(size=(2, 4)), turning)
 
     @pytest.mark.parametrize("lag", [0, 2])
     def test_estimation(self, lag: int) -> None:
@@ -1003,7 +1005,7 @@ class TestControl:
         rng, k = np.random.default_rng(1), 3
         estimates, turning = rng.normal(size=(k, z)), turning_of(CART.state_coordinates)
         states, controls = rng.normal(size=(k, 3)), rng.normal(size=(k, 2))
-        measured = Measured(states, np.array([0.0, 1.0, 0.0]))
+        measured = Measurements(states, np.array([0.0, 1.0, 0.0]))
         replay(
             source,
             SIZES,
@@ -1049,9 +1051,9 @@ class TestInteriorPoint:
         begun, costates = (3, 1), rng.normal(size=(4, 3))
         for second in (0, 1):
             given = *begun, second, 0, plan, costates, stages._model, stages._values, rows, stages.models
-            replay(source_of(active_set), SIZES, "look", *given, stages.active._replace(size=0))
+            replay(source_of(active_set), SIZES, "linearize_plan", *given, stages.active._replace(size=0))
         replay(source, SIZES, "convex_models", *begun, plan, stages._model, stages.models)
-        replay(source, SIZES, "trial", *begun, plan, stages._model, np.zeros((3, 3)))
+        replay(source, SIZES, "trial_cost", *begun, plan, stages._model, np.zeros((3, 3)))
         gradient, jacobian = stages.models.gradient, stages.models.jacobian
         replay(source, SIZES, "adjoint", 3, gradient, jacobian, np.zeros((4, 3)), np.zeros((3, 2)))
         policy = Policy(np.zeros((3, 2, 3)), np.zeros((3, 2)))
@@ -1070,7 +1072,7 @@ class TestInteriorPoint:
         assert changes.states.any()
         limits = Limits(plan.controls - 0.1, plan.controls + 0.1)
         out = Motion(np.zeros((4, 3)), np.zeros((3, 2)))
-        replay(source, SIZES, "follow", 3, 0.5, plan, policy, limits, stages._model, out)
+        replay(source, SIZES, "closed_loop_rollout", 3, 0.5, plan, policy, limits, stages._model, out)
         bent = convex.copy()
         bent[2, 3:, 3:] -= 1e4 * np.eye(2)
         assert direction(bent) == 2  # the controls of that step have no least
@@ -1103,8 +1105,10 @@ class TestActiveSet:
         gaps, costates = np.zeros((3, 3)), rng.normal(size=(4, 3))
         for own in (0, 1):
             given = 3, 1, 1, own, plan, costates, stages._model, stages._values, known, stages.models
-            replay(source, SIZES, "look", *given, active)
-        replay(source, SIZES, "measure", 3, plan, stages.models, gaps, active, np.full(3, 0.5), np.full(2, 2.0))
+            replay(source, SIZES, "linearize_plan", *given, active)
+        replay(
+            source, SIZES, "optimality_measures", 3, plan, stages.models, gaps, active, np.full(3, 0.5), np.full(2, 2.0)
+        )
         stages.convexify(plan)
         stages.models.convex[...] += np.eye(5)
         policy = Policy(np.zeros((3, 2, 3)), np.zeros((3, 2)))
@@ -1120,7 +1124,7 @@ class TestActiveSet:
             assert failed == -1
             assert wrong == np.count_nonzero(active.wrong) > 1
             before = active.held.copy()
-            replay(source, SIZES, "change", 3, worst, active)
+            replay(source, SIZES, "update_active_set", 3, worst, active)
             changed = np.flatnonzero(active.held != before)
             assert (active.wrong[changed] < 0).all()
             assert 1 <= len(changed) <= (wrong if worst else 1)
@@ -1129,7 +1133,7 @@ class TestActiveSet:
         limits = Limits(*(np.tile(side, (3, 1)) for side in (stages.low, stages.high)))
         motion = Motion(np.zeros((4, 3)), np.zeros((3, 2)))
         given = 3, 1, plan, policy, limits, active, stages._model, stages._values, motion
-        replay(source, SIZES, "carry_out", *given)
+        replay(source, SIZES, "rollout_of_active_set", *given)
 
 
 def test_no_kernel_is_left_out() -> None:

@@ -1,7 +1,7 @@
 """Newton's method at the end of `smooth`: its second derivatives, its order, what it finds, and its policy.
 
 References are differences of what has fewer derivatives, problems solved again from other starts, and
-`whole_problems.kkt`, which knows a problem by its formulas alone.
+`oracle.kkt`, which knows a problem by its formulas alone.
 """
 
 import ctypes

@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from linear_quadratic import LinearQuadratic, solve_dense
-from whole_problems import kkt
+from oracle import kkt
 
 import lqrsim as ls
 from lqrsim.errors import Array

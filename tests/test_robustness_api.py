@@ -1,5 +1,5 @@
 """Hostile calls of the public API: one clear line of InputError, whatever is passed; a sample of what
-experiments/benchmark_robustness.py tries, and the cases that once were not refused."""
+tests/tools/benchmark_robustness.py tries, and the cases that once were not refused."""
 
 import ast
 import dataclasses

@@ -7,7 +7,8 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
-from whole_problems import draws, known, planar_quadrotor
+from oracle import planar_quadrotor
+from whole_problems import draws, known
 from whole_problems.claims import contradictions
 
 import lqrsim as ls

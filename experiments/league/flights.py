@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from whole_problems import planar_quadrotor
+from oracle import planar_quadrotor
 
 import lqrsim as ls
 

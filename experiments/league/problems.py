@@ -8,7 +8,7 @@ import altro_problems
 import numpy as np
 import three_link_arm
 from numpy.typing import NDArray
-from whole_problems import planar_quadrotor
+from oracle import planar_quadrotor
 
 import lqrsim as ls
 from league import flights

@@ -1,13 +1,13 @@
 """Whether a plan is what a solver says of it, in plain NumPy: nothing of lqrsim's or the other solvers' is used.
 
-Dynamics, costs and constraints are evaluated anew by `whole_problems/kkt.py` and `constraints.py`: formulas through
+Dynamics, costs and constraints are evaluated anew by `oracle/kkt.py` and `constraints.py`: formulas through
 SymPy's `lambdify`, distances from geometry.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from whole_problems import constraints, kkt
+from oracle import constraints, kkt
 
 import lqrsim as ls
 from lqrsim.errors import Array

@@ -66,12 +66,12 @@ _SIGNATURES: dict[str, tuple[str | Scalar, ...]] = {
     "augmentation": ("", "", INT, "", ""),  # x, u, t, data, multipliers
     "constraint_values": ("", "", INT, INT, "", "", ""),  # x, u, t, acts, data, multipliers, values
     "add_slope": ("", "", INT, INT, "", ""),  # x, u, t, row, data, gradient
-    "noise_value": ("", "", "", "", "Ahead"),  # x, u, data, risk, ahead
-    "noise_quadratic": ("", "", "", "", "Ahead", INT, "Stage"),  # x, u, data, risk, ahead, convex, stage
+    "noise_value": ("", "", "", "", "NextStep"),  # x, u, data, risk, ahead
+    "noise_quadratic": ("", "", "", "", "NextStep", INT, "QuadraticStage"),  # x, u, data, risk, ahead, convex, stage
     "measure": ("", "", ""),  # x, data, out
     "measure_slope": ("", "", "N"),  # x, data, out
 }
-_RECORDS = {"Ahead": ("W", "", "N", ""), "Stage": ("W", "")}
+_RECORDS = {"NextStep": ("W", "", "N", ""), "QuadraticStage": ("W", "")}
 
 
 class CompiledModule:

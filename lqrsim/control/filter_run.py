@@ -9,7 +9,7 @@ from lqrsim.control.controllers import ControllerRun
 from lqrsim.control.filter_law import FilterLaw
 from lqrsim.errors import Array
 from lqrsim.kernels.estimation import FAR
-from lqrsim.kernels.records import Limits, Measured, Policy
+from lqrsim.kernels.records import Limits, Measurements, Policy
 
 
 class FilterRun(ControllerRun):
@@ -66,7 +66,7 @@ class FilterRun(ControllerRun):
         lost = (measured == self._last).all(axis=1).astype(np.float64)
         self._last[:] = measured
         model.compiled.correct(
-            self._trials, Measured(in_c_order(measured), lost), in_c_order(law.model.plan.states[knot]),
+            self._trials, Measurements(in_c_order(measured), lost), in_c_order(law.model.plan.states[knot]),
             law.filter.gain[knot], model.compiled_sensor, model.turning, self.z, self._differences,
         )  # fmt: skip
         at = step - self._latency

@@ -11,7 +11,7 @@ from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
 from lqrsim.kernels import policy_evaluation
-from lqrsim.kernels.records import Limits, Policy, Turning
+from lqrsim.kernels.records import AngularStates, Limits, Policy
 from lqrsim.results.coordinates import Coordinates
 
 
@@ -26,7 +26,7 @@ def evaluator(states: Coordinates, controls: Coordinates) -> Callable[..., Array
     def evaluate(shown: Array, gain: Array, offset: Array, nominal: Array) -> Array:
         near, out = np.array(shown, dtype=np.float64), np.empty((len(shown), len(controls)))
         law = Policy(in_c_order(gain), in_c_order(offset))
-        laws.apply_law(len(shown), near, law, in_c_order(nominal), turning, limits, out)
+        laws.apply_policy(len(shown), near, law, in_c_order(nominal), turning, limits, out)
         return out
 
     return evaluate
@@ -35,14 +35,14 @@ def evaluator(states: Coordinates, controls: Coordinates) -> Callable[..., Array
 def turn_to_nearest(space: Coordinates, states: Array, nominal: Array) -> None:
     """As `space.nearest`, compiled and in place: states (T+1, K, n), C-ordered, become those nearest to (T+1, n)."""
     flat, turning = states.reshape(-1, len(space)), turning_of(space)
-    _laws(len(space), 1).turn_all(len(states), states.shape[1], flat, in_c_order(nominal), turning)
+    _laws(len(space), 1).all_to_nearest(len(states), states.shape[1], flat, in_c_order(nominal), turning)
 
 
 def _laws(n: int, m: int) -> CompiledModule:
     return module_of(source_of(policy_evaluation), f"policies of {n} states and {m} controls", N=n, M=m, W=n + m)
 
 
-def turning_of(space: Coordinates) -> Turning:
+def turning_of(space: Coordinates) -> AngularStates:
     """Which states are to be turned to the nearest, as `kernels/policy_evaluation.py` takes it."""
     angles, rotations = (np.array(one, dtype=np.float64) for one in (space.angles, space.rotation_vectors))
-    return Turning(angles, len(angles), rotations, len(rotations))
+    return AngularStates(angles, len(angles), rotations, len(rotations))

@@ -16,7 +16,7 @@ from lqrsim.control.plan_model import PlanModel
 from lqrsim.errors import Array
 
 
-class Moments(NamedTuple):
+class LoopMoments(NamedTuple):
     """Of a closed loop about its plan, X as above.
 
     Attributes:
@@ -51,7 +51,7 @@ class Loop:
     low: Array
     high: Array
 
-    def moments(self) -> Moments:
+    def moments(self) -> LoopMoments:
         """Prediction from the start to the plan's end; of C laws, gain (C, T, m, Z), all at once."""
         model, steps, n, size = self.model, self.model.plan.steps, self.model.n, self.model.size
         estimates = self.filter_gain is not None
@@ -83,7 +83,7 @@ class Loop:
             covariance[..., t + 1, :, :] = 0.5 * (ahead + np.swapaxes(ahead, -1, -2))
             drift = np.tile(model.c[t], width // size)
             mean[..., t + 1, :] = mean[..., t, :] @ free.T + (level - planned) @ onto.T + drift
-        return Moments(mean, covariance, across, std, saturation)
+        return LoopMoments(mean, covariance, across, std, saturation)
 
     def _without_control(self, t: int, seen: Array) -> tuple[Array, Array]:
         """How X goes on without a deviation of the control, and what that adds, (X, X) and (X, m)."""

@@ -31,7 +31,7 @@ from lqrsim.control.uncertainty import (
 )
 from lqrsim.errors import Array
 from lqrsim.kernels import estimation
-from lqrsim.kernels.records import DynamicsModel, Predictor, SensorModel, Turning
+from lqrsim.kernels.records import AngularStates, DynamicsModel, Predictor, SensorModel
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers.compiled import dynamics_model
@@ -193,7 +193,7 @@ class PlanModel:
         return SensorModel(measure, slope, self.sensor.data)
 
     @cached_property
-    def turning(self) -> Turning:
+    def turning(self) -> AngularStates:
         """Which states are angles."""
         return turning_of(self.dynamics.state_coordinates)
 

@@ -9,13 +9,13 @@ from math import inf, isnan
 from lqrsim.kernels.declarations import M, N, W, stack
 from lqrsim.kernels.interior_point import (
     add_initial,
+    closed_loop_rollout,
+    constraint_slopes,
     cost_of_plan,
-    end_with,
-    follow,
-    lead,
-    slopes,
+    forward_sweep,
+    riccati_step,
     stage_models,
-    step_back,
+    terminal_cost_to_go,
 )
 from lqrsim.kernels.model_functions import evaluate_constraints
 
@@ -26,7 +26,7 @@ INEQUALITY, LIMIT, EQUALITY = 0, 1, 2
 ROUNDING = 1e-10  # of a row's size, by which it may be missed by a model
 
 
-def look(steps, soft, second, own, plan, costates, model, values, rows, out, active):
+def linearize_plan(steps, soft, second, own, plan, costates, model, values, rows, out, active):
     """Write the models of all stages at a plan: those of its cost, its steps and its constraints; and the numbers of
     the active set's rows, if it has any. Return the cost.
 
@@ -39,13 +39,13 @@ def look(steps, soft, second, own, plan, costates, model, values, rows, out, act
     """
     if active.size > 0:
         evaluate_constraints(steps, plan.states, plan.controls, model.stage.constraints, values)
-        take_numbers(steps, plan, model.stage.constraints, values, rows, active)
-    slopes(steps, plan, model.stage.constraints, rows, out)
+        read_row_values(steps, plan, model.stage.constraints, values, rows, active)
+    constraint_slopes(steps, plan, model.stage.constraints, rows, out)
     total, slope = 0.0, stack(W)
     for t in range(steps, -1, -1):
         total += stage_models(t, steps, second, plan, costates, model, rows, out)
         if own == 1 and t > 0:
-            slope_at(t, steps, costates[min(t + 1, steps)], out, active, slope)
+            lagrangian_slope(t, steps, costates[min(t + 1, steps)], out, active, slope)
             for i in range(N):
                 costates[t, i] = slope[i]
     if soft == 1:
@@ -53,7 +53,7 @@ def look(steps, soft, second, own, plan, costates, model, values, rows, out, act
     return total
 
 
-def take_numbers(steps, plan, constraints, values, rows, active):
+def read_row_values(steps, plan, constraints, values, rows, active):
     """Write what all rows have to spare, in the order of rows."""
     for t in range(steps + 1):
         u = plan.controls[min(t, steps - 1)]
@@ -72,7 +72,7 @@ def take_numbers(steps, plan, constraints, values, rows, active):
                 active.force[at], active.held[at] = 0.0, 0.0
 
 
-def slope_at(t, steps, after, models, active, slope):
+def lagrangian_slope(t, steps, after, models, active, slope):
     """Write the slope (W,) of the Lagrangian in the state and the control at t, given the costate (N,) after it."""
     for i in range(W):
         slope[i] = models.gradient[t, i]
@@ -87,7 +87,7 @@ def slope_at(t, steps, after, models, active, slope):
                 slope[i] -= active.force[at] * models.slopes[at, i]
 
 
-def measure(steps, plan, models, gaps, active, state_size, control_size):
+def optimality_measures(steps, plan, models, gaps, active, state_size, control_size):
     """How far a plan is from an optimum; writes its gaps (T, N).
 
     Returns:
@@ -98,7 +98,7 @@ def measure(steps, plan, models, gaps, active, state_size, control_size):
     slope, after = stack(W), stack(N)
     steepest, missed, unequal, widest, product = 0.0, -inf, 0.0, 0.0, 0.0
     for t in range(steps, -1, -1):
-        slope_at(t, steps, after, models, active, slope)
+        lagrangian_slope(t, steps, after, models, active, slope)
         for i in range(N):
             after[i] = slope[i]
         if t < steps:
@@ -132,8 +132,8 @@ def pivot(steps, free, share, scale, weight, price, models, gaps, active, policy
       free: (N,) 0 for the states that the start fixes. share: of the projected Hessian of the cost.
       scale: cost that multipliers are relative to. weight: on what a row that is held is away from zero, by its size;
         of constraints that share of it that is `price`.
-      models: `records.StageModels`. gaps: (T, N). active: `records.ActiveRows`. policy, to_go: as in `step_back`; the
-        gradients are the costates where the step leads. changes: gets those of the plan.
+      models: `records.StageModels`. gaps: (T, N). active: `records.ActiveRows`. policy, to_go: as in
+        `riccati_step`; the gradients are the costates where the step leads. changes: gets those of the plan.
 
     Returns:
       The step whose control block is not positive definite, steps + 1 where it is the start's, or else -1; and how many
@@ -143,18 +143,18 @@ def pivot(steps, free, share, scale, weight, price, models, gaps, active, policy
     for t in range(steps, -1, -1):
         for i in range(W):
             slope[i] = models.gradient[t, i]
-        mix(share, models.hessian[t], models.convex[t], stage)
-        hold(t, weight, price, models, active, stage, slope)
+        blend(share, models.hessian[t], models.convex[t], stage)
+        add_held_rows(t, weight, price, models, active, stage, slope)
         if t == steps:
-            end_with(steps, stage, slope, to_go)
-        elif not step_back(t, stage, slope, models.jacobian[t], gaps[t], policy, to_go):
+            terminal_cost_to_go(steps, stage, slope, to_go)
+        elif not riccati_step(t, stage, slope, models.jacobian[t], gaps[t], policy, to_go):
             return t, 0
-    if not lead(steps, free, models.jacobian, gaps, policy, to_go, changes):
+    if not forward_sweep(steps, free, models.jacobian, gaps, policy, to_go, changes):
         return steps + 1, 0
-    return -1, look_ahead(steps, scale, weight, price, models, active, changes)
+    return -1, predict_rows(steps, scale, weight, price, models, active, changes)
 
 
-def mix(share, one, other, out):
+def blend(share, one, other, out):
     """Write a matrix (W, W) with that share of another one in it."""
     for i in range(W):
         for j in range(W):
@@ -166,13 +166,13 @@ def mix(share, one, other, out):
                 out[i, j] = (1 - share) * one[i, j] + share * other[i, j]
 
 
-def hold(t, weight, price, models, active, stage, slope):
+def add_held_rows(t, weight, price, models, active, stage, slope):
     """Add what the rows at a step that are held add to its model."""
     for row in range(active.size):
         at = active.size * t + row
         if active.held[at] == 0:
             continue
-        own = weight_of(row, weight, price, active)
+        own = held_weight(row, weight, price, active)
         pull = own * (active.numbers[at] - active.table[row, AIM]) - active.force[at]
         for i in range(W):
             entry = models.slopes[at, i]
@@ -182,13 +182,13 @@ def hold(t, weight, price, models, active, stage, slope):
                     stage[i, j] += own * entry * models.slopes[at, j]
 
 
-def weight_of(row, weight, price, active):
+def held_weight(row, weight, price, active):
     """The weight on a row that is held."""
     size = active.table[row, SIZE]
     return (weight if active.table[row, KIND] == LIMIT else price * weight) / (size * size)
 
 
-def look_ahead(steps, scale, weight, price, models, active, changes):
+def predict_rows(steps, scale, weight, price, models, active, changes):
     """Write the multipliers that a step leads to, and which rows are wrong there; returns how many."""
     count = 0
     for t in range(steps + 1):
@@ -204,7 +204,7 @@ def look_ahead(steps, scale, weight, price, models, active, changes):
                 for i in range(M):
                     ahead += models.slopes[at, N + i] * changes.controls[t, i]
             if active.held[at] != 0:
-                active.pressing[at] = active.force[at] - weight_of(row, weight, price, active) * ahead
+                active.pressing[at] = active.force[at] - held_weight(row, weight, price, active) * ahead
                 missed = 0.0 if active.table[row, KIND] == EQUALITY else active.pressing[at] * size / scale
             else:
                 missed = ahead / size
@@ -214,7 +214,7 @@ def look_ahead(steps, scale, weight, price, models, active, changes):
     return count
 
 
-def change(steps, worst, active):
+def update_active_set(steps, worst, active):
     """Hold rows that are missed, and let those go that pull.
 
     Args:
@@ -238,7 +238,7 @@ def change(steps, worst, active):
         active.held[last] = 1 - active.held[last]
 
 
-def carry_out(steps, soft, plan, policy, limits, active, model, values, out):
+def rollout_of_active_set(steps, soft, plan, policy, limits, active, model, values, out):
     """Write the motion that a plan comes to with a policy about it, and the constraints' numbers; return its cost.
 
     Args:
@@ -256,6 +256,6 @@ def carry_out(steps, soft, plan, policy, limits, active, model, values, out):
                 plan.controls[t, i] = active.table[row, SIDE]
                 for j in range(N):
                     policy.gain[t, i, j] = 0.0
-    follow(steps, 0.0, plan, policy, limits, model, out)
+    closed_loop_rollout(steps, 0.0, plan, policy, limits, model, out)
     evaluate_constraints(steps, out.states, out.controls, model.stage.constraints, values)
     return cost_of_plan(steps, soft, out, model)

@@ -16,7 +16,7 @@ from lqrsim.kernels.declarations import (
 )
 from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve
 from lqrsim.kernels.model_functions import cost_added, cost_quadratic, noise_quadratic, step_jacobian
-from lqrsim.kernels.records import Ahead, Limits, Stage, Step
+from lqrsim.kernels.records import Limits, LinearStep, NextStep, QuadraticStage
 
 
 def certify(settings, own, plan, policy, to_go, model, found):
@@ -34,7 +34,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
     it is with controls at their limits, and written to the cost-to-go: those of a Riccati pass take controls to respond
     that cannot. The cost includes no augmented Lagrangian, the decrease does.
     """
-    stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
+    stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived, room = stack(N), Limits(stack(M), stack(M))
     none, costate, size, beyond = stack(M), stack(N), stack(N), stack(N)
     states, steps, hessians, nowhere = plan.states, settings.steps, to_go.hessian, stack(N)
@@ -59,7 +59,7 @@ def certify(settings, own, plan, policy, to_go, model, found):
         cost += cost_quadratic(x, u, t, model.stage, stage.hessian, stage.gradient)
         cost -= cost_added(x, u, t, model.stage)
         if NOISY:  # of the policy as it is, the slope ahead is the costate
-            slope = Ahead(
+            slope = NextStep(
                 step.jacobian,
                 nowhere if own else arrived,
                 hessians[t + 1],
@@ -74,14 +74,14 @@ def certify(settings, own, plan, policy, to_go, model, found):
         for i in range(M):
             room.low[i], room.high[i] = model.limits.low[i] - u[i], model.limits.high[i] - u[i]
             limits = max(limits, room.low[i], -room.high[i])
-        law = off_the_law(x, u, policy.gain[t], policy.offset[t], model.limits, law)
-        decrease += promised(step, stage, policy.gain[t], hessians[t + 1], room, costate)
+        law = policy_residual(x, u, policy.gain[t], policy.offset[t], model.limits, law)
+        decrease += promised_decrease(step, stage, policy.gain[t], hessians[t + 1], room, costate)
         if own:
             closed_loop_hessian(step.jacobian, stage.hessian, policy.gain[t], room, hessians[t + 1], hessians[t])
     if not settings.fixed:
         cost += cost_quadratic(states[0], none, 0, model.initial, stage.hessian, stage.gradient)
         scale += scale_of(states[0], none, stage)
-        decrease += promised_of_start(stage, hessians[0], costate)
+        decrease += start_decrease(stage, hessians[0], costate)
     motion = 0.0
     for i in range(N):
         if not beyond[i] <= motion * size[i]:
@@ -102,7 +102,7 @@ def scale_of(x, u, stage):
     return scale
 
 
-def off_the_law(x, u, gain, offset, limits, worst):
+def policy_residual(x, u, gain, offset, limits, worst):
     """By how much a control is off the policy's within the limits, or what is worse already."""
     for i in range(M):
         total, terms = offset[i], abs(offset[i]) + abs(u[i])
@@ -115,7 +115,7 @@ def off_the_law(x, u, gain, offset, limits, worst):
     return worst
 
 
-def promised(step, stage, gain, S, room, costate):
+def promised_decrease(step, stage, gain, S, room, costate):
     """What the controls of a step promise: `1/2 e' E^-1 e` within the room that the limits leave.
 
     The costate at t + 1 becomes that at t, the controls responding with the gain (M, N); at a limit they do not.
@@ -145,10 +145,10 @@ def promised(step, stage, gain, S, room, costate):
                 before[j] += gain[i, j] * slope[i]
     for i in range(N):
         costate[i] = before[i]
-    return within_box(factor, slope, room.low, room.high, moved)
+    return box_decrease(factor, slope, room.low, room.high, moved)
 
 
-def flat(matrix):
+def singular_semidefinite(matrix):
     """Whether a block is singular and no more than that: positive definite with next to nothing on its diagonal."""
     block, size = stack(M, M), 1e-300
     for i in range(M):
@@ -160,7 +160,7 @@ def flat(matrix):
     return cholesky(block, M)
 
 
-def promised_of_start(stage, S, costate):
+def start_decrease(stage, S, costate):
     """What a soft start promises, its cost quadratised in `stage`."""
     factor, direction = stack(N, N), stack(N)
     for i in range(N):
@@ -212,7 +212,7 @@ def closed_loop_hessian(jacobian, cost, gain, room, ahead, out):
                 out[i, j] += closed[k, i] * product[k, j]
 
 
-def within_box(matrix, slope, lowest, highest, best):
+def box_decrease(matrix, slope, lowest, highest, best):
     """The decrease of `1/2 x'E x + e'x` at its minimiser `best` (M,) within a box about zero; NaN unless E >= 0.
 
     Where E is singular, it is that of e'x.
@@ -223,12 +223,14 @@ def within_box(matrix, slope, lowest, highest, best):
         best[i] = -slope[i]
         for j in range(M):
             factor[i, j] = matrix[i, j]
-    if not cholesky(factor, M):  # flat: no more than a straight line promises, up to where the box ends
+    if not cholesky(
+        factor, M
+    ):  # singular_semidefinite: no more than a straight line promises, up to where the box ends
         decrease = 0.0
         for i in range(M):
             if slope[i] != 0:
                 decrease += slope[i] * -lowest[i] if slope[i] > 0 else -slope[i] * highest[i]
-        return decrease if flat(matrix) else nan
+        return decrease if singular_semidefinite(matrix) else nan
     cholesky_solve(factor, M, best)
     for i in range(M):
         inside = inside and lowest[i] <= best[i] <= highest[i]

@@ -14,7 +14,7 @@ from math import sqrt
 from lqrsim.kernels.declarations import M, N, inline, stack
 from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve, offset, within
 from lqrsim.kernels.model_functions import step_jacobian
-from lqrsim.kernels.records import Reduced
+from lqrsim.kernels.records import EliminatedControl
 
 
 def initial_cost_to_come(Q, q, constant, x, to_go, to_come):
@@ -83,11 +83,11 @@ def forward_jacobian(x, u, model, arrived, step, spare):
 def riccati_forward(t, step, stage, constant, to_come, smoothing):
     """One step of the cost-to-come, in moments: from t to t + 1. Returns whether it succeeded.
 
-    The stage is as in `riccati_backward`. What the backward pass needs is written, too; see `Smoothing`.
+    The stage is as in `riccati_backward`. What the backward pass needs is written, too; see `SmootherGains`.
     """
     V0, x0, c, slope = to_come.matrix[t], to_come.vector[t], step.offset, stage.gradient
     V, x, updated = to_come.matrix[t + 1], to_come.vector[t + 1], smoothing.state[t]
-    reduced = Reduced(
+    reduced = EliminatedControl(
         stack(M, M), stack(M, N), stack(M), stack(N, N), stack(M, N), stack(N, N), stack(N), stack(N)
     )  # fmt: skip
     h, AT, BT, Q, q = reduced.h, reduced.AT, reduced.BT, reduced.Q, reduced.q
@@ -150,7 +150,7 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
 
 @inline
 def eliminate_control(step, stage, reduced):
-    """Write a step and its stage without the control; see `Reduced`.
+    """Write a step and its stage without the control; see `EliminatedControl`.
 
     Returns whether R is positive definite, and a number that is zero where no cost couples states and controls.
     """
@@ -270,7 +270,7 @@ def update(V, Q, size):
     return True
 
 
-def minimizer(t, to_go, to_come, costate, x):
+def smoothed_state(t, to_go, to_come, costate, x):
     """Write the minimiser of the total cost at t and the costate there; False if there is none.
 
     costate = (I + S V)^-1 (S x0 + s), x = x0 - V costate.
@@ -329,7 +329,7 @@ def solve(a, b):
     return True
 
 
-def backtrack(t, x_hat, costate, smoothing, model, x, u):
+def previous_state(t, x_hat, costate, smoothing, model, x, u):
     """Write the state and control (x, u) on the way to the minimiser at t + 1, whose costate is given."""
     for i in range(N):
         total = smoothing.state[t, i]

@@ -86,7 +86,7 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing):
     return decrease >= 0
 
 
-def minimizer(t, to_go, to_come, costate, x):
+def smoothed_state(t, to_go, to_come, costate, x):
     """Write x = -(S + Sbar)^-1 (s + sbar), Eq. (21), and the costate S x + s; False unless the sum is definite."""
     S, s, Sbar, sbar = to_go.hessian[t], to_go.gradient[t], to_come.matrix[t], to_come.vector[t]
     total = stack(N, N)
@@ -104,7 +104,7 @@ def minimizer(t, to_go, to_come, costate, x):
     return True
 
 
-def backtrack(t, x_hat, costate, smoothing, model, x, u):
+def previous_state(t, x_hat, costate, smoothing, model, x, u):
     """Write the state and control (x, u) that lead to x_hat = x_{t+1}: the inverse policy, then the inverse step."""
     affine(smoothing.control_gain[t], smoothing.control[t], x_hat, u)
     within(u, model.limits)

@@ -21,18 +21,18 @@ from lqrsim.kernels.declarations import (
     stack,
 )
 from lqrsim.kernels.iterations import outcome_of, relative_improvement, relative_optimality, write_row
-from lqrsim.kernels.passes import backward_pass, copy, forward_pass, minimizers
-from lqrsim.kernels.records import Linearization, Order
+from lqrsim.kernels.passes import backward_pass, copy, forward_pass, smoothed_states
+from lqrsim.kernels.records import Linearization, ModelOrder
 from lqrsim.kernels.rollouts import (
-    about_plan,
+    copy_plan,
     differential_pass,
     dynamics_residual,
-    follow,
     initial_step,
-    keep_plan,
     largest_gap,
     line_search,
     plan_cost,
+    policy_about_plan,
+    shorten_step,
 )
 
 
@@ -60,14 +60,14 @@ def damped_iterations(first, last, settings, model, work, memory, log):
         return last, RUNNING, failed >= 0, failed
     for done in range(first, last):
         reach = memory.reach
-        merit, cost, fraction, nothing = damped_step(settings, model, work, memory)
+        merit, cost, fraction, negligible = damped_step(settings, model, work, memory)
         full = done + 1 == settings.max_iterations
         if fraction > 0:
-            improvement = relative_improvement(memory.merit, merit, nothing)
-            follow(settings.steps, fraction, work.plan, work.x_hats)
-            # At reach 0 as for iLQR: nothing but a rollout was linearised about.
+            improvement = relative_improvement(memory.merit, merit, negligible)
+            shorten_step(settings.steps, fraction, work.plan, work.x_hats)
+            # At reach 0 as for iLQR: negligible but a rollout was linearised about.
             gap = largest_gap(settings.steps, work.x_hats, work.rollout.states) if reach > 0 else 0.0
-            keep_plan(settings.steps, work.rollout, work.plan)
+            copy_plan(settings.steps, work.rollout, work.plan)
             memory.plan_cost, memory.merit = cost, merit
             small = abs(improvement) < settings.tolerance and (gap < settings.gap_tolerance or not settings.optimal)
             memory.small_changes = memory.small_changes + 1 if small else 0.0
@@ -80,7 +80,7 @@ def damped_iterations(first, last, settings, model, work, memory, log):
             settled = stalled
             write_row(log[done], memory.plan_cost, 0.0, nan, nan, nan, REJECTED)
         if settled or full:
-            outcome, _ = relinearize(settings, settled, nothing, model, work, memory, log[done])
+            outcome, _ = relinearize(settings, settled, negligible, model, work, memory, log[done])
             if outcome == RUNNING and (stalled or full):
                 outcome = STALLED if stalled else MAX_ITERATIONS
             if outcome != RUNNING:
@@ -93,25 +93,25 @@ def damped_step(settings, model, work, memory):
     that is as good as none; see `backward_pass`.
     """
     shift, reach = stack(N), memory.reach
-    merit, cost, fraction, nothing = inf, inf, 0.0, 0.0
+    merit, cost, fraction, negligible = inf, inf, 0.0, 0.0
     copy(work.start if settings.fixed else work.plan.states[0], N, work.x_hat)
     about = Linearization(work.plan, True, reach, memory.weight, work.prior)
     failed, _ = forward_pass(settings, model, about, work)
     if failed < 0:
-        failed, _, nothing = backward_pass(settings, model, about, work)
+        failed, _, negligible = backward_pass(settings, model, about, work)
     if failed < 0:
         for i in range(N):
             shift[i] = work.x_hat[i] - work.plan.states[0, i]
-        about_plan(settings.steps, work.plan, work.policy)
+        policy_about_plan(settings.steps, work.plan, work.policy)
         if NOISY:  # as the new policy's cost-to-go weighs it
-            weigh_plan(settings.steps, model, work, memory)
+            update_plan_cost(settings.steps, model, work, memory)
         smallest = 0.1 if reach > 0 else 1e-8
         bound = memory.merit + 1e-12 * abs(memory.merit)  # what differs by rounding is not refused
         merit, cost, fraction = line_search(settings.steps, shift, work, model, bound, 0.0, smallest, work.rollout)
-    return merit, cost, fraction, nothing
+    return merit, cost, fraction, negligible
 
 
-def weigh_plan(steps, model, work, memory):
+def update_plan_cost(steps, model, work, memory):
     """Work out anew what the plan is expected to cost, with the cost-to-go that was found last."""
     cost, added = plan_cost(steps, work.plan, model, work.to_go)
     memory.plan_cost, memory.merit = cost, cost + added
@@ -149,26 +149,26 @@ def turn_to_ilqr(memory):
     memory.ilqr_next *= 2
 
 
-def relinearize(settings, settled, nothing, model, work, memory, row):
+def relinearize(settings, settled, negligible, model, work, memory, row):
     """Policy and value functions about the plan, without a weight. Returns the outcome, and the step that failed or -1.
 
     Writes optimality and residual to the row of the log.
     """
     steps, plan, policy, to_go, shift = settings.steps, work.plan, work.policy, work.to_go, stack(N)
-    failed, _, left = differential_pass(steps, plan, model, Order(0.0, 0.0, to_go), 1, policy, to_go)
+    failed, _, left = differential_pass(steps, plan, model, ModelOrder(0.0, 0.0, to_go), 1, policy, to_go)
     if failed >= 0:
         return RUNNING, failed
     if NOISY:
-        weigh_plan(steps, model, work, memory)
+        update_plan_cost(steps, model, work, memory)
         row.cost = memory.plan_cost
     if not settings.fixed:
         left += initial_step(plan.states[0], model, 0.0, to_go, shift)
-    row.optimality = left = relative_optimality(failed, left, memory.merit, nothing)
-    model_come_to(settings, model, work, memory, row)
+    row.optimality = left = relative_optimality(failed, left, memory.merit, negligible)
+    value_functions_at_plan(settings, model, work, memory, row)
     return outcome_of(settled and left < settings.tolerance, settings, left, memory.plan_cost, False), -1
 
 
-def model_come_to(settings, model, work, memory, row):
+def value_functions_at_plan(settings, model, work, memory, row):
     """What is left after a pass about the plan: its policy as one that makes the plan, and the cost-to-come.
 
     Writes the residual to the row of the log, and to the memory how far the states of least total cost are from the
@@ -178,7 +178,7 @@ def model_come_to(settings, model, work, memory, row):
     copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
     failed, _ = forward_pass(settings, model, Linearization(plan, True, 1.0, 0.0, work.prior), work)
     memory.final_gap = inf
-    if failed < 0 and minimizers(steps, work.to_go, work.to_come, work.x_hats):
+    if failed < 0 and smoothed_states(steps, work.to_go, work.to_come, work.x_hats):
         memory.final_gap = largest_gap(steps, work.x_hats, plan.states)
     # The forward pass has left it at the end; what comes next begins at the start.
     copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)

@@ -186,10 +186,10 @@ def riccati_forward(t, step, stage, constant, to_come, smoothing) -> bool:
     return True
 
 
-def minimizer(t, to_go, to_come, costate, x) -> bool:
+def smoothed_state(t, to_go, to_come, costate, x) -> bool:
     """Write the minimiser of the total cost at t, and the costate there."""
     return True
 
 
-def backtrack(t, x_hat, costate, smoothing, model, x, u) -> None:
+def previous_state(t, x_hat, costate, smoothing, model, x, u) -> None:
     """Write the state and control, within its limits, on the way to the minimiser at t + 1."""

@@ -8,7 +8,7 @@ gain and the offset of each control.
 from math import nan
 
 from lqrsim.kernels.declarations import M, N, call, outline, stack
-from lqrsim.kernels.policy_evaluation import turn
+from lqrsim.kernels.policy_evaluation import to_nearest
 
 LAG, D, Y = 0, 1, 1  # lagging actuators, states of unknowns, measured numbers
 P, Z, V = 1, 1, 1  # unknown parameters; N + LAG + D; P + 2 M
@@ -68,14 +68,14 @@ def correct(count, measured, near, gain, sensor, turning, estimates, innovations
 def correct_one(shown, lost, near, gain, sensor, turning, z, innovation) -> None:
     """That of one trial: z (Z,)."""
     x, seen, expected = stack(N), stack(Y), stack(Y)
-    turn(z, near, turning)
+    to_nearest(z, near, turning)
     if lost != 0.0:
         for j in range(Y):
             innovation[j] = nan
         return
     for i in range(N):
         x[i] = shown[i]
-    turn(x, z, turning)
+    to_nearest(x, z, turning)
     call(sensor.measure, x, sensor.data, seen)
     call(sensor.measure, z, sensor.data, expected)
     for j in range(Y):
@@ -136,7 +136,7 @@ def command(count, estimates, near, law, limits, turning, out) -> None:
 @outline
 def command_one(z, near, law, limits, turning, u) -> None:
     """Those of one trial: z (Z,) and u (M,)."""
-    turn(z, near, turning)
+    to_nearest(z, near, turning)
     for j in range(M):
         total = law.offset[j]
         for i in range(Z):

@@ -69,7 +69,7 @@ def add_initial(x, model, out):
     return cost
 
 
-def slopes(steps, plan, constraints, rows, out):
+def constraint_slopes(steps, plan, constraints, rows, out):
     """Write the slopes of all constraints at all steps, and which entries they depend on."""
     slope = stack(W)
     for t in range(steps + 1):
@@ -119,18 +119,18 @@ def subtract_curvature(k, row, x, u, t, constraints, rows, hessian):
         far = STEP * max(1.0, abs(z))
         for i in range(W):
             ahead[i], behind[i] = 0.0, 0.0
-        put(y, v, j, z + far)
+        set_entry(y, v, j, z + far)
         slope_of_constraint(k, row, y, v, t, constraints, ahead)
-        put(y, v, j, z - far)
+        set_entry(y, v, j, z - far)
         slope_of_constraint(k, row, y, v, t, constraints, behind)
-        put(y, v, j, z)
+        set_entry(y, v, j, z)
         for i in range(W):
             half = 0.5 * weight * (ahead[i] - behind[i]) / (2 * far)
             hessian[i, j] -= half
             hessian[j, i] -= half
 
 
-def put(y, v, j, number):
+def set_entry(y, v, j, number):
     """Write one entry of a state and a control, joined."""
     if j < N:
         y[j] = number
@@ -138,7 +138,7 @@ def put(y, v, j, number):
         v[j - N] = number
 
 
-def trial(steps, soft, plan, model, arrived):
+def trial_cost(steps, soft, plan, model, arrived):
     """The cost of a plan; writes where each of its steps leads, (T, N)."""
     for t in range(steps):
         advance(plan.states[t], plan.controls[t], model, model.dt, arrived[t])
@@ -171,7 +171,7 @@ def adjoint(steps, gradient, jacobian, costates, slopes):
                 slopes[t, j - N] = total
 
 
-def end_with(steps, stage, slope, to_go):
+def terminal_cost_to_go(steps, stage, slope, to_go):
     """Write the cost-to-go at the end."""
     for i in range(N):
         to_go.gradient[steps, i] = slope[i]
@@ -179,7 +179,7 @@ def end_with(steps, stage, slope, to_go):
             to_go.hessian[steps, i, j] = stage[i, j]
 
 
-def step_back(t, stage, slope, jacobian, gap, policy, to_go):
+def riccati_step(t, stage, slope, jacobian, gap, policy, to_go):
     """A step of the Riccati recursion, from t + 1 to t, with the gap closed; uses up the stage.
 
     Args:
@@ -197,16 +197,16 @@ def step_back(t, stage, slope, jacobian, gap, policy, to_go):
         for j in range(N):
             ahead[i] += to_go.hessian[t + 1, i, j] * gap[j]
     congruence(jacobian, to_go.hessian[t + 1], ahead, stage, slope)
-    if not definite(stage, least):
+    if not control_block_definite(stage, least):
         return False
     return minimize_control(stage, slope, policy.gain[t], policy.offset[t], to_go.hessian[t], to_go.gradient[t]) >= 0
 
 
-def lead(steps, free, jacobian, gaps, policy, to_go, changes):
+def forward_sweep(steps, free, jacobian, gaps, policy, to_go, changes):
     """Write the changes of the plan that a policy makes, and as gradients of the cost-to-go the costates where they
-    lead; whether the start's have a minimum. `free` (N,) is 0 for the states that the start fixes.
+    forward_sweep; whether the start's have a minimum. `free` (N,) is 0 for the states that the start fixes.
     """
-    if not first_change(free, to_go, changes.states[0]):
+    if not start_change(free, to_go, changes.states[0]):
         return False
     for t in range(steps):
         for i in range(M):
@@ -228,7 +228,7 @@ def lead(steps, free, jacobian, gaps, policy, to_go, changes):
     return True
 
 
-def first_change(free, to_go, change):
+def start_change(free, to_go, change):
     """Write by how much the start moves, (N,); whether that has a minimum. What is fixed does not move."""
     curve = stack(N, N)
     for i in range(N):
@@ -242,7 +242,7 @@ def first_change(free, to_go, change):
     return good
 
 
-def definite(stage, least):
+def control_block_definite(stage, least):
     """Whether a control block is positive definite when so much is subtracted from its diagonal, (M,)."""
     block = stack(M, M)
     for i in range(M):
@@ -252,11 +252,11 @@ def definite(stage, least):
     return cholesky(block, M)
 
 
-def follow(steps, part, plan, policy, limits, model, out):
+def closed_loop_rollout(steps, part, plan, policy, limits, model, out):
     """The motion that a part of a step leads to, its gains closing the loop; writes states and controls.
 
     Args:
-      plan: a motion. policy: gains, and changes of controls where states do not change, as `step_back` writes them.
+      plan: a motion. policy: gains, and changes of controls where states do not change, as `riccati_step` writes them.
       limits: what the controls are held between, at each step, (T, M) each. out: gets the motion.
     """
     for i in range(N):

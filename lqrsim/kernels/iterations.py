@@ -32,13 +32,13 @@ from lqrsim.kernels.declarations import (
     stack,
 )
 from lqrsim.kernels.passes import backward_pass, copy, forward_pass
-from lqrsim.kernels.records import CostToGo, Linearization, Model, Order, Policy, Prior
+from lqrsim.kernels.records import CostToGo, Linearization, ModelOrder, Policy, Prior, ProblemModel
 from lqrsim.kernels.rollouts import (
+    copy_plan,
+    copy_policy,
     differential_pass,
     dynamics_residual,
     initial_step,
-    keep_plan,
-    keep_policy,
     largest_gap,
     line_search,
     noise_cost,
@@ -47,14 +47,14 @@ from lqrsim.kernels.rollouts import (
 )
 
 
-def relative_improvement(old, cost, nothing):
+def relative_improvement(old, cost, negligible):
     """The decrease of cost relative to what is left; 0 for no change, at a cost of zero too; infinite if the cost is.
 
-    Costs below `nothing` are zero but for rounding: what there is of them never settles.
+    Costs below `negligible` are zero but for rounding: what there is of them never settles.
     """
     if not abs(cost) < inf:
         return -inf
-    return 0.0 if old == cost else (old - cost) / max(abs(cost), nothing)
+    return 0.0 if old == cost else (old - cost) / max(abs(cost), negligible)
 
 
 def smoother_iterations(first, last, settings, model, work, memory, log):
@@ -68,10 +68,12 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
     no_weight, steps, fixed, x_hat = stack(N), settings.steps, settings.fixed, work.x_hat
     for i in range(N):
         no_weight[i] = 0.0
-    eased = Model(model.dynamics, model.dt, model.initial, work.eased, model.final, model.limits, model.noise)
+    scaled = ProblemModel(
+        model.dynamics, model.dt, model.initial, work.homotopy_scaled, model.final, model.limits, model.noise
+    )
     if memory.started == 0:
         memory.started, memory.plan_cost = 1.0, inf
-        keep_rollout(steps, work.start, model, work, memory)
+        roll_out_and_keep(steps, work.start, model, work, memory)
         copy(work.start, N, x_hat)
         if settings.guided and not fixed:
             copy(work.guess.states[0], N, x_hat)
@@ -82,16 +84,16 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
         weight = work.prior.weight if done < settings.prior_iterations else no_weight
         guided = settings.guided and done == 0
         about = Linearization(work.guess, guided, 1.0, 0.0, Prior(weight, work.prior.about))
-        failed, good = forward_pass(settings, eased, about, work)
+        failed, good = forward_pass(settings, scaled, about, work)
         if failed >= 0:
             return done, failure(good, model), False, failed
-        failed, good, nothing = backward_pass(settings, eased, about, work)
+        failed, good, negligible = backward_pass(settings, scaled, about, work)
         if failed >= 0:
             return done, failure(good, model), True, failed
         if NOISY and done == 0 and memory.plan_cost > -inf:  # the cost-to-go of the first policy was not known
             memory.plan_cost, _ = plan_cost(steps, work.plan, model, work.to_go)
-        cost = keep_rollout(steps, x_hat, model, work, memory)
-        improvement = relative_improvement(log[done - 1].cost if done > 0 else inf, cost, nothing)
+        cost = roll_out_and_keep(steps, x_hat, model, work, memory)
+        improvement = relative_improvement(log[done - 1].cost if done > 0 else inf, cost, negligible)
         gap = largest_gap(steps, work.x_hats, work.rollout.states)
         settled = abs(improvement) < settings.tolerance and (gap < settings.gap_tolerance or not settings.optimal)
         full = done + 1 == settings.max_iterations
@@ -100,7 +102,7 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
             write_row(log[done], cost, improvement, gap, left, residual, SMOOTH)
             return done + 1, IN_VALLEY, False, -1
         if settled or full:
-            left = optimality(settings, work.rollout, model, cost, nothing)
+            left = optimality(settings, work.rollout, model, cost, negligible)
             residual = dynamics_residual(steps, work.x_hats, work.policy, model, work.rollout.states)
         write_row(log[done], cost, improvement, gap, left, residual, SMOOTH)
         outcome = outcome_of(settled, settings, left, cost, full)
@@ -113,15 +115,15 @@ def smoother_iterations(first, last, settings, model, work, memory, log):
     return last, RUNNING, False, -1
 
 
-def keep_rollout(steps, start, model, work, memory):
+def roll_out_and_keep(steps, start, model, work, memory):
     """Run the policy and keep it with where it leads; the best so far is the plan. Returns the cost."""
     cost = rollout(steps, start, work.policy, model, work.rollout)
     if NOISY:
         cost += noise_cost(steps, work.rollout, model, work.to_go)
-    keep_policy(steps, work.policy, work.kept)
+    copy_policy(steps, work.policy, work.kept)
     if cost < memory.plan_cost:
         memory.plan_cost = cost
-        keep_plan(steps, work.rollout, work.plan)
+        copy_plan(steps, work.rollout, work.plan)
     return cost
 
 
@@ -175,14 +177,14 @@ def no_progress(log, done):
     return since >= NO_FALL or slow >= SLOW_FALL
 
 
-def optimality(settings, plan, model, cost, nothing):
+def optimality(settings, plan, model, cost, negligible):
     """What a linear-quadratic model about a trajectory promises, relative to its cost; infinite if there is none."""
     policy, to_go = Policy(stack(1, M, N), stack(1, M)), CostToGo(stack(1, N, N), stack(1, N), stack(1))
     shift = stack(N)
-    failed, _, left = differential_pass(settings.steps, plan, model, Order(0.0, 0.0, to_go), 0, policy, to_go)
+    failed, _, left = differential_pass(settings.steps, plan, model, ModelOrder(0.0, 0.0, to_go), 0, policy, to_go)
     if not settings.fixed:
         left += initial_step(plan.states[0], model, 0.0, to_go, shift)
-    return relative_optimality(failed, left, cost, nothing)
+    return relative_optimality(failed, left, cost, negligible)
 
 
 def write_row(row, cost, improvement, gap, left, residual, method):
@@ -191,11 +193,11 @@ def write_row(row, cost, improvement, gap, left, residual, method):
     row.optimality, row.residual, row.method = left, residual, method
 
 
-def relative_optimality(failed, decrease, cost, nothing):
+def relative_optimality(failed, decrease, cost, negligible):
     """A promised decrease relative to the cost; infinite where the pass failed that was to tell it."""
     if failed >= 0 or not decrease < inf or not abs(cost) < inf:
         return inf
-    return decrease / max(abs(cost), nothing, 1e-300)
+    return decrease / max(abs(cost), negligible, 1e-300)
 
 
 def outcome_of(settled, settings, left, cost, full):
@@ -230,14 +232,16 @@ def ilqr_iterations(first, last, settings, model, work, log):
             return 0, NO_START, False, -1
     cost = log[first - 1 if first > 0 else settings.max_iterations].cost
     if first == last:
-        failed, _, _ = differential_pass(steps, plan, model, Order(0.0, 0.0, to_go), 1, policy, to_go)
+        failed, _, _ = differential_pass(steps, plan, model, ModelOrder(0.0, 0.0, to_go), 1, policy, to_go)
         return last, RUNNING, failed >= 0, failed
     for done in range(first, last):
         damping[0] *= 0.1
-        failed, good, _ = differential_pass(steps, plan, model, Order(damping[0], 0.0, to_go), 1, policy, to_go)
+        failed, good, _ = differential_pass(steps, plan, model, ModelOrder(damping[0], 0.0, to_go), 1, policy, to_go)
         while failed >= 0 and good and damping[0] < 1e25:
             damping[0] = max(10 * damping[0], 1.0)
-            failed, good, _ = differential_pass(steps, plan, model, Order(damping[0], 0.0, to_go), 1, policy, to_go)
+            failed, good, _ = differential_pass(
+                steps, plan, model, ModelOrder(damping[0], 0.0, to_go), 1, policy, to_go
+            )
         if failed >= 0:
             return done, failure(good, model), True, failed
         if not damping[0] > 1.0:
@@ -247,12 +251,12 @@ def ilqr_iterations(first, last, settings, model, work, log):
         old = cost
         cost, _, fraction = line_search(steps, no_shift, work, model, old, 0.0, 1e-8, work.trial)
         if fraction > 0:
-            keep_plan(steps, work.trial, plan)
+            copy_plan(steps, work.trial, plan)
         improvement = relative_improvement(old, cost, 0.0)
         settled = abs(improvement) < settings.tolerance
         left = nan
         if settled or done + 1 == settings.max_iterations:
-            failed, _, left = differential_pass(steps, plan, model, Order(0.0, 0.0, to_go), 1, policy, to_go)
+            failed, _, left = differential_pass(steps, plan, model, ModelOrder(0.0, 0.0, to_go), 1, policy, to_go)
             if NOISY:
                 cost, _ = plan_cost(steps, plan, model, to_go)
             left = relative_optimality(failed, left, cost, 0.0)
@@ -262,6 +266,6 @@ def ilqr_iterations(first, last, settings, model, work, log):
             outcome = STALLED
         if outcome != RUNNING:
             if isnan(left):  # not worked out; but policy and cost-to-go are to be about the trajectory that was found
-                failed, _, _ = differential_pass(steps, plan, model, Order(0.0, 0.0, to_go), 1, policy, to_go)
+                failed, _, _ = differential_pass(steps, plan, model, ModelOrder(0.0, 0.0, to_go), 1, policy, to_go)
             return done + 1, outcome, failed >= 0, failed
     return last, RUNNING, False, -1

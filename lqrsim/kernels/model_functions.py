@@ -1,7 +1,7 @@
 """What a problem brings, called at its addresses: dynamics, costs, constraints, noise.
 
-So the passes and iterations are compiled once for a size, and serve all problems of it. See `records.Model`; the C
-signatures are in `codegen/compiled_module.py`.
+So the passes and iterations are compiled once for a size, and serve all problems of it. See `records.ProblemModel`; the
+C signatures are in `codegen/compiled_module.py`.
 """
 
 from lqrsim.kernels.declarations import W, call, call_for_value, stack

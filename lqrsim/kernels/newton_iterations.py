@@ -8,7 +8,7 @@ enough curvature, the plan's error is squared in each iteration.
 
 from math import isnan, nan
 
-from lqrsim.kernels.damped_iterations import model_come_to, weigh_plan
+from lqrsim.kernels.damped_iterations import update_plan_cost, value_functions_at_plan
 from lqrsim.kernels.declarations import (
     CONVERGED,
     MAX_ITERATIONS,
@@ -23,8 +23,8 @@ from lqrsim.kernels.declarations import (
 )
 from lqrsim.kernels.iterations import failure, relative_improvement, relative_optimality, write_row
 from lqrsim.kernels.passes import copy
-from lqrsim.kernels.records import CostToGo, Order
-from lqrsim.kernels.rollouts import differential_pass, initial_step, keep_plan, line_search
+from lqrsim.kernels.records import CostToGo, ModelOrder
+from lqrsim.kernels.rollouts import copy_plan, differential_pass, initial_step, line_search
 
 # The shares that are tried where a pass with more of the second order has no minimum.
 SHARES = (1.0, 0.97, 0.9, 0.75, 0.5, 0.0)
@@ -44,7 +44,7 @@ def newton_iterations(first, last, settings, model, work, memory, log):
 
     The policy is, at the end, the one of the last pass. The value functions are about the plan, and those of smoothing,
     without the second order: convex, so that their sum has its minimum at the plan. Where it is not there yet, some
-    more steps are made: in flat directions a plan may be far off though there is nothing to gain.
+    more steps are made: in flat directions a plan may be far off though there is negligible to gain.
     """
     steps, plan, shift = settings.steps, work.plan, stack(N)
     if memory.share < 0:
@@ -54,7 +54,7 @@ def newton_iterations(first, last, settings, model, work, memory, log):
             return first, failure(good, model), True, int(memory.failed)
         if first < last and memory.promised < settings.tolerance:
             write_row(log[first], memory.plan_cost, 0.0, 0.0, memory.promised, nan, NEWTON)
-            if come_to_plan(settings, model, work, memory, log[first]):
+            if finish_at_plan(settings, model, work, memory, log[first]):
                 return first + 1, CONVERGED, False, -1
     for done in range(first, last):
         for i in range(N):
@@ -63,8 +63,8 @@ def newton_iterations(first, last, settings, model, work, memory, log):
         merit, cost, fraction = line_search(steps, shift, work, model, bound, wanted, SMALLEST, work.rollout)
         outcome = RUNNING
         if fraction > 0:
-            improvement = relative_improvement(memory.merit, merit, memory.nothing)
-            keep_plan(steps, work.rollout, plan)
+            improvement = relative_improvement(memory.merit, merit, memory.negligible)
+            copy_plan(steps, work.rollout, plan)
             memory.plan_cost, memory.merit, memory.share = cost, merit, 1.0
             write_row(log[done], cost, improvement, 0.0, nan, nan, NEWTON)
         else:
@@ -75,7 +75,7 @@ def newton_iterations(first, last, settings, model, work, memory, log):
         if memory.failed >= 0:
             return done + 1, failure(good, model), True, int(memory.failed)
         log[done].cost, log[done].optimality = memory.plan_cost, memory.promised
-        if memory.promised < settings.tolerance and come_to_plan(settings, model, work, memory, log[done]):
+        if memory.promised < settings.tolerance and finish_at_plan(settings, model, work, memory, log[done]):
             return done + 1, CONVERGED, False, -1
         if outcome == STALLED and memory.promised < settings.tolerance:  # the rest is rounding
             outcome = CONVERGED
@@ -98,15 +98,17 @@ def newton_pass(settings, model, work, memory):
     failed, good, left = -1, True, nan
     second = CostToGo(work.to_come.matrix, work.to_come.vector, work.to_come.constant)
     if NOISY:  # what noise costs is what smoothing takes it to cost
-        failed, good, _ = differential_pass(steps, plan, model, Order(0.0, 0.0, work.to_go), 1, work.kept, work.to_go)
+        failed, good, _ = differential_pass(
+            steps, plan, model, ModelOrder(0.0, 0.0, work.to_go), 1, work.kept, work.to_go
+        )
         memory.failed = failed
         if failed >= 0:
             return good
-        weigh_plan(steps, model, work, memory)
+        update_plan_cost(steps, model, work, memory)
     for k in range(len(SHARES)):
         share = SHARES[k]
         if share <= begin:
-            order = Order(0.0, share, work.to_go)
+            order = ModelOrder(0.0, share, work.to_go)
             failed, good, left = differential_pass(steps, plan, model, order, 1, work.policy, second)
             copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
             if failed < 0 and not settings.fixed:
@@ -123,20 +125,20 @@ def newton_pass(settings, model, work, memory):
     size = 0.0
     for t in range(steps + 1):
         size = max(size, abs(second.constant[t]))
-    memory.nothing = 1e-26 * size
+    memory.negligible = 1e-26 * size
     memory.decrease = 2 * left
-    memory.promised = relative_optimality(failed, left, memory.merit, memory.nothing)
+    memory.promised = relative_optimality(failed, left, memory.merit, memory.negligible)
     return good
 
 
 def damped_pass(settings, model, work, memory, second):
-    """A pass where not even convex models have a minimum, as where a control costs nothing: with the least weight on
+    """A pass where not even convex models have a minimum, as where a control costs negligible: with the least weight on
     changes of the controls, of some, with which they have. Returns as a pass does, without whether numbers are finite.
     """
     steps, plan, shift, damping, failed, left = settings.steps, work.plan, stack(N), 0.0, 0, nan
     for k in range(WEIGHTS):
         damping = SMALL * max(abs(memory.merit), SMALL) * 1e3**k
-        order = Order(damping, 0.0, work.to_go)
+        order = ModelOrder(damping, 0.0, work.to_go)
         failed, good, left = differential_pass(steps, plan, model, order, 1, work.policy, second)
         copy(work.start if settings.fixed else plan.states[0], N, work.x_hat)
         if failed < 0 and not settings.fixed:
@@ -151,7 +153,7 @@ def damped_pass(settings, model, work, memory, second):
     return failed, left
 
 
-def come_to_plan(settings, model, work, memory, row):
+def finish_at_plan(settings, model, work, memory, row):
     """Make policy and value functions of the answer; whether it is one. If not, there is a pass to go on with."""
     value_functions(settings, model, work, memory, row)
     if memory.final_gap < settings.gap_tolerance or memory.small_changes >= MORE:
@@ -168,9 +170,9 @@ def value_functions(settings, model, work, memory, row):
     """
     policy, controls = work.policy, work.plan.controls
     if not NOISY:
-        order = Order(memory.damping, 0.0, work.to_go)
+        order = ModelOrder(memory.damping, 0.0, work.to_go)
         differential_pass(settings.steps, work.plan, model, order, 1, work.kept, work.to_go)
-    model_come_to(settings, model, work, memory, row)
+    value_functions_at_plan(settings, model, work, memory, row)
     for t in range(settings.steps):
         for i in range(M):
             if controls[t, i] == model.limits.low[i] or controls[t, i] == model.limits.high[i]:

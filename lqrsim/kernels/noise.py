@@ -26,11 +26,11 @@ from lqrsim.kernels.model_functions import advance, cost_value
 
 ROWS = (0,)  # the states that noise acts on at once
 COUNT = 1  # how many these are
-FIRST = 0  # whether these are the first ones, in their order
+CONTIGUOUS = 0  # whether these are the first ones, in their order
 SIZE = 1  # independent normal numbers in w
 ACTIVE = (0,)  # entries of (x, u) that M depends on
-SOME = 1  # how many these are
-WIDE = 4  # the same, rounded up to vectors of four
+ACTIVE_COUNT = 1  # how many these are
+PADDED_COUNT = 4  # the same, rounded up to vectors of four
 
 
 def noise_value(x, u, data, risk, ahead):
@@ -39,16 +39,16 @@ def noise_value(x, u, data, risk, ahead):
     factor, root, weighed = stack(SIZE, SIZE), stack(SIZE), stack(COUNT, SIZE)
     S = stack(COUNT, COUNT)
     noise_values(x, u, data, values)
-    gather(ahead.hessian, S)
-    weigh(S, values, weighed)
+    noisy_block(ahead.hessian, S)
+    times_hessian(S, values, weighed)
     theta = risk[0]
     if theta == 0:
         return half_trace(values, weighed)
     total, good = factor_of_risk(theta, values, weighed, factor, root)
     if not good:
         return inf
-    mix(theta, factor, root, values, mixed)
-    slope_ahead(ahead, slope)
+    risk_columns(theta, factor, root, values, mixed)
+    next_slope(ahead, slope)
     return total + 0.5 * theta * square_along(mixed, slope)
 
 
@@ -58,20 +58,20 @@ def noise_quadratic(x, u, data, risk, ahead, convex, stage):
     With `convex` what is added is positive semidefinite, with a negative risk, too. Where the risk is too high the
     Hessian is spoilt, so that the pass fails, and `risk[1]` is 1.
     """
-    values, slopes = stack(COUNT, SIZE), stack(SIZE, COUNT, WIDE)
+    values, slopes = stack(COUNT, SIZE), stack(SIZE, COUNT, PADDED_COUNT)
     weighed, factor, root = stack(COUNT, SIZE), stack(SIZE, SIZE), stack(SIZE)
     S = stack(COUNT, COUNT)
     for k in range(SIZE):
         for i in range(COUNT):
-            for a in range(SOME, WIDE):
+            for a in range(ACTIVE_COUNT, PADDED_COUNT):
                 slopes[k, i, a] = 0.0
     noise_slopes(x, u, data, values, slopes)
-    gather(ahead.hessian, S)
-    weigh(S, values, weighed)
+    noisy_block(ahead.hessian, S)
+    times_hessian(S, values, weighed)
     theta = risk[0]
     if theta == 0:
-        if SOME:
-            add_weighed(S, weighed, slopes, stage)
+        if ACTIVE_COUNT:
+            add_trace_model(S, weighed, slopes, stage)
         return half_trace(values, weighed)
     total, good = factor_of_risk(theta, values, weighed, factor, root)
     risk[1] = 0.0 if good else 1.0
@@ -79,12 +79,12 @@ def noise_quadratic(x, u, data, risk, ahead, convex, stage):
         stage.hessian[W - 1, W - 1] = -inf
         return inf
     mixed, slope = stack(COUNT, SIZE), stack(COUNT)
-    mix(theta, factor, root, values, mixed)
-    if SOME:
-        weigh(S, mixed, weighed)
-        mix_slopes(theta, factor, root, slopes)
-        add_weighed(S, weighed, slopes, stage)
-    slope_ahead(ahead, slope)
+    risk_columns(theta, factor, root, values, mixed)
+    if ACTIVE_COUNT:
+        times_hessian(S, mixed, weighed)
+        risk_column_slopes(theta, factor, root, slopes)
+        add_trace_model(S, weighed, slopes, stage)
+    next_slope(ahead, slope)
     add_risk(theta, ahead, mixed, slopes, slope, convex, stage)
     return total + 0.5 * theta * square_along(mixed, slope)
 
@@ -104,21 +104,21 @@ def noisy_costs(count, steps, start, policy, model, draws, costs):
             noise_values(x, u, model.noise.data, values)
             for i in range(COUNT):
                 for k in range(SIZE):
-                    ahead[i if FIRST else ROWS[i]] += values[i, k] * draws[run * steps + t, k]
+                    ahead[i if CONTIGUOUS else ROWS[i]] += values[i, k] * draws[run * steps + t, k]
             for i in range(N):
                 x[i] = ahead[i]
         costs[run] = total + cost_value(x, u, steps, model.final)
 
 
-def gather(S, compact):
+def noisy_block(S, compact):
     """Write the rows and columns of S that noise acts on; looked up once, for that takes longer than the sums."""
     for i in range(COUNT):
-        row = i if FIRST else ROWS[i]
+        row = i if CONTIGUOUS else ROWS[i]
         for j in range(COUNT):
-            compact[i, j] = S[row, j if FIRST else ROWS[j]]
+            compact[i, j] = S[row, j if CONTIGUOUS else ROWS[j]]
 
 
-def weigh(S, values, weighed):
+def times_hessian(S, values, weighed):
     """Write S M."""
     for i in range(COUNT):
         for k in range(SIZE):
@@ -137,31 +137,31 @@ def half_trace(values, weighed):
     return 0.5 * total
 
 
-def add_weighed(S, weighed, slopes, stage):
+def add_trace_model(S, weighed, slopes, stage):
     """Add 1/2 tr M'SM linearised: with columns m_i ~ J_i z, the sums of J_i'S J_i and of J_i'S m_i, given S M."""
-    line, curve, slope = stack(WIDE), stack(SOME, WIDE), stack(WIDE)
-    for b in range(WIDE):
+    line, curve, slope = stack(PADDED_COUNT), stack(ACTIVE_COUNT, PADDED_COUNT), stack(PADDED_COUNT)
+    for b in range(PADDED_COUNT):
         slope[b] = 0.0
-        for a in range(SOME):
+        for a in range(ACTIVE_COUNT):
             curve[a, b] = 0.0
     for k in range(SIZE):
         for i in range(COUNT):  # line by line, which stays in registers
             factor = weighed[i, k]
-            for b in range(WIDE):
+            for b in range(PADDED_COUNT):
                 line[b] = 0.0
                 slope[b] += slopes[k, i, b] * factor
             for j in range(COUNT):
                 factor = S[i, j]
-                for b in range(WIDE):
+                for b in range(PADDED_COUNT):
                     line[b] += factor * slopes[k, j, b]
-            for a in range(SOME):
+            for a in range(ACTIVE_COUNT):
                 factor = slopes[k, i, a]
-                for b in range(WIDE):
+                for b in range(PADDED_COUNT):
                     curve[a, b] += factor * line[b]
-    for a in range(SOME):
+    for a in range(ACTIVE_COUNT):
         entry = ACTIVE[a]
         stage.gradient[entry] += slope[a]
-        for b in range(SOME):
+        for b in range(ACTIVE_COUNT):
             stage.hessian[entry, ACTIVE[b]] += curve[a, b]
 
 
@@ -190,7 +190,7 @@ def factor_of_risk(theta, values, weighed, factor, root):
     return total, True
 
 
-def mix(theta, factor, root, values, mixed):
+def risk_columns(theta, factor, root, values, mixed):
     """Write M V with V V' = W: other columns with the same covariance as noise has when it is as bad as the risk."""
     for k in range(SIZE):
         for i in range(COUNT):
@@ -202,23 +202,23 @@ def mix(theta, factor, root, values, mixed):
             mixed[i, k] *= root[k]
 
 
-def mix_slopes(theta, factor, root, slopes):
+def risk_column_slopes(theta, factor, root, slopes):
     """Mix the slopes of the columns likewise, in place."""
     for k in range(SIZE):
         for j in range(k):
             for i in range(COUNT):
-                for a in range(WIDE):
+                for a in range(PADDED_COUNT):
                     slopes[k, i, a] += factor[k, j] * slopes[j, i, a]
     for k in range(SIZE):
         for i in range(COUNT):
-            for a in range(WIDE):
+            for a in range(PADDED_COUNT):
                 slopes[k, i, a] *= root[k]
 
 
-def slope_ahead(ahead, slope):
+def next_slope(ahead, slope):
     """Write the slope of the cost-to-go where the step leads, in the states that noise acts on."""
     for i in range(COUNT):
-        row = i if FIRST else ROWS[i]
+        row = i if CONTIGUOUS else ROWS[i]
         total = ahead.gradient[row]
         for j in range(N):
             total += ahead.hessian[row, j] * ahead.arrived[j]
@@ -252,7 +252,7 @@ def add_risk(theta, ahead, mixed, slopes, slope, convex, stage):
         for j in range(N):
             steered[j] = 0.0
         for i in range(COUNT):
-            state, factor = i if FIRST else ROWS[i], mixed[i, k]
+            state, factor = i if CONTIGUOUS else ROWS[i], mixed[i, k]
             for j in range(N):
                 steered[j] += S[state, j] * factor
         for a in range(W):
@@ -264,15 +264,15 @@ def add_risk(theta, ahead, mixed, slopes, slope, convex, stage):
         for a in range(W):
             slopes_along[k, a] = line[a]
             stage.gradient[a] += theta * total * line[a]
-    if SOME:
-        gather(S, compact)
+    if ACTIVE_COUNT:
+        noisy_block(S, compact)
         for i in range(COUNT):  # the slope at g + y
             pulled[i] = slope[i]
             for j in range(COUNT):
                 for k in range(SIZE):
                     pulled[i] += theta * along[k] * compact[i, j] * mixed[j, k]
         for k in range(SIZE):
-            for a in range(SOME):
+            for a in range(ACTIVE_COUNT):
                 pull, entry = 0.0, ACTIVE[a]
                 for i in range(COUNT):
                     pull += slopes[k, i, a] * pulled[i]

@@ -7,7 +7,7 @@ from lqrsim.kernels.declarations import M, N, noise_values, stack
 
 SIZE = 1  # columns of M
 ACTIVE = (0,)  # entries of (x, u) that it depends on
-SOME = 1  # how many these are
+ACTIVE_COUNT = 1  # how many these are
 
 
 def noise_slopes(x, u, data, out, slopes):
@@ -18,7 +18,7 @@ def noise_slopes(x, u, data, out, slopes):
     for i in range(M):
         v[i] = u[i]
     noise_values(x, u, data, out)
-    for a in range(SOME):
+    for a in range(ACTIVE_COUNT):
         j = ACTIVE[a]
         at = x[j] if j < N else u[j - N]
         h = 6e-6 * max(1.0, abs(at))

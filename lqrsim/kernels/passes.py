@@ -11,17 +11,17 @@ from lqrsim.kernels.declarations import (
     M,
     N,
     W,
-    backtrack,
     forward_jacobian,
     initial_cost_to_come,
     linearize,
-    minimizer,
+    previous_state,
     riccati_forward,
+    smoothed_state,
     stack,
 )
 from lqrsim.kernels.linear_algebra import about_origin, affine, cholesky, cholesky_solve, clear, finite, offset, within
 from lqrsim.kernels.model_functions import advance, cost_quadratic, noise_quadratic, step_jacobian
-from lqrsim.kernels.records import Ahead, Linearization, Stage, Step
+from lqrsim.kernels.records import Linearization, LinearStep, NextStep, QuadraticStage
 
 
 def forward_pass(settings, model, about, work):
@@ -30,7 +30,7 @@ def forward_pass(settings, model, about, work):
     `work.x_hat` is where c_0 is quadratised, and on return the minimiser at T, where c_l was. The cost-to-go at T is
     set. Where the linearisation is guided, it is about the plan, and not about the minimisers.
     """
-    stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
+    stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived = stack(N)
     costate, u, x_hat, to_go, to_come = stack(N), stack(M), work.x_hat, work.to_go, work.to_come
     spare = stack(N, W)
@@ -46,21 +46,21 @@ def forward_pass(settings, model, about, work):
             within(u, model.limits)
         linearize(x_hat, u, model, arrived, step)
         jacobian = forward_jacobian(x_hat, u, model, arrived, step, spare)
-        ahead = Ahead(jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
+        ahead = NextStep(jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
         constant = stage_model(x_hat, u, t, model, about, ahead, True, stage)
         constant += fix_controls_at_limits(u, work.policy.gain[t], model.limits, stage, step)
         if not riccati_forward(t, step, stage, constant, to_come, work.smoothing):
             return t, finite(stage.hessian, W, W) and finite(step.jacobian, N, W)
-        if t + 1 < settings.steps and not about.guided and not minimizer(t + 1, to_go, to_come, costate, x_hat):
+        if t + 1 < settings.steps and not about.guided and not smoothed_state(t + 1, to_go, to_come, costate, x_hat):
             return t + 1, finite(to_go.hessian[t + 1], N, N) and finite(to_come.matrix[t + 1], N, N)
     steps = settings.steps
     if about.guided:
         copy(about.plan.states[steps], N, x_hat)
-    elif not minimizer(steps, to_go, to_come, costate, x_hat):
+    elif not smoothed_state(steps, to_go, to_come, costate, x_hat):
         # In the first iteration there may be no minimum without c_l, and the state of arrival is what we have.
         copy(arrived, N, x_hat)
     final_model(x_hat, steps, model, to_go)
-    if not minimizer(steps, to_go, to_come, costate, x_hat):
+    if not smoothed_state(steps, to_go, to_come, costate, x_hat):
         return steps, finite(to_go.hessian[steps], N, N) and finite(to_come.matrix[steps], N, N)
     return -1, True
 
@@ -75,25 +75,25 @@ def backward_pass(settings, model, about, work):
     Returns also a cost that is as good as none. Where the least cost is zero, squares of rounding errors remain of it,
     some 1e-13 of the numbers that cancel: those are in what the quadratic models are at the origin.
     """
-    stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
+    stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived = stack(N)
     x, u, costate, x_hat, to_go, to_come = stack(N), stack(M), stack(N), work.x_hat, work.to_go, work.to_come
     steps = settings.steps
-    if not minimizer(steps, to_go, to_come, costate, x_hat):
+    if not smoothed_state(steps, to_go, to_come, costate, x_hat):
         return steps, finite(to_go.hessian[steps], N, N) and finite(to_come.matrix[steps], N, N), 0.0
     size = abs(to_go.constant[steps])
     for t in range(steps - 1, -1, -1):
         copy(x_hat, N, work.x_hats[t + 1])
-        backtrack(t, x_hat, costate, work.smoothing, model, x, u)
+        previous_state(t, x_hat, costate, work.smoothing, model, x, u)
         if about.reach < 1:
             towards(x, about.reach, about.plan.states[t], N)
             towards(u, about.reach, about.plan.controls[t], M)
         linearize_forward(x, u, model, arrived, step)
-        ahead = Ahead(step.jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
+        ahead = NextStep(step.jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
         constant = stage_model(x, u, t, model, about, ahead, False, stage)
         size += abs(constant)
         good = riccati_backward_within(t, step, stage, constant, x, model.limits, work.policy, to_go)
-        if not good or not minimizer(t, to_go, to_come, costate, x_hat):
+        if not good or not smoothed_state(t, to_go, to_come, costate, x_hat):
             return (
                 t,
                 finite(stage.hessian, W, W) and finite(step.jacobian, N, W) and finite(to_come.matrix[t], N, N),
@@ -103,7 +103,7 @@ def backward_pass(settings, model, about, work):
     if not settings.fixed:
         good, constant = initial_model(x_hat, settings.fixed, model, about, to_go, to_come)
         size += abs(constant)
-    if not good or not minimizer(0, to_go, to_come, costate, x_hat):
+    if not good or not smoothed_state(0, to_go, to_come, costate, x_hat):
         return 0, finite(to_go.hessian[0], N, N) and finite(to_come.matrix[0], N, N), 0.0
     copy(x_hat, N, work.x_hats[0])
     return -1, True, 1e-26 * size if size < inf else 0.0
@@ -115,7 +115,7 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
     Without a plan to be guided by, the dynamics run backwards from the minimiser of c_l, with the controls of the
     guess; c_l is first quadratised at its last state.
     """
-    stage, step = Stage(stack(W, W), stack(W)), Step(stack(N, W), stack(N))
+    stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived = stack(N)
     x, x_hat, u = stack(N), stack(N), stack(M)
     about = Linearization(guess, guided, 1.0, 0.0, prior)
@@ -123,7 +123,7 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
     for _ in range(2):
         final_model(x_hat, steps, model, to_go)
         if not guided:
-            minimizer_of_cost_to_go(to_go.hessian[steps], to_go.gradient[steps], x_hat)
+            minimize_cost_to_go(to_go.hessian[steps], to_go.gradient[steps], x_hat)
     for t in range(steps - 1, -1, -1):
         copy(guess.controls[t], M, u)
         if guided:
@@ -131,12 +131,12 @@ def opening_pass(steps, guided, guess, prior, model, policy, to_go):
         else:
             advance(x_hat, u, model, -model.dt, x)
         linearize_forward(x, u, model, arrived, step)
-        ahead = Ahead(step.jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
+        ahead = NextStep(step.jacobian, arrived, to_go.hessian[t + 1], to_go.gradient[t + 1])
         constant = stage_model(x, u, t, model, about, ahead, False, stage)
         if not riccati_backward_within(t, step, stage, constant, x, model.limits, policy, to_go):
             return t, finite(stage.hessian, W, W) and finite(step.jacobian, N, W)
         copy(x, N, x_hat)
-        minimizer_of_cost_to_go(to_go.hessian[t], to_go.gradient[t], x_hat)
+        minimize_cost_to_go(to_go.hessian[t], to_go.gradient[t], x_hat)
     return -1, True
 
 
@@ -221,15 +221,15 @@ def towards(z, fraction, origin, size):
         z[i] = origin[i] + fraction * (z[i] - origin[i]) if fraction > 0 else origin[i]
 
 
-def minimizers(steps, to_go, to_come, x_hats):
+def smoothed_states(steps, to_go, to_come, x_hats):
     """Write the states of least total cost; False if one has none."""
     costate, good = stack(N), True
     for t in range(steps + 1):
-        good = minimizer(t, to_go, to_come, costate, x_hats[t]) and good
+        good = smoothed_state(t, to_go, to_come, costate, x_hats[t]) and good
     return good
 
 
-def minimizer_of_cost_to_go(S, s, x):
+def minimize_cost_to_go(S, s, x):
     """Write the minimiser of a cost-to-go, if it has one; leave x as it is if not."""
     factor, least = stack(N, N), stack(N)
     for i in range(N):

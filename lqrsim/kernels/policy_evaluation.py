@@ -6,7 +6,7 @@ from lqrsim.kernels.declarations import outline
 from lqrsim.kernels.linear_algebra import affine, within
 
 
-def apply_law(count, near, law, nominal, turning, limits, out) -> None:
+def apply_policy(count, near, law, nominal, turning, limits, out) -> None:
     """Controls (count, M) within the limits, of states (count, N), which become those nearest to the nominal (N,)."""
     for k in range(count):
         apply_one(near[k], law, nominal, turning, limits, out[k])
@@ -15,20 +15,20 @@ def apply_law(count, near, law, nominal, turning, limits, out) -> None:
 @outline
 def apply_one(x, law, nominal, turning, limits, u) -> None:
     """One of these."""
-    turn(x, nominal, turning)
+    to_nearest(x, nominal, turning)
     affine(law.gain, law.offset, x, u)
     within(u, limits)
 
 
-def turn_all(steps, count, states, nominal, turning) -> None:
+def all_to_nearest(steps, count, states, nominal, turning) -> None:
     """Takes each of the states (steps count, N) to its representative nearest to its step's nominal (steps, N)."""
     for t in range(steps):
         for k in range(count):
-            turn(states[t * count + k], nominal[t], turning)
+            to_nearest(states[t * count + k], nominal[t], turning)
 
 
 @outline
-def turn(x, nominal, turning) -> None:
+def to_nearest(x, nominal, turning) -> None:
     """Takes a state to its representative nearest to the nominal: its angles and its rotation vectors."""
     for k in range(turning.angle_count):
         nearest_angle(x, nominal, int(turning.angles[k]))

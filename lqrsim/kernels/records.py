@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 Arrays = Any  # an ndarray for Python, a pointer for compiled code
-Rows = npt.NDArray[np.void]  # with fields by name, of one of the types below
+StructuredArray = npt.NDArray[np.void]  # with fields by name, of one of the types below
 
 
 class Limits(NamedTuple):
@@ -73,7 +73,7 @@ class NoiseModel(NamedTuple):
     risk: Arrays
 
 
-class Model(NamedTuple):
+class ProblemModel(NamedTuple):
     """A problem as numbers and addresses; the time step is in s, and `noise` is empty where there is none."""
 
     dynamics: DynamicsModel
@@ -115,7 +115,7 @@ class CostToCome(NamedTuple):
     constant: Arrays
 
 
-class Smoothing(NamedTuple):
+class SmootherGains(NamedTuple):
     """What leads from the minimiser at t + 1 to that at t.
 
     In the dual form the state is `state - state_gain costate` and the control `control_gain costate + control`; in the
@@ -149,7 +149,7 @@ class Linearization(NamedTuple):
     prior: Prior
 
 
-class Order(NamedTuple):
+class ModelOrder(NamedTuple):
     """What the models of a pass about a plan are made of.
 
     `damping` is a weight on changes of the controls. `share` is how much of the second order there is: 0 for the models
@@ -162,14 +162,14 @@ class Order(NamedTuple):
     known: CostToGo
 
 
-class Step(NamedTuple):
+class LinearStep(NamedTuple):
     """A linearised step: [A B] (N, W) and c (N,)."""
 
     jacobian: Arrays
     offset: Arrays
 
 
-class Ahead(NamedTuple):
+class NextStep(NamedTuple):
     """What lies ahead of a step: its Jacobian [A B] (N, W), where it leads (N,), and the cost-to-go there, Hessian
     (N, N) and gradient at the origin (N,).
     """
@@ -180,7 +180,7 @@ class Ahead(NamedTuple):
     gradient: Arrays
 
 
-class Stage(NamedTuple):
+class QuadraticStage(NamedTuple):
     """A cost about the origin, or about a point: Hessian (W, W) and gradient (W,) in states and controls."""
 
     hessian: Arrays
@@ -238,7 +238,7 @@ class ActiveRows(NamedTuple):
     wrong: Arrays
 
 
-class Reduced(NamedTuple):
+class EliminatedControl(NamedTuple):
     """A step and its stage with the control eliminated by u = w - F x - h, for the dual form.
 
     `factor` (M, M) is that of R, AT (N, N) and BT (M, N) the step's matrices transposed, Q (N, N) and q (N,) the cost
@@ -255,7 +255,7 @@ class Reduced(NamedTuple):
     size: Arrays
 
 
-class Settings(NamedTuple):
+class IterationSettings(NamedTuple):
     """Of a solve: how long, and when it has converged.
 
     `optimal` asks for more than a cost that has settled; with `fixed` the start is given; with `guided` the first
@@ -274,12 +274,12 @@ class Settings(NamedTuple):
     valley: float = 0.0
 
 
-class Workspace(NamedTuple):
+class SmootherArrays(NamedTuple):
     """All that a smoother reads and writes.
 
     Attributes:
       start: (N,) where it begins. x_hat: (N,) the minimiser that a pass has come to. x_hats: (T+1, N) all of them.
-      eased: the stage cost as the passes see it, which is not yet the true one in the first iterations of a
+      homotopy_scaled: the stage cost as the passes see it, which is not yet the true one in the first iterations of a
         continuation.
       guess: what the first pass can be guided by. plan: the best so far. rollout: where the last policy leads.
       kept: that policy. certificate: (1,) rows of `CERTIFICATE`.
@@ -291,8 +291,8 @@ class Workspace(NamedTuple):
     policy: Policy
     to_go: CostToGo
     to_come: CostToCome
-    smoothing: Smoothing
-    eased: Any
+    smoothing: SmootherGains
+    homotopy_scaled: Any
     prior: Prior
     guess: Motion
     plan: Motion
@@ -301,17 +301,17 @@ class Workspace(NamedTuple):
     certificate: Arrays
 
 
-class Passes(NamedTuple):
+class RiccatiArrays(NamedTuple):
     """What the passes of a linear-quadratic problem write; x_hats (T+1, N) are the minimisers."""
 
     policy: Policy
     to_go: CostToGo
     to_come: CostToCome
-    smoothing: Smoothing
+    smoothing: SmootherGains
     x_hats: Arrays
 
 
-class Descent(NamedTuple):
+class IlqrArrays(NamedTuple):
     """All that iLQR reads and writes: the plan is the best so far, `trial` what a line search tries.
 
     `damping` (1,) is the weight on changes of the controls; `certificate` (1,) rows of `CERTIFICATE`.
@@ -330,7 +330,7 @@ class Predictor(NamedTuple):
     """What takes estimates a control period on: see `estimation.py`.
 
     Attributes:
-      dynamics, dt: as in `Model`. places: which of the parameters are unknown, (P,).
+      dynamics, dt: as in `ProblemModel`. places: which of the parameters are unknown, (P,).
       lag: how much is left of the distance to a command at the end of a period, and in the mean over it, (2,).
       transition: of the unknowns' states, (D, D). output: from these to the unknowns' values, (V, D).
     """
@@ -351,14 +351,14 @@ class SensorModel(NamedTuple):
     data: Arrays
 
 
-class Measured(NamedTuple):
+class Measurements(NamedTuple):
     """What is shown of the states (count, N), and 1 where that was lost, else 0, (count,)."""
 
     shown: Arrays
     lost: Arrays
 
 
-class Turning(NamedTuple):
+class AngularStates(NamedTuple):
     """Which states are angles, and where rotation vectors begin: their places, (any,), and how many there are."""
 
     angles: Arrays
@@ -381,7 +381,7 @@ def _row(*names: str) -> np.dtype[np.void]:
 # is as good as none; and the weight on changes of controls without which it has no minimum.
 MEMORY = _row(
     "plan_cost", "merit", "reach", "weight", "small_changes", "ilqr_left", "ilqr_next", "since_ilqr", "final_gap",
-    "started", "watched", "share", "failed", "decrease", "promised", "nothing", "damping",
+    "started", "watched", "share", "failed", "decrease", "promised", "negligible", "damping",
 )  # fmt: skip
 
 # A line of the log: NaN where something was not worked out.

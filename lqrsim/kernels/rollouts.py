@@ -25,7 +25,7 @@ from lqrsim.kernels.model_functions import (
     step_second_order,
 )
 from lqrsim.kernels.passes import copy, end_model
-from lqrsim.kernels.records import Ahead, Limits, Stage
+from lqrsim.kernels.records import Limits, NextStep, QuadraticStage
 
 
 def rollout(steps, x0, policy, model, plan):
@@ -47,7 +47,7 @@ def noise_cost(steps, plan, model, to_go):
     """What noise is expected to cost along a trajectory, with the cost-to-go of the policy that makes it."""
     total, none = 0.0, stack(N, W)
     for t in range(steps):
-        ahead = Ahead(none, plan.states[t + 1], to_go.hessian[t + 1], to_go.gradient[t + 1])
+        ahead = NextStep(none, plan.states[t + 1], to_go.hessian[t + 1], to_go.gradient[t + 1])
         total += noise_value(plan.states[t], plan.controls[t], model.noise, ahead)
     return total
 
@@ -73,7 +73,7 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
 
     Returns as every pass does, and the decrease of cost that the linear-quadratic model predicts.
     """
-    share, stage, arrived, weights = order.share, Stage(stack(W, W), stack(W)), stack(N), stack(N)
+    share, stage, arrived, weights = order.share, QuadraticStage(stack(W, W), stack(W)), stack(N), stack(N)
     jacobian, none, no_change = stack(N, W), stack(M), stack(N)
     slope, curve = stack(N), stack(N, N)
     hessian, gradient, room = stage.hessian, stage.gradient, Limits(stack(M), stack(M))
@@ -100,9 +100,9 @@ def differential_pass(steps, plan, model, order, keep, policy, to_go):
         else:
             step_jacobian(x, u, model, model.dt, arrived, jacobian)
         if NOISY:
-            beyond = Ahead(jacobian, arrived, curve, s[(t + 1) * keep])
+            beyond = NextStep(jacobian, arrived, curve, s[(t + 1) * keep])
             if share > 0:
-                beyond = Ahead(jacobian, arrived, order.known.hessian[t + 1], order.known.gradient[t + 1])
+                beyond = NextStep(jacobian, arrived, order.known.hessian[t + 1], order.known.gradient[t + 1])
             ahead += noise_quadratic(x, u, model.noise, beyond, False, stage)
         congruence(jacobian, curve, slope, hessian, gradient)
         for i in range(M):
@@ -221,7 +221,7 @@ def line_search(steps, shift, work, model, bound, slope, smallest, trial):
     return bound, bound, 0.0
 
 
-def keep_plan(steps, source, target):
+def copy_plan(steps, source, target):
     """Copy a trajectory."""
     for t in range(steps + 1):
         copy(source.states[t], N, target.states[t])
@@ -229,7 +229,7 @@ def keep_plan(steps, source, target):
         copy(source.controls[t], M, target.controls[t])
 
 
-def keep_policy(steps, source, target):
+def copy_policy(steps, source, target):
     """Copy a policy."""
     for t in range(steps):
         for i in range(M):
@@ -238,7 +238,7 @@ def keep_policy(steps, source, target):
                 target.gain[t, i, j] = source.gain[t, i, j]
 
 
-def follow(steps, fraction, plan, x_hats):
+def shorten_step(steps, fraction, plan, x_hats):
     """Make of the states that a whole step was to lead to those that a part of it was."""
     if fraction < 1:
         for t in range(steps + 1):
@@ -246,7 +246,7 @@ def follow(steps, fraction, plan, x_hats):
                 x_hats[t, i] = plan.states[t, i] + fraction * (x_hats[t, i] - plan.states[t, i])
 
 
-def about_plan(steps, plan, policy):
+def policy_about_plan(steps, plan, policy):
     """Make the policy relative to the plan: l becomes L x + l - u, the change of the controls that it asks for."""
     u = stack(M)
     for t in range(steps):

@@ -59,8 +59,8 @@ class NoiseTerm:
         """The constants that the kernels leave open."""
         some = len(self.active)
         return {
-            "ROWS": self.rows, "COUNT": len(self.rows), "FIRST": int(self.rows == tuple(range(len(self.rows)))),
-            "SIZE": self.size, "ACTIVE": self.active, "SOME": some, "WIDE": -4 * (some // -4),
+            "ROWS": self.rows, "COUNT": len(self.rows), "CONTIGUOUS": int(self.rows == tuple(range(len(self.rows)))),
+            "SIZE": self.size, "ACTIVE": self.active, "ACTIVE_COUNT": some, "PADDED_COUNT": -4 * (some // -4),
         }  # fmt: skip
 
 
@@ -253,7 +253,7 @@ class Noise:
             unused=tuple((i, name) for i, name in enumerate(names) if i not in active),
         )  # fmt: skip
         given = source_of(function_noise, SIZE=self.size, STRENGTH=1 + len(self.parameters))
-        differences = source_of(noise_differences, SIZE=self.size, ACTIVE=active, SOME=len(active))
+        differences = source_of(noise_differences, SIZE=self.size, ACTIVE=active, ACTIVE_COUNT=len(active))
         source = differences.filled(noise_values=given)
         return NoiseTerm(source, numbers, tuple(range(n)), self.size, active, (function,))
 

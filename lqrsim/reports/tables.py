@@ -19,7 +19,7 @@ WORST_EACH = 3  # worst trials that are listed of each policy and sweep
 
 
 @dataclass(frozen=True)
-class Rows:
+class PageTable:
     """A table of the page."""
 
     caption: str
@@ -37,7 +37,7 @@ def policies(table: analysis.Table) -> list[str]:
     return list(dict.fromkeys(cell.policy for cell in table))
 
 
-def breaks_table(table: analysis.Table) -> Rows:
+def breaks_table(table: analysis.Table) -> PageTable:
     """At which strength each policy breaks in each sweep."""
     rows = [
         [
@@ -46,7 +46,7 @@ def breaks_table(table: analysis.Table) -> Rows:
         ]
         for one in analysis.breaks(table, below=BROKEN_BELOW)
     ]  # fmt: skip
-    return Rows("Where policies break", ("policy", "sweep", "at strength", "success there"), rows)
+    return PageTable("Where policies break", ("policy", "sweep", "at strength", "success there"), rows)
 
 
 def _percent(one: Estimate, scale: float = 100.0, unit: str = " %") -> str:
@@ -56,7 +56,7 @@ def _percent(one: Estimate, scale: float = 100.0, unit: str = " %") -> str:
     return f"{scale * one.value:.1f} ({scale * one.low:.1f} to {scale * one.high:.1f}){unit}"
 
 
-def comparison_tables(table: analysis.Table, unit: str) -> list[Rows]:
+def comparison_tables(table: analysis.Table, unit: str) -> list[PageTable]:
     """Policies two by two on the same trials, a table for each pair and sweep; `unit` is that of tracking errors."""
     found = analysis.comparisons(table)
     factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
@@ -66,7 +66,7 @@ def comparison_tables(table: analysis.Table, unit: str) -> list[Rows]:
     )  # fmt: skip
     groups = dict.fromkeys((one.first.sweep, one.first.policy, one.second.policy) for one in found)
     return [
-        Rows(
+        PageTable(
             f"{sweep}: {first} against {second}",
             head,
             [
@@ -89,7 +89,7 @@ def _between(value: float, low: float, high: float, scale: float = 1.0) -> str:
     return f"{scale * value:.3g}" if low == high else f"{scale * value:.3g} ({scale * low:.3g} to {scale * high:.3g})"
 
 
-def failure_table(table: analysis.Table) -> Rows:
+def failure_table(table: analysis.Table) -> PageTable:
     """How many trials of each cell ended how, and what they hit."""
     kinds = [outcome for outcome in OUTCOMES if outcome != "reached"]
     rows = []
@@ -101,14 +101,14 @@ def failure_table(table: analysis.Table) -> Rows:
         if modes:
             rows.append([*_cell_names(cell), str(len(outcomes)), *map(str, counts), ", ".join(hit[:4]) + more])
     head = ("policy", "sweep", "strength", "trials", *kinds, "collided with")
-    return Rows("Failures by how they ended, and the obstacles that were hit most", head, rows)
+    return PageTable("Failures by how they ended, and the obstacles that were hit most", head, rows)
 
 
 def _cell_names(cell: Cell) -> list[str]:
     return [cell.policy, cell.sweep, f"{cell.strength:g}"]
 
 
-def measure_tables(table: analysis.Table, scenario: Scenario) -> list[Rows]:
+def measure_tables(table: analysis.Table, scenario: Scenario) -> list[PageTable]:
     """Quantiles of all that is measured, a table for each sweep."""
     units = dict(analysis.MEASURES)
     of_controls = set(scenario.robot.dynamics.control_coordinates.units)
@@ -128,7 +128,7 @@ def measure_tables(table: analysis.Table, scenario: Scenario) -> list[Rows]:
                 quantiles = [analysis.quantiles(outcomes, name) for name in units]
                 values = [_between(middle, low, high) for low, middle, high in quantiles]
                 rows.append([cell.policy, f"{cell.strength:g}", *values])
-        tables.append(Rows(sweep, head, rows))
+        tables.append(PageTable(sweep, head, rows))
     return tables
 
 
@@ -144,7 +144,7 @@ def worst_trials(table: analysis.Table, group: tuple[str, str]) -> list[analysis
     return analysis.worst({cell: one for cell, one in table.items() if (cell.policy, cell.sweep) == group}, WORST_EACH)
 
 
-def worst_table(table: analysis.Table, unit: str) -> Rows:
+def worst_table(table: analysis.Table, unit: str) -> PageTable:
     """The worst trials of each policy and sweep; `unit` is that of tracking errors."""
     rows = [
         [
@@ -158,16 +158,16 @@ def worst_table(table: analysis.Table, unit: str) -> Rows:
         "policy", "sweep", "strength", "trial", "outcome", "collided with", "ended (s)", "least clearance (m)",
         f"largest error ({unit})",
     )  # fmt: skip
-    return Rows("Worst trials", head, rows)
+    return PageTable("Worst trials", head, rows)
 
 
-def success_table(sweep: str, curves: Mapping[str, Sequence[analysis.Success]]) -> Rows:
+def success_table(sweep: str, curves: Mapping[str, Sequence[analysis.Success]]) -> PageTable:
     """How many trials of each policy reached their goal, a strength a row; curves are those of the policies."""
     points = [point for of_policy in curves.values() for point in of_policy]
     strengths = sorted({point.cell.strength for point in points})
     of_cell = {(point.cell.policy, point.cell.strength): point for point in points}
     rows = [[f"{s:g}", *(_share(of_cell.get((policy, s))) for policy in curves)] for s in strengths]
-    return Rows(f"{sweep}: trials that reached their goal", ("strength", *curves), rows)
+    return PageTable(f"{sweep}: trials that reached their goal", ("strength", *curves), rows)
 
 
 def _share(point: analysis.Success | None) -> str:

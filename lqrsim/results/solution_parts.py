@@ -69,6 +69,7 @@ class Status(enum.StrEnum):
     CONVERGED = "converged"
     COST_CONVERGED = "cost converged"
     MAX_ITERATIONS = "max iterations"
+    STALLED = "stalled"
     TIME_LIMIT = "time limit"
     INTERRUPTED = "interrupted"
     INFEASIBLE = "infeasible"
@@ -100,8 +101,12 @@ _STATUS_TEXT = {
         'look at the gap, or solve with stop="optimal"',
     ),
     Status.MAX_ITERATIONS: (
-        "the iteration limit came first, or no step lowered the cost any more",
+        "the iteration limit came first",
         "raise max_iterations if the improvements still shrink; if they do not, try another start",
+    ),
+    Status.STALLED: (
+        "no step makes the plan better, though it is not within tolerance",
+        "try another start; scale states, controls and costs to similar sizes; or accept a larger tolerance",
     ),
     Status.TIME_LIMIT: (
         "the time limit came first; the plan is the best so far",
@@ -218,11 +223,12 @@ class Certificate:
 
     Attributes:
       cost: of the plan; see `Solution.cost`.
-      start: largest difference of its first state from a `FixedState`; 0 where the start is not fixed.
-      motion: largest difference of a state from a step of the dynamics out of the state before it; each state relative
-        to its largest size along the plan, at least 1 unit.
-      law: largest difference of a control from the policy's at that state, relative to the terms of `L x + l`.
-      limits: by how much a control is beyond its limits, in its unit.
+      start: largest difference between its first state and a `FixedState`; 0 where the start is not fixed.
+      dynamics_residual: largest difference between a state and one step of the dynamics from the state before, each
+        state relative to its largest size along the plan, at least 1 unit.
+      policy_residual: largest difference between a control and the policy's at that state, relative to the terms of
+        `L x + l`.
+      limits: how far a control is beyond its limits, in its unit.
       violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all inequalities are
         kept and there are no equalities. Of a converged plan it is at most `constraint_tolerance`, of equalities at
         most 1e-6, unless constraints are elastic.
@@ -232,8 +238,8 @@ class Certificate:
 
     cost: float
     start: float
-    motion: float
-    law: float
+    dynamics_residual: float
+    policy_residual: float
     limits: float
     violation: float
     optimality: float

@@ -11,7 +11,7 @@ import numpy as np
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import CERTIFICATE, CostToGo, Rows
+from lqrsim.kernels.records import CERTIFICATE, CostToGo, StructuredArray
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Certificate
 from lqrsim.results.value_functions import Quadratic
@@ -26,7 +26,7 @@ REST = 1e-13
 SLACK = 2.0
 
 
-Work = Callable[[int, CostToGo, Rows], object]
+Work = Callable[[int, CostToGo, StructuredArray], object]
 
 
 def certified(
@@ -84,8 +84,8 @@ def certificate_of(problem: Problem, found: np.void, states: Array, *, violation
         decrease = np.inf
     optimality = decrease / max(abs(cost), 1e-26 * scale, 1e-300) if np.isfinite(decrease) else np.inf
     return Certificate(
-        cost=cost, start=start, motion=motion, law=law, limits=max(limits, 0.0), violation=violation,
-        optimality=optimality,
+        cost=cost, start=start, dynamics_residual=motion, policy_residual=law, limits=max(limits, 0.0),
+        violation=violation, optimality=optimality,
     )  # fmt: skip
 
 
@@ -102,10 +102,10 @@ def faults(
     found = []
     if certificate.start != 0:
         found.append(f"it begins {certificate.start:.2g} off the fixed start")
-    if not certificate.motion <= MOTION:
-        found.append(f"it is {certificate.motion:.2g} off the dynamics")
-    if not certificate.law <= LAW:
-        found.append(f"its controls are {certificate.law:.2g} off the policy's")
+    if not certificate.dynamics_residual <= MOTION:
+        found.append(f"it is {certificate.dynamics_residual:.2g} off the dynamics")
+    if not certificate.policy_residual <= LAW:
+        found.append(f"its controls are {certificate.policy_residual:.2g} off the policy's")
     if certificate.limits > 0:
         found.append(f"a control is {certificate.limits:.2g} beyond its limit")
     if certificate.violation > 0 and not kept:

@@ -26,7 +26,16 @@ from lqrsim.kernels import (
     projection,
 )
 from lqrsim.kernels import noise as noise_kernel
-from lqrsim.kernels.records import Constraints, CostModel, DynamicsModel, Limits, Model, Motion, NoiseModel, Policy
+from lqrsim.kernels.records import (
+    Constraints,
+    CostModel,
+    DynamicsModel,
+    Limits,
+    Motion,
+    NoiseModel,
+    Policy,
+    ProblemModel,
+)
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.dynamics import Dynamics
@@ -36,7 +45,7 @@ from lqrsim.problem.problem import FixedState, Problem
 # The forms of the cost-to-come, and what brings each.
 FORMS = {"dual": cost_to_come_dual, "primal": cost_to_come_primal}
 _OF_FORM = (
-    "initial_cost_to_come", "linearize", "forward_jacobian", "riccati_forward", "minimizer", "backtrack",
+    "initial_cost_to_come", "linearize", "forward_jacobian", "riccati_forward", "smoothed_state", "previous_state",
 )  # fmt: skip
 
 
@@ -78,7 +87,7 @@ def structure(problem: Problem) -> tuple[Any, ...]:
 _FIELDS = ("initial", "stage_cost", "final_cost")
 
 
-def arguments(problem: Problem, *, multipliers: Sequence[Array] = (), second_order: bool = False) -> Model:
+def arguments(problem: Problem, *, multipliers: Sequence[Array] = (), second_order: bool = False) -> ProblemModel:
     """The problem as the passes take it; compiles what it brings, if that is new.
 
     Args:
@@ -88,7 +97,7 @@ def arguments(problem: Problem, *, multipliers: Sequence[Array] = (), second_ord
     multipliers = multipliers or [no_multipliers(problem, term) for term in problem.constraint_terms]
     pairs = list(zip(problem.constraint_terms, multipliers, strict=True))
     space, term = problem.control_coordinates, problem.noise_term
-    return Model(
+    return ProblemModel(
         dynamics_model(problem.dynamics, second_order=second_order), float(problem.dt),
         initial=_cost(problem, "initial", []), stage=_cost(problem, "stage_cost", pairs),
         final=_cost(problem, "final_cost", [pair for pair in pairs if not pair[0].uses_control]),

@@ -26,7 +26,7 @@ from lqrsim.kernels.records import ActiveRows, ConstraintRows, CostToGo, Limits,
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Iteration
 from lqrsim.solvers import compiled
-from lqrsim.solvers.common import INSIDE
+from lqrsim.solvers.settings import INSIDE
 
 INTERIOR = "interior point"  # what its iterations are called
 MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # shares of the projected Hessian, tried in turn
@@ -208,7 +208,7 @@ class Stages:
     def trial(self, plan: Motion) -> tuple[float, Array]:
         """The cost of a plan, and where its steps lead (T, n)."""
         arrived = np.empty((self.steps, self.n))
-        return self._call("trial", self.steps, self._soft, plan, self._model, arrived), arrived
+        return self._call("trial_cost", self.steps, self._soft, plan, self._model, arrived), arrived
 
     def linearize(self, plan: Motion, costates: Array, multipliers: Array, least: float) -> float:
         """Make the models about a plan, with costates (T+1, n) and multipliers (T+1, R); return its cost."""
@@ -283,7 +283,7 @@ class Stages:
     def follow(self, plan: Motion, part: float, policy: tuple[Array, Array], limits: Limits) -> Motion:
         """The motion that a part of a step leads to; see the kernel's."""
         out = Motion(np.empty((self.steps + 1, self.n)), np.empty((self.steps, self.m)))
-        self._call("follow", self.steps, float(part), plan, Policy(*policy), limits, self._model, out)
+        self._call("closed_loop_rollout", self.steps, float(part), plan, Policy(*policy), limits, self._model, out)
         return out
 
     def adjoint(self, gradient: Array) -> tuple[Array, Array]:
@@ -313,14 +313,14 @@ class Stages:
     ) -> float:  # fmt: skip
         rows = self._rows._replace(least=float(least), multipliers=multipliers.reshape(-1))
         return self._call(
-            "look", self.steps, self._soft, int(second), int(own), plan, costates, self._model, self._values, rows,
-            self.models, active, module=self._active,
+            "linearize_plan", self.steps, self._soft, int(second), int(own), plan, costates, self._model, self._values,
+            rows, self.models, active, module=self._active,
         )  # fmt: skip
 
     def measure(self, plan: Motion, gaps: Array, sizes: Sizes) -> tuple[float, ...]:
         """How far the plan about which the models are is from an optimum; writes its gaps. See the kernel's."""
         of = plan, self.models, gaps, self.active, sizes.states, sizes.controls
-        return self._call("measure", self.steps, *of, module=self._active)
+        return self._call("optimality_measures", self.steps, *of, module=self._active)
 
     def pivot(self, gaps: Array, *, share: float, scale: float, weight: float, price: float = 1.0) -> tuple[bool, int]:
         """As `direction`, with rows that are held; also returns how many are wrong there. See the kernel's."""
@@ -338,7 +338,7 @@ class Stages:
 
     def change(self, *, worst: bool) -> None:
         """Change which rows are held; see the kernel's."""
-        self._call("change", self.steps, int(worst), self.active, module=self._active)
+        self._call("update_active_set", self.steps, int(worst), self.active, module=self._active)
 
     def carry_out(self, plan: Motion, gain: Array) -> tuple[Motion, float, list[Array]]:
         """The motion that a plan comes to with gains about it, its cost, and of each constraint the numbers.
@@ -348,8 +348,8 @@ class Stages:
         out = Motion(np.empty_like(plan.states), np.empty_like(plan.controls))
         limits = Limits(*(np.tile(side, (self.steps, 1)) for side in (self.low, self.high)))
         cost = self._call(
-            "carry_out", self.steps, self._soft, plan, Policy(gain, self.offset), limits, self.active, self._model,
-            self._values, out, module=self._active,
+            "rollout_of_active_set", self.steps, self._soft, plan, Policy(gain, self.offset), limits, self.active,
+            self._model, self._values, out, module=self._active,
         )  # fmt: skip
         return out, cost, [one.reshape(self.steps + 1, -1) for one in self._values]
 

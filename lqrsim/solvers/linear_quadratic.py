@@ -6,8 +6,15 @@ from typing import NamedTuple
 import numpy as np
 
 from lqrsim.errors import Array, InputError, check_array, check_kind, check_memory, check_name, check_number
-from lqrsim.kernels.records import CostToCome, CostToGo, Passes, Policy, Smoothing, Step
-from lqrsim.kernels.records import Stage as QuadraticStage
+from lqrsim.kernels.records import (
+    CostToCome,
+    CostToGo,
+    LinearStep,
+    Policy,
+    QuadraticStage,
+    RiccatiArrays,
+    SmootherGains,
+)
 from lqrsim.problem.linear_quadratic import Stage, check_end
 from lqrsim.problem.problem import FixedState
 from lqrsim.results.coordinates import Coordinates
@@ -80,7 +87,13 @@ def smooth_lq(
         clearance=None,
         # The plan is the rollout just made.
         certificate=Certificate(
-            cost=value, start=0.0, motion=0.0, law=0.0, limits=0.0, violation=0.0, optimality=optimality
+            cost=value,
+            start=0.0,
+            dynamics_residual=0.0,
+            policy_residual=0.0,
+            limits=0.0,
+            violation=0.0,
+            optimality=optimality,
         ),
         gap=gap,
         solver="smooth_lq",
@@ -132,8 +145,8 @@ def _passes(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Qu
     back = np.zeros((steps, n, n)), np.zeros((steps, n)), np.zeros((steps, m, n)), np.zeros((steps, m))
     x_hat = np.zeros((steps + 1, n))
     failed, which = compiled.linear_quadratic(n, m, form).lq_passes(
-        steps, Step(jacobian, c.copy()), Step(inverse, c_inverse), QuadraticStage(cost, slope), constant.copy(),
-        Passes(Policy(*law), CostToGo(*go), CostToCome(*come), Smoothing(*back), x_hat),
+        steps, LinearStep(jacobian, c.copy()), LinearStep(inverse, c_inverse), QuadraticStage(cost, slope),
+        constant.copy(), RiccatiArrays(Policy(*law), CostToGo(*go), CostToCome(*come), SmootherGains(*back), x_hat),
     )  # fmt: skip
     failure = f"{_WHICH[which]}, step {failed} of {steps}" if failed >= 0 else ""
     if failed >= 0 and form == "dual" and which > 0:

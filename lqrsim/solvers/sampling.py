@@ -8,7 +8,7 @@ from lqrsim.kernels.records import Policy
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
 from lqrsim.solvers import compiled
-from lqrsim.solvers.common import check_problem
+from lqrsim.solvers.settings import check_problem
 
 MOST_TRIALS = 10_000_000
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from lqrsim.errors import Array, InputError, check_function, check_kind
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.verify.verdict import Test
+from lqrsim.verify.verdict import Criterion
 from lqrsim.view.recorded_model import model_of, place_in, robot_body
 
 Progress = Callable[[int, int], object]
@@ -67,27 +67,27 @@ def frame_positions(rollout: Rollout, trial: int, model: mujoco.MjModel, times: 
     return np.stack([np.interp(times, rollout.frame_times[good], column) for column in columns], axis=1)
 
 
-def check_record(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: float) -> Test:
+def check_record(rollout: Rollout, trial: int, model: mujoco.MjModel, bound: float) -> Criterion:
     """Whether states and what was recorded for drawing are one motion."""
     times, _ = frames_at_states(rollout, trial)
     found, wanted = frame_positions(rollout, trial, model, times), state_positions(rollout, trial, times)
     apart = np.linalg.norm(found - wanted, axis=1).max()
     said = f"frames and states at most {1e3 * apart:.2f} mm apart, want {1e3 * bound:.2f} at most"
-    return Test("record", bool(apart <= bound), said)
+    return Criterion("record", bool(apart <= bound), said)
 
 
-def check_plan(rollout: Rollout, solution: Solution | None) -> Test:
+def check_plan(rollout: Rollout, solution: Solution | None) -> Criterion:
     """Whether the plan is the solution's; None (not checked) where another policy was run."""
     if solution is None:
-        return Test("plan", None, "whether it is the one that was followed takes the solution")
+        return Criterion("plan", None, "whether it is the one that was followed takes the solution")
     same = np.array_equal(rollout.plan.states, solution.trajectory.states)
     same = same and np.array_equal(rollout.plan.controls, solution.trajectory.controls)
     if not same:
-        return Test("plan", False, "not as the solution has it")
+        return Criterion("plan", False, "not as the solution has it")
     if not ran_policy_of(solution, rollout):
         unknown = "another policy or a controller was run, of which the solution does not say what plan it followed"
-        return Test("plan", None, f"as the solution has it; {unknown}")
-    return Test("plan", True, "as the solution has it, whose policy was run")
+        return Criterion("plan", None, f"as the solution has it; {unknown}")
+    return Criterion("plan", True, "as the solution has it, whose policy was run")
 
 
 def ran_policy_of(solution: Solution, rollout: Rollout) -> bool:

@@ -13,7 +13,7 @@ VERDICTS = {True: "passed", False: "FAILED", None: "not checked"}
 
 
 @dataclass(frozen=True)
-class Test:
+class Criterion:
     """One thing that must hold.
 
     Attributes:
@@ -28,9 +28,9 @@ class Test:
 
     def __post_init__(self) -> None:
         for name in ("name", "detail"):
-            check_kind(f"Test: {name}", getattr(self, name), str, "text")
+            check_kind(f"Criterion: {name}", getattr(self, name), str, "text")
         if self.passed not in (True, False, None):
-            raise InputError(f"Test: passed: got {excerpt(self.passed)}, want True, False or None")
+            raise InputError(f"Criterion: passed: got {excerpt(self.passed)}, want True, False or None")
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Verification:
     worst: float
     shift: float
     scale: float
-    tests: tuple[Test, ...]
+    tests: tuple[Criterion, ...]
     likely: str
 
     def __post_init__(self) -> None:
@@ -77,7 +77,7 @@ class Verification:
             object.__setattr__(self, name, shaped(f"Verification: {name}", getattr(self, name), seen.shape))
         for name in ("rms", "worst", "shift", "scale"):
             object.__setattr__(self, name, float(shaped(f"Verification: {name}", getattr(self, name), ())))
-        object.__setattr__(self, "tests", check_items("Verification: tests", self.tests, Test, "a tuple of tests"))
+        object.__setattr__(self, "tests", check_items("Verification: tests", self.tests, Criterion, "a tuple of tests"))
 
     @property
     def passed(self) -> bool:
@@ -129,7 +129,7 @@ def compare(
     *,
     bound: float,
     interval: float,
-    others: tuple[Test, ...] = (),
+    others: tuple[Criterion, ...] = (),
 ) -> Verification:
     """Compares what was seen with what there was.
 
@@ -140,7 +140,7 @@ def compare(
     """
     times, seen, actual = positions.times, positions.seen, positions.actual
     good = np.asarray(np.isfinite(seen).all(axis=1))
-    visible = Test(
+    visible = Criterion(
         "seen",
         bool(good.mean() >= 1 - HIDDEN) and int(good.sum()) > 2,
         f"in {good.sum()} of {len(good)} frames, want {100 * (1 - HIDDEN):.0f} % of them",
@@ -159,18 +159,18 @@ def compare(
     most_apart, agreement = float(positions.apart[good].max()), ()
     if most_apart > 0:  # only one view leaves nothing to disagree about
         detail = f"at worst {1e3 * most_apart:.1f} mm apart, want {1e3 * bound:.1f} at most"
-        agreement = (Test("views agree", most_apart <= bound, detail),)
+        agreement = (Criterion("views agree", most_apart <= bound, detail),)
     tests = (
         *others,
         visible,
-        Test(
+        Criterion(
             "position",
             bool(distance.max() <= bound),
             f"at worst {1e3 * distance.max():.1f} mm off, at {times[number]:.2f} s, want {1e3 * bound:.1f} at most",
         ),
         *agreement,
-        Test("time", abs(shift) <= most, f"{1e3 * shift:+.1f} ms ahead, want {1e3 * most:.1f} at most either way"),
-        Test("scale", abs(scale) <= stretch, f"{1 + scale:.4f}, want 1 within {stretch:.4f}"),
+        Criterion("time", abs(shift) <= most, f"{1e3 * shift:+.1f} ms ahead, want {1e3 * most:.1f} at most either way"),
+        Criterion("scale", abs(scale) <= stretch, f"{1 + scale:.4f}, want 1 within {stretch:.4f}"),
     )
     return Verification(
         subject, method, times, seen, actual, positions.planned, _rms(distance), float(distance.max()), shift,
@@ -178,7 +178,7 @@ def compare(
     )  # fmt: skip
 
 
-def _likely_cause(tests: tuple[Test, ...], positions: Positions, bound: float, interval: float) -> str:
+def _likely_cause(tests: tuple[Criterion, ...], positions: Positions, bound: float, interval: float) -> str:
     """What is wrong, in a line; empty if no test failed."""
     failed = {test.name for test in tests if test.passed is False}
     if "mark" in failed:

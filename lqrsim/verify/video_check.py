@@ -16,7 +16,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.verify import ground_truth, pixels
 from lqrsim.verify.ground_truth import Progress
-from lqrsim.verify.verdict import Positions, Test, Verification, compare
+from lqrsim.verify.verdict import Criterion, Positions, Verification, compare
 from lqrsim.view import video_metadata
 from lqrsim.view.cameras import Camera
 from lqrsim.view.video_metadata import Pane, VideoMetadata
@@ -104,7 +104,7 @@ def verify_video(
     )
 
 
-def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, area: float) -> tuple[Test, ...]:
+def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, area: float) -> tuple[Criterion, ...]:
     """Whether the file is of the run of that digest, with its frames at their times, and its marks large enough.
 
     Args:
@@ -112,17 +112,17 @@ def _check_file(metadata: VideoMetadata, digest: str, frames: int, off: float, a
       area: of the smallest mark, in pixels.
     """
     return (
-        Test(
+        Criterion(
             "run",
             digest in metadata.runs,
             f"the video says that it shows {', '.join(metadata.runs)}, this run is {digest}",
         ),
-        Test(
+        Criterion(
             "frames",
             frames == metadata.frames and off < 1 / float(metadata.rate) / 4,
             f"got {frames}, want the {metadata.frames} that were written; {1e3 * off:.1f} ms from their times at most",
         ),
-        Test(
+        Criterion(
             "mark",
             area >= pixels.FEWEST_PIXELS,
             f"{area:.0f} pixels in the pane where it is smallest, want {pixels.FEWEST_PIXELS} or more",

@@ -96,7 +96,8 @@ def by_hand(plan: ls.Trajectory, policy: ls.AffinePolicy) -> ls.Solution:
         trajectory=plan, iterations=(), clearance=None, gap=np.nan, solver="by hand", options={}, problem_digest="",
         versions={},
         certificate=Certificate(
-            cost=np.nan, start=0.0, motion=0.0, law=0.0, limits=0.0, violation=0.0, optimality=np.inf
+            cost=np.nan, start=0.0, dynamics_residual=0.0, policy_residual=0.0, limits=0.0, violation=0.0,
+            optimality=np.inf
         ),
     )  # fmt: skip
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from whole_problems.planar_quadrotor import ARM, DRAG, INERTIA, MASS, rate
+from oracle.planar_quadrotor import ARM, DRAG, INERTIA, MASS, rate
 
 import lqrsim as ls
 

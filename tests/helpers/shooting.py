@@ -1,6 +1,6 @@
 """A problem as a function of its controls alone, in plain NumPy, and what SciPy's SLSQP makes of it.
 
-Nothing of the package's solvers is used; formulas are evaluated by `whole_problems.kkt`, derivatives are complex steps.
+Nothing of the package's solvers is used; formulas are evaluated by `oracle.kkt`, derivatives are complex steps.
 """
 
 from collections.abc import Callable
@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from oracle import constraints, kkt
 from scipy.optimize import minimize
-from whole_problems import constraints, kkt
 
 import lqrsim as ls
 from lqrsim.errors import Array

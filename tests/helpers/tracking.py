@@ -45,7 +45,13 @@ def track(robot: Robot, start: npt.ArrayLike, controls: npt.ArrayLike, dt: float
         clearance=None,
         # There is no problem, so no cost of it; the plan is made by the dynamics, and by the law.
         certificate=Certificate(
-            cost=np.nan, start=0.0, motion=0.0, law=0.0, limits=0.0, violation=0.0, optimality=np.inf
+            cost=np.nan,
+            start=0.0,
+            dynamics_residual=0.0,
+            policy_residual=0.0,
+            limits=0.0,
+            violation=0.0,
+            optimality=np.inf,
         ),
         gap=np.nan,
         solver="by hand",

@@ -4,13 +4,13 @@ What must be so of any plan, whatever the status; what a success claims besides;
 """
 
 import numpy as np
+from oracle import constraints, kkt
 from scipy.optimize import lsq_linear
 
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.problem.costs import terms_of
 from lqrsim.results.solution_parts import Status
-from whole_problems import constraints, kkt
 
 # Rounding, of sums of a few hundred terms, and of a step that may amplify it a thousandfold.
 COST, MOTION, LAW = 1e-7, 1e-7, 1e-9

@@ -9,7 +9,7 @@ import numpy as np
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from whole_problems import kkt
+from oracle import kkt
 
 Values = kkt.Values
 

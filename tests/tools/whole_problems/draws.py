@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import systems
 from numpy.random import Generator
+from oracle import kkt, planar_quadrotor
 from reliability import classics
 
 import lqrsim as ls
-from whole_problems import kkt, planar_quadrotor
 
 
 @dataclass(frozen=True, repr=False)
