@@ -13,7 +13,7 @@ from mujoco import batch
 from lqrsim.codegen import distances
 from lqrsim.errors import Array, InputError, check_kind, check_number, shaped, vectors_of
 from lqrsim.problem.collision_spheres import evaluate
-from lqrsim.results.ball_record import BallRecord
+from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
 from lqrsim.scenes.world import World

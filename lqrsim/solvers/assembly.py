@@ -1,4 +1,4 @@
-"""From what a solver found to the `Solution` that users get."""
+"""Makes a `Solution` from the result of a run."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -28,7 +28,7 @@ def assemble(
     options: dict[str, object],
     candidates: tuple[Candidate, ...] = (),
 ) -> Solution:
-    """The Solution of what a run found, in memory of its own."""
+    """Copy the result of a run into a Solution."""
     assert found.certificate is not None
     states, controls, law = found.states.copy(), found.controls.copy(), (found.law[0].copy(), found.law[1].copy())
     inverse_law = found.values.get("inverse_law")
@@ -71,14 +71,14 @@ def assemble(
 
 
 def _copied(value: Any) -> Any:
-    """A value function in memory of its own."""
+    """A copy of a value function."""
     if value is None:
         return None
     return type(value)(*(np.array(getattr(value, field.name)) for field in fields(value)))
 
 
 def goal_radius_of(problem: Problem) -> float | None:
-    """The robot's radius, where the goal has a position, and the problem obstacles that know it; None for a point."""
+    """The robot's radius, from its obstacle costs and clearances; None without these, or without a goal position."""
     goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
     if not position or (goal is not None and np.isnan(goal[position]).all()):
         return None
@@ -88,7 +88,7 @@ def goal_radius_of(problem: Problem) -> float | None:
 def clearance_of(problem: Problem, states: Array) -> Array | None:
     """Signed distance to the nearest obstacle minus the robot's radius, (T+1,); None without obstacles.
 
-    Of a robot of several balls it is the least of theirs.
+    For a robot of several collision spheres it is the smallest of theirs.
     """
     space = problem.dynamics.state_coordinates
     place = states[:, list(space.position)]

@@ -1,4 +1,4 @@
-"""One run of the method from one start: its memory, its iterations, Newton's steps at the end, and the safeguard."""
+"""One run of the solver from one start: memory, smoothing, Newton's method at the end, and the safeguard."""
 
 import contextlib
 import threading
@@ -73,7 +73,7 @@ _lending = threading.Lock()
 
 @dataclass(frozen=True)
 class Ending:
-    """How iterations ended, as the kernel says it, and in the words that users read.
+    """How iterations ended: the kernel's outcome, and what users read of it.
 
     Attributes:
       outcome: of `kernels/declarations.py`. done: how many iterations there are, those before included.
@@ -97,7 +97,7 @@ class Ending:
 
     @property
     def pass_failed(self) -> bool:
-        """Whether one more iteration was begun, and a pass of it failed."""
+        """Whether a pass of one more iteration failed."""
         return self.outcome in (
             declarations.NOT_POSITIVE_DEFINITE, declarations.NOT_FINITE, declarations.RISK_TOO_HIGH
         )  # fmt: skip
@@ -184,7 +184,7 @@ def iterate(
 
 
 def raised_by(functions: Iterable[UserFunction]) -> str:
-    """What functions have raised since they were told to forget it."""
+    """What the functions have raised, in words."""
     raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
     return "; ".join(raised)
 
@@ -192,12 +192,12 @@ def raised_by(functions: Iterable[UserFunction]) -> str:
 def check_finite_at_start(
     problem: Problem, ending: Ending, costs: Array, x: Array, u: Array, *, refuse: bool
 ) -> Ending:
-    """Look for the cause if the first iteration led nowhere: a function that is not finite at the start (n,), (m,).
+    """Find the cause if the first iteration is not finite: a function that is not finite at the start (x, u).
 
     `costs` are those of the iterations so far.
 
     Raises:
-      InputError: that is so, and `refuse` is set; otherwise the returned ending says it.
+      InputError: there is one, and `refuse` is set; otherwise the returned ending names it.
     """
     lost = not len(costs) and ending.status is Status.NOT_FINITE
     if lost or (len(costs) and not np.isfinite(costs[0])):
@@ -212,12 +212,12 @@ def check_finite_at_start(
 
 @dataclass(frozen=True, kw_only=True)
 class RunResult:
-    """What a run can answer with; `assemble` makes a `Solution` of it.
+    """Result of a run, from which `assemble` makes a `Solution`.
 
     Attributes:
       cost: of the plan, as the log has it; infinite where there is no plan.
       law: gain (T, m, n) and offset (T, m). values: cost-to-go, cost-to-come and inverse law, as `assemble` takes them.
-      final: another start would not do better.
+      final: whether another start cannot do better.
     """
 
     status: Status
@@ -234,10 +234,10 @@ class RunResult:
     final: bool = False
 
     @property
-    def rank(self) -> tuple[bool, float, bool, float]:
-        """The smaller, the better: success first, then the violation, then INFEASIBLE before others, then the cost."""
+    def rank(self) -> tuple[bool, bool, float, float]:
+        """The smaller, the better: success first, then INFEASIBLE before others, then the violation, then the cost."""
         missed = 0.0 if self.success else float(f"{self.violation:.2g}")
-        return not self.success, missed, self.status is not Status.INFEASIBLE, self.cost
+        return not self.success, self.status is not Status.INFEASIBLE, missed, self.cost
 
     @property
     def success(self) -> bool:
@@ -245,7 +245,7 @@ class RunResult:
 
 
 class SolveRun:
-    """Iterated LQR smoothing from one start, as far as it has got.
+    """Iterated LQR smoothing from one start, in whatever state it is.
 
     Attributes:
       initial_guess: where it starts from. work: its memory. budget: its iterations and its time.
@@ -349,7 +349,7 @@ class SolveRun:
         return added
 
     def roll_out(self) -> None:
-        """See where the start leads, if nothing has been done yet; the states and controls are in `work`."""
+        """Roll out the initial guess, before any iteration; the states and controls are in `work`."""
         self._loop(*self._arguments(0, 0, self._rows))
 
     def solve(self, *, look_back: bool = True) -> RunResult:
@@ -377,7 +377,7 @@ class SolveRun:
         return self.safeguard(found) if self.settings.safeguard else found
 
     def checked_ending(self) -> Ending:
-        """How smoothing ended; NOT_FINITE if that is for a function that is not finite at the start.
+        """How smoothing ended; NOT_FINITE if a function is not finite at the start.
 
         Raises:
           InputError: so it is, and the budget is attentive.
@@ -401,7 +401,7 @@ class SolveRun:
         return self.damped_result(ending, ending.status, detail)
 
     def checkpoint(self) -> list[Array]:
-        """Copies of what smoothing goes on from."""
+        """A copy of the state of smoothing."""
         return [array.copy() for array in self._going_on]
 
     def go_on(self, checkpoint: list[Array], others: Sequence[Iteration] = ()) -> None:
@@ -423,7 +423,7 @@ class SolveRun:
         return *arrays.policy, *arrays.kept, *arrays.to_go, arrays.x_hat
 
     def result(self, ending: Ending) -> RunResult:
-        """What smoothing found; `ending` is its own, or one that knows more of why it failed."""
+        """Result of smoothing, with its ending."""
         work, last = self.work, self._last
         return RunResult(
             status=ending.status, detail=ending.detail(self.problem.steps), states=work.states, controls=work.controls,
@@ -443,7 +443,7 @@ class SolveRun:
         return self._about_plan(optimality, status, detail)
 
     def linearize_about_plan(self) -> float:
-        """Make policy and value functions about the plan in the memory; its optimality, NaN if that fails."""
+        """Compute policy and value functions about the plan in memory; return its optimality, NaN if that fails."""
         work, rows = self.work, np.full(1, np.nan, LOG)
         trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
         work.memory["merit"] = work.memory["plan_cost"]
@@ -453,7 +453,7 @@ class SolveRun:
     def fails_at(self, risk: float) -> int:
         """The step at which a pass about the plan in the memory fails with another risk, or -1; with noise only.
 
-        The arrays of the passes are written over.
+        Overwrites the arrays of the passes.
         """
         work, rows = self.work, np.full(1, np.nan, LOG)
         trial, own = Motion(np.zeros_like(work.states), np.zeros_like(work.controls)), self.problem.risk
@@ -476,7 +476,7 @@ class SolveRun:
                 return found
         assert damped is not None
         if not np.isfinite(work.memory["plan_cost"]):
-            # Nothing that was tried leads anywhere. What is left is how it failed.
+            # Nothing leads anywhere: report how it failed.
             given_up = found.status in (Status.MAX_ITERATIONS, Status.STALLED)
             return replace(found, status=Status.DIVERGED if given_up else found.status, detail=detail, values={})
         if self.second_order and damped.success:
@@ -487,7 +487,7 @@ class SolveRun:
         return self.damped_result(damped, status, detail)
 
     def law_about_plan(self) -> tuple[Array, Array]:
-        """Gain and offset that make the plan in the memory, by the last pass about it."""
+        """Gain and offset of the policy about the plan in memory."""
         gain, (states, controls) = self.work.arrays.policy.gain, self.work.plan
         return gain, controls - np.einsum("tij,tj->ti", gain, states[:-1])
 
@@ -507,7 +507,7 @@ class SolveRun:
         )  # fmt: skip
 
     def damped_result(self, ending: Ending, status: Status, detail: str) -> RunResult:
-        """The plan that damped iterations or Newton's found, and what was modelled about it."""
+        """Result of damped iterations or Newton's: the plan, with policy and value functions about it."""
         if ending.outcome in (declarations.RUNNING, declarations.TIMED_OUT):  # stopped, and did not look back
             return self.best(
                 RunResult(
@@ -519,7 +519,7 @@ class SolveRun:
         return self._about_plan(optimality, status, detail)
 
     def _about_plan(self, optimality: float, status: Status, detail: str) -> RunResult:
-        """The plan in the memory, with the policy and the value functions that were made about it last."""
+        """The plan in memory, with the last policy and value functions about it."""
         work = self.work
         states, controls = work.plan
         values, law, gap = {}, work.arrays.policy, float(work.memory["final_gap"])
@@ -540,7 +540,7 @@ class SolveRun:
         )  # fmt: skip
 
     def certified(self, found: RunResult) -> RunResult:
-        """With its certificate; a success that fails it is none."""
+        """The result with its certificate; NOT_CERTIFIED if that contradicts a success."""
         values = self.work.constraint_values(found.states, found.controls)
         violation = self.work.violation(values)
         value = found.values.get("cost_to_go")
@@ -557,17 +557,17 @@ class SolveRun:
         return replace(found, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
 
     def candidate(self, name: str, found: RunResult | None) -> Candidate:
-        """This run as one of several; `found` if it was run to its end."""
+        """This run as a candidate of a search; `found` is its result if it was run to its end."""
         states, controls = (self.work.states, self.work.controls) if found is None else (found.states, found.controls)
         plan = Trajectory(states.copy(), controls.copy(), self.problem.dt)
         cost, status = (self.cost, None) if found is None else (found.cost, found.status)
         return Candidate(name, cost, len(self.budget.log), status, plan)
 
     def run_opening_pass(self) -> bool:
-        """Do what comes before the first iteration; False if it fails."""
+        """Do the backward pass that comes before the first iteration, if any; return whether it succeeded."""
         if self.settings.first_pass == "forward":
             return True
-        self.roll_out()  # before the start is forgotten
+        self.roll_out()  # before its arrays are overwritten
         work = self.work
         arrays, homotopy_scaled = work.arrays, work.model._replace(stage=work.homotopy_scaled(self._obstacle_share(0)))
         failed, good = work.core.opening_pass(
@@ -580,13 +580,13 @@ class SolveRun:
         return failed < 0
 
     def _arguments(self, first: int, last: int, rows: StructuredArray, *, again: bool = False) -> tuple[Any, ...]:
-        """What the loop takes, for the iterations from `first` up to `last`, or fewer: of a continuation, one."""
+        """Arguments of the loop for iterations from `first` up to `last`; one at a time during a homotopy."""
         settings, work = self.settings, self.work
         share = 1.0 if again else self._obstacle_share(first)
         tolerance, valley = self.rough, 0.0 if again else self._valley
         if share != 1:
             last = min(last, first + 1)
-            tolerance = valley = 0.0  # what is not all of the cost does not settle
+            tolerance = valley = 0.0  # a part of the cost must not converge
         guided = self.initial_guess.trajectory is not None and settings.first_pass == "forward" and not again
         prior, count = (work.no_prior, 0) if again else (work.prior, work.prior_iterations)
         options = self._settings(len(rows), tolerance, settings.gap_tolerance)._replace(
@@ -604,7 +604,7 @@ class SolveRun:
         trial: Motion,
         least: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[Any, ...]:
-        """What it takes for damped iterations, of which there are to be `most`; `trial` is written to on the way."""
+        """Arguments for at most `most` damped iterations; `trial` is scratch memory."""
         settings, work = self.settings, self.work
         options = self._settings(most, max(self.rough, least[0]), max(settings.gap_tolerance, least[1]))
         arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
@@ -613,7 +613,7 @@ class SolveRun:
     def _newton_arguments(
         self, first: int, last: int, rows: StructuredArray, most: int, trial: Motion
     ) -> tuple[Any, ...]:
-        """What it takes for Newton iterations, of which there are to be `most`; `trial` is written to on the way."""
+        """Arguments for at most `most` Newton iterations; `trial` is scratch memory."""
         settings, work = self.settings, self.work
         options = self._settings(most, self.final, settings.gap_tolerance)
         arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
@@ -622,7 +622,7 @@ class SolveRun:
     def _check_arguments(
         self, task: int, found: RunResult, to_go: CostToGo, certificate: StructuredArray
     ) -> tuple[Any, ...]:
-        """What it takes to certify a plan and its policy, with this cost-to-go."""
+        """Arguments for certifying a plan and its policy with this cost-to-go."""
         settings, work = self.settings, self.work
         arrays = work.arrays._replace(
             to_go=to_go, rollout=Motion(found.states, found.controls),
@@ -632,7 +632,7 @@ class SolveRun:
         return task, 0, 0, options, work.model, arrays, work.memory_rows, self._rows
 
     def _settings(self, most: int, tolerance: float, gap_tolerance: float) -> IterationSettings:
-        """What the iterations go by, of which there are to be `most`."""
+        """Settings of the kernels for at most `most` iterations."""
         return IterationSettings(
             steps=self.problem.steps, max_iterations=most, tolerance=float(tolerance),
             gap_tolerance=float(gap_tolerance), optimal=self.settings.stop == "optimal", fixed=self.work.fixed,
@@ -640,7 +640,7 @@ class SolveRun:
         )  # fmt: skip
 
     def _obstacle_share(self, iteration: int) -> float:
-        """How much of the obstacle costs the passes of an iteration see."""
+        """Fraction of the obstacle costs in an iteration."""
         return self._shares[iteration] if iteration < len(self._shares) else 1.0
 
     def _violation(self) -> float:
@@ -688,7 +688,7 @@ class Workspace:
         self.begin(problem, settings, initial_guess, start)
 
     def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
-        """Begin a solve; after another one, of a problem of the same size with as many steps."""
+        """Begin a solve, also after another one of the same size with as many steps."""
         self._problem, self._tolerance, steps = problem, settings.missed(problem), problem.steps
         self._exact, self.priced = settings.second_order(problem), np.isfinite(settings.price)
         self.fixed = isinstance(problem.initial, FixedState)
@@ -704,7 +704,7 @@ class Workspace:
         self.multipliers = multipliers
         self.model = compiled.arguments(problem, multipliers=multipliers, second_order=settings.second_order(problem))
         arrays = self.arrays = self.arrays._replace(homotopy_scaled=self.model.stage, prior=self.prior)
-        # All else is written before it is read.
+        # Everything else is written before it is read.
         self.memory_rows[...] = 0.0
         arrays.start[...] = arrays.x_hat[...] = start
         arrays.policy.gain[...], arrays.policy.offset[...] = initial_guess.gain, initial_guess.offset
@@ -712,7 +712,7 @@ class Workspace:
         known = (0.0, 0.0, 0.0) if value is None else (value.hessian, value.gradient, value.constant)
         for array, given in zip(arrays.to_go, known, strict=True):
             array[...] = given
-        # Without a trajectory to begin with: the start, and the controls with which the dynamics can run backwards.
+        # Without a trajectory: the start state, and the controls with which the dynamics can run backwards.
         plan = initial_guess.trajectory
         for array in (arrays.guess, arrays.plan):
             array.states[...] = start if plan is None else plan.states
@@ -720,26 +720,26 @@ class Workspace:
 
     @property
     def start(self) -> Array:
-        """Where it begins, (n,)."""
+        """The start state, (n,)."""
         return self.arrays.start
 
     @property
     def plan(self) -> Motion:
-        """The best so far."""
+        """The best plan so far."""
         return self.arrays.plan
 
     @property
     def states(self) -> Array:
-        """Where the last policy led, (T+1, n)."""
+        """States of the last rollout, (T+1, n)."""
         return self.arrays.rollout.states
 
     @property
     def controls(self) -> Array:
-        """Those of that, (T, m)."""
+        """Controls of the last rollout, (T, m)."""
         return self.arrays.rollout.controls
 
     def value_functions(self) -> dict[str, Any]:
-        """Cost-to-go, cost-to-come and inverse law of the last passes, as `assemble` takes them."""
+        """Cost-to-go, cost-to-come and inverse law of the last passes, for `assemble`."""
         to_go, to_come = Quadratic(*self.arrays.to_go), self.arrays.to_come
         inverse = self.arrays.smoothing.control_gain, self.arrays.smoothing.control
         if not self.dual:
@@ -766,7 +766,7 @@ class Workspace:
         return self.model.stage._replace(data=tuple(data))
 
     def constraint_values(self, states: Array, controls: Array) -> list[Array]:
-        """Of each constraint (T+1, rows): not to be negative, or zero; where it does not act, infinite or zero."""
+        """Values of each constraint, (T+1, rows): d >= 0 or d = 0; infinite or zero where it does not act."""
         values = [np.empty(len(multipliers) - declarations.HEADER) for multipliers in self.multipliers]
         if values:
             constraints = self.model.stage.constraints
@@ -780,14 +780,14 @@ class Workspace:
         return slope
 
     def violation(self, values: list[Array]) -> float:
-        """By how much the worst constraint is missed, given their values; 0 where none is, infinite if one is NaN."""
+        """The largest violation of a constraint, given their values; infinite if one is NaN."""
         terms = self._problem.constraint_terms
         return max((violation_of(term, one) for term, one in zip(terms, values, strict=True)), default=0.0)
 
     def keeps(self, values: list[Array]) -> bool:
-        """Whether values are those of a plan that keeps all constraints, within what they may be missed by.
+        """Whether a plan with these values keeps all constraints within their tolerance.
 
-        Those that have a price may be missed by anything.
+        Elastic constraints, which have a price, count as kept.
         """
         pairs = zip(self._problem.constraint_terms, values, strict=True)
         allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)

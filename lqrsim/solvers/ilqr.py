@@ -139,7 +139,7 @@ def _solve(
     assert problem.start is not None
     assert settings.tolerance is not None
     initial_guess = resolve(settings.start, problem)
-    if initial_guess.prior is not None:  # of a function, too
+    if initial_guess.prior is not None:  # a function may return one
         raise InputError(_NO_PRIOR)
     start, control = problem.start.copy(), initial_guess.offset[0].copy()
     check_functions(problem, start, control)
@@ -169,10 +169,10 @@ def _solve(
     done = len(budget.log)
     ending = check_finite_at_start(problem, ending, rows["cost"][:done], start, control, refuse=attentive)
     whole = done > 0 and ending.failed < 0
-    if ending.outcome == declarations.TIMED_OUT:  # the last backward pass was about the trajectory before
+    if ending.outcome == declarations.TIMED_OUT:  # the last backward pass was about the previous trajectory
         *_, failed = loop(declarations.ITERATE, done, done, options, model, work, rows)
         whole = failed < 0 and np.isfinite(states).all()
-    if not whole:  # without a pass about the trajectory there is no feedback, and the policy plays the controls
+    if not whole:  # without a pass about the trajectory the policy has no feedback
         policy.gain[:] = 0
     offset = controls - np.einsum("tij,tj->ti", policy.gain, states[:-1]) if whole else controls.copy()
     status, detail = ending.status, ending.detail(steps)

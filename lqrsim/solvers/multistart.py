@@ -16,13 +16,13 @@ from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, ter
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
-from lqrsim.results.solution_parts import Candidate
+from lqrsim.results.solution_parts import Candidate, Status
 from lqrsim.solvers.assembly import clearance_of
 from lqrsim.solvers.budget import Callback
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, resolve
 from lqrsim.solvers.parallel import workers
-from lqrsim.solvers.strategy import finish, refine
+from lqrsim.solvers.strategy import Known, finish, refine
 
 # `python experiments/benchmark_quality.py --sections ingredients` shows what each of these choices brings.
 STARTS = 7
@@ -182,7 +182,7 @@ class Search:
 
     def __init__(self, names: Sequence[str], runs: Sequence[SolveRun], callback: Callback | None, threads: int) -> None:
         self._named = list(zip(names, runs, strict=True))
-        self._callback, self._threads = callback, threads
+        self._callback, self._threads, self._known = callback, threads, Known()
         self._problem, self._settings = runs[0].problem, runs[0].settings
         self._start, self._budget = runs[0].work.start.copy(), runs[0].budget
         self._finished: list[tuple[SolveRun, RunResult]] = []
@@ -203,7 +203,8 @@ class Search:
             best = self.best[1]
             if self._budget.stop.due or best.final or (best.success and not run.cost < best.cost):
                 break
-            self._finish(run)
+            if self._finish(run).final and best.status is Status.INFEASIBLE:
+                break
 
     @property
     def is_unacceptable(self) -> bool:
@@ -218,7 +219,7 @@ class Search:
             return self._idle()
         (run, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
         if not found.success:
-            return run.budget.left > 0
+            return run.budget.left > 0 and found.status is not Status.INFEASIBLE
         if space.position:
             place = list(space.position)
             arrived = np.linalg.norm(found.states[-1, place] - problem.goal[place]) <= max(radius, 1e-3)
@@ -250,7 +251,7 @@ class Search:
         named = dict(zip(map(id, runs), SWAYS, strict=True))
         chosen = choose(runs, self._threads)[0]
         self._named.append((f"controls that sway {named[id(chosen)]} times", chosen))
-        found, best = self._to_its_end(chosen, finish), self.best[1]
+        found, best = self._to_its_end(chosen, finish, Known()), self.best[1]
         # Even one that is not at its end is better than to do nothing.
         better = found.violation <= best.violation and found.cost < best.cost
         self._finished.insert(0 if better else len(self._finished), (chosen, found))
@@ -270,7 +271,7 @@ class Search:
         summary = f"a plan for {times:g} times the weight of obstacles and goal"
         run = self._another(InitialGuess(boldest.law[0].copy(), boldest.law[1].copy(), None, None, summary))
         self._named.append((summary, run))
-        found, best = self._to_its_end(run, refine), self.best[1]
+        found, best = self._to_its_end(run, refine, self._known), self.best[1]
         # The same optimum once more, a little different within the tolerances, is no other way.
         other = found.rank < best.rank and (not best.success or found.cost < best.cost - 1e-3 * abs(best.cost))
         self._finished.insert(0 if other else len(self._finished), (run, found))
@@ -281,7 +282,7 @@ class Search:
             return
         riskless = dataclasses.replace(self._problem, risk=0.0)
         runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
-        found = finish(choose(runs, self._threads)[0])
+        found = finish(choose(runs, self._threads)[0], Known())
         if not found.success or self._budget.stop.due:
             return
         summary = "a plan without a risk"
@@ -303,14 +304,16 @@ class Search:
         problem = self._problem if problem is None else problem
         return SolveRun(problem, self._settings, initial_guess, self._start, self._budget.another())
 
-    def _finish(self, run: SolveRun) -> None:
-        self._finished.append((run, self._to_its_end(run, finish)))
+    def _finish(self, run: SolveRun) -> RunResult:
+        found = self._to_its_end(run, finish, self._known)
+        self._finished.append((run, found))
         self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equals, the first
+        return found
 
-    def _to_its_end(self, run: SolveRun, how: Callable[[SolveRun], RunResult]) -> RunResult:
-        """What a run comes to; the callback is told of its iterations, those before included."""
+    def _to_its_end(self, run: SolveRun, how: Callable[[SolveRun, Known], RunResult], known: Known) -> RunResult:
+        """Run to the end; report all its iterations to the callback, also those before."""
         run.budget.report_to(self._callback)
-        return how(run)
+        return how(run, known)
 
 
 def choose(runs: Sequence[SolveRun], threads: int) -> list[SolveRun]:

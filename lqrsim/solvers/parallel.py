@@ -1,4 +1,4 @@
-"""Many problems at once, on several threads."""
+"""Solves many problems on several threads."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
@@ -30,8 +30,8 @@ def solve_all(
     threads: int | None,
     progress: Callable[[int, int], object] | None,
 ) -> list[Solution]:
-    """Solve each problem with `solve(problem, settings)`, on several threads; the answers in order."""
-    check_function("progress", progress, "a function of how many are done, of how many", arguments=2)
+    """Solve each problem with `solve(problem, settings)`, on several threads; return the solutions in order."""
+    check_function("progress", progress, "a function of two numbers: solved, all", arguments=2)
     threads = check_threads(threads)
     for i, problem in enumerate(problems):
         try:
@@ -53,7 +53,7 @@ def solve_all(
 
 @contextlib.contextmanager
 def workers(threads: int, functions: Iterable[UserFunction]) -> Iterator[ThreadPoolExecutor]:
-    """Threads that solve. On an error, Ctrl-C too, what is compiled ends in a moment; plain functions are told to."""
+    """A pool of threads. After an error or Ctrl-C plain Python functions are told to stop; compiled code ends soon."""
     with ThreadPoolExecutor(threads, thread_name_prefix="lqrsim") as pool:
         try:
             yield pool
@@ -67,17 +67,17 @@ def workers(threads: int, functions: Iterable[UserFunction]) -> Iterator[ThreadP
 
 
 def check_threads(threads: int | None) -> int:
-    """How many threads to use; by default as many as there are processors. Raises InputError."""
+    """Check a number of threads; by default the number of processors. Raises InputError."""
     return processors() if threads is None else check_count("threads", threads, at_most=MOST_THREADS)
 
 
 def list_of(problems: Iterable[Problem]) -> list[Problem]:
-    """The problems as a list. Raises InputError for what is no collection."""
+    """The problems as a list. Raises InputError unless they are a collection."""
     return list(check_items("problems", problems, object, "a list of Problem"))
 
 
 def all_driven_by(problems: Iterable[Problem], noise: Noise | None, risk: float | None) -> list[Problem]:
-    """The problems as a list, under that noise and risk; of what is None, their own."""
+    """The problems as a list, with that noise and risk; None keeps their own."""
     listed = list_of(problems)
     if noise is None and risk is None:
         return listed

@@ -1,4 +1,4 @@
-"""Solving again and again in real time: all is compiled beforehand, and each solve ends in time with what it has."""
+"""Repeated solves in real time: everything is compiled beforehand, and each solve ends by its deadline."""
 
 import time
 from dataclasses import replace
@@ -12,9 +12,8 @@ from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
-from lqrsim.results.plan import Plan
+from lqrsim.results.plan import Plan, Replan
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.replan import Replan
 from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
@@ -28,9 +27,9 @@ from lqrsim.solvers.interior_point import INTERIOR, InteriorPoint, Measures, Sta
 from lqrsim.solvers.settings import SmootherSettings, check_problem
 from lqrsim.solvers.strategy import LITTLE
 
-SLOPES = 1e-6  # of a Lagrangian, relative to the cost; what they promise is about the square of that
-BEGINNING = 15.0  # times as long as models of a plan, what the interior point takes for its first iteration
-ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
+SLOPES = 1e-6  # of the Lagrangian, relative to the cost; the promised decrease of the cost is about the square of that
+BEGINNING = 15.0  # duration of the interior point's first iteration, relative to that of making the models about a plan
+ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
 
 
 def prepare(
@@ -42,10 +41,10 @@ def prepare(
     max_iterations: int = 100,
     finish: str | None = "newton",
 ) -> "PreparedSolver":
-    """Compile all that solving problems of this structure can need, now: nothing is compiled while a robot runs.
+    """Compile everything that problems of this structure need, so that nothing is compiled while a robot runs.
 
     Args:
-      problem: what is to be solved again and again, with other states, goals, obstacles and parameters.
+      problem: one of the problems; others may have other states, goals, obstacles and parameters.
       tolerance: as in `smooth`; with constraints by default 1e-6, of the slopes of the Lagrangian in the controls,
         times their ranges and relative to the cost.
       gap_tolerance: as in `smooth`.
@@ -70,11 +69,11 @@ def prepare(
 
 
 class PreparedSolver:
-    """Solves problems of one structure, from one state after the other; `prepare` makes it.
+    """Solves problems of one structure from one state after another; `prepare` makes it.
 
     Attributes:
-      problem: what is solved by default.
-      settings: as `prepare` was told.
+      problem: the problem that is solved by default.
+      settings: the options given to `prepare`.
     """
 
     def __init__(self, problem: Problem, settings: SmootherSettings) -> None:
@@ -86,8 +85,8 @@ class PreparedSolver:
         self._states = problem.dynamics.state_coordinates
         self._controls = problem.applied_coordinates
         self._structure = compiled.structure(problem)
-        self._pace, self._closing = 0.0, 0.0  # s, of a slow iteration, and of what follows the last one
-        self._idle: list[Stages] = []  # whose memory waits for the next solve
+        self._pace, self._closing = 0.0, 0.0  # seconds of a slow iteration, and of the work after the last one
+        self._idle: list[Stages] = []  # memory for the next solve
         self._compile()
 
     def _compile(self) -> None:
@@ -105,7 +104,7 @@ class PreparedSolver:
         if self.problem.constraints and run.second_order:
             stages, plan = Stages(self.problem), Motion(*run.work.plan)
             _Neighbour(run, stages, plan, _Best(run)).find()
-            # What that can do without, another solve may need.
+            # Another solve may need what this one did not.
             stages.convexify(plan)
             stages.change(worst=False)
             with np.errstate(all="ignore"):
@@ -116,11 +115,11 @@ class PreparedSolver:
     def _stages_of(self, problem: Problem) -> Stages:
         try:
             return self._idle.pop().renewed(problem)
-        except IndexError:  # others are at work in the memory that there is
+        except IndexError:  # other threads use all there are
             return Stages(problem)
 
     def check(self, problem: Problem) -> Problem:
-        """Check that solving a problem compiles nothing: only numbers may differ from the prepared one.
+        """Check that a problem needs no compiling: only numbers may differ from the prepared one.
 
         Args:
           problem: to be solved.
@@ -148,14 +147,14 @@ class PreparedSolver:
         after: int = 0,
         time_limit: float | None = None,
     ) -> Replan:
-        """Solve from a state, beginning with a law: the answer is no worse than to go on with that; see `Replan`.
+        """Solve from a state, starting from a plan. The answer is no worse than going on with that plan; see `Replan`.
 
         Args:
-          state: (n,) where the plan is to begin.
-          start: the law, of as many steps as are left of the problem: `before.shifted(k)`.
-          problem: what to solve, the start apart; the prepared one, or one with other numbers.
-          after: how many steps of it are over: what is left is solved.
-          time_limit: seconds from this call to its end. An iteration that would probably end later is not begun.
+          state: (n,) the state to plan from.
+          start: a plan with as many steps as the problem has left: `before.shifted(k)`.
+          problem: the problem to solve from that state; by default the prepared one.
+          after: the number of steps that are over; the rest is solved.
+          time_limit: seconds from this call to its return. An iteration that would probably end later is not begun.
 
         Returns:
           A Replan.
@@ -186,14 +185,14 @@ class PreparedSolver:
         self._pace = max(0.5 * self._pace, max(seconds, default=0.0))
         best.consider(found)
         answer = self._answer(problem, best, found, budget, clock, best.rolling_out + sum(seconds))
-        run.give_back()  # but not where something was raised
+        run.give_back()  # not after an exception
         self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
         return answer
 
     def _answer(
         self, problem: Problem, best: "_Best", found: RunResult, budget: Budget, clock: float, iterating: float
     ) -> Replan:
-        # The next solve writes over the memory that this one has worked in.
+        # The next solve overwrites this memory.
         states, controls, gain, offset = (array.copy() for array in (*best.plan, *best.law))
         value = best.cost_to_go
         if value is not None:
@@ -212,9 +211,10 @@ class PreparedSolver:
 
 
 def _plan_of(start: Plan | InitialGuess, best: "_Best") -> Motion:
-    """Where a law leads, but for the last state: a horizon that moves has a last step that the law was not made for.
+    """The plan to start from: the rollout of the old policy, but with the old plan's last state.
 
-    Where that misses constraints, the plan that the law belongs to, but for where it begins.
+    A horizon that moves along has a last step for which the old policy was not made. Where the rollout violates
+    constraints, it is the old plan itself, from the new state.
     """
     plan = Motion(*(array.copy() for array in best.plan))
     if isinstance(start, InitialGuess) or start.trajectory.states.shape != plan.states.shape:
@@ -227,7 +227,7 @@ def _plan_of(start: Plan | InitialGuess, best: "_Best") -> Motion:
 
 
 def _initial_guess(start: Plan, problem: Problem) -> InitialGuess:
-    """The law to begin with, and what is known of its cost-to-go and of the multipliers."""
+    """The policy to start from, with its cost-to-go and multipliers as far as they are known."""
     n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
     law = start.policy
     gain, offset = (
@@ -241,7 +241,7 @@ def _initial_guess(start: Plan, problem: Problem) -> InitialGuess:
 
 
 def _solve(run: SolveRun, best: "_Best") -> RunResult:
-    """The method, its safeguard and what else keeps the constraints, until it converges or has to stop."""
+    """Smoothing, its safeguard and the augmented Lagrangian, until they converge or have to stop."""
     run.budget.report_to(best)
     try:
         if run.initial_guess.multipliers:
@@ -255,7 +255,7 @@ def _solve(run: SolveRun, best: "_Best") -> RunResult:
 
 
 def _unchanged(best: "_Best") -> RunResult:
-    """What there is before the first iteration."""
+    """The result before the first iteration."""
     return RunResult(
         status=Status.TIME_LIMIT, detail="", states=best.plan[0], controls=best.plan[1], law=best.law,
         cost=np.inf, violation=np.inf, gap=np.nan,
@@ -263,7 +263,7 @@ def _unchanged(best: "_Best") -> RunResult:
 
 
 class _Neighbour:
-    """The optimum with constraints that is next to the plan of a law: by its active set, or by the interior point.
+    """Finds the constrained optimum next to a plan, by Newton steps with its active set or by the interior point.
 
     Args:
       run: with the law and multipliers to begin with. stages: of its problem.
@@ -310,11 +310,11 @@ class _Neighbour:
                 if found.solved or not np.isfinite(active.measures.cost):
                     active = ActiveSet(self._stages, found.plan, found.multipliers, self._allowed)
                     solved = self._solve(active)
-            self.ended = time.perf_counter()  # also of a step that was left
+            self.ended = time.perf_counter()  # also of an abandoned step
             return self._result(active, solved)
 
     def _solve(self, active: ActiveSet) -> bool:
-        """Take the steps of an active set; whether it is solved. One that would end too late is left halfway."""
+        """Take the steps of an active set; return whether they converge. A step that would be too late is abandoned."""
 
         def watch(measures: Measures) -> bool:
             self._log(measures, "active set")
@@ -323,7 +323,7 @@ class _Neighbour:
         return active.run(self._run.final, watch, self._late)
 
     def _late(self, seconds: float) -> bool:
-        """Whether what takes so long would end too late; then it all ends."""
+        """Whether something that takes so long would end too late; if so, the solve ends."""
         self._out_of_time |= time.perf_counter() + seconds + self._closing >= self._budget.stop.deadline
         return self._out_of_time
 
@@ -333,7 +333,7 @@ class _Neighbour:
         self.ended, self._cost = now, measures.cost
 
     def _result(self, active: ActiveSet, solved: bool) -> RunResult:
-        """Where the plan leads with a policy about it."""
+        """The rollout of the plan with a policy about it."""
         problem = self._run.problem
         if not np.isfinite(active.measures).all():
             status = Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
@@ -354,7 +354,7 @@ class _Neighbour:
 
 
 class _Best:
-    """The best plan so far, which is at first that of the law that the solve began with; called after each iteration.
+    """The best plan so far, at first the one that the solve starts from. It is called after each iteration.
 
     Attributes:
       plan: states and controls. law: gain and offset. cost_to_go: of the law; None where that is not known.
@@ -373,30 +373,30 @@ class _Best:
         self.plan = self._work.states.copy(), self._work.controls.copy()
         self.law, self.cost_to_go, self.multipliers = (guess.gain, guess.offset), guess.cost_to_go, guess.multipliers
         self.improved = False
-        # Equalities are never kept but within a tolerance.
+        # Equalities are kept only within a tolerance.
         allowed = run.settings.missed(run.problem)
         self._none = max((allowed_violation(term, allowed) for term in run.problem.constraint_terms), default=0.0)
         self._copies: tuple[Array, ...] = ()
 
     def __call__(self, iteration: Iteration) -> None:
         if iteration.optimality < self._run.final and iteration.violation == 0:
-            return  # the last, most likely, and considered as such
+            return  # probably the last one; `consider` sees it
         if iteration.method in ("smooth", "newton") and self._beaten_by(iteration.cost, iteration.violation):
             arrays = self._work.arrays
             if iteration.method == "newton":
                 there = *arrays.plan, *self._run.law_about_plan()
             else:
                 there = *arrays.rollout, *arrays.kept, *arrays.to_go
-            # The next iteration writes over these; and what is allocated anew each time is slow to write to.
+            # The next iteration overwrites these. Copies are allocated once, since writing to new memory is slow.
             if not self._copies:
                 self._copies = tuple(np.empty_like(array) for array in (*arrays.plan, *arrays.kept, *arrays.to_go))
-            copies = self._copies[: len(there)]  # about Newton's plans the cost-to-go is worked out at the end
+            copies = self._copies[: len(there)]  # the cost-to-go about Newton's plans is computed at the end
             for copy, array in zip(copies, there, strict=True):
                 np.copyto(copy, array)
             self._keep(iteration.cost, iteration.violation, copies)
 
     def consider(self, found: RunResult) -> None:
-        """What it ended with: that, if it converged and is as good; and if it is better in any case."""
+        """Take the final result if it converged and is as good as the best, or if it is better."""
         as_good = found.success and not self._better(self.cost, self.violation, found.cost, found.violation)
         if as_good or self._beaten_by(found.cost, found.violation):
             there = found.states, found.controls, *found.law, *(self._work.arrays.to_go if found.values else ())

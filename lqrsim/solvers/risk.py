@@ -1,4 +1,4 @@
-"""How high the risk can be: above that, the expectation of exp(risk * cost) does not exist."""
+"""The largest risk for which the expectation of exp(risk * cost) exists."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import resolve
 from lqrsim.solvers.settings import SmootherSettings, check_problem
 
-DIGITS = 1e-12  # to which it is found, relatively
+DIGITS = 1e-12  # relative accuracy
 
 Fails = Callable[[float], int]  # the step at which a backward pass fails with a risk, or -1
 
@@ -55,11 +55,11 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
 
 
 def named(fails: Fails, risk: float, steps: int) -> str:
-    """What there is to say of a risk that was too high: where, and what would do; nothing where it cannot be told."""
+    """Say at which step a risk is too high, and which one is not; empty if that cannot be told."""
     failed = fails(risk)
     if failed < 0 or fails(0.0) >= 0:
         return ""
-    most = _bisect(fails, risk) * (1 - 1e-5)  # what is said works, though it is rounded
+    most = _bisect(fails, risk) * (1 - 1e-5)  # so that the rounded number works, too
     return f"about the best plan risk {risk:g} is too high at step {failed} of {steps}, and at most {most:.5g} will do"
 
 

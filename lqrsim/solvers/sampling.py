@@ -1,4 +1,4 @@
-"""What runs of a policy cost under a problem's noise, by the problem's own model: what the expected cost is held to."""
+"""Costs of sampled runs under a problem's noise, with which expected costs can be compared."""
 
 import numpy as np
 

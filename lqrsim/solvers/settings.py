@@ -1,4 +1,4 @@
-"""What a caller asks of a solver: settings, their defaults and their checks."""
+"""The options of the solvers, with defaults and checks."""
 
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
@@ -28,7 +28,7 @@ MISSED, SPARED = 1e-6, 1e-3  # default tolerances of constraints: interior point
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """When to stop, and from where to start; see `ilqr` for what each means."""
+    """Options that all solvers have; see `ilqr`."""
 
     stop: str = "optimal"
     tolerance: float | None = None
@@ -40,10 +40,10 @@ class Settings:
         check_name("stop", self.stop, ("optimal", "cost"))
         if is_function(self.start):
             check_function("start", self.start, "a function of a Problem, or what it returns", arguments=1)
-        # What is kept is plain Python's: NumPy's numbers would be other types for the compiler, and not for JSON.
+        # Plain Python numbers: NumPy's are other types for the compiler, and JSON cannot have them.
         if self.tolerance is not None:
             object.__setattr__(self, "tolerance", check_number("tolerance", self.tolerance, above=0.0))
-        # The log of so many takes 48 MB.
+        # A log of that length takes 48 MB.
         most = check_count("max_iterations", self.max_iterations, at_most=1_000_000)
         object.__setattr__(self, "max_iterations", most)
         if self.time_limit is not None:
@@ -51,17 +51,17 @@ class Settings:
 
     @property
     def core_form(self) -> str:
-        """The form of the core that is used."""
+        """The form of the compiled passes."""
         return "dual"
 
     def options(self, start: InitialGuess) -> dict[str, object]:
-        """The settings as a solution keeps them."""
+        """The options that a solution records."""
         return {field.name: getattr(self, field.name) for field in fields(self)} | {"start": start.summary}
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmootherSettings(Settings):
-    """What `smooth` has beyond that."""
+    """Options of `smooth`."""
 
     gap_tolerance: float = 1e-3
     form: str = "dual"
@@ -100,29 +100,29 @@ class SmootherSettings(Settings):
         return self.form
 
     def second_order(self, problem: Problem) -> bool:
-        """Whether the last iterations are of second order. With "cost", the paper's test ends the paper's method.
+        """Whether Newton's method has the last iterations. With stop="cost", the paper's test ends the paper's method.
 
-        Steps of an MJCF have no second derivatives. Without these it is Gauss-Newton's, of which an iteration of
-        smoothing is worth several; see `experiments/convergence.py`. Nor has what noise costs.
+        The steps of an MJCF have no second derivatives, and without these an iteration of smoothing is worth several of
+        Newton's; see `experiments/convergence.py`. Nor has the expected cost of noise.
         """
         exact = not problem.dynamics.discrete and not (problem.constraints and problem.noise_term is not None)
         return self.finish is not None and self.stop == "optimal" and exact
 
     @property
     def price(self) -> float:
-        """What missing constraints costs, a unit; infinite where they are not to be missed."""
+        """Price of violating constraints, in cost per unit; infinite unless they are elastic."""
         return np.inf if self.elastic is None else self.elastic
 
     def missed(self, problem: Problem) -> float:
-        """By how much constraints may be missed, or what is to spare where the augmented Lagrangian keeps them."""
+        """Tolerance of constraints: the allowed violation, or the margin that the augmented Lagrangian aims at."""
         return self.constraint_tolerance or (MISSED if self.second_order(problem) else SPARED)
 
     def final(self, problem: Problem) -> float:
-        """What the optimality of the answer is to be below."""
+        """Tolerance of the optimality."""
         return self.tolerance or (FINE if self.second_order(problem) else ROUGH)
 
     def rough(self, problem: Problem) -> float:
-        """The same of what smoothing comes to: where Newton's method goes on from there, it need not be less."""
+        """Tolerance at which smoothing ends, coarser where Newton's method follows."""
         final = self.final(problem)
         return max(final, ROUGH) if self.second_order(problem) else final
 
@@ -131,11 +131,11 @@ S = TypeVar("S", bound=Settings)
 
 
 def settings_from(kind: type[S], function: str, options: dict[str, Any]) -> S:
-    """Settings of keyword arguments by name.
+    """Make settings from keyword arguments.
 
     Raises:
       InputError: one is not as described.
-      TypeError: there is no such argument, as Python says it of a function.
+      TypeError: there is no such argument.
     """
     names = [field.name for field in fields(kind)]
     for name in options:
@@ -145,7 +145,7 @@ def settings_from(kind: type[S], function: str, options: dict[str, Any]) -> S:
 
 
 def check_callback(callback: Callback | None) -> None:
-    """Raises InputError for what cannot be called."""
+    """Raises InputError unless it is None or callable with one argument."""
     check_function("callback", callback, "a function of an Iteration", arguments=1)
 
 

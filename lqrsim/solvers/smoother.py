@@ -24,7 +24,7 @@ from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
 from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import SmootherSettings, check_callback, check_problem, check_runs, settings_from
 
-# Of a free duration: how often shorter ones are tried, by how much, and with how many iterations.
+# For a free duration: how often a shorter one is tried, by what factor, and with how many iterations.
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 
 
@@ -173,7 +173,7 @@ def _solve(
         SolveRun.lent(problem, settings, guess, start, Budget(settings.max_iterations, stop, attentive=attentive))
         for guess in (first, *(resolve(one, problem) for _, one in given[1:]))
     ]
-    stop.begin(settings.time_limit)  # from now on: compiling does not count
+    stop.begin(settings.time_limit)  # compiling, which comes before, does not count
     search = Search([name for name, _ in given], runs, callback, threads)
     with problem.dynamics.solving(threads if len(runs) == 1 else 1):
         search.run()
