@@ -56,6 +56,7 @@ FLOORS_WITHIN = {
     ),
     "problem": (
         ("dynamics", "linear_quadratic"),
+        ("collision_geoms",),
         ("collision_spheres", "noise"),
         ("costs",),
         ("constraints",),
