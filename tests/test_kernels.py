@@ -39,13 +39,13 @@ from lqrsim.kernels import (
     damped_iterations,
     declarations,
     estimation,
+    exponential,
     interior_point,
     iterations,
     linear_algebra,
     mjcf_dynamics,
     mjcf_places,
     model_functions,
-    obstacle_cost,
     policy_evaluation,
     projection,
     rollouts,
@@ -761,9 +761,9 @@ def of_term(term: ls.types.CostTerm, x: Array = X, u: Array = U) -> None:
 
 
 def of_constraint(term: ls.types.ConstraintTerm, equality: int = 0) -> None:
-    data, source = compiled.numbers(term), source_of(augmented_lagrangian, BALLS=term.balls)
+    data, source = compiled.numbers(term), source_of(augmented_lagrangian, SHARED=term.shared)
     pairs = {"constraint_value": (term.code, "value"), "constraint_slope": (term.code, "slope")}
-    if term.balls:
+    if term.shared:
         pairs |= {name: (term.code, name) for name in ("places", "places_jacobian")}
     source, sizes = source.filled(**pairs), SIZES | {"EQUALITY": equality}
     multipliers = np.concatenate([[3.0, term.rows, 0.0, 0.01], np.linspace(0.0, 2.0, 4 * term.rows)])
@@ -913,7 +913,7 @@ class TestParts:
         self.steps(ls.Quadrotor().dynamics, x, np.full(4, 1.2), 0.05)
         for name in [one for one in vars(rotation_ratios) if "ratio" in one]:
             replay(source_of(rotation_ratios), {}, name, size**2)
-        replay(source_of(obstacle_cost), {}, "exponential", -size)
+        replay(source_of(exponential), {}, "exponential", -size)
 
     @pytest.mark.parametrize("kind", mjcf_files.KINDS)
     def test_mujoco(self, kind: str) -> None:

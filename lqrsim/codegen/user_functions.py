@@ -73,6 +73,7 @@ class UserFunction:
       entries: what each returned value is for, in messages; empty where a single number is returned.
       columns: size of the rows in which the values are returned; 0 for a flat list.
       with_control: False for a `function(x, p)`.
+      is_memory: whether the address is that of numbers, not of a function.
     """
 
     function: Callable[..., Any]
@@ -87,6 +88,7 @@ class UserFunction:
     unused: tuple[tuple[int, str], ...] = ()
     columns: int = 0
     with_control: bool = True
+    is_memory: bool = False
     held: list[tuple[Any, int]] = field(default_factory=list, init=False, repr=False, compare=False)
     stopped: threading.Event = field(default_factory=threading.Event, init=False, repr=False, compare=False)
     _thread: threading.local = field(default_factory=threading.local, init=False, repr=False, compare=False)

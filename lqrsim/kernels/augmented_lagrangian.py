@@ -14,8 +14,8 @@ its force would be. Of its curvature only `mu n n'` is used, n the gradient of d
 the first step at which they act, the tolerance, the price (infinite where there is none), and from HEADER on lambda,
 step by step.
 
-A constraint on the balls of a robot computes their centres once a step: its value and its slope then take the centres
-(3 BALLS,) and their Jacobian (3 BALLS, N) in place of state and control.
+A constraint whose rows share numbers, such as the centres of a robot's balls, computes these once a step, by `places`.
+Its value and its slope then take the numbers (SHARED,) and their Jacobian (SHARED, N) in place of state and control.
 """
 
 from math import inf
@@ -34,24 +34,24 @@ from lqrsim.kernels.declarations import (
 )
 from lqrsim.kernels.linear_algebra import fill
 
-BALLS = 0  # 0 for a constraint on state and control
+SHARED = 0  # numbers that the rows share; 0 for a constraint on state and control
 
 
 def augment(x, u, t, data, multipliers, hessian, gradient):
     """Add the quadratic model at (x, u) to hessian (W, W) and gradient (W,), and return the value."""
     total = 0.0
     if multipliers[0] > 0 and t >= multipliers[2]:
-        if BALLS:
-            centres, jacobian = stack(3 * BALLS), zeros(3 * BALLS, N)
-            places_jacobian(x, data, centres, jacobian)
-            total = augment_at(centres, jacobian, t, data, multipliers, hessian, gradient)
+        if SHARED:
+            shared, jacobian = stack(SHARED), zeros(SHARED, N)
+            places_jacobian(x, data, shared, jacobian)
+            total = augment_at(shared, jacobian, t, data, multipliers, hessian, gradient)
         else:
             total = augment_at(x, u, t, data, multipliers, hessian, gradient)
     return total
 
 
 def augment_at(x, u, t, data, multipliers, hessian, gradient):
-    """Add the quadratic model, and return the value; x and u may be centres and their Jacobian."""
+    """Add the quadratic model, and return the value; x and u may be the shared numbers and their Jacobian."""
     rows, slope, total = int(multipliers[1]), stack(W), 0.0
     for row in range(rows):
         force, held, value = force_of(x, u, t, row, data, multipliers)
@@ -71,17 +71,17 @@ def augmentation(x, u, t, data, multipliers):
     """The value alone."""
     total = 0.0
     if multipliers[0] > 0 and t >= multipliers[2]:
-        if BALLS:
-            centres = stack(3 * BALLS)
-            places(x, data, centres)
-            total = augmentation_at(centres, u, t, data, multipliers)
+        if SHARED:
+            shared = stack(SHARED)
+            places(x, data, shared)
+            total = augmentation_at(shared, u, t, data, multipliers)
         else:
             total = augmentation_at(x, u, t, data, multipliers)
     return total
 
 
 def augmentation_at(x, u, t, data, multipliers):
-    """The value alone; x may be centres."""
+    """The value alone; x may be the shared numbers."""
     total = 0.0
     for row in range(int(multipliers[1])):
         _, _, value = force_of(x, u, t, row, data, multipliers)
@@ -105,16 +105,16 @@ def constraint_values(x, u, t, acts, data, multipliers, values):
 
     Where it does not act they are satisfied: infinite for an inequality, zero for an equality.
     """
-    if BALLS:
-        centres = stack(3 * BALLS)
-        places(x, data, centres)
-        values_at(centres, u, t, acts, data, multipliers, values)
+    if SHARED:
+        shared = stack(SHARED)
+        places(x, data, shared)
+        values_at(shared, u, t, acts, data, multipliers, values)
     else:
         values_at(x, u, t, acts, data, multipliers, values)
 
 
 def values_at(x, u, t, acts, data, multipliers, values):
-    """Write the values; x may be centres."""
+    """Write the values; x may be the shared numbers."""
     rows = int(multipliers[1])
     for row in range(rows):
         satisfied = 0.0 if EQUALITY else inf
@@ -123,9 +123,9 @@ def values_at(x, u, t, acts, data, multipliers, values):
 
 def add_slope(x, u, t, row, data, gradient):
     """Add the gradient (W,) of one of a constraint's values."""
-    if BALLS:
-        centres, jacobian = stack(3 * BALLS), zeros(3 * BALLS, N)
-        places_jacobian(x, data, centres, jacobian)
-        constraint_slope(centres, jacobian, t, row, data, gradient)
+    if SHARED:
+        shared, jacobian = stack(SHARED), zeros(SHARED, N)
+        places_jacobian(x, data, shared, jacobian)
+        constraint_slope(shared, jacobian, t, row, data, gradient)
     else:
         constraint_slope(x, u, t, row, data, gradient)

@@ -5,19 +5,14 @@ sharpness, the weight, the number of obstacles, the number of steps with a table
 from its step on, the radius of each ball (of a point, one), and the tables. What `places` reads comes before AT.
 """
 
-from math import floor, inf
-
-from lqrsim.kernels.declarations import ROW, N, exact, places, places_jacobian, power_of_two, stack, zeros
+from lqrsim.kernels.declarations import ROW, N, places, places_jacobian, stack, zeros
+from lqrsim.kernels.exponential import exponential
 from lqrsim.kernels.signed_distance import signed_distance, signed_distance_derivatives
 
 AT = 0
 BALLS = 0  # 0 for a point
 AXES = (0, 1, 2)  # states that are the position, two in a plane, whose third coordinate is 0; or that move the balls
 BLOCK = 8  # obstacles whose exponentials are computed together, as vectors
-
-LOG2_E = 1.4426950408889634
-LN2_HIGH, LN2_LOW = 0.693145751953125, 1.4286068203094173e-06  # ln 2 in two parts; products with the first are exact
-LEAST, MOST = -708.0, 709.0  # below, exp x is taken to be zero; above, infinite
 
 
 def value(x, u, t, data):
@@ -119,18 +114,3 @@ def derivatives_of_ball(a, b, c, radius, table, data, force, stiffness):
         for k in range(3):
             stiffness[j, k] = curves[j, k]
     return total
-
-
-@exact
-def exponential(x):
-    """exp x, to some 2e-16 of it: arithmetic alone, so that loops vectorise, and every C library gives the same bits.
-
-    With k the whole number nearest to x / ln 2 it is 2^k exp r; Taylor's series for r, which is at most 0.35, has an
-    error of 1e-17 after the twelfth power.
-    """
-    k = floor(x * LOG2_E + 0.5)
-    r = x - k * LN2_HIGH - k * LN2_LOW
-    high = 1 / 5040 + r * (1 / 40320 + r * (1 / 362880 + r * (1 / 3628800 + r * (1 / 39916800 + r / 479001600))))
-    series = 1.0 + r * (1.0 + r * (0.5 + r * (1 / 6 + r * (1 / 24 + r * (1 / 120 + r * (1 / 720 + r * high))))))
-    result = series * power_of_two(k)
-    return inf if x > MOST else 0.0 if x < LEAST else result
