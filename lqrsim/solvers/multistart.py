@@ -17,11 +17,11 @@ from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, ter
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
-from lqrsim.results.solution_parts import Candidate, Status
+from lqrsim.results.solution_parts import Candidate, Trajectory
 from lqrsim.solvers.assembly import clearance_of
 from lqrsim.solvers.attempt import Attempt, AttemptResult
 from lqrsim.solvers.common import Callback, SmootherSettings, Stop, workers
-from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, resolve
+from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, StartLike, resolve
 from lqrsim.solvers.strategy import Known, finish, refine
 
 # `python experiments/benchmark_quality.py --sections ingredients` shows what each of these choices brings.
@@ -200,8 +200,7 @@ class Search:
                 best = self.best[1]
                 if attempt.stop.due or best.final or (best.success and not attempt.cost < best.cost):
                     break
-                if self._finish(attempt).final and best.status is Status.INFEASIBLE:
-                    break
+                self._finish(attempt)
 
     def poor(self, problem: Problem) -> bool:
         """Whether the best plan so far is one that nobody would want: far from the goal, or through an obstacle.
@@ -211,10 +210,10 @@ class Search:
         """
         space = problem.dynamics.state_coordinates
         if _pull(problem) == 0 or problem.goal is None:
-            return self._idle(problem)
+            return self._idle(problem) or self._stuck
         (attempt, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
         if not found.success:
-            return attempt.iterations_left(found.iterations) > 0 and found.status is not Status.INFEASIBLE
+            return attempt.iterations_left(found.iterations) > 0
         if space.position:
             place = list(space.position)
             arrived = np.linalg.norm(found.states[-1, place] - problem.goal[place]) <= max(radius, 1e-3)
@@ -232,8 +231,16 @@ class Search:
         off = np.abs(found.controls - nominal).max()
         return found.success and found.cost > 0 and off <= IDLE * max(1.0, np.abs(nominal).max())
 
+    @property
+    def _stuck(self) -> bool:
+        """Whether what is missed is stationary somewhere, and nothing else was found."""
+        return bool(self._known.evidence) and not self.best[1].success
+
     def widen(self, problem: Problem, settings: SmootherSettings, start: Array, stop: Stop, threads: int) -> None:
         """Look for another way round: of bold plans, go on from the best by steps that lower the true cost alone."""
+        if self._stuck and _pull(problem) == 0:
+            self._elsewhere(problem, settings, start, stop)
+            return
         if _pull(problem) == 0:
             controls = [swayed(problem, cycles) for cycles in SWAYS]
             attempts = [Attempt(problem, settings, resolve(one, problem), start, stop) for one in controls]
@@ -264,6 +271,27 @@ class Search:
             other = found.rank < best.rank and (not best.success or found.cost < best.cost - 1e-3 * abs(best.cost))
             self._finished.insert(0 if other else len(self._finished), (attempt, found))
 
+    def _elsewhere(self, problem: Problem, settings: SmootherSettings, start: Array, stop: Stop) -> None:
+        """From other starts, until one leads to a plan: before constraints are said to contradict each other."""
+        starts: dict[str, StartLike] = {f"controls that sway {n} times": swayed(problem, n) for n in SWAYS[:2]}
+        place = list(problem.dynamics.state_coordinates.position)
+        if place and problem.goal is not None and problem.start is not None:
+            ends = problem.start, problem.goal
+            for name, bend in bends((ends[1] - ends[0])[place], 3)[1:]:
+                states = path(*ends, np.zeros(len(start)), problem.steps)
+                states[:, place] = path(ends[0][place], ends[1][place], bend, problem.steps)
+                controls = np.tile(problem.nominal_control, (problem.steps, 1))
+                starts[f"a path {name}"] = Trajectory(states, controls, problem.dt)
+        for name, one in starts.items():
+            if stop.due or self.best[1].success:
+                break
+            attempt = Attempt(problem, settings, resolve(one, problem), start, stop)
+            self._named.append((name, attempt))
+            known = dataclasses.replace(self._known, from_start=False)
+            found = finish(attempt, each=self._each, callback=self._callback, known=known)
+            self._finished.append((attempt, found))
+            self._finished.sort(key=lambda pair: pair[1].rank)
+
     def calm(self, problem: Problem, settings: SmootherSettings, start: Array, stop: Stop, threads: int) -> None:
         """Where the risk was too high on the way: search without a risk, and go on from that plan."""
         if all(attempt.termination.outcome != declarations.RISK_TOO_HIGH for _, attempt in self._named):
@@ -292,7 +320,7 @@ class Search:
     def _advance(self, attempt: Attempt, *, last: int) -> None:
         attempt.run(last, each=self._each)
 
-    def _finish(self, attempt: Attempt) -> AttemptResult:
+    def _finish(self, attempt: Attempt) -> None:
         if self._callback is not None:
             for iteration in attempt.termination.iterations:
                 try:
@@ -303,7 +331,6 @@ class Search:
         found = finish(attempt, each=self._each, callback=self._callback, known=self._known)
         self._finished.append((attempt, found))
         self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equals, the first
-        return found
 
 
 def choose(attempts: Sequence[Attempt], advance: Callable[..., None], threads: int) -> list[Attempt]:
