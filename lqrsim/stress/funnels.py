@@ -34,7 +34,7 @@ from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.disturbances.state_noise import as_disturbances
 from lqrsim.simulation.effects import seeded
 from lqrsim.simulation.plant import Plant
-from lqrsim.solvers.common import check_threads
+from lqrsim.solvers.parallel import check_threads
 from lqrsim.stress.levels import BATCH, MOST_TRIALS, FoundLevel, Test, find_level, smallest_test
 from lqrsim.stress.statistics import CONFIDENCE, Estimate
 from lqrsim.stress.statistics import rate as rate_of
