@@ -445,7 +445,8 @@ class Ladder:
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()
                 status = Status.INFEASIBLE
-                detail += f"; against it stand {least.against}" if least.against else ""
+                beside = least.beside(detail)
+                detail += f"; against it stand {beside}" if beside else ""
             best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
         return run.certified(best)
 
