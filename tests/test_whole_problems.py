@@ -35,7 +35,7 @@ def test_nothing_that_a_solution_claims_is_false(kinds: tuple[str, ...], example
 
 
 def test_a_large_penalty_does_not_spoil_the_certified_cost() -> None:
-    """Far from a goal the augmented Lagrangian adds 1e13 times the cost, of which the certificate once kept rounding."""
+    """Far from a goal the augmented Lagrangian adds 1e13 times the cost, of which rounding was left."""
     drawn = draws.draw("parking", 4285210)
     for solution in draws.solve(drawn):
         assert contradictions(drawn.problem, solution, drawn.rate) == []

@@ -182,11 +182,10 @@ class Search:
 
     def __init__(self, names: Sequence[str], runs: Sequence[SolveRun], callback: Callback | None, threads: int) -> None:
         self._named = list(zip(names, runs, strict=True))
-        self._callback, self._threads = callback, threads
+        self._callback, self._threads, self._known = callback, threads, Known()
         self._problem, self._settings = runs[0].problem, runs[0].settings
         self._start, self._budget = runs[0].work.start.copy(), runs[0].budget
         self._finished: list[tuple[SolveRun, RunResult]] = []
-        self._known = Known()
 
     @property
     def best(self) -> tuple[SolveRun, RunResult]:
@@ -244,7 +243,7 @@ class Search:
 
     @property
     def _stuck(self) -> bool:
-        """Whether what is missed is stationary somewhere, and no plan was found."""
+        """Whether a violation is stationary somewhere, and no plan was found."""
         return bool(self._known.evidence) and not self.best[1].success
 
     def widen(self) -> None:
@@ -263,7 +262,7 @@ class Search:
         named = dict(zip(map(id, runs), SWAYS, strict=True))
         chosen = choose(runs, self._threads)[0]
         self._named.append((f"controls that sway {named[id(chosen)]} times", chosen))
-        found, best = self._to_its_end(chosen, finish), self.best[1]
+        found, best = self._to_its_end(chosen, finish, Known()), self.best[1]
         # Even one that is not at its end is better than to do nothing.
         better = found.violation <= best.violation and found.cost < best.cost
         self._finished.insert(0 if better else len(self._finished), (chosen, found))
@@ -275,7 +274,7 @@ class Search:
             f"controls that sway {cycles} times": sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]
         }
         place, begin, goal = list(problem.dynamics.state_coordinates.position), problem.start, problem.goal
-        if place and begin is not None and goal is not None:
+        if place and begin is not None and goal is not None and (goal != begin)[place].any():
             for name, bend in bends((goal - begin)[place], 3)[1:]:
                 states = path(begin, goal, np.zeros(len(begin)), problem.steps)
                 states[:, place] = path(begin[place], goal[place], bend, problem.steps)
@@ -304,7 +303,7 @@ class Search:
         summary = f"a plan for {times:g} times the weight of obstacles and goal"
         run = self._another(InitialGuess(boldest.law[0].copy(), boldest.law[1].copy(), None, None, summary))
         self._named.append((summary, run))
-        found, best = self._to_its_end(run, refine), self.best[1]
+        found, best = self._to_its_end(run, refine, self._known), self.best[1]
         # The same optimum once more, a little different within the tolerances, is no other way.
         other = found.rank < best.rank and (not best.success or found.cost < best.cost - 1e-3 * abs(best.cost))
         self._finished.insert(0 if other else len(self._finished), (run, found))
@@ -315,7 +314,7 @@ class Search:
             return
         riskless = dataclasses.replace(self._problem, risk=0.0)
         runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
-        found = finish(choose(runs, self._threads)[0])
+        found = finish(choose(runs, self._threads)[0], Known())
         if not found.success or self._budget.stop.due:
             return
         summary = "a plan without a risk"
@@ -338,13 +337,13 @@ class Search:
         return SolveRun(problem, self._settings, initial_guess, self._start, self._budget.another())
 
     def _finish(self, run: SolveRun) -> None:
-        self._finished.append((run, self._to_its_end(run, finish)))
+        self._finished.append((run, self._to_its_end(run, finish, self._known)))
         self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equals, the first
 
-    def _to_its_end(self, run: SolveRun, how: Callable[[SolveRun, Known], RunResult]) -> RunResult:
-        """What a run comes to; the callback is told of its iterations, those before included."""
+    def _to_its_end(self, run: SolveRun, how: Callable[[SolveRun, Known], RunResult], known: Known) -> RunResult:
+        """Run to the end; report all its iterations to the callback, also those before."""
         run.budget.report_to(self._callback)
-        return how(run, self._known)
+        return how(run, known)
 
 
 def choose(runs: Sequence[SolveRun], threads: int) -> list[SolveRun]:
