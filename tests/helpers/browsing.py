@@ -30,7 +30,7 @@ class Page:
         self._number += 1
         self._connection.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            answer = json.loads(self._connection.recv(timeout=60))
+            answer = json.loads(self._connection.recv(timeout=600))
             if answer.get("id") == self._number:
                 assert "error" not in answer, answer
                 return answer["result"]
@@ -61,7 +61,7 @@ class Page:
 
     def pictures(self) -> Iterator[np.ndarray]:
         """What the page shows, once it draws a scene, and from then on each picture that differs."""
-        last, until = self.picture(), time.monotonic() + 90
+        last, until = self.picture(), time.monotonic() + 600
         while time.monotonic() < until:
             picture = self.picture()
             # Before the scene is there the page is dark; colours are what the scene has.
@@ -84,7 +84,7 @@ def browser(url: str, profile: Path, *, size: tuple[int, int] = (800, 560)) -> I
     command = [CHROMIUM, *FLAGS, window, f"--user-data-dir={profile}", "--remote-debugging-port=0", url]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
-            told, until = profile / "DevToolsActivePort", time.monotonic() + 60
+            told, until = profile / "DevToolsActivePort", time.monotonic() + 600
             while not (told.exists() and told.read_text().count("\n")):
                 assert time.monotonic() < until, "the browser did not start"
                 assert process.poll() is None, "the browser ended"

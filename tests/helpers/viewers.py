@@ -40,13 +40,13 @@ class Recorder(Viewer):
 
 @contextlib.contextmanager
 def viewing(folder: Path, *arguments: str, before: str = "") -> Iterator[subprocess.Popen[str]]:
-    """`lqrsim view` in a process of its own, for three minutes at most, and as it ends with Ctrl-C.
+    """`lqrsim view` in a process of its own, for 20 minutes at most, and as it ends with Ctrl-C.
 
     Args:
       before: what that process does first.
     """
     code = f"{before}\nimport sys; from lqrsim.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "view", *arguments, "--viewer", "browser", "--seconds", "200"]
+    command = [sys.executable, "-c", code, "view", *arguments, "--viewer", "browser", "--seconds", "1200"]
     # MuJoCo keeps the layout of its panels in the home; what is compiled stays where it is.
     environment = {**os.environ, "HOME": str(folder), "LQRSIM_CACHE_DIR": str(disk_cache.folder())}
     environment["PYTHONFAULTHANDLER"] = "1"
@@ -57,7 +57,7 @@ def viewing(folder: Path, *arguments: str, before: str = "") -> Iterator[subproc
         finally:
             process.send_signal(signal.SIGINT)
             try:
-                process.communicate(timeout=60)  # reads on, for a process that cannot write cannot end
+                process.communicate(timeout=600)  # reads on, for a process that cannot write cannot end
             except subprocess.TimeoutExpired:
                 process.send_signal(signal.SIGABRT)  # where it hangs is then in what it wrote
                 raise AssertionError(f"it did not end with Ctrl-C:\n{process.communicate()[0]}") from None
