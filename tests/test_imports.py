@@ -41,10 +41,10 @@ FLOORS_WITHIN = {
     "kernels": (("declarations",), ("linear_algebra", "rotation_ratios", "runge_kutta", "signed_distance")),
     "scenes": (("world",),),
     "results": (
-        ("schema", "hashing", "ball_record", "coordinates", "solution_parts", "trial_outcome", "value_functions"),
+        ("fields", "schema", "hashing", "coordinates", "solution_parts", "value_functions"),
         ("archive", "goal", "notebook", "policy"),
         ("plan",),
-        ("replan", "solution"),
+        ("solution",),
         ("rollout",),
     ),
     "codegen": (
@@ -57,6 +57,7 @@ FLOORS_WITHIN = {
     ),
     "problem": (
         ("dynamics", "linear_quadratic"),
+        ("collision_geoms",),
         ("collision_spheres", "noise"),
         ("costs",),
         ("constraints",),

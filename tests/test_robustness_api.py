@@ -252,7 +252,7 @@ class TestDataThatUsersBuild:
         for field in ("policy", "trajectory", "cost_to_go", "goal"):
             other = getattr(quadrotor_solution, field)
             line = refusal(lambda f=field, o=other: dataclasses.replace(plan, **{f: o}))
-            assert line.startswith(f"Plan: {'policy' if field == 'trajectory' else field}")
+            assert line.startswith(f"Plan: {'trajectory' if field == 'policy' else field}")
 
     def test_a_rollout(self, differential_drive: ls.Scenario, drive_solution: ls.Solution) -> None:
         rollout = ls.simulate(differential_drive.plant(), drive_solution, frames=False)

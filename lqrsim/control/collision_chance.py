@@ -17,6 +17,7 @@ from lqrsim.errors import Array, InputError
 from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_spheres import SphereCenters, bind_outline, evaluate_slopes
 from lqrsim.problem.costs import ObstacleCost
+from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import Problem
 from lqrsim.scenes.world import World
 
@@ -38,12 +39,14 @@ class Surroundings:
     """What a robot must not touch.
 
     Attributes:
+      dynamics: of the problem.
       worlds: with what is to be kept from each: the costs and constraints that say so, each kind once.
       seen: the worlds as the robot sees them. places: of those that are kept from balls, where these are.
       place: which states are its position. position: these, or, with balls, all that move it.
       std: of where an obstacle is, in m.
     """
 
+    dynamics: Dynamics
     worlds: tuple[ObstacleCost | Clearance, ...]
     seen: tuple[World, ...]
     places: tuple[SphereCenters | None, ...]
@@ -57,30 +60,41 @@ class Surroundings:
         space, worlds = problem.dynamics.state_coordinates, []
         clearances = [one for one in problem.constraints if isinstance(one, Clearance)]
         for one in (*problem.obstacle_costs, *clearances):
-            kind = id(one.world), one.radius, id(one.balls)
-            if not any((id(other.world), other.radius, id(other.balls)) == kind for other in worlds):
+            kind = id(one.world), one.radius, id(one.balls), id(one.geoms)
+            if not any(kind == (id(other.world), other.radius, id(other.balls), id(other.geoms)) for other in worlds):
                 worlds.append(one)
         if any(one.moving for one in worlds):
             raise InputError(
                 "problem: got obstacles that move, want none: chances of collision are for obstacles that stand still"
             )
-        bound = [bind_outline("problem", one.balls, problem.dynamics, one.world) for one in worlds]
+        bound = [
+            (None, one.world)
+            if one.geoms is not None
+            else bind_outline("problem", one.balls, problem.dynamics, one.world)
+            for one in worlds
+        ]
         found = [(one, places, seen) for one, (places, seen) in zip(worlds, bound, strict=True) if len(seen)]
         moving = space.position
-        if any(places is not None for _, places, _ in found):
-            own = [places.depends_on if places is not None else space.position for _, places, _ in found]
+        if any(places is not None or one.geoms is not None for one, places, _ in found):
+            own = [
+                tuple(range(one.geoms.bind(problem.dynamics, one.world, 0.0).moved))
+                if one.geoms is not None
+                else places.depends_on
+                if places is not None
+                else space.position
+                for one, places, _ in found
+            ]
             moving = tuple(sorted({i for indices in own for i in indices}))
         kept, of_balls, seen = (tuple(part) for part in zip(*found, strict=True)) if found else ((), (), ())
-        return cls(kept, seen, of_balls, space.position, moving, std)
+        return cls(problem.dynamics, kept, seen, of_balls, space.position, moving, std)
 
     def keep_away(self, margin: Array) -> list[Clearance]:
         """Constraints that keep a margin from each obstacle, (T+1, O)."""
         kept, first = [], 0
         for one, seen in zip(self.worlds, self.seen, strict=True):
             own = margin[:, first : first + len(seen)]
-            kept.append(
-                Clearance(one.world, radius=one.radius if one.balls is None else None, balls=one.balls, margin=own)
-            )
+            radius = one.radius if one.balls is None and one.geoms is None else None
+            kept.append(Clearance(one.world, radius=radius, balls=one.balls, geoms=one.geoms, margin=own))
             first += len(seen)
         return kept
 
@@ -103,6 +117,9 @@ class Surroundings:
     def _of_one(
         self, one: ObstacleCost | Clearance, seen: World, places: SphereCenters | None, states: Array
     ) -> tuple[Array, Array]:
+        if one.geoms is not None:
+            distances, slopes = one.geoms.slopes(self.dynamics, one.world, states)
+            return distances, slopes[..., list(self.position)]
         if one.balls is None or places is None:
             distances, across = distances_with_normals(seen, states[:, list(self.place)])
             normals = np.zeros((*distances.shape, len(self.position)))

@@ -25,16 +25,15 @@ from lqrsim.errors import (
 )
 from lqrsim.problem.noise import Noise
 from lqrsim.results.funnel import Funnel, flat
-from lqrsim.results.goal import Target
+from lqrsim.results.goal import Target, endings
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.results.trial_outcome import endings
 from lqrsim.simulation.begun_later import simulate_from
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.disturbances.state_noise import as_disturbances
 from lqrsim.simulation.effects import seeded
 from lqrsim.simulation.plant import Plant
-from lqrsim.solvers.common import check_threads
+from lqrsim.solvers.parallel import check_threads
 from lqrsim.stress.levels import BATCH, MOST_TRIALS, FoundLevel, Test, find_level, smallest_test
 from lqrsim.stress.statistics import CONFIDENCE, Estimate
 from lqrsim.stress.statistics import rate as rate_of

@@ -13,7 +13,7 @@ def funnel_by_hand(
 ) -> ls.Funnel:
     """Of the first d states, with a shape (d, d) or one each knot (T+1, d, d)."""
     shape, space = np.asarray(shape, dtype=float), solution.policy.state_coordinates
-    tried = (np.asarray(levels) > 0).astype(int)
+    tried = 1000 * (np.asarray(levels) > 0)  # enough to show any rate that is asked for
     return ls.Funnel(
         plan=solution.trajectory, state_coordinates=space, control_coordinates=solution.policy.control_coordinates,
         states=space.names[: shape.shape[-1]], family="given",

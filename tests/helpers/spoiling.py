@@ -26,7 +26,7 @@ def contents(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 def rewrite(path: Path, *, sealed: Any = True, **changes: Any) -> None:
     """Change what a file says, as another program could: with the hash that belongs to it, or the old one.
 
-    An array replaces one, None takes one out, and a function changes it; anything else is metadata.
+    An array replaces one, None takes one out, and a function changes it; anything else is metadata, by its path.
     """
     arrays, meta = contents(path)
     for name, change in changes.items():
@@ -38,7 +38,11 @@ def rewrite(path: Path, *, sealed: Any = True, **changes: Any) -> None:
         elif isinstance(change, np.ndarray):
             arrays[name] = change
         else:
-            meta[name] = change(meta[name]) if callable(change) else change
+            *outer, last = name.split(".")
+            inner: Any = meta
+            for part in outer:
+                inner = inner[int(part) if part.isdigit() else part]
+            inner[last] = change(inner[last]) if callable(change) else change
     if sealed:
         meta["sha256"] = content_hash(arrays, meta)
     with path.open("wb") as file:
