@@ -24,6 +24,8 @@ UNFINISHED = "an installation that was interrupted"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 GL_PACKAGES = ("libegl1", "libgl1-mesa-dri", "libopengl0")
 
+COMPILE = "import compileall, sysconfig; compileall.compile_dir(sysconfig.get_path('purelib'), quiet=2, workers=0)"
+
 COMMANDS = {
     "demo": "solve, simulate and render both robots (arguments go to `lqrsim demo`)",
     "test": "run the tests; --long includes whole experiments (other arguments go to pytest: test -k solver)",
@@ -89,9 +91,10 @@ def set_up_python() -> None:
     STAMP.write_text(UNFINISHED, encoding="utf-8")
     say("Installing lqrsim and what it depends on into .venv (a minute or two the first time) ...")
     pip = [PYTHON, "-m", "pip", "install", "--disable-pip-version-check"]
-    code = run([*pip, *([] if sys.stdout.isatty() else ["--quiet"]), "--editable", ".[dev,docs]"])
+    code = run([*pip, *([] if sys.stdout.isatty() else ["--quiet"]), "--no-compile", "--editable", ".[dev,docs]"])
     if code:
         sys.exit("run.py: the installation failed for the reason above; the next run starts it again")
+    run([PYTHON, "-c", COMPILE])  # on all processors, where pip takes one; what it cannot compile it leaves
     STAMP.write_text(wanted, encoding="utf-8")
 
 
