@@ -1,4 +1,4 @@
-"""A browser without a screen, driven through its own debugging protocol: what a page shows, and what keys do to it."""
+"""A headless browser, driven through its debugging protocol: what a page shows, and how it reacts to keys."""
 
 import base64
 import contextlib
@@ -26,7 +26,7 @@ class Page:
         self._connection, self._number = connection, 0
 
     def call(self, method: str, **parameters: Any) -> Any:
-        """One command of the protocol, and what came of it."""
+        """Send one command of the protocol; its result."""
         self._number += 1
         self._connection.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
@@ -41,7 +41,7 @@ class Page:
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
     def press(self, key: str, code: int) -> None:
-        """Press and release a key, for long enough that a frame is drawn in between."""
+        """Press a key for long enough that a frame is drawn, and release it."""
         names = {"key": key, "code": key, "windowsVirtualKeyCode": code, "nativeVirtualKeyCode": code}
         self.call("Input.dispatchKeyEvent", type="rawKeyDown", **names)
         time.sleep(0.3)
@@ -78,7 +78,7 @@ class Page:
 
 @contextlib.contextmanager
 def browser(url: str, profile: Path, *, size: tuple[int, int] = (800, 560)) -> Iterator[Page]:
-    """Opens `url`; the browser ends with the block."""
+    """Open `url`; the browser is closed at the end of the block."""
     assert CHROMIUM is not None
     window = f"--window-size={size[0]},{size[1]}"
     command = [CHROMIUM, *FLAGS, window, f"--user-data-dir={profile}", "--remote-debugging-port=0", url]
