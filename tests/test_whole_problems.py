@@ -17,7 +17,6 @@ from lqrsim.results.solution_parts import Status
 # Each kind is compiled where nothing is cached, some 5 seconds. Most of these are so by other tests, too; those that
 # are left out have nothing that these have not, and benchmark_claims.py draws them by the hundred.
 KINDS = ("linear", "pendulum", "parking", "planar", "drive", "quadrotor")
-pytestmark = pytest.mark.timeout(900)
 
 
 @pytest.mark.parametrize(
