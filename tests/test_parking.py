@@ -25,6 +25,29 @@ def test_nothing_false_is_said() -> None:
     assert "CONVERGED" in {one.status for one in found if one.verdict == "right"}
 
 
+@pytest.mark.parametrize("number", [1, 5])
+def test_a_goal_that_is_reached_exactly_may_have_any_weight(number: int) -> None:
+    """The final cost is the same for all plans that end there, so weights from 1 to 5000 lead to one plan."""
+    task = cases.draw(number).task
+    assert task.exact
+    plans = [ls.smooth(problem_of(replace(task, weight=weight)), threads=1) for weight in (1.0, 50.0, 5000.0)]
+    assert {plan.status for plan in plans} == {ls.Status.CONVERGED}
+    np.testing.assert_allclose([plan.cost for plan in plans], plans[0].cost, rtol=1e-6)
+
+
+@pytest.mark.parametrize("number", [68, 178])
+def test_a_plan_that_is_hard_to_find_is_found(number: int) -> None:
+    """From both starts what is missed can be stationary, or a descent at a price long, though there is a plan."""
+    found = outcomes.look(number)
+    assert (found.verdict, found.status) == ("right", "CONVERGED"), found.said
+
+
+@pytest.mark.parametrize("number", [13, 133])
+def test_what_has_no_plan_is_infeasible(number: int) -> None:
+    found = outcomes.look(number)
+    assert (found.verdict, found.status) == ("right", "INFEASIBLE"), found.said
+
+
 def test_what_is_known_is_so() -> None:
     drawn = [cases.draw(number) for number in SAMPLE]
     assert all(case.proved for case in drawn)

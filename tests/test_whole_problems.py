@@ -33,6 +33,13 @@ def test_nothing_that_a_solution_claims_is_false(kinds: tuple[str, ...], example
     holds()
 
 
+def test_a_large_penalty_does_not_spoil_the_certified_cost() -> None:
+    """Far from a goal the augmented Lagrangian adds 1e13 times the cost, of which rounding was left."""
+    drawn = draws.draw("parking", 4285210)
+    for solution in draws.solve(drawn):
+        assert contradictions(drawn.problem, solution, drawn.rate) == []
+
+
 def test_every_kind_can_be_drawn() -> None:
     assert set(KINDS) < set(draws.KINDS)
     for kind in draws.KINDS:
