@@ -12,7 +12,8 @@ With constraints, whatever comes first is followed by the interior point, which 
     the same, after such a descent.
 
 Where none of these converges, the plan that misses the constraints least is the answer. It is INFEASIBLE if two starts
-came to plans about which no change lessens what is missed.
+came to plans about which no change lessens what is missed, which is as much for both. A search tells its runs what the
+others came to, and tries other starts before it says so.
 
 Problems with noise and constraints, those of an MJCF, and `finish=None` have the augmented Lagrangian alone.
 """
@@ -36,7 +37,7 @@ from lqrsim.solvers.interior_point import INTERIOR, Found, InteriorPoint, Measur
 from lqrsim.solvers.restoration import Restored, restore
 
 FAR = 100.0  # times what may be missed: then the price is too low, or there is no way to keep all
-STARTS, SURE = 2, 4  # from which what is missed has to be stationary, to be called infeasible; and not to try others
+STARTS, ALIKE = 2, 0.05  # that have to come to the least that can be missed, to within this share, for INFEASIBLE
 AUGMENTED = 100  # iterations of the augmented Lagrangian
 OPENING, GUIDED = 10, 60  # iterations of smoothing at most before constraints come in; and with an ObstacleCost
 MOST, RESTORED = 300, 150  # of the interior point from one plan; and of a descent at one price
@@ -52,26 +53,28 @@ AT_LIMIT = 1e-9  # of its range, within which a control that presses against its
 
 @dataclass
 class Known:
-    """What the runs of one search know of each other's results.
+    """What the runs of one search know of each other's.
 
     Attributes:
-      evidence: plans whose violation is stationary. from_start: whether the start itself was tried.
+      evidence: plans about which no change lessens what is missed. from_start: whether the start itself was tried.
+      rows: (R,) the sizes by which what is missed is measured.
     """
 
     evidence: list[tuple[Evidence, RunResult]] = field(default_factory=list)
     from_start: bool = False
+    rows: Array | None = None
 
 
-def finish(run: SolveRun, known: Known) -> RunResult:
-    """Run to the end; certified. `known` is what other runs of the search found."""
+def finish(run: SolveRun, known: Known | None = None) -> RunResult:
+    """Run to the end; certified. `known` is what other runs of the same problem came to."""
     if run.initial_guess.found is not None:
-        return Ladder(run, known).climb()
+        return Ladder(run).climb()
     if not run.problem.constraints:
         return run.certified(_without_constraints(run))
     return Ladder(run, known).climb() if run.second_order else augmented_lagrangian.finish(run)
 
 
-def refine(run: SolveRun, known: Known) -> RunResult:
+def refine(run: SolveRun, known: Known | None = None) -> RunResult:
     """Run to the end from where the first policy leads, and stay on that way round; certified."""
     if run.problem.constraints and run.second_order:
         return Ladder(run, known).climb(stay=True)
@@ -88,13 +91,13 @@ def _without_constraints(run: SolveRun) -> RunResult:
     controls = run.work.plan.controls
     pressed = ((controls <= space.low) | (controls >= space.high)).any()
     if run.ending.outcome == declarations.RUNNING and pressed and np.isfinite(run.cost):
-        found = Ladder(run, Known()).from_plan(run.work.plan)
+        found = Ladder(run).from_plan(run.work.plan)
         if found is not None:
             return found
     found = run.solve()
     if found.success or budget.stop.due or budget.left < 2:
         return found
-    ladder = Ladder(run, Known())
+    ladder = Ladder(run)
     plan = run.work.plan if np.isfinite(found.cost) else ladder.start()
     return ladder.from_plan(plan) or found
 
@@ -102,7 +105,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
 class Ladder:
     """The ways to a plan that keeps constraints, one after the other."""
 
-    def __init__(self, run: SolveRun, known: Known) -> None:
+    def __init__(self, run: SolveRun, known: Known | None = None) -> None:
         self._run, self._problem, self._budget = run, run.problem, run.budget
         self._allowed = run.settings.missed(run.problem)
         clock = time.perf_counter()
@@ -114,7 +117,7 @@ class Ladder:
         self._valley: Motion | None = None
         # Whether smoothing and its search have gone round obstacles, which are then to be passed on that side.
         self._guided = any(cost.weight for cost in run.problem.obstacle_costs)
-        self._known = known
+        self._known = Known() if known is None else known
         if run.settings.penalty is None:
             self._without_multipliers()
 
@@ -143,7 +146,7 @@ class Ladder:
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
             rungs += [self._from_valley, self._augmented, lambda: self._at_a_price(self._valley)]
-        if stay or not self._known.from_start:  # all runs of a search have the same start
+        if stay or not self._known.from_start:  # the paths of a search all have the same start
             rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._from_start(start)]
         for rung in rungs:
             found = rung()
@@ -163,10 +166,6 @@ class Ladder:
             return found
         self._run.go_on(checkpoint, self._budget.log[begin:])
         return None
-
-    def _from_start(self, start: RunResult) -> RunResult | None:
-        self._known.from_start = True
-        return self._at_a_price(_plan(start))
 
     def _from_valley(self) -> RunResult | None:
         """From where smoothing leads without the constraints."""
@@ -190,6 +189,10 @@ class Ladder:
         bottom = _plan(found) if found.success else self._valley
         run.go_on(checkpoint)
         return None if self._budget.stop.due else self._interior(bottom, LITTLE if self._guided else MUCH)
+
+    def _from_start(self, start: RunResult) -> RunResult | None:
+        self._known.from_start = True
+        return self._at_a_price(_plan(start))
 
     def _refined(self) -> RunResult | None:
         """From where steps lead that lower the augmented Lagrangian alone."""
@@ -247,6 +250,9 @@ class Ladder:
             return budget.stop.due or slow == PATIENCE
 
         sizes = self._stages.sizes(plan)
+        if self._known.rows is None:
+            self._known.rows = sizes.rows
+        sizes = sizes._replace(rows=self._known.rows)
         if left < 1 or budget.stop.due:
             return None
         try:
@@ -260,7 +266,7 @@ class Ladder:
             return None
 
     def _look_for_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
-        """Whether the violation of a plan is stationary; if so, that is kept as evidence."""
+        """Whether what is missed there is stationary; if so it is kept."""
         there = self._result(plan.states, plan.controls, self._without_gains(plan))
         if not there.violation > FAR * self._allowed:
             return False
@@ -432,15 +438,15 @@ class Ladder:
             lagrangian.evaluate(best.states, best.controls)
             status = Status.STALLED if self._budget.left > 1 else Status.MAX_ITERATIONS
             detail = lagrangian.worst()
-            if len(self._known.evidence) >= STARTS and best.violation > self._allowed:
-                least, best = min(self._known.evidence, key=lambda pair: pair[0].missed)
+            evidence = sorted(self._known.evidence, key=lambda pair: pair[0].missed)
+            alike = [one for one in evidence if one[0].missed <= (1 + ALIKE) * evidence[0][0].missed]
+            if len(alike) >= STARTS and best.violation > self._allowed:
+                least, best = alike[0]
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()
                 status = Status.INFEASIBLE
                 detail += f"; against it stand {least.against}" if least.against else ""
-            status = Status.TIME_LIMIT if stop.due else status
-            sure = status is Status.INFEASIBLE and len(self._known.evidence) >= SURE
-            best = replace(best, status=status, detail=detail, final=sure)
+            best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
         return run.certified(best)
 
 
