@@ -62,7 +62,7 @@ class Known:
 class Ladder:
     """Tries one way to a plan that keeps the constraints after another."""
 
-    def __init__(self, run: SolveRun, known: Known | None = None) -> None:
+    def __init__(self, run: SolveRun, known: Known) -> None:
         self._run, self._problem, self._budget = run, run.problem, run.budget
         self._allowed = run.settings.missed(run.problem)
         clock = time.perf_counter()
@@ -74,7 +74,7 @@ class Ladder:
         self._valley: Motion | None = None
         # With an ObstacleCost, smoothing has chosen the side on which obstacles are passed.
         self._guided = any(cost.weight for cost in run.problem.obstacle_costs)
-        self._known = Known() if known is None else known
+        self._known = known
         if run.settings.penalty is None:
             self._without_multipliers()
 
@@ -223,7 +223,7 @@ class Ladder:
             return None
 
     def _look_for_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
-        """Whether what is missed there is stationary; if so it is kept."""
+        """Whether the violation of a plan is stationary; if so, that is kept as evidence."""
         there = self._result(plan.states, plan.controls, self._without_gains(plan))
         if not there.violation > FAR * self._allowed:
             return False
@@ -402,7 +402,8 @@ class Ladder:
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()
                 status = Status.INFEASIBLE
-                detail += f"; against it stand {least.against}" if least.against else ""
+                beside = least.beside(detail)
+                detail += f"; against it stand {beside}" if beside else ""
             best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
         return run.certified(best)
 

@@ -95,16 +95,16 @@ def solve(
     return stop.finish(solution)
 
 
-def finish(run: SolveRun, known: Known | None = None) -> RunResult:
+def finish(run: SolveRun, known: Known) -> RunResult:
     """Run from one start to the end; certified. `known` is what other runs of the same problem found."""
     if run.initial_guess.found is not None:
-        return Ladder(run).climb()
+        return Ladder(run, known).climb()
     if not run.problem.constraints:
         return run.certified(_without_constraints(run))
     return Ladder(run, known).climb() if run.second_order else augmented_lagrangian.finish(run)
 
 
-def refine(run: SolveRun, known: Known | None = None) -> RunResult:
+def refine(run: SolveRun, known: Known) -> RunResult:
     """Run to the end from the rollout of the first policy, on its side of the obstacles; certified."""
     if run.problem.constraints and run.second_order:
         return Ladder(run, known).climb(stay=True)
@@ -121,13 +121,13 @@ def _without_constraints(run: SolveRun) -> RunResult:
     controls = run.work.plan.controls
     pressed = ((controls <= space.low) | (controls >= space.high)).any()
     if run.ending.outcome == declarations.RUNNING and pressed and np.isfinite(run.cost):
-        found = Ladder(run).from_plan(run.work.plan)
+        found = Ladder(run, Known()).from_plan(run.work.plan)
         if found is not None:
             return found
     found = run.solve()
     if found.success or budget.stop.due or budget.left < 2:
         return found
-    ladder = Ladder(run)
+    ladder = Ladder(run, Known())
     plan = run.work.plan if np.isfinite(found.cost) else ladder.start()
     return ladder.from_plan(plan) or found
 
@@ -141,11 +141,10 @@ class Search:
 
     def __init__(self, names: Sequence[str], runs: Sequence[SolveRun], callback: Callback | None, threads: int) -> None:
         self._named = list(zip(names, runs, strict=True))
-        self._callback, self._threads = callback, threads
+        self._callback, self._threads, self._known = callback, threads, Known()
         self._problem, self._settings = runs[0].problem, runs[0].settings
         self._start, self._budget = runs[0].work.start.copy(), runs[0].budget
         self._finished: list[tuple[SolveRun, RunResult]] = []
-        self._known = Known()
 
     @property
     def best(self) -> tuple[SolveRun, RunResult]:
@@ -222,7 +221,7 @@ class Search:
         named = dict(zip(map(id, runs), SWAYS, strict=True))
         chosen = choose(runs, self._threads)[0]
         self._named.append((f"controls that sway {named[id(chosen)]} times", chosen))
-        found, best = self._to_its_end(chosen, finish), self.best[1]
+        found, best = self._to_its_end(chosen, finish, Known()), self.best[1]
         # Even a plan that has not converged is better than doing nothing.
         better = found.violation <= best.violation and found.cost < best.cost
         self._finished.insert(0 if better else len(self._finished), (chosen, found))
@@ -234,7 +233,7 @@ class Search:
             f"controls that sway {cycles} times": sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]
         }
         place, begin, goal = list(problem.dynamics.state_coordinates.position), problem.start, problem.goal
-        if place and begin is not None and goal is not None:
+        if place and begin is not None and goal is not None and (goal != begin)[place].any():
             for name, bend in bends((goal - begin)[place], 3)[1:]:
                 states = path(begin, goal, np.zeros(len(begin)), problem.steps)
                 states[:, place] = path(begin[place], goal[place], bend, problem.steps)
@@ -263,7 +262,7 @@ class Search:
         summary = f"a plan for {times:g} times the weight of obstacles and goal"
         run = self._another(InitialGuess(boldest.law[0].copy(), boldest.law[1].copy(), None, None, summary))
         self._named.append((summary, run))
-        found, best = self._to_its_end(run, refine), self.best[1]
+        found, best = self._to_its_end(run, refine, self._known), self.best[1]
         # The same optimum, different within the tolerances, is no improvement.
         other = found.rank < best.rank and (not best.success or found.cost < best.cost - 1e-3 * abs(best.cost))
         self._finished.insert(0 if other else len(self._finished), (run, found))
@@ -274,7 +273,7 @@ class Search:
             return
         riskless = dataclasses.replace(self._problem, risk=0.0)
         runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
-        found = finish(choose(runs, self._threads)[0])
+        found = finish(choose(runs, self._threads)[0], Known())
         if not found.success or self._budget.stop.due:
             return
         summary = "a plan without a risk"
@@ -297,13 +296,13 @@ class Search:
         return SolveRun(problem, self._settings, initial_guess, self._start, self._budget.another())
 
     def _finish(self, run: SolveRun) -> None:
-        self._finished.append((run, self._to_its_end(run, finish)))
+        self._finished.append((run, self._to_its_end(run, finish, self._known)))
         self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equals, the first
 
-    def _to_its_end(self, run: SolveRun, how: Callable[[SolveRun, Known], RunResult]) -> RunResult:
+    def _to_its_end(self, run: SolveRun, how: Callable[[SolveRun, Known], RunResult], known: Known) -> RunResult:
         """Finish a run; the callback hears of all its iterations, also those before."""
         run.budget.report_to(self._callback)
-        return how(run, self._known)
+        return how(run, known)
 
 
 def _solve_for_duration(
