@@ -1,14 +1,14 @@
 """Records that other functions return or take, for annotations and for extensions."""
 
 from lqrsim.control.chance_constrained import SafePlan
-from lqrsim.control.live_replanner import LiveReplanner
 from lqrsim.control.replan_rule import ReplanRecord
+from lqrsim.control.replanner import LiveReplanner
 from lqrsim.control.tubes import Tube
 from lqrsim.problem.collision_spheres import SphereCenters
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.derivative_check import DerivativeCheck
-from lqrsim.results.replan import Replan
+from lqrsim.results.plan import Replan
 from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 from lqrsim.simulation.plant_check import PlantCheck

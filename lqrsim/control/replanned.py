@@ -16,8 +16,7 @@ import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.controllers import ControllerRun
-from lqrsim.control.filter_law import FilterLaw
-from lqrsim.control.filter_run import FilterRun
+from lqrsim.control.filter_law import FilterLaw, FilterRun
 from lqrsim.control.kalman import kalman_filter
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.replan_rule import ReplanLog, ReplanRule, SolveRequest
@@ -117,7 +116,7 @@ class ReplannedRun(ControllerRun):
         self.plans[trial][step] = solution.trajectory
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
         # The filter begins with a measurement that is taken in already.
-        kalman = kalman_filter(about, law.filter.corrected[done])
+        kalman = kalman_filter(about, law.filter.corrected_root[done])
         run.law, run.first = FilterLaw.of(solution, about, kalman, law.weights, granted), step
 
 

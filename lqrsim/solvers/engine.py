@@ -234,10 +234,10 @@ class RunResult:
     final: bool = False
 
     @property
-    def rank(self) -> tuple[bool, float, bool, float]:
-        """The smaller, the better: success first, then the violation, then INFEASIBLE before others, then the cost."""
+    def rank(self) -> tuple[bool, bool, float, float]:
+        """The smaller, the better: success first, then INFEASIBLE before others, then the violation, then the cost."""
         missed = 0.0 if self.success else float(f"{self.violation:.2g}")
-        return not self.success, missed, self.status is not Status.INFEASIBLE, self.cost
+        return not self.success, self.status is not Status.INFEASIBLE, missed, self.cost
 
     @property
     def success(self) -> bool:

@@ -12,14 +12,15 @@ With constraints, whatever comes first is followed by the interior point, which 
     the same, after such a descent.
 
 Where none of these converges, the plan that misses the constraints least is the answer. It is INFEASIBLE if two starts
-came to plans about which no change lessens what is missed.
+came to plans whose violation is stationary, and of the same size. A search tells its runs what the others found, and
+tries further starts before it says so.
 
 Problems with noise and constraints, those of an MJCF, and `finish=None` have the augmented Lagrangian alone.
 """
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -36,7 +37,7 @@ from lqrsim.solvers.interior_point import INTERIOR, Found, InteriorPoint, Measur
 from lqrsim.solvers.restoration import Restored, restore
 
 FAR = 100.0  # times what may be missed: then the price is too low, or there is no way to keep all
-STARTS = 2  # from which what is missed has to be stationary, before that is called infeasible
+STARTS, ALIKE = 2, 0.05  # that have to come to the least stationary violation, to within this share, for INFEASIBLE
 AUGMENTED = 100  # iterations of the augmented Lagrangian
 OPENING, GUIDED = 10, 60  # iterations of smoothing at most before constraints come in; and with an ObstacleCost
 MOST, RESTORED = 300, 150  # of the interior point from one plan; and of a descent at one price
@@ -50,19 +51,33 @@ ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
 AT_LIMIT = 1e-9  # of its range, within which a control that presses against its limit is put there
 
 
-def finish(run: SolveRun) -> RunResult:
-    """Run to the end; certified."""
+@dataclass
+class Known:
+    """What the runs of one search know of each other's results.
+
+    Attributes:
+      evidence: plans whose violation is stationary. from_start: whether the start itself was tried.
+      rows: (R,) the sizes of rows by which violations are measured.
+    """
+
+    evidence: list[tuple[Evidence, RunResult]] = field(default_factory=list)
+    from_start: bool = False
+    rows: Array | None = None
+
+
+def finish(run: SolveRun, known: Known) -> RunResult:
+    """Run to the end; certified. `known` is what other runs of the search found."""
     if run.initial_guess.found is not None:
-        return Ladder(run).climb()
+        return Ladder(run, known).climb()
     if not run.problem.constraints:
         return run.certified(_without_constraints(run))
-    return Ladder(run).climb() if run.second_order else augmented_lagrangian.finish(run)
+    return Ladder(run, known).climb() if run.second_order else augmented_lagrangian.finish(run)
 
 
-def refine(run: SolveRun) -> RunResult:
+def refine(run: SolveRun, known: Known) -> RunResult:
     """Run to the end from where the first policy leads, and stay on that way round; certified."""
     if run.problem.constraints and run.second_order:
-        return Ladder(run).climb(stay=True)
+        return Ladder(run, known).climb(stay=True)
     return augmented_lagrangian.refine(run)
 
 
@@ -76,13 +91,13 @@ def _without_constraints(run: SolveRun) -> RunResult:
     controls = run.work.plan.controls
     pressed = ((controls <= space.low) | (controls >= space.high)).any()
     if run.ending.outcome == declarations.RUNNING and pressed and np.isfinite(run.cost):
-        found = Ladder(run).from_plan(run.work.plan)
+        found = Ladder(run, Known()).from_plan(run.work.plan)
         if found is not None:
             return found
     found = run.solve()
     if found.success or budget.stop.due or budget.left < 2:
         return found
-    ladder = Ladder(run)
+    ladder = Ladder(run, Known())
     plan = run.work.plan if np.isfinite(found.cost) else ladder.start()
     return ladder.from_plan(plan) or found
 
@@ -90,7 +105,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
 class Ladder:
     """The ways to a plan that keeps constraints, one after the other."""
 
-    def __init__(self, run: SolveRun) -> None:
+    def __init__(self, run: SolveRun, known: Known) -> None:
         self._run, self._problem, self._budget = run, run.problem, run.budget
         self._allowed = run.settings.missed(run.problem)
         clock = time.perf_counter()
@@ -102,7 +117,7 @@ class Ladder:
         self._valley: Motion | None = None
         # Whether smoothing and its search have gone round obstacles, which are then to be passed on that side.
         self._guided = any(cost.weight for cost in run.problem.obstacle_costs)
-        self._evidence: list[tuple[Evidence, RunResult]] = []
+        self._known = known
         if run.settings.penalty is None:
             self._without_multipliers()
 
@@ -131,7 +146,8 @@ class Ladder:
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
             rungs += [self._from_valley, self._augmented, lambda: self._at_a_price(self._valley)]
-        rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._at_a_price(_plan(start))]
+        if stay or not self._known.from_start:  # all runs of a search have the same start
+            rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._from_start(start)]
         for rung in rungs:
             found = rung()
             if found is not None and found.success:
@@ -150,6 +166,10 @@ class Ladder:
             return found
         self._run.go_on(checkpoint, self._budget.log[begin:])
         return None
+
+    def _from_start(self, start: RunResult) -> RunResult | None:
+        self._known.from_start = True
+        return self._at_a_price(_plan(start))
 
     def _from_valley(self) -> RunResult | None:
         """From where smoothing leads without the constraints."""
@@ -202,21 +222,20 @@ class Ladder:
         if plan is None or self._run.settings.elastic is not None:
             return None
         for price in PRICES:
-            priced, sizes = self._restore(plan, price)
+            priced = self._restore(plan, price)
             if priced is None:
                 return None
             plan = priced.plan
-            there = self._note(self._result(plan.states, plan.controls, self._without_gains(plan)))
-            missed = there.violation > FAR * self._allowed
-            if missed and price == PRICES[-1] and priced.settled and self._look_for_evidence(priced, there, sizes):
+            self._note(self._result(plan.states, plan.controls, self._without_gains(plan)))
+            if priced.settled:
                 return None
-            if not missed or price == PRICES[-1]:
+            if priced.near or price == PRICES[-1]:
                 found = self._interior(plan, MUCH)
                 if found is not None and found.success:
                     return found
         return None
 
-    def _restore(self, plan: Motion, price: float) -> tuple[Restored | None, Sizes]:
+    def _restore(self, plan: Motion, price: float) -> Restored | None:
         """Descent at a price, with a line of the log each."""
         budget, left = self._budget, self._budget.left - 1
         before, clock, slow = np.inf, time.perf_counter(), 0
@@ -231,24 +250,33 @@ class Ladder:
             return budget.stop.due or slow == PATIENCE
 
         sizes = self._stages.sizes(plan)
+        if self._known.rows is None:
+            self._known.rows = sizes.rows
+        sizes = sizes._replace(rows=self._known.rows)
         if left < 1 or budget.stop.due:
-            return None, sizes
+            return None
         try:
             with np.errstate(all="ignore"):
-                return restore(self._stages, plan, sizes, price=price, most=min(RESTORED, left), watch=watch), sizes
+                return restore(
+                    self._stages, plan, sizes, price=price, most=min(RESTORED, left), watch=watch,
+                    stationary=lambda plan, shares: self._look_for_evidence(plan, shares, sizes),
+                )  # fmt: skip
         except BaseException as error:  # Ctrl-C: raised again when there is a solution
             budget.stop.error = error
-            return None, sizes
+            return None
 
-    def _look_for_evidence(self, priced: Restored, there: RunResult, sizes: Sizes) -> bool:
-        """Whether what is missed there is stationary; if so it is kept."""
-        rows = [sizes.rows[self._stages.owners == k] for k in range(len(priced.shares))]
+    def _look_for_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
+        """Whether the violation of a plan is stationary; if so, that is kept as evidence."""
+        there = self._result(plan.states, plan.controls, self._without_gains(plan))
+        if not there.violation > FAR * self._allowed:
+            return False
+        rows = [sizes.rows[self._stages.owners == k] for k in range(len(shares))]
         found = evidence(
-            self._problem, self._run.work, there.states, there.controls, shares=priced.shares, sizes=rows,
+            self._problem, self._run.work, there.states, there.controls, shares=shares, sizes=rows,
             allowed=self._allowed, control_size=sizes.controls, state_size=sizes.states,
         )  # fmt: skip
         if found is not None:
-            self._evidence.append((found, there))
+            self._known.evidence.append((found, there))
         return found is not None
 
     def _interior(
@@ -410,12 +438,15 @@ class Ladder:
             lagrangian.evaluate(best.states, best.controls)
             status = Status.STALLED if self._budget.left > 1 else Status.MAX_ITERATIONS
             detail = lagrangian.worst()
-            if len(self._evidence) >= STARTS and best.violation > self._allowed:
-                least, best = min(self._evidence, key=lambda pair: pair[0].missed)
+            evidence = sorted(self._known.evidence, key=lambda pair: pair[0].missed)
+            alike = [one for one in evidence if one[0].missed <= (1 + ALIKE) * evidence[0][0].missed]
+            if len(alike) >= STARTS and best.violation > self._allowed:
+                least, best = alike[0]
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()
                 status = Status.INFEASIBLE
-                detail += f"; against it stand {least.against}" if least.against else ""
+                beside = least.beside(detail)
+                detail += f"; against it stand {beside}" if beside else ""
             best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
         return run.certified(best)
 

@@ -25,10 +25,9 @@ from lqrsim.errors import (
 )
 from lqrsim.problem.noise import Noise
 from lqrsim.results.funnel import Funnel, flat
-from lqrsim.results.goal import Target
+from lqrsim.results.goal import Target, endings
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.results.trial_outcome import endings
 from lqrsim.simulation.begun_later import simulate_from
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.disturbances.state_noise import as_disturbances
