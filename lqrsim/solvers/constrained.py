@@ -138,7 +138,7 @@ class Ladder:
             return None
         if ending.outcome != declarations.IN_VALLEY or (not self._guided and self._budget.log[-1].violation):
             return self._interior(self._valley, MUCH)
-        # The bottom of the valley is the answer if it keeps the constraints; with an ObstacleCost it is next to the answer.
+        # If the bottom of the valley keeps the constraints, it is the answer; with an ObstacleCost it is next to it.
         checkpoint = run.checkpoint()
         found = run.newton()
         if found.success and found.violation == 0:

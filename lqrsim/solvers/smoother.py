@@ -45,7 +45,7 @@ def smooth(
     interior point.
 
     Which local optimum it ends in depends on the start. With an ObstacleCost, unless a start is given, several are
-    tried for a few iterations each, and the most promising goes on; see `solvers/multistart.py`.
+    tried for a few iterations each, and the most promising goes on; see `solvers/strategy.py`.
 
     Args:
       problem: with an initial cost, the paper's soft start, or a `FixedState`, which only the dual form takes.
