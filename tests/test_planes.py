@@ -409,5 +409,5 @@ def test_it_is_the_robot_that_is_measured_and_not_what_moves_before_it_in_the_fi
     video = ls.render(rollout, tmp_path / "run.mp4", camera="side", size=(640, 480), fps=10)
     assert ls.verify_video(video, rollout, solution=solution).passed
     assert ls.load(ls.save(rollout, tmp_path / "run.npz"), ls.Rollout).body == "drone"
-    with pytest.raises(ls.InputError, match=r"rollout.body: got 'ghost', want a body of its model"):
+    with pytest.raises(ls.InputError, match=r"rollout.body: got 'ghost', want the name of a body of the model"):
         ls.verify_run(dataclasses.replace(rollout, body="ghost"))
