@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError
-from lqrsim.view.cameras import Camera, measuring_of
+from lqrsim.view.cameras import Camera, measuring
 from lqrsim.view.decorative_geoms import RIM
 
 FEWEST_PIXELS = 20  # of the tracked object; the centre of fewer is too uncertain
@@ -57,7 +57,7 @@ def triangulate(views: Sequence[Camera], measured: npt.ArrayLike, plane: str) ->
     axes = np.vstack([view.axes for view in views])[:, columns] if views else np.zeros((0, size))
     if np.linalg.matrix_rank(axes) < size:
         names = " and ".join(view.name for view in views) or "none"
-        raise InputError(f"views: got {names}, want {' and '.join(measuring_of(plane))} to measure positions")
+        raise InputError(f"views: got {names}, want {' and '.join(measuring(plane))} to measure positions")
     values = np.asarray(measured, dtype=np.float64).reshape(-1, len(axes))
     seen = np.linalg.norm(axes, axis=1) > 1e-6  # leaves out directions across the plane
     axes, values = axes[seen], values[:, seen]

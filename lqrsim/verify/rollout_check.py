@@ -57,7 +57,7 @@ def verify_run(
     if rollout.balls is not None and not rollout.state_coordinates.position:
         body = rollout.balls.tracked[0]
     geom = _tracked_geom(model, body)
-    views = [{"top": cameras.top, "side": cameras.side}[name](rollout) for name in cameras.measuring(rollout)]
+    views = [{"top": cameras.top, "side": cameras.side}[name](rollout) for name in cameras.measuring(rollout.plane)]
     times, rows = ground_truth.frames_at_states(rollout, trial)
     measured: list[Array] = []
     offsets: list[Array] = []

@@ -1,10 +1,12 @@
 """The result of a verification: positions from pixels, and tests of their errors against bounds."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from lqrsim.errors import Array, InputError, check_items, check_kind, excerpt, shaped
+from lqrsim.errors import Array, InputError
+from lqrsim.results.fields import LINE, Line, check_fields
 from lqrsim.verify.diagnosis import diagnose
 
 HIDDEN = 0.05  # share of the frames in which the robot may be hidden
@@ -24,15 +26,12 @@ class Criterion:
 
     __test__ = False  # pytest would collect it
 
-    name: str
+    name: Line
     passed: bool | None
-    detail: str
+    detail: Line
 
     def __post_init__(self) -> None:
-        for name in ("name", "detail"):
-            check_kind(f"Criterion: {name}", getattr(self, name), str, "text")
-        if self.passed not in (True, False, None):
-            raise InputError(f"Criterion: passed: got {excerpt(self.passed)}, want True, False or None")
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -54,32 +53,22 @@ class Verification:
       likely: the likely cause if a test failed; otherwise empty.
     """
 
-    subject: str
-    method: str
-    times: Array
-    seen: Array
-    actual: Array
-    planned: Array
+    subject: Annotated[str, 10 * LINE]
+    method: Annotated[str, 10 * LINE]
+    times: Annotated[Array, "N"]
+    seen: Annotated[Array, "N d"]
+    actual: Annotated[Array, "N d"]
+    planned: Annotated[Array, "N d"]
     rms: float
     worst: float
     shift: float
     scale: float
     tests: tuple[Criterion, ...]
-    likely: str
+    likely: Annotated[str, 10 * LINE]
 
     def __post_init__(self) -> None:
-        for name in ("subject", "method", "likely"):
-            check_kind(f"Verification: {name}", getattr(self, name), str, "text")
-        times = shaped("Verification: times", self.times, (None,))
-        if not len(times):
+        if not check_fields(self)["N"]:
             raise InputError("Verification: times: got none, want one for each frame")
-        object.__setattr__(self, "times", times)
-        seen = shaped("Verification: seen", self.seen, (len(times), None))
-        for name in ("seen", "actual", "planned"):
-            object.__setattr__(self, name, shaped(f"Verification: {name}", getattr(self, name), seen.shape))
-        for name in ("rms", "worst", "shift", "scale"):
-            object.__setattr__(self, name, float(shaped(f"Verification: {name}", getattr(self, name), ())))
-        object.__setattr__(self, "tests", check_items("Verification: tests", self.tests, Criterion, "a tuple of tests"))
 
     @property
     def passed(self) -> bool:

@@ -99,13 +99,8 @@ def side(rollout: Rollout, aspect: float = 4 / 3) -> Camera:
     return _camera("side", low, high, right, np.array([0.0, 0.0, 1.0]), aspect)
 
 
-def measuring(rollout: Rollout) -> tuple[str, ...]:
-    """The cameras, of `top` and `side`, that together measure the position of the robot."""
-    return measuring_of(rollout.plane)
-
-
-def measuring_of(plane: str) -> tuple[str, ...]:
-    """The same, for robots that move along these axes."""
+def measuring(plane: str) -> tuple[str, ...]:
+    """The cameras, of `top` and `side`, that together measure positions along these axes of the world."""
     return ("top", "side") if len(plane) == 3 else ("side",) if "z" in plane else ("top",)
 
 

@@ -1,9 +1,9 @@
 """Video files from frames: h264 in an mp4 that browsers can stream, or a looping GIF."""
 
+import collections
 import contextlib
-import queue
-import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 
@@ -69,28 +69,14 @@ def gif(path: Path, rate: Fraction, samples: Sequence[Pixels]) -> Iterator[Calla
 @contextlib.contextmanager
 def _on_another_thread(work: Callable[[Pixels], None]) -> Iterator[Callable[[Pixels], None]]:
     """A function that hands frames to `work` on another thread, in order, while the caller draws the next."""
-    waiting: queue.Queue[Pixels | None] = queue.Queue(maxsize=QUEUE_LENGTH)
-    failed: list[BaseException] = []
-
-    def run() -> None:
-        while (pixels := waiting.get()) is not None:
-            if not failed:
-                try:
-                    work(pixels)
-                except BaseException as error:  # raised again in `put`
-                    failed.append(error)
+    waiting: collections.deque[Future[None]] = collections.deque()
 
     def put(pixels: Pixels) -> None:
-        if failed:
-            raise failed[0]
-        waiting.put(pixels)
+        if len(waiting) == QUEUE_LENGTH:
+            waiting.popleft().result()  # raises what `work` did
+        waiting.append(executor.submit(work, pixels))
 
-    thread = threading.Thread(target=run, name="encoder", daemon=True)
-    thread.start()
-    try:
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="encoder") as executor:
         yield put
-    finally:
-        waiting.put(None)
-        thread.join()
-    if failed:
-        raise failed[0]
+        for one in waiting:
+            one.result()
