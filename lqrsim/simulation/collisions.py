@@ -1,16 +1,15 @@
 """The one definition of a collision: the first moment at which a robot touches an obstacle, of each trial.
 
-It touches one where the signed distance of its position less its radius is negative, or that of one of its balls, or
-where MuJoCo sees a contact of any of its geoms with one. All of it is looked for in runs without obstacle contacts, so
-that it is the same to the bit whether an obstacle then stops the robot or not: at the knots, and between them at each
-part of the control period, as `Physics` has them; and between these along the straight line.
+It touches one where the signed distance of its position less its radius is negative, or that of one of its balls or
+geoms, or where MuJoCo sees a contact of any of its geoms with one. All of it is looked for in runs without obstacle
+contacts, so that it is the same to the bit whether an obstacle then stops the robot or not: at the knots, and between
+them at each part of the control period, as `Physics` has them; and between these along the straight line.
 """
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
-from lqrsim.scenes.world import ROW, signed_distance
 from lqrsim.simulation.physics import Period
 from lqrsim.simulation.plant import Plant
 
@@ -69,10 +68,10 @@ class Collisions:
         self.clearance = self._clear(self._last)
 
     def _search_line(self, step: int, part: int, parts: int, there: Array, open_: npt.NDArray[np.bool_]) -> None:
-        """Look along the lines from where the balls were last to these places (K, B, 2 or 3)."""
+        """Look along the lines from where the robot was last to these places, (K, B, 2 or 3) or (K, 1, n)."""
         last, before = self._last, self.clearance
         self._last, self.clearance = there, self._clear(there)
-        length = np.linalg.norm(there - last, axis=2).max(axis=1)  # of the ball that went furthest
+        length = self.plant.travel(last, there)
         # No place of a line is nearer to an obstacle than its ends allow.
         rows = np.flatnonzero(open_ & np.isinf(self.at) & ~(before + self.clearance > length))
         rows = rows[np.isfinite(length[rows])]
@@ -100,13 +99,4 @@ class Collisions:
     def _hit(self, row: int, time: float, places: Array) -> None:
         """A collision with the obstacle that is nearest to the balls at these places (B, 2 or 3)."""
         self.at[row] = time
-        world, points = self.plant.world, np.zeros((len(places), 3))
-        points[:, : places.shape[1]] = places
-        table, away = world.table.ravel(), self.plant.across(self.displaced[row])
-        nearest = np.full(len(world), np.inf)
-        larger = self.plant.radii - self.plant.radii.min()  # what all have changes no order, except by rounding
-        for point, radius in zip(points, larger, strict=True):
-            there = (point - away).tolist()  # seen from where each obstacle is
-            found = [signed_distance(table, ROW * number, *seen) - radius for number, seen in enumerate(there)]
-            nearest = np.minimum(nearest, found)
-        self.obstacles[row] = world.names[int(np.argmin(nearest))]
+        self.obstacles[row] = self.plant.nearest(places, self.displaced[row])

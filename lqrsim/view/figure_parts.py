@@ -112,7 +112,7 @@ def surface(obstacle: Obstacle, low: Array, high: Array) -> Array:
         up = np.linspace(0, np.pi, 13)
         local = np.broadcast_arrays(np.cos(around) * np.sin(up), np.sin(around) * np.sin(up), np.cos(up))
         local = radius * np.stack(local)
-    elif obstacle.kind == "box":
+    elif obstacle.kind not in ("capsule", "cylinder"):  # a box, or the one that it is in
         ring = obstacle.size[:2, None] * np.array([[-1, -1, 1, 1, -1], [-1, 1, 1, -1, -1]])
         ends = obstacle.size[2] * np.array([-1, 1])
         local = np.stack(np.broadcast_arrays(ring[0][:, None], ring[1][:, None], ends))
