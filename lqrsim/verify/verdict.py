@@ -182,7 +182,7 @@ def _likely_cause(tests: tuple[Criterion, ...], positions: Positions, bound: flo
     causes = {
         "run": "the video is of another run, or the file of this run has changed",
         "plan": "the plan in this file is not the one that the policy followed",
-        "frames": "frames were removed or added, or the speed of the video was changed",
+        "frames": "frames were cut from the video or added to it, or its speed was changed",
         "record": "frames and states in the file are not of the same run",
         "seen": "something covers the robot, or it leaves the picture",
     }
