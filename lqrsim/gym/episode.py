@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lqrsim.control import law
-from lqrsim.control.controllers import Controller, ControllerRun
+from lqrsim.control.controllers import Controller, ControllerRun, turn_to_nearest
 from lqrsim.errors import Array
 from lqrsim.gym.task import Flags, Task, Trials
 from lqrsim.results.coordinates import Coordinates
@@ -146,5 +145,5 @@ class Episode:
 
     def _near_plan(self, states: Array) -> Array:
         near = np.array(states, order="C")[None]
-        law.turn_to_nearest(self._loop.settings.states, near, self._plan.states[self._loop.step][None])
+        turn_to_nearest(self._loop.settings.states, near, self._plan.states[self._loop.step][None])
         return near[0]
