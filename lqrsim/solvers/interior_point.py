@@ -743,7 +743,7 @@ class InteriorPoint:
         return mixed + barrier
 
     def _mix(self, barrier: Array, sigma: Array, duals: Array) -> float | None:
-        """Write the step to `stages` with the least fraction of the projected Hessian that gives one; None if none does."""
+        """Write the step to `stages` with the least fraction of the projected Hessian that works; None if none does."""
         none = np.zeros(len(self.point.slack))
         nothing = np.zeros(len(self.point.numbers))
         for mix in MIXES:
