@@ -26,7 +26,7 @@ def sensor_slopes(count, states, sensor, out) -> None:
 
 
 def measurements(count, states, sensor, out) -> None:
-    """Write what the sensors say at states (count, N): (count, Y)."""
+    """Write the measurements at states (count, N): (count, Y)."""
     for t in range(count):
         call(sensor.measure, states[t], sensor.data, out[t])
 
@@ -55,7 +55,7 @@ def parameter_slopes(steps, states, controls, dynamics, dt, which, changes, slop
 
 
 def correct(count, measured, near, gain, sensor, turning, estimates, innovations) -> None:
-    """Take a measurement into the estimates (count, Z), but where it was lost.
+    """Correct the estimates (count, Z) by a measurement, except those of trials that lost it.
 
     The states that are shown (count, N) are taken to the representatives nearest to the estimates, and these nearest to
     `near` (N,). Writes what measurements differ by from what was expected, (count, Y); NaN where they were lost.
@@ -66,7 +66,7 @@ def correct(count, measured, near, gain, sensor, turning, estimates, innovations
 
 @outline
 def correct_one(shown, lost, near, gain, sensor, turning, z, innovation) -> None:
-    """That of one trial: z (Z,)."""
+    """The same for one trial, z (Z,)."""
     x, seen, expected = stack(N), stack(Y), stack(Y)
     to_nearest(z, near, turning)
     if lost != 0.0:
@@ -89,14 +89,14 @@ def correct_one(shown, lost, near, gain, sensor, turning, z, innovation) -> None
 
 
 def predict(count, controls, predictor, estimates) -> None:
-    """Take the estimates (count, Z) one control period on, in which the controls (count, M) are commanded."""
+    """Predict the estimates (count, Z) by one control period under the commands (count, M)."""
     for k in range(count):
         predict_one(controls[k], predictor, estimates[k])
 
 
 @outline
 def predict_one(control, predictor, z) -> None:
-    """That of one trial: z (Z,)."""
+    """The same for one trial, z (Z,)."""
     p, places, lag = predictor.dynamics.parameters, predictor.places, predictor.lag
     q, v, after, value, fresh = stack(NUMBERS), stack(M), stack(N), stack(V), stack(HELD)
     for i in range(V):
@@ -135,7 +135,7 @@ def command(count, estimates, near, law, limits, turning, out) -> None:
 
 @outline
 def command_one(z, near, law, limits, turning, u) -> None:
-    """Those of one trial: z (Z,) and u (M,)."""
+    """The same for one trial, z (Z,) and u (M,)."""
     to_nearest(z, near, turning)
     for j in range(M):
         total = law.offset[j]
@@ -145,7 +145,7 @@ def command_one(z, near, law, limits, turning, u) -> None:
 
 
 def diverged(count, estimates, out) -> None:
-    """Write which entry of each estimate is the first that is not finite or beyond `FAR`, (count,); Z where none is."""
+    """Write the first entry of each estimate that is not finite or beyond `FAR`, (count,); Z if there is none."""
     for k in range(count):
         out[k] = Z
         for i in range(Z - 1, -1, -1):
