@@ -72,7 +72,7 @@ def test_a_tube_is_added_to_runs_of_its_plan_alone(
         tube.added_to(moved)
     with pytest.raises(ls.InputError, match="rollout: got 3, want a Rollout"):
         tube.added_to(3)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ls.InputError, match=r"Rollout: tube: got shape \(2, 2\), want \(151, 2, 2\)"):
+    with pytest.raises(ls.InputError, match=r"Rollout: tube: got shape \(2, 2\), want \(T\+1, p, p\) = \(151, p, p\)"):
         dataclasses.replace(run, tube=np.eye(2))
 
 
