@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 from scipy import stats
 
-from lqrsim.stress.multilevel_splitting import NoFailure, split
+from lqrsim.stress.multilevel_splitting import NoFailure, failure_probability
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, paired_difference
 from lqrsim.versions import versions
 
@@ -91,7 +91,7 @@ def rare(config: Config) -> list[dict[str, Any]]:
         studies = min(config.studies, 40) if config.quick else config.studies
         for seed in range(studies):
             try:
-                one = split(
+                one = failure_probability(
                     lambda z, least=threshold: z[:, 0] - least,
                     size, particles=particles, repetitions=repetitions, seed=seed,
                 ).probability  # fmt: skip

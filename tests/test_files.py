@@ -366,7 +366,7 @@ def test_another_number_is_not_taken_for_what_was_saved(saved: Path) -> None:
     for change in changes:
         saved.write_bytes(original)
         rewrite(saved, sealed=False, **change)
-        with pytest.raises(ls.InputError, match="sha256: got another than that of the content"):
+        with pytest.raises(ls.InputError, match="sha256: got one that does not fit the content"):
             ls.load(saved, ls.Solution)
 
 

@@ -173,7 +173,7 @@ def test_options_of_reset(quadrotor: ls.Scenario, quadrotor_solution: ls.Solutio
         (lambda env: (env.reset(), env.step([np.nan] * 4)), "action: got array([[nan, nan, nan, nan]]), want finite"),
         (lambda env: (env.reset(), env.step([0.0])), "action: got shape (1, 1)"),
         (lambda env: env.reset(options={"wind": 1}), "options: got 'wind', want one of: disturbances, preset"),
-        (lambda env: env.reset(options={"preset": "mild"}), "sweep: got 'mild', want one of: scenario, calm"),
+        (lambda env: env.reset(options={"preset": "mild"}), "disturbances: got 'mild', want one of: scenario, calm"),
         (lambda env: env.reset(options={"strength": 2}), "options: got strength alone"),
         (lambda env: env.reset(options={"preset": "calm", "disturbances": ()}), "options: got disturbances and preset"),
     ],

@@ -192,7 +192,8 @@ class TestCounts:
     @pytest.mark.parametrize("name", ["size", "particles", "moves", "repetitions", "most_levels"])
     def test_of_splitting(self, name: str, count: int) -> None:
         options = {"size": 2, name: count}
-        assert refusal(lambda: lq.stress.split(lambda z: z[:, 0], **options)).startswith(f"{name}: got {count}, ")
+        said = refusal(lambda: lq.stress.failure_probability(lambda z: z[:, 0], **options))
+        assert said.startswith(f"{name}: got {count}, ")
 
     def test_of_campaigns(self, tmp_path: Path) -> None:
         campaign = ls.stress.Campaign(

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from lqrsim.reports.curves import COLOURS, LINES, MARKERS
 from lqrsim.simulation.disturbances import PRESETS
-from lqrsim.stress.campaign import POLICIES
+from lqrsim.stress.policies import POLICIES
 from lqrsim.view import style
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 from paper.common import Result, Settings, figure

@@ -16,7 +16,7 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.tube_under import tube_under
+from lqrsim.simulation.uncertainty_of import tube_under
 from lqrsim.view import gl
 from lqrsim.view.plots import plot_run
 from lqrsim.view.policy_plot import plot_policy

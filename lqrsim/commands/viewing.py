@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from lqrsim.commands.options import ControllerName, SolutionFile, optional
+from lqrsim.commands.options import ControllerName, DesignSet, SolutionFile, optional
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
@@ -168,8 +168,7 @@ class View:
     solution: SolutionFile = None
     controller: ControllerName = "feedback"
     """Controller of a live run, as in `lqrsim simulate`."""
-    stated: Annotated[str | None, optional("NAME")] = None
-    """Disturbances for which track or offset_free is designed, as in `lqrsim simulate`. By default moderate."""
+    design_disturbances: DesignSet = None
     replan: Annotated[float | None, optional("HZ")] = None
     """Re-plan this many times a second, rounded to control periods; the run then continues after the plan's horizon. A
     solve that takes longer than a control period of real time is not used."""
@@ -183,7 +182,7 @@ class View:
         from lqrsim.results import save_load
         from lqrsim.results.rollout import Rollout
         from lqrsim.scenarios.references import resolve
-        from lqrsim.stress.trials import controller_by_name
+        from lqrsim.stress.policies import check_designed, make_controller
         from lqrsim.view import viewer
 
         check_number("--speed", self.speed, at_least=0.01, at_most=100)
@@ -196,12 +195,10 @@ class View:
         kind = self.viewer if self.viewer != "auto" else "window" if viewer.has_display() else "browser"
         options = {"push": self.push, "speed": self.speed, "seconds": self.seconds}
         if self.what.endswith(".npz"):
-            if self.controller != "feedback" or self.stated is not None:
-                raise InputError(f"--controller, --stated: got one with {self.what}, want them with a SCENARIO")
-            if self.solution is not None:
-                raise InputError(f"--solution: got {self.solution} with {self.what}, want it with a SCENARIO")
-            if self.replan is not None:
-                raise InputError(f"--replan: got {self.replan:g} with {self.what}, want it with a SCENARIO")
+            for name in ("controller", "design_disturbances", "solution", "replan"):
+                if (value := getattr(self, name)) not in (None, "feedback"):
+                    option = name.replace("_", "-")
+                    raise InputError(f"--{option}: got {value} with {self.what}, want it with a SCENARIO")
             rollout = save_load.load(self.what, Rollout)
             shown = viewer.arguments_for_rollout(rollout, self.trial)
 
@@ -214,12 +211,14 @@ class View:
             solution = console.solve(scenario) if self.solution is None else self._given(scenario, self.solution)
             planner, goal = (None, None) if self.replan is None else self._planning(scenario.problem, solution)
             shown = viewer.arguments_for_plant(plant, solution, goal)
-            law = controller_by_name(self.controller, scenario, solution, self.stated)
-            wrong = [one.scaled(self.disturbances) for one in scenario.disturbances if self.disturbances]
+            if self.design_disturbances is not None:
+                check_designed((self.controller,))
+            controller = make_controller(self.controller, scenario, solution, design=self.design_disturbances)
+            disturbances = [one.scaled(self.disturbances) for one in scenario.disturbances if self.disturbances]
 
             def go(screen: "Viewer") -> None:
                 console.say(viewer.KEYS if goal is None else f"{viewer.KEYS}\n{viewer.GOAL_KEYS}")
-                options = {"controller": law, "disturbances": wrong, "seed": self.seed}
+                options = {"controller": controller, "disturbances": disturbances, "seed": self.seed}
                 viewer.live(plant, solution, screen, ended=console.say, planner=planner, goal=goal, **options)
 
         with viewer.open_viewer(kind, self.port, title=f"lqrsim {self.what}", **shown, **options) as screen:

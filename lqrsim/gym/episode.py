@@ -7,11 +7,11 @@ import numpy as np
 from lqrsim.control import law
 from lqrsim.control.controllers import Controller, ControllerRun
 from lqrsim.errors import Array
-from lqrsim.gym.task import Flags, Task, Trials
+from lqrsim.gym.task import EpisodeTrials, Flags, Task
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.rollout import Rollout
 from lqrsim.scenes.scene import unlogged
-from lqrsim.simulation.closed_loop import Loop
+from lqrsim.simulation.closed_loop import ClosedLoop
 from lqrsim.simulation.run_settings import RunSettings
 
 
@@ -60,7 +60,7 @@ class Episode:
       ended: (K,) whose episode is over. outcomes: (K,) how; empty for those that go on.
     """
 
-    def __init__(self, task: Task, trials: Trials, count: int, *, frames: bool, threads: int | None) -> None:
+    def __init__(self, task: Task, trials: EpisodeTrials, count: int, *, frames: bool, threads: int | None) -> None:
         self.task, self.trials = task, trials
         dynamics = task.plant.robot.dynamics
         commanded = Commanded((dynamics.state_coordinates, dynamics.control_coordinates))
@@ -70,7 +70,7 @@ class Episode:
             generators=None, progress=None, watch=None, **task.scenario.near_enough(),
         )  # fmt: skip
         self._costs, self._plan = task.costs, settings.trajectory
-        self._loop = Loop(settings)
+        self._loop = ClosedLoop(settings)
         self._loop.begin()
         self.ended = np.zeros(count, dtype=bool)
         self.outcomes = np.full(count, "", dtype=object)

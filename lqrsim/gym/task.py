@@ -24,12 +24,11 @@ from lqrsim.errors import (
 )
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.scenarios.references import resolve
+from lqrsim.scenarios.references import disturbance_set, resolve
 from lqrsim.scenarios.solutions import given, remarks, solve
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.compiled import CostsByStep
-from lqrsim.stress.sweeps import sweep
 
 _log = logging.getLogger("lqrsim")
 
@@ -42,7 +41,7 @@ RESET_OPTIONS = ("disturbances", "preset", "strength", "trial")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trials:
+class EpisodeTrials:
     """Which trials an episode runs: `first` and those after it, of a seed, under these disturbances."""
 
     seed: int
@@ -133,10 +132,10 @@ class Task:
         items = (given,) if isinstance(given, str) else check_items("disturbances", given, (str, Disturbance), wanted)
         found: list[Disturbance] = []
         for one in items:
-            found += sweep(one, self.scenario) if isinstance(one, str) else (one,)
+            found += disturbance_set(one, self.scenario) if isinstance(one, str) else (one,)
         return tuple(found if strength == 1 else [one.scaled(strength) for one in found])
 
-    def trials(self, seed: int, following: int, options: Any) -> Trials:
+    def trials(self, seed: int, following: int, options: Any) -> EpisodeTrials:
         """What `reset` asks for, with `following` as the first trial where its options name none.
 
         Raises:
@@ -151,10 +150,10 @@ class Task:
         if "preset" not in stated and "disturbances" not in stated:
             if "strength" in stated:
                 raise InputError("options: got strength alone, want it with disturbances or preset")
-            return Trials(seed=seed, first=first, disturbances=self._disturbances)
+            return EpisodeTrials(seed=seed, first=first, disturbances=self._disturbances)
         disturbances = stated.get("disturbances", stated.get("preset"))
         disturbances = self.disturbances_of(disturbances, stated.get("strength", 1.0))
-        return Trials(seed=seed, first=first, disturbances=disturbances)
+        return EpisodeTrials(seed=seed, first=first, disturbances=disturbances)
 
 
 def stated_options(options: Any) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """Running a policy on a plant: one code path for one trial and for many.
 
-`simulate` is the loop over the control periods; `Loop` has a method for each phase of one. What the disturbances do in
-them is in `effects.py`, MuJoCo's part in `physics.py`, what counts as a collision in `collisions.py`, and what is kept
-in `recorder.py`.
+`simulate` is the loop over the control periods; `ClosedLoop` has a method for each phase of one. What the disturbances
+do in them is in `effects.py`, MuJoCo's part in `physics.py`, what counts as a collision in `collisions.py`, and what is
+kept in `recorder.py`.
 """
 
 import copy
@@ -13,14 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lqrsim.control.controllers import ControllerLike, ControllerRun
-from lqrsim.errors import Array, InputError, check_kind, excerpt, told
+from lqrsim.errors import Array, InputError, check_kind, excerpt, format_error
 from lqrsim.problem.noise import Noise
 from lqrsim.results.plan import Plan
 from lqrsim.results.rollout import Rollout
 from lqrsim.scenes.scene import unlogged
 from lqrsim.simulation.collisions import Collisions
-from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.disturbances.state_noise import as_disturbances
+from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import Effects
 from lqrsim.simulation.physics import Physics
 from lqrsim.simulation.plant import Plant
@@ -92,13 +91,13 @@ def simulate(
         first_trial=first_trial, goal_radius=goal_radius, goal_tolerance=goal_tolerance, frames=frames,
         contacts=contacts, threads=threads, generators=generators, progress=progress, watch=watch,
     )  # fmt: skip
-    loop = Loop(settings)
+    loop = ClosedLoop(settings)
     with unlogged():
         loop.run()
     return loop.rollout()
 
 
-class Loop:
+class ClosedLoop:
     """The closed loop of K trials: what happens in a control period, phase by phase.
 
     The states (K, n) and what is recorded of them are those of all trials at once. `run` runs all of it; `begin` and
@@ -172,7 +171,7 @@ class Loop:
             reasons = [_not_a_number(row, self._names) for row in commands[failed]]
         except Exception as error:  # of a controller, whatever it is: these trials failed
             commands, failed = np.zeros(shape), np.ones(len(shown), dtype=bool)
-            reasons = [told(error)] * len(shown)
+            reasons = [format_error(error)] * len(shown)
         self.records.estimator_diverged(step, self.controller_run.estimator_diverged())
         self.records.fail(step, failed, reasons)
         self.records.commanded[:, step] = commands
