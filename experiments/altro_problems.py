@@ -27,7 +27,7 @@ import numpy as np
 from altro import models
 from altro.airplane import TRIM_CONTROLS, airplane, unclamped
 from numpy.typing import NDArray
-from paper.common import Result, Settings, opening, run, table
+from runner import FolderSettings, Result, opening, run, table
 from scipy.interpolate import CubicSpline
 from tqdm import tqdm
 
@@ -234,7 +234,7 @@ CASES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     problems: tuple[str, ...] = tuple(CASES)
     """Which of them."""
 
@@ -282,4 +282,4 @@ def report(result: Result) -> str:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, lambda result: [], __doc__)  # of the paper's statements, for it has none of this
+    run(Config, main, report, __doc__)

@@ -29,15 +29,12 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import tyro
+from runner import Settings, at_most, opening, run
 from tqdm import tqdm
-
-from lqrsim.machine import description
-from lqrsim.versions import versions
 
 Section = Literal["first", "known", "features"]
 HERE = Path(__file__).resolve().parent
@@ -54,7 +51,7 @@ TARGET_KNOWN = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     """What is measured."""
 
     sections: tuple[Section, ...] = get_args(Section)
@@ -71,17 +68,11 @@ class Config:
     """Processes that each set of instructions has in turn."""
     reference: Path | None = None
     """Folder of the C++ reference; by default as benchmark_solver.py finds it."""
-    quick: bool = False
-    """The pendulums only, one process of each kind, 2 queries."""
-    json: bool = False
-    """Print everything as JSON instead of the tables."""
 
 
 def main(config: Config) -> dict[str, Any]:
-    if config.quick:
-        config = replace(config, repeats=1, processes=1, queries=2, rounds=1)
-    settings = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(config).items()}
-    result: dict[str, Any] = {"config": settings, "versions": versions(), "machine": description()}
+    config = at_most(config, repeats=1, processes=1, queries=2, rounds=1)
+    result = opening(config)
     folders = {"now": HERE.parent} | ({"before": config.before.resolve()} if config.before else {})
     for folder in folders.values():
         if not (folder / "lqrsim" / "__init__.py").is_file():
@@ -262,6 +253,4 @@ def _milliseconds(processes: list[list[float]]) -> float:
 
 
 if __name__ == "__main__":
-    settings = tyro.cli(Config, description=__doc__)
-    outcome = main(settings)
-    print(json.dumps(outcome) if settings.json else report(outcome))
+    run(Config, main, report, __doc__)

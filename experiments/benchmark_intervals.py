@@ -8,19 +8,17 @@ differences  Success of two policies on the same n trials. The coverage is exact
 rare         `split` of a standard normal number beyond a threshold, whose probability is known, again and again.
 """
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
 from typing import Any
 
 import numpy as np
-import tyro
+from runner import Settings, opening, run
 from scipy import stats
 
 from lqrsim.stress.multilevel_splitting import NoFailure, failure_probability
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, paired_difference
-from lqrsim.versions import versions
 
 TRIALS = 20, 50, 200, 500
 SHARES = 0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4
@@ -36,16 +34,12 @@ RARE = (
 )
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(Settings):
     """What is measured."""
 
     studies: int = 2000
     """Of each rare failure."""
-    quick: bool = False
-    """A small part."""
-    json: bool = False
-    """Print all numbers as JSON."""
 
 
 @cache
@@ -109,8 +103,7 @@ def rare(config: Config) -> list[dict[str, Any]]:
 
 
 def main(config: Config) -> dict[str, Any]:
-    measured = {"differences": differences(config), "rare": rare(config)}
-    return {"config": asdict(config), "versions": versions(), **measured}
+    return opening(config) | {"differences": differences(config), "rare": rare(config)}
 
 
 def report(result: dict[str, Any]) -> str:
@@ -131,6 +124,4 @@ def report(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    settings = tyro.cli(Config, description=__doc__)
-    outcome = main(settings)
-    print(json.dumps(outcome) if settings.json else report(outcome))
+    run(Config, main, report, __doc__)

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import tyro
 from mjcf.files import FILES
-from paper.common import table
+from runner import Result, Settings, at_most, opening, run, table
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -23,35 +22,22 @@ from lqrsim.scenes.scene import scene_from_xml
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     steps: int = 150
     """Of the horizon."""
     rounds: int = 15
     """Of measurements that alternate; medians are printed."""
-    quick: bool = False
-    """Few steps and rounds."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """Of a robot: what an iteration takes in ms on one thread and on two, and the steps that it needs."""
-
-    name: str
-    alone: float
-    together: float
-    needed: float
-
-
-def main(config: Config) -> list[Row]:
-    """Measure each robot."""
-    if config.quick:
-        config = Config(steps=10, rounds=2)
+def main(config: Config) -> Result:
+    """Milliseconds of each robot: of an iteration on one thread and on two, and of the steps that it needs alone."""
+    config = at_most(config, steps=10, rounds=2)
     robots = {name: ls.MjcfRobot(scene_from_xml(xml, name)) for name, xml in FILES.items()}
     robots["quadrotor"] = ls.MjcfRobot("cage")
-    return [measure(config, name, robot) for name, robot in robots.items()]
+    return opening(config) | {"robots": {name: measure(config, robot) for name, robot in robots.items()}}
 
 
-def measure(config: Config, name: str, robot: ls.MjcfRobot) -> Row:
+def measure(config: Config, robot: ls.MjcfRobot) -> dict[str, float]:
     """One iteration about the same trajectory again and again, on one thread and on two, and the steps alone."""
     dynamics, timestep = robot.dynamics, float(robot.scene.model.opt.timestep)
     dt = max(1, round(0.02 / timestep)) * timestep
@@ -72,12 +58,12 @@ def measure(config: Config, name: str, robot: ls.MjcfRobot) -> Row:
             times[which].append(1000 * solution.iterations[1].seconds)
         one = steps_alone(dynamics, states, controls, dt)
         times["needed"].append(1000 * one * (2 * (2 * (n + m) + 1) + 1))
-    return Row(name, *(float(np.median(times[which][1:])) for which in ("alone", "together", "needed")))
+    return {which: float(np.median(values[1:])) for which, values in times.items()}
 
 
 def steps_alone(dynamics: Any, states: Array, controls: Array, dt: float) -> float:
     """Seconds that a control period of `mj_step` at each of the states takes, called from compiled code."""
-    data, out, advance = dynamics.data, np.empty(states.shape[1]), dynamics._core.advance
+    data, out, advance = dynamics.data, np.empty(states.shape[1]), dynamics.compiled.advance
     seconds = []
     for sign in (1, -1):  # backwards nothing is done but the call
         clock = time.perf_counter()
@@ -87,13 +73,13 @@ def steps_alone(dynamics: Any, states: Array, controls: Array, dt: float) -> flo
     return seconds[0] - seconds[1]
 
 
-def report(rows: list[Row]) -> str:
+def report(result: Result) -> str:
     head = ("robot", "ms of an iteration", "of the steps that it needs", "ratio", "two threads against one")
     return table(head, [
-        [row.name, f"{row.alone:.1f}", f"{row.needed:.1f}", f"{row.alone / row.needed:.2f}",
-         f"{row.alone / row.together:.2f}"] for row in rows
+        [name, f"{one['alone']:.1f}", f"{one['needed']:.1f}", f"{one['alone'] / one['needed']:.2f}",
+         f"{one['alone'] / one['together']:.2f}"] for name, one in result["robots"].items()
     ])  # fmt: skip
 
 
 if __name__ == "__main__":
-    print(report(main(tyro.cli(Config, description=__doc__))))
+    run(Config, main, report, __doc__)

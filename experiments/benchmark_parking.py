@@ -17,7 +17,6 @@ raised            An exception.
 """
 
 import dataclasses
-import json
 import statistics
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -27,17 +26,16 @@ from functools import partial
 from multiprocessing import get_context
 from typing import Any, get_args
 
-import tyro
 from parking import cases
 from parking.outcomes import Outcome, Verdict, look
+from runner import Settings, at_most, opening, run
 from tqdm import tqdm
 
 from lqrsim.machine import processors
-from lqrsim.versions import versions
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     problems: int = 2000
     """How many: those of the numbers below."""
     only: tuple[int, ...] = ()
@@ -52,24 +50,18 @@ class Config:
     """Every how manieth is tried for a cheaper plan, if it is said to be optimal; with `only` each."""
     workers: int | None = None
     """How many processes; by default as many as there are processors."""
-    quick: bool = False
-    """24 problems, in this process."""
-    json: bool = False
-    """Print every outcome as JSON instead of the table."""
 
 
 def main(config: Config) -> dict[str, Any]:
     if config.quick:
-        config = dataclasses.replace(config, problems=min(config.problems, 24), workers=1)
+        config = dataclasses.replace(at_most(config, problems=24), workers=1)
     numbers = config.only or range(config.problems)
     with tqdm(total=len(numbers), desc="parking", disable=None) as bar:
         found = []
         for outcome in _solved(config, numbers):
             found.append(asdict(outcome))
             bar.update()
-    return {
-        "config": asdict(config), "versions": versions(), "processors": processors(), "outcomes": found,
-    }  # fmt: skip
+    return opening(config) | {"outcomes": found}
 
 
 def _look(config: Config, number: int) -> Outcome:
@@ -139,7 +131,4 @@ def _median(values: Iterable[float]) -> float:
 
 
 if __name__ == "__main__":
-    settings = tyro.cli(Config, description=__doc__)
-    outcome = main(settings)
-    print(json.dumps(outcome) if settings.json else report(outcome))
-    raise SystemExit(1 if false(outcome) else 0)
+    run(Config, main, report, __doc__, failures=false)

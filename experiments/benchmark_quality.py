@@ -23,49 +23,33 @@ finish       Newton's method at the end against smoothing alone, from hover: ite
              the same optimum.
 """
 
-import json
-from dataclasses import asdict
-from types import ModuleType
-from typing import Any
-
 import peers
-import tyro
 from quality import clearances, finish, ingredients, limits, random_worlds, resolve, starts, timing
-from quality.common import Config, Section
+from quality.common import Config
+from runner import Result, Section, measure, opening, report_of, run
 
-from lqrsim.machine import processors
-from lqrsim.versions import versions
-
-SECTIONS: dict[Section, ModuleType] = {
-    "starts": starts,
-    "time": timing,
-    "clearance": clearances,
-    "limits": limits,
-    "worlds": random_worlds,
-    "resolve": resolve,
-    "ingredients": ingredients,
-    "finish": finish,
+SECTIONS = {
+    "starts": Section(starts),
+    "time": Section(timing),
+    "clearance": Section(clearances),
+    "limits": Section(limits),
+    "worlds": Section(random_worlds),
+    "resolve": Section(resolve),
+    "ingredients": Section(ingredients),
+    "finish": Section(finish),
 }
 
 
-def main(config: Config) -> dict[str, Any]:
+def main(config: Config) -> Result:
     config = config.bounded()
-    paths = {name: path and str(path) for name, path in (("reference", config.reference), ("save", config.save))}
-    result: dict[str, Any] = {
-        "config": asdict(config) | paths,
-        "versions": versions() | peers.versions(),
-        "processors": processors(),
-    }
-    for name in config.sections:
-        result[name] = SECTIONS[name].measure(config)
-    return result
+    result = opening(config)
+    result["versions"] |= peers.versions()
+    return measure(config, SECTIONS, result)
 
 
-def report(result: dict[str, Any]) -> str:
-    return "\n\n".join(section.table(result[name]) for name, section in SECTIONS.items() if name in result)
+def report(result: Result) -> str:
+    return "\n\n".join(report_of(SECTIONS, result))
 
 
 if __name__ == "__main__":
-    settings = tyro.cli(Config, description=__doc__)
-    outcome = main(settings)
-    print(json.dumps(outcome) if settings.json else report(outcome))
+    run(Config, main, report, __doc__)

@@ -15,43 +15,27 @@ overhead  That the safeguard costs nothing where it is not needed: the same iter
 ablation  The quadrotor's queries with and without each part: form, start, prior, safeguard.
 """
 
-import dataclasses
-import json
-from dataclasses import asdict
-from types import ModuleType
-from typing import Any
-
-import tyro
 from reliability import ablation, fragile, overhead, stiff, thousand
-from reliability.common import Config, Section
+from reliability.common import Config
+from runner import Result, Section, at_most, measure, opening, report_of, run
 
-from lqrsim.machine import processors
-from lqrsim.versions import versions
-
-SECTIONS: dict[Section, ModuleType] = {
-    "stiff": stiff,
-    "fragile": fragile,
-    "random": thousand,
-    "overhead": overhead,
-    "ablation": ablation,
+SECTIONS = {
+    "stiff": Section(stiff),
+    "fragile": Section(fragile),
+    "random": Section(thousand),
+    "overhead": Section(overhead),
+    "ablation": Section(ablation),
 }
 
 
-def main(config: Config) -> dict[str, Any]:
-    if config.quick:
-        few = {"queries": min(config.queries, 8), "sample": min(config.sample, 2), "rounds": min(config.rounds, 2)}
-        config = dataclasses.replace(config, share=min(config.share, 0.02), **few)
-    result: dict[str, Any] = {"config": asdict(config), "versions": versions(), "processors": processors()}
-    for name in config.sections:
-        result[name] = SECTIONS[name].measure(config)
-    return result
+def main(config: Config) -> Result:
+    config = at_most(config, queries=8, sample=2, rounds=2, share=0.02)
+    return measure(config, SECTIONS, opening(config))
 
 
-def report(result: dict[str, Any]) -> str:
-    return "\n\n".join(section.table(result[name]) for name, section in SECTIONS.items() if name in result)
+def report(result: Result) -> str:
+    return "\n\n".join(report_of(SECTIONS, result))
 
 
 if __name__ == "__main__":
-    settings = tyro.cli(Config, description=__doc__)
-    outcome = main(settings)
-    print(json.dumps(outcome) if settings.json else report(outcome))
+    run(Config, main, report, __doc__)

@@ -10,23 +10,18 @@ all of them, tube and caption too. Videos count from the call to the finished fi
 What counts are medians of the ratios of a round. They are to be at most 1.15 and at most 1.40.
 """
 
-import json
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
-import tyro
-from quality.common import judge
+from runner import Settings, judge, opening, progress, run
 from solver_benchmark.common import median
-from tqdm import tqdm
 
 import lqrsim as ls
-from lqrsim.machine import description
-from lqrsim.versions import versions
 from lqrsim.view import gl
 from lqrsim.view.picture import QUALITIES
 
@@ -37,15 +32,11 @@ SIZE = 1280, 720
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     rounds: int = 7
     """How often each has its turn."""
     seed: int = 0
     """Of the disturbances."""
-    quick: bool = False
-    """1 round of a tenth of the frames."""
-    json: bool = False
-    """Print all that is measured as JSON."""
 
 
 class Contest:
@@ -91,7 +82,7 @@ def main(config: Config) -> dict[str, Any]:
     seconds = {name: {"bare": [], PLAIN: [], FULL: []} for name in contests}
     turns = [(number, name) for number in range(rounds) for name in contests]
     with tempfile.TemporaryDirectory() as folder:
-        for number, name in tqdm(turns, unit="round", leave=False, delay=2.0, disable=None):
+        for number, name in progress(turns, "rendering", unit="round"):
             contest, spent = contests[name], seconds[name]
             take = {
                 "bare": contest.bare,
@@ -108,10 +99,7 @@ def main(config: Config) -> dict[str, Any]:
         name: {who: median([a / b for a, b in zip(spent[who], spent["bare"], strict=True)]) for who in MOST}
         for name, spent in seconds.items()
     }
-    return {
-        "config": asdict(config),
-        "versions": versions(),
-        "machine": description(),
+    return opening(config) | {
         "frames": {name: contest.frames for name, contest in contests.items()},
         "seconds": seconds,
         "ratios": ratios,
@@ -132,6 +120,4 @@ def report(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    settings = tyro.cli(Config, description=__doc__)
-    outcome = main(settings)
-    print(json.dumps(outcome) if settings.json else report(outcome))
+    run(Config, main, report, __doc__)

@@ -13,51 +13,36 @@ estimate  Output feedback with new plans, made with what is estimated, against t
 peers     Other people's solvers on the same work, run by run in turn: how long a re-plan takes, what the loop costs.
 """
 
-import json
 from dataclasses import dataclass
-from types import ModuleType
-from typing import Any, Literal
+from typing import Literal, get_args
 
-from paper.common import Result, opening, run
 from replan import changes, common, delay, estimate, peers, times
+from runner import Result, Section, measure, opening, report_of, run
 
-from lqrsim.results.save_load import replacing
-
-Section = Literal["times", "changes", "delay", "estimate", "peers"]
-SECTIONS: dict[Section, tuple[ModuleType, str]] = {
-    "times": (times, "How long re-plans take"),
-    "changes": (changes, "What changes on the way"),
-    "delay": (delay, "What a delay costs"),
-    "estimate": (estimate, "Planning again with estimates"),
-    "peers": (peers, "Against other solvers"),
+Name = Literal["times", "changes", "delay", "estimate", "peers"]
+SECTIONS = {
+    "times": Section(times, "How long re-plans take"),
+    "changes": Section(changes, "What changes on the way"),
+    "delay": Section(delay, "What a delay costs"),
+    "estimate": Section(estimate, "Planning again with estimates"),
+    "peers": Section(peers, "Against other solvers"),
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(common.Config):
-    sections: tuple[Section, ...] = tuple(SECTIONS)
+    sections: tuple[Name, ...] = get_args(Name)
     """Which of them."""
 
 
 def main(config: Config) -> Result:
-    result = opening(config)
-    asked: Any = common.few(config) if config.quick else config
-    for name in config.sections:
-        result[name] = SECTIONS[name][0].measure(asked)
-        if not config.quick:
-            config.out.mkdir(parents=True, exist_ok=True)
-            with replacing(config.out / f"replanning_{name}.json") as unfinished:
-                unfinished.write_text(json.dumps(result[name], allow_nan=False) + "\n", encoding="utf-8")
-    return result
+    config = config.bounded()
+    return measure(config, SECTIONS, opening(config), keep_as="replanning")
 
 
 def report(result: Result) -> str:
-    parts = ["## Re-planning in real time"]
-    for name, (section, title) in SECTIONS.items():
-        if name in result:
-            parts += [f"### {title}", *section.report(result[name])]
-    return "\n\n".join(parts)
+    return "\n\n".join(["## Re-planning in real time", *report_of(SECTIONS, result)])
 
 
 if __name__ == "__main__":
-    run(Config, main, report, lambda result: [], __doc__)  # of the paper's statements, for it does not re-plan
+    run(Config, main, report, __doc__)

@@ -10,24 +10,21 @@ medians. The same with a Kalman filter in the loop, `OffsetFree`; and how long t
 tolerances that are given and with those that are chosen.
 """
 
-import json
 import resource
 import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
-import tyro
 from mujoco import batch
-from quality.common import judge
+from runner import Settings, judge, opening, run
 from solver_benchmark.common import median, take_turns
 
 import lqrsim as ls
-from lqrsim.machine import description, processors
+from lqrsim.machine import processors
 from lqrsim.stress.outcome_table import outcomes
-from lqrsim.versions import versions
 
 LEAST = 0.85  # of raw, one thread
 LEAST_WITH_FILTER = 0.8  # with `OffsetFree`
@@ -39,7 +36,7 @@ FULL = 256  # simulations from which the first target is for
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     simulations: tuple[int, ...] = (256, 1024)
     """At once."""
     trials: int = 10_000
@@ -48,10 +45,6 @@ class Config:
     """How often each is timed."""
     seed: int = 0
     """Of the noise."""
-    quick: bool = False
-    """64 simulations, 500 trials, 2 rounds."""
-    json: bool = False
-    """Print everything as JSON instead of the table."""
 
 
 class Contest:
@@ -108,9 +101,7 @@ def main(config: Config) -> dict[str, Any]:
     counts = (64,) if config.quick else config.simulations
     rounds, trials = (2, 500) if config.quick else (config.rounds, config.trials)
     threads = (1, 2) if processors() > 1 else (1,)
-    result: dict[str, Any] = {
-        "config": asdict(config), "versions": versions(), "machine": description(), "robots": {},
-    }  # fmt: skip
+    result = opening(config) | {"robots": {}}
     for name in ls.scenarios.names():
         contest = Contest(name, config.seed)
         result["robots"][name] = {str(count): throughput(contest, count, threads, rounds) for count in counts}
@@ -234,6 +225,4 @@ def report(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    settings = tyro.cli(Config, description=__doc__)
-    outcome = main(settings)
-    print(json.dumps(outcome) if settings.json else report(outcome))
+    run(Config, main, report, __doc__)

@@ -21,56 +21,30 @@ threads   smooth_many on two threads against one.
 startup   Fresh processes: --help, the first solution with warm caches, and with empty ones.
 """
 
-import dataclasses
-import json
-from dataclasses import asdict
-from types import ModuleType
-from typing import Any
-
 import peers
-import tyro
-from peers import Unavailable
+from runner import Result, Section, at_most, measure, opening, report_of, run
 from solver_benchmark import peer_comparison, scaling, speed, startup, threads
-from solver_benchmark.common import Config, Section
+from solver_benchmark.common import Config
 
-from lqrsim.machine import processors
-from lqrsim.versions import versions
-
-SECTIONS: dict[Section, ModuleType] = {
-    "speed": speed,
-    "peers": peer_comparison,
-    "scaling": scaling,
-    "threads": threads,
-    "startup": startup,
+SECTIONS = {
+    "speed": Section(speed),
+    "peers": Section(peer_comparison),
+    "scaling": Section(scaling),
+    "threads": Section(threads),
+    "startup": Section(startup),
 }
 
 
-def main(config: Config) -> dict[str, Any]:
-    if config.quick:
-        config = dataclasses.replace(config, queries=min(config.queries, 8), rounds=min(config.rounds, 2))
-    result: dict[str, Any] = {
-        "config": asdict(config) | {"reference": str(config.reference) if config.reference else None},
-        "versions": versions() | peers.versions(),
-        "processors": processors(),
-    }
-    for name in config.sections:
-        try:
-            result[name] = SECTIONS[name].measure(config)
-        except Unavailable as error:
-            result[name] = {"skipped": str(error)}
-    return result
+def main(config: Config) -> Result:
+    config = at_most(config, queries=8, rounds=2)
+    result = opening(config)
+    result["versions"] |= peers.versions()
+    return measure(config, SECTIONS, result)
 
 
-def report(result: dict[str, Any]) -> str:
-    parts = []
-    for name, section in SECTIONS.items():
-        if name in result:
-            found = result[name]
-            parts.append(f"{name}: skipped: {found['skipped']}" if "skipped" in found else section.table(found))
-    return "\n\n".join(parts)
+def report(result: Result) -> str:
+    return "\n\n".join(report_of(SECTIONS, result))
 
 
 if __name__ == "__main__":
-    settings = tyro.cli(Config, description=__doc__)
-    outcome = main(settings)
-    print(json.dumps(outcome) if settings.json else report(outcome))
+    run(Config, main, report, __doc__)

@@ -9,21 +9,16 @@ measured as its file has it. Then each fault is made in the decoded frames, whic
 says of itself.
 """
 
-import json
 import tempfile
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import injected_faults as faults
-import tyro
-from quality.common import judge
-from tqdm import tqdm
+from runner import Settings, counting, judge, opening, progress, run
 
 import lqrsim as ls
-from lqrsim.machine import description
-from lqrsim.versions import versions
 from lqrsim.view import gl, video_metadata
 
 VIEWS = {"quadrotor": ("top", "side"), "differential_drive": ("top",)}  # a camera, and insets
@@ -39,20 +34,16 @@ SAID = {"rms": "rms", "worst": "at worst"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     seed: int = 0
     """Of the disturbances; the other run's is the next."""
-    quick: bool = False
-    """Draft quality, 10 frames a second."""
-    json: bool = False
-    """Print all that is measured as JSON."""
 
 
 def main(config: Config) -> dict[str, Any]:
     gl.bind()
     with tempfile.TemporaryDirectory() as folder:
         robots = {name: measure(name, config, Path(folder)) for name in VIEWS}
-    return {"config": asdict(config), "versions": versions(), "machine": description(), "robots": robots}
+    return opening(config) | {"robots": robots}
 
 
 def measure(name: str, config: Config, folder: Path) -> dict[str, dict[str, Any]]:
@@ -60,29 +51,24 @@ def measure(name: str, config: Config, folder: Path) -> dict[str, dict[str, Any]
     scenario = ls.scenarios.get(name)
     solution, plant = ls.smooth(scenario.problem), scenario.plant()
     tube = ls.predict_tube(scenario.problem, solution, ls.uncertainty_of(plant, scenario.disturbances))
-    run, other = (
+    disturbed, other = (
         tube.added_to(ls.simulate(plant, solution, disturbances=scenario.disturbances, seed=seed))
         for seed in (config.seed, config.seed + 1)
     )
     video, changed = folder / f"{name}.mp4", folder / f"{name}_changed.mp4"
     camera, *insets = VIEWS[name]
     quality, fps = ("draft", 10) if config.quick else ("standard", 30)
-    with tqdm(desc=f"{name}, rendering", unit="frame", leave=False, delay=2.0, disable=None) as bar:
-
-        def progress(done: int, count: int) -> None:
-            bar.total = count
-            bar.update(done - bar.n)
-
+    with counting(f"{name}, rendering") as rendered:
         options = {"camera": camera, "insets": insets, "quality": quality, "fps": fps}
-        ls.render(run, video, progress=progress, **options)
+        ls.render(disturbed, video, progress=rendered, **options)
     found = {
-        RUN: verdict(ls.verify_run(run, solution=solution)),
-        VIDEO: verdict(ls.verify_video(video, run, solution=solution)),
+        RUN: verdict(ls.verify_run(disturbed, solution=solution)),
+        VIDEO: verdict(ls.verify_video(video, disturbed, solution=solution)),
     }
     made = all_faults(video, video_metadata.digest(other))
-    for label, (make, is_other) in tqdm(made.items(), desc=f"{name}, faults", leave=False, delay=2.0, disable=None):
+    for label, (make, is_other) in progress(made.items(), f"{name}, faults"):
         make(video, changed)
-        found[label] = verdict(ls.verify_video(changed, other if is_other else run, solution=solution))
+        found[label] = verdict(ls.verify_video(changed, other if is_other else disturbed, solution=solution))
     return found
 
 
@@ -148,6 +134,4 @@ def joined(said: Iterable[str]) -> str:
 
 
 if __name__ == "__main__":
-    settings = tyro.cli(Config, description=__doc__)
-    outcome = main(settings)
-    print(json.dumps(outcome) if settings.json else report(outcome))
+    run(Config, main, report, __doc__)

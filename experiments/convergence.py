@@ -15,20 +15,7 @@ from typing import Any
 
 import numpy as np
 from paper import settling
-from paper.common import (
-    Result,
-    Settings,
-    Statement,
-    as_in_the_paper,
-    between,
-    figure,
-    interval,
-    numbers,
-    opening,
-    picture,
-    run,
-    table,
-)
+from paper.common import as_in_the_paper, figure, numbers, picture
 from paper.convergence_figures import ABOVE, EVERY, LINES, draw_ellipsoids, draw_iterations, draw_order
 from paper.convergence_runs import (
     FINISHED,
@@ -45,7 +32,7 @@ from paper.convergence_runs import (
     smooth,
 )
 from paper.rates import CLOSE, FEWEST, ROUNDING, rate
-from solver_benchmark.common import progress
+from runner import FolderSettings, Result, Statement, between, interval, opening, progress, run, table
 
 import lqrsim as ls
 from lqrsim.stress.statistics import bootstrap
@@ -60,7 +47,7 @@ EXACT = 1e-6  # in SI units: what counts as satisfying the dynamics
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     queries: int = 100
     """How many random starts and goals."""
     seed: int = 0
@@ -369,4 +356,4 @@ def statements(result: Result) -> list[Statement]:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, __doc__, statements=statements)

@@ -14,19 +14,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d import Axes3D
-from paper.common import (
-    Result,
-    Settings,
-    Statement,
-    figure,
-    interval,
-    numbers,
-    opening,
-    picture,
-    run,
-    table,
-)
-from solver_benchmark.common import progress
+from paper.common import figure, numbers, picture
+from runner import FolderSettings, Result, Statement, interval, opening, progress, run, table
 
 import lqrsim as ls
 from lqrsim.stress.statistics import compare, rate
@@ -40,7 +29,7 @@ FULL = 1.0  # the strength that the disturbances have in the demo
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     trials: int = 200
     """Of each robot, strength and policy."""
     strengths: tuple[float, ...] = (0.0, 0.5, FULL, 2.0)
@@ -261,4 +250,4 @@ def statements(result: Result) -> list[Statement]:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, __doc__, statements=statements)

@@ -17,24 +17,9 @@ from typing import Any
 
 import numpy as np
 from paper import arena
-from paper.common import (
-    Result,
-    Settings,
-    Statement,
-    as_in_the_paper,
-    between,
-    counting,
-    figure,
-    interval,
-    numbers,
-    opening,
-    picture,
-    render_still,
-    run,
-    shown,
-    table,
-)
+from paper.common import as_in_the_paper, figure, numbers, picture, render_still, shown
 from paper.plans import described, sensitive, solved
+from runner import FolderSettings, Result, Statement, between, counting, interval, opening, run, table
 from solver_benchmark.common import median, take_turns
 
 import lqrsim as ls
@@ -52,7 +37,7 @@ DISTURBED, UNDISTURBED, OPEN_LOOP = "disturbed", "undisturbed", "disturbed, with
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     rounds: int = 21
     """How often each plan is timed."""
     trials: int = 200
@@ -348,4 +333,4 @@ def statements(result: Result) -> list[Statement]:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, __doc__, statements=statements)

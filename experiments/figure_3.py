@@ -12,21 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d import Axes3D
-from paper.common import (
-    Result,
-    Settings,
-    Statement,
-    as_in_the_paper,
-    between,
-    figure,
-    interval,
-    numbers,
-    opening,
-    picture,
-    render_still,
-    run,
-    table,
-)
+from paper.common import as_in_the_paper, figure, numbers, picture, render_still
+from runner import FolderSettings, Result, Statement, between, interval, opening, run, table
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
@@ -41,7 +28,7 @@ DRAWN = 30  # disturbed runs
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     query: int = 0
     """Which of the random queries."""
     seed: int = 0
@@ -193,4 +180,4 @@ def statements(result: Result) -> list[Statement]:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, __doc__, statements=statements)

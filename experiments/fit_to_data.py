@@ -13,21 +13,18 @@ import contextlib
 import importlib
 import io
 import logging
-import sys
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
-import tyro
 from mjcf.files import CART_POLE
 from mjcf.packaged import quadrotor
-from paper.common import table
+from runner import Settings, opening, run, table
 
 import lqrsim as ls
 from lqrsim.scenes.scene import scene_from_xml
-from lqrsim.versions import versions
 
 FACTOR = 10.0  # how many times as much, and as little, as in the MJCF a number may be
 
@@ -78,7 +75,7 @@ CASES: dict[str, Callable[[], Case]] = {"cart-pole": cart_pole, "quadrotor": loa
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     """What the script is told."""
 
     only: tuple[str, ...] = ()
@@ -87,8 +84,6 @@ class Config:
     """Runs of each policy, with noise."""
     seed: int = 0
     """Of the noise."""
-    quick: bool = False
-    """Ten runs of each policy of the cart-pole."""
 
 
 def library() -> Any:
@@ -197,10 +192,7 @@ def main(config: Config) -> dict[str, Any]:
     names = ["cart-pole"] if config.quick else [*CASES]
     chosen = [name for name in names if not config.only or name in config.only]
     trials = min(config.trials, 10) if config.quick else config.trials
-    return {
-        "config": asdict(config), "versions": versions(),
-        "cases": [of_case(CASES[name](), trials, config.seed) for name in chosen],
-    }  # fmt: skip
+    return opening(config) | {"cases": [of_case(CASES[name](), trials, config.seed) for name in chosen]}
 
 
 def report(result: dict[str, Any]) -> str:
@@ -229,8 +221,4 @@ def report(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        print(report(main(tyro.cli(Config, description=__doc__))))
-    except ls.InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+    run(Config, main, report, __doc__)

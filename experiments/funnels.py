@@ -12,12 +12,12 @@ replanning  Planning again when the funnel is left, against planning again at ev
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
-from paper.common import Result, Settings, Statement, between, counting, interval, opening, run, table
 from replan.common import scenario_of
 from replan.delay import firm
+from runner import FolderSettings, Result, at_most, between, counting, interval, opening, run, table
 
 import lqrsim as ls
 from lqrsim.stress.levels import find_level, fresh, smallest_test
@@ -39,7 +39,7 @@ Section = Literal["coverage", "robots", "replanning"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     sections: tuple[Section, ...] = ("coverage", "robots", "replanning")
     """Which of them."""
     repetitions: int = 2000
@@ -57,10 +57,9 @@ class Config(Settings):
     seed: int = 0
     """Of all draws."""
 
-
-def few(config: Config) -> Config:
-    """What `--quick` comes to."""
-    return replace(config, repetitions=20, rate=0.8, confidence=0.8, trials=20, replanned=4, failures=5)
+    def bounded(self) -> Self:
+        """The settings, reduced by `--quick`."""
+        return at_most(self, repetitions=20, rate=0.8, confidence=0.8, trials=20, replanned=4, failures=5)
 
 
 # The share of successes at a level: all succeed up to level 1. In a ball of d states of which those in a smaller ball
@@ -271,9 +270,10 @@ SECTIONS: dict[Section, tuple[Any, Any, str]] = {
 
 
 def main(config: Config) -> Result:
-    result, asked = opening(config), few(config) if config.quick else config
+    config = config.bounded()
+    result = opening(config)
     for name in config.sections:
-        result[name] = SECTIONS[name][0](asked)
+        result[name] = SECTIONS[name][0](config)
     return result
 
 
@@ -285,10 +285,5 @@ def report(result: Result) -> str:
     return "\n\n".join(parts)
 
 
-def statements(result: Result) -> list[Statement]:
-    """None: the paper says nothing of funnels."""
-    return []
-
-
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, __doc__)

@@ -9,24 +9,20 @@ ridge regression on the observed state, with coefficients that are piecewise lin
 time alone, which is imitation without feedback. All of them then meet the same new episodes.
 """
 
-import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import tyro
-from paper.common import table
+from runner import Settings, opening, run, table
 
-import lqrsim as ls
 import lqrsim.gym
-from lqrsim.versions import versions
 
 RIDGE = 1e-6  # beside features of unit variance
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     scenario: str = "differential_drive"
     """What `lqrsim.gym.make_vec` makes."""
     disturbances: str = "moderate"
@@ -39,8 +35,6 @@ class Config:
     """Of the coefficients, evenly in time."""
     seed: int = 0
     """Of the training; the tests have the next one."""
-    quick: bool = False
-    """Fewer episodes."""
 
 
 class Learner:
@@ -74,7 +68,7 @@ class Learner:
         return (hats[:, :, None] * seen[:, None, :]).reshape(len(states), -1)
 
 
-def run(
+def run_episodes(
     env: lqrsim.gym.VectorEnvironment, act: Callable[[np.ndarray], np.ndarray], seed: int
 ) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """Observations (k, n+1) and actions (k, m) of all episodes while they go on, and how these ended."""
@@ -101,16 +95,14 @@ def main(config: Config) -> dict[str, Any]:
     options: dict[str, Any] = {"disturbances": config.disturbances}
     training: Any = lqrsim.gym.make_vec(config.scenario, episodes, **options)
     testing: Any = lqrsim.gym.make_vec(config.scenario, tests, solution=training.solution, **options)
-    observations, actions, _ = run(training, lqrsim.gym.Expert(training), config.seed)
+    observations, actions, _ = run_episodes(training, lqrsim.gym.Expert(training), config.seed)
     agents = {
         "the policy": lqrsim.gym.Expert(testing),
         "learnt, with the state": Learner(observations, actions, config.knots, feedback=True),
         "learnt, time alone": Learner(observations, actions, config.knots, feedback=False),
     }
-    return {
-        "config": asdict(config), "versions": versions(), "samples": len(actions),
-        "agents": {name: run(testing, act, config.seed + 1)[2] for name, act in agents.items()},
-    }  # fmt: skip
+    tested = {name: run_episodes(testing, act, config.seed + 1)[2] for name, act in agents.items()}
+    return opening(config) | {"samples": len(actions), "agents": tested}
 
 
 def report(result: dict[str, Any]) -> str:
@@ -128,8 +120,4 @@ def report(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        print(report(main(tyro.cli(Config, description=__doc__))))
-    except ls.InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+    run(Config, main, report, __doc__)

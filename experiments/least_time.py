@@ -1,6 +1,6 @@
 """The drive and the quadrotor as fast as their motors take them: a final time that is free.
 
-    python experiments/least_time.py            # both, 10 s, and a figure in runs/least_time
+    python experiments/least_time.py            # both, 10 s, and a figure in runs/least_time/figures
     python experiments/least_time.py --quick    # the drive alone
 
 The controls cost next to nothing, and time does: motors stand at their limits most of the way. The paths keep clear of
@@ -14,13 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 from matplotlib.axes import Axes
-from tqdm import tqdm
+from paper.common import figure
+from runner import FolderSettings, Result, opening, progress, run, table
 
 import lqrsim as ls
 from lqrsim.problem.costs import CostSum, ObstacleCost
-from lqrsim.view import style
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,11 +65,9 @@ CASES = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(FolderSettings):
     out: Path = Path("runs/least_time")
-    """Folder for the figure."""
-    quick: bool = False
-    """The drive alone."""
+    """Folder for the figure, in a folder of that name."""
 
 
 def problem_of(case: Case) -> tuple[ls.Scenario, ls.Problem]:
@@ -94,10 +91,11 @@ def problem_of(case: Case) -> tuple[ls.Scenario, ls.Problem]:
     return scenario, freed
 
 
-def main(config: Config) -> None:
+def main(config: Config) -> Result:
+    result = opening(config)
     chosen = CASES[:1] if config.quick else CASES
     rows, plans = [], []
-    for case in tqdm(chosen, desc="solving", unit="robot", leave=False, disable=None):
+    for case in progress(chosen, "solving", unit="robot", delay=0):
         scenario, problem = problem_of(case)
         clock = time.perf_counter()
         solution = ls.smooth(problem)
@@ -122,22 +120,21 @@ def main(config: Config) -> None:
             ]
         )  # fmt: skip
         plans.append((case, scenario, problem, solution))
-    head = (
-        "robot", "status", "stated duration (s)", "least time (s)", "iterations", "seconds",
-        "controls at limits (%)", "clearance (m)", "in MuJoCo",
-    )  # fmt: skip
-    for row in (head, ["---"] * len(head), *rows):
-        print("| " + " | ".join(row) + " |")
-    files = [config.out / f"least_time{suffix}" for suffix in (".png", ".pdf")]
-    config.out.mkdir(parents=True, exist_ok=True)
-    with style.figure(*files, size=(9, 3.4 * len(plans))) as drawn:
+    with figure(config, result, "least_time", (9, 3.4 * len(plans))) as drawn:
         grid = drawn.subplots(len(plans), 2, squeeze=False)
         for (path, motors), plan in zip(grid, plans, strict=True):
             draw_path(path, *plan)
             draw_controls(motors, *plan)
         drawn.set_layout_engine("tight")
-    for file in files:
-        print(f"wrote {file}")
+    return result | {"rows": rows}
+
+
+def report(result: Result) -> str:
+    head = (
+        "robot", "status", "stated duration (s)", "least time (s)", "iterations", "seconds",
+        "controls at limits (%)", "clearance (m)", "in MuJoCo",
+    )  # fmt: skip
+    return table(head, result["rows"])
 
 
 def draw_path(axes: Axes, case: Case, scenario: ls.Scenario, problem: ls.Problem, solution: ls.Solution) -> None:
@@ -165,7 +162,4 @@ def draw_controls(axes: Axes, case: Case, scenario: ls.Scenario, problem: ls.Pro
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except KeyboardInterrupt:
-        raise SystemExit(130) from None
+    run(Config, main, report, __doc__)

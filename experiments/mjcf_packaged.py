@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 from mjcf.packaged import FRAME, ORDER, drive, quadrotor
-from paper.common import Result, Settings, opening, run, table
 from paper.homotopy import way
+from runner import FolderSettings, Result, opening, run, table
 
 import lqrsim as ls
 
@@ -26,7 +26,7 @@ DRAWN = {f"create_base_{name}": weight for name, weight in {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     only: tuple[str, ...] = ()
     """Of quadrotor and drive; by default both."""
     iterations: int = 60
@@ -133,4 +133,4 @@ def _cells(one: dict[str, Any]) -> list[Any]:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, lambda result: [], __doc__)
+    run(Config, main, report, __doc__)

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 from mjcf.tasks import TASKS, Task
-from paper.common import FIGURES, Result, Settings, opening, render_still, run, table
+from paper.common import render_still
 from PIL import Image
-from solver_benchmark.common import progress
+from runner import FIGURES, FolderSettings, Result, opening, progress, run, table
 
 import lqrsim as ls
 
@@ -27,7 +27,7 @@ WORSE, BETTER = 1.01, 0.99  # of iLQR's cost: from where a cost is worse, and be
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     out: Path = OUT
     """Folder for the pictures, in a folder of that name."""
     only: tuple[str, ...] = ()
@@ -128,4 +128,4 @@ def report(result: Result) -> str:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, lambda result: [], __doc__)
+    run(Config, main, report, __doc__)

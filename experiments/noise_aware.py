@@ -13,49 +13,42 @@ risk        What a growing risk makes of the spread of costs.
 """
 
 from dataclasses import dataclass
-from types import ModuleType
-from typing import Any, Literal
+from typing import Literal, get_args
 
-from paper.common import Result, Statement, opening, run
+from runner import Result, Section, measure, opening, report_of, run
 from stochastic import common, growth, iterated, planning, prediction, risks, timing
 
-Section = Literal["prediction", "planning", "ilqg", "time", "growth", "risk"]
-SECTIONS: dict[Section, tuple[ModuleType, str]] = {
-    "prediction": (prediction, "What is expected"),
-    "planning": (planning, "What knowing of the noise is worth"),
-    "ilqg": (iterated, "Against iLQG"),
-    "time": (timing, "What it takes"),
-    "growth": (growth, "As noise grows"),
-    "risk": (risks, "Risk"),
+Name = Literal["prediction", "planning", "ilqg", "time", "growth", "risk"]
+SECTIONS = {
+    "prediction": Section(prediction, "What is expected"),
+    "planning": Section(planning, "What knowing of the noise is worth"),
+    "ilqg": Section(iterated, "Against iLQG"),
+    "time": Section(timing, "What it takes"),
+    "growth": Section(growth, "As noise grows"),
+    "risk": Section(risks, "Risk"),
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(common.Config):
-    sections: tuple[Section, ...] = tuple(SECTIONS)
+    sections: tuple[Name, ...] = get_args(Name)
     """Which of them."""
 
 
 def main(config: Config) -> Result:
-    result = opening(config)
-    asked: Any = common.few(config) if config.quick else config
-    for name in config.sections:
-        result[name] = SECTIONS[name][0].measure(asked)
-    return result
+    config = config.bounded()
+    return measure(config, SECTIONS, opening(config))
 
 
 def report(result: Result) -> str:
-    parts = ["## Plans under noise", "Noise that depends on state and control in the plan itself, and a risk."]
-    for name, (section, title) in SECTIONS.items():
-        if name in result:
-            parts += [f"### {title}", *section.report(result[name])]
-    return "\n\n".join(parts)
-
-
-def statements(result: Result) -> list[Statement]:
-    """None: the paper says nothing of noise."""
-    return []
+    return "\n\n".join(
+        [
+            "## Plans under noise",
+            "Noise that depends on state and control in the plan itself, and a risk.",
+            *report_of(SECTIONS, result),
+        ]
+    )
 
 
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, __doc__)

@@ -11,8 +11,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-from tqdm import tqdm
+from runner import Result, Settings, opening, progress, run
 
 from lqrsim import cli
 
@@ -69,22 +68,25 @@ PICTURES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     out: Path = Path()
     """Folder that the lines are run in."""
-    quick: bool = False
-    """Small pictures of few frames, and a funnel of few trials."""
 
 
-def main(config: Config) -> list[Path]:
-    """Runs the lines; what they made."""
+def main(config: Config) -> Result:
+    """Run the lines; megabytes of each file that they made."""
     lines = dict.fromkeys(line for of_picture in PICTURES.values() for line in of_picture)
     config.out.mkdir(parents=True, exist_ok=True)
     with contextlib.chdir(config.out):
-        for line in tqdm(lines, unit="line", leave=False, delay=2.0, disable=None):
+        for line in progress(lines, "pictures", unit="line"):
             if code := cli.main(shlex.split(_small(line) if config.quick else line)[1:]):
                 raise SystemExit(code)
-    return [config.out / picture for picture in PICTURES]
+    made = [config.out / picture for picture in PICTURES]
+    return opening(config) | {"made": {str(path): path.stat().st_size / 1e6 for path in made}}
+
+
+def report(result: Result) -> str:
+    return "\n".join(f"wrote {path}: {size:.2f} MB" for path, size in result["made"].items())
 
 
 def _small(line: str) -> str:
@@ -93,5 +95,4 @@ def _small(line: str) -> str:
 
 
 if __name__ == "__main__":
-    for made in main(tyro.cli(Config, description=__doc__)):
-        print(f"wrote {made}: {made.stat().st_size / 1e6:.2f} MB")
+    run(Config, main, report, __doc__)

@@ -22,7 +22,7 @@ from board.double_pendulum import Robot
 from board.law import SwingUp
 from board.trials import Trial, columns, simulate, trials
 from numpy.typing import NDArray
-from paper.common import Result, Settings, opening, run, table
+from runner import FolderSettings, Result, opening, run, table
 from tqdm import tqdm
 
 from lqrsim.machine import processors
@@ -39,7 +39,7 @@ Job = tuple[list[Trial], Robot, int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     robots: tuple[Robot, ...] = ("acrobot", "pendubot")
     """Which of them."""
     versions: tuple[int, ...] = (1, 2)
@@ -107,4 +107,4 @@ def report(result: Result) -> str:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, lambda result: [], __doc__)  # of the paper's statements, for it has none of this
+    run(Config, main, report, __doc__)

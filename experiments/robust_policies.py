@@ -15,58 +15,44 @@ chances  The predicted chance of collision against what splitting measures.
 worlds   Whether safe plans in random worlds keep the chance that they were asked for, and what they cost.
 """
 
-import json
 from dataclasses import dataclass
-from types import ModuleType
-from typing import Any, Literal
+from typing import Literal, get_args
 
-from paper.common import Result, Statement, opening, run
 from robust import alone, chances, common, consistency, drive, presets, steady, worlds
+from runner import Result, Section, measure, opening, report_of, run
 
-from lqrsim.results.save_load import replacing
-
-Section = Literal["presets", "alone", "steady", "drive", "filter", "chances", "worlds"]
-SECTIONS: dict[Section, tuple[ModuleType, str]] = {
-    "presets": (presets, "All disturbances of a preset"),
-    "alone": (alone, "One disturbance alone"),
-    "steady": (steady, "Steady disturbances"),
-    "drive": (drive, "The differential drive"),
-    "filter": (consistency, "Consistency of the filter"),
-    "chances": (chances, "Predicted chances of collision"),
-    "worlds": (worlds, "Safe plans in random worlds"),
+Name = Literal["presets", "alone", "steady", "drive", "filter", "chances", "worlds"]
+SECTIONS = {
+    "presets": Section(presets, "All disturbances of a preset"),
+    "alone": Section(alone, "One disturbance alone"),
+    "steady": Section(steady, "Steady disturbances"),
+    "drive": Section(drive, "The differential drive"),
+    "filter": Section(consistency, "Consistency of the filter"),
+    "chances": Section(chances, "Predicted chances of collision"),
+    "worlds": Section(worlds, "Safe plans in random worlds"),
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(common.Config):
-    sections: tuple[Section, ...] = tuple(SECTIONS)
+    sections: tuple[Name, ...] = get_args(Name)
     """Which of them."""
 
 
 def main(config: Config) -> Result:
-    result = opening(config)
-    asked: Any = common.few(config) if config.quick else config
-    for name in config.sections:
-        result[name] = SECTIONS[name][0].measure(asked)
-        if not config.quick:  # what took so long is not to be lost with what comes after it
-            kept = config.out / f"robust_policies_{name}.json"
-            with replacing(kept) as unfinished:
-                unfinished.write_text(json.dumps(result[name], allow_nan=False) + "\n", encoding="utf-8")
-    return result
+    config = config.bounded()
+    return measure(config, SECTIONS, opening(config), keep_as="robust_policies")
 
 
 def report(result: Result) -> str:
-    parts = ["## Policies that survive", "What the paper's policy does not do: mind being off its plan, and ask why."]
-    for name, (section, title) in SECTIONS.items():
-        if name in result:
-            parts += [f"### {title}", *section.report(result[name])]
-    return "\n\n".join(parts)
-
-
-def statements(result: Result) -> list[Statement]:
-    """None: the paper says nothing of disturbances."""
-    return []
+    return "\n\n".join(
+        [
+            "## Policies that survive",
+            "What the paper's policy does not do: mind being off its plan, and ask why.",
+            *report_of(SECTIONS, result),
+        ]
+    )
 
 
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, __doc__)

@@ -12,12 +12,12 @@ there; the trials are others than the table's. Needs the `bench` extra.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 
 import numpy as np
-import tyro
 from peers.rotorpy import BEST_AT_LIGHT, BEST_AT_MODERATE, DEFAULT, Gains, RotorPy
+from runner import Result, Settings, at_most, opening, progress, run, table
 
 import lqrsim as ls
 from lqrsim.simulation.disturbances import preset
@@ -30,7 +30,7 @@ VERTICAL = (8.0, 15.0, 25.0), (0.6, 0.9, 1.2)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     search: bool = False
     """Search for gains, too."""
     trials: int = 100
@@ -43,8 +43,6 @@ class Config:
     """Of each point of the search."""
     search_seed: int = 1
     """Of the search's disturbances."""
-    quick: bool = False
-    """Few trials, for a first look."""
 
 
 @dataclass(frozen=True)
@@ -122,13 +120,11 @@ def ranked(bench: Bench, tunings: Iterable[Tuning], config: Config) -> list[Tuni
     return best
 
 
-def main(config: Config) -> dict[str, dict[str, int]]:
-    """Successes by law and preset."""
+def main(config: Config) -> Result:
+    """Successes by law and preset, with what else the table has."""
     bench = Bench()
-    if config.quick:
-        config = replace(config, trials=min(config.trials, 4), search_trials=min(config.search_trials, 2))
-    if config.search:
-        search(bench, config)
+    config = at_most(config, trials=4, search_trials=2)
+    best = search(bench, config)[:8] if config.search else []
     laws = {
         "the solution's policy": None,
         "RotorPy, default gains": Tuning(DEFAULT, False),
@@ -136,19 +132,27 @@ def main(config: Config) -> dict[str, dict[str, int]]:
         "RotorPy, the same, drag fed forward": Tuning(BEST_AT_LIGHT, True),
         "RotorPy, best at moderate": Tuning(BEST_AT_MODERATE, True),
     }
-    found: dict[str, dict[str, int]] = {}
-    for law, tuning in laws.items():
-        found[law] = {}
-        for name in ("undisturbed", "calm", "light", "moderate", "severe"):
-            table = bench.run(tuning, name, config.trials, config.seed)
-            found[law][name] = reached(table)
-            print(
-                f"{law:36s} {name:12s} reached {reached(table):3d} of {len(table):3d},"
-                f" worst error {np.median(table.worst):.3f} m in the median, {np.mean(table.saturated):.0%} saturated",
-                flush=True,
-            )
-    return found
+    laws_at = list(product(laws, ("undisturbed", "calm", "light", "moderate", "severe")))
+    rows = []
+    for law, name in progress(laws_at, "laws"):
+        one = bench.run(laws[law], name, config.trials, config.seed)
+        rows.append(
+            {
+                "law": law, "preset": name, "reached": reached(one), "trials": len(one),
+                "worst": float(np.median(one.worst)), "saturated": float(np.mean(one.saturated)),
+            }
+        )  # fmt: skip
+    return opening(config) | {"rows": rows, "best": [asdict(tuning) for tuning in best]}
+
+
+def report(result: Result) -> str:
+    rows = [
+        [one["law"], one["preset"], f"{one['reached']} of {one['trials']}", f"{one['worst']:.3f}",
+         f"{one['saturated']:.0%}"] for one in result["rows"]
+    ]  # fmt: skip
+    head = ("law", "preset", "reached", "worst error (m), median", "saturated")
+    return "\n".join([table(head, rows), *(f"found: {tuning}" for tuning in result["best"])])
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    run(Config, main, report, __doc__)

@@ -46,10 +46,10 @@ import numpy as np
 from league.contestants import CONTESTANTS, Run, Solve
 from league.problems import FAMILIES, Instance, instances
 from league.verification import VIOLATION, Verified, verify
-from paper.common import Result, Settings, Statement, opening, run, table
 from peers import Unavailable
 from peers import versions as versions_of_peers
 from peers.shooting import Moment
+from runner import FolderSettings, Result, opening, run, table
 from tqdm import tqdm
 
 from lqrsim.errors import check_count, check_name
@@ -58,7 +58,7 @@ ABOVE_BEST = 1.001
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     problems: tuple[str, ...] = tuple(FAMILIES)
     """Which of them."""
     solvers: tuple[str, ...] = tuple(CONTESTANTS)
@@ -180,11 +180,6 @@ def _progress(items: Sequence[Any], name: str) -> Any:
     return tqdm(items, name, leave=False, delay=2.0, position=1, disable=None)
 
 
-def statements(result: Result) -> list[Statement]:
-    """None: the paper says nothing of other solvers and constraints."""
-    return []
-
-
 def report(result: Result) -> str:
     head = (
         "problem", "solver", "instances", "solved", "at the target", "iterations", "ms", "at 1e-8", "iterations", "ms",
@@ -236,4 +231,4 @@ def _median(values: Sequence[float | None], spec: str) -> str:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, __doc__)

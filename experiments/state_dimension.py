@@ -17,20 +17,8 @@ from typing import Any
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator, StrMethodFormatter
-from paper.common import (
-    Result,
-    Settings,
-    Statement,
-    as_in_the_paper,
-    between,
-    figure,
-    interval,
-    numbers,
-    opening,
-    picture,
-    run,
-    table,
-)
+from paper.common import as_in_the_paper, figure, numbers, picture
+from runner import FolderSettings, Result, Statement, between, interval, opening, run, table
 from solver_benchmark.common import median, take_turns
 from solver_benchmark.scaling import chain_of_masses
 
@@ -56,7 +44,7 @@ PAPER, WITHIN = 18, (9, 36)  # times the time of the drive; what counts as that,
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     masses: tuple[int, ...] = (1, 2, 4, 8)
     """Of the chains."""
     rounds: int = 60
@@ -212,4 +200,4 @@ def statements(result: Result) -> list[Statement]:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, __doc__, statements=statements)

@@ -15,28 +15,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from paper.common import (
-    Result,
-    Settings,
-    Statement,
-    as_in_the_paper,
-    between,
-    figure,
-    fixed,
-    interval,
-    numbers,
-    opening,
-    picture,
-    run,
-    table,
-)
+from paper.common import as_in_the_paper, figure, fixed, numbers, picture
 from paper.contestants import draw_excess, draw_means
 from peers import Answer
 from peers.common import line
 from peers.common import versions as versions_of_peers
 from quality.common import PEERS, all_iterations, clearance, cost, others
 from quality.common import Config as Asked
-from solver_benchmark.common import progress, take_turns
+from runner import FolderSettings, Result, Statement, between, interval, opening, progress, run, table
+from solver_benchmark.common import take_turns
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -58,7 +45,7 @@ MEASURES: dict[str, tuple[Callable[[Mapping[str, Array]], float], str]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     queries: int = 100
     """How many random starts and goals."""
     seed: int = 0
@@ -306,4 +293,4 @@ def statements(result: Result) -> list[Statement]:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, __doc__, statements=statements)

@@ -15,19 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from paper.common import (
-    Result,
-    Settings,
-    Statement,
-    between,
-    counting,
-    interval,
-    opening,
-    picture,
-    run,
-    table,
-)
+from paper.common import picture
 from paper.stress_figures import NAMES, WORDS, draw_alone, draw_together
+from runner import FolderSettings, Result, between, counting, interval, opening, run, table
 
 import lqrsim as ls
 from lqrsim.disturbances import Disturbance
@@ -41,7 +31,7 @@ GRID = (2.0 ** (np.arange(-4, 15) / 2)).tolist()  # of one kind alone
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     trials: int = 300
     """Of each robot, strength and policy, under all disturbances together."""
     alone: int = 100
@@ -293,10 +283,5 @@ def brief(text: str) -> str:
     return re.sub(r"\d+\.\d{2,}", lambda number: f"{float(number[0]):.3g}", text)
 
 
-def statements(result: Result) -> list[Statement]:
-    """None: the paper says nothing of how often its policies fail."""
-    return []
-
-
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, __doc__)

@@ -15,21 +15,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from paper.common import (
-    Result,
-    Settings,
-    Statement,
-    as_in_the_paper,
-    between,
-    figure,
-    fixed,
-    interval,
-    numbers,
-    opening,
-    picture,
-    run,
-    table,
-)
+from paper.common import as_in_the_paper, figure, fixed, numbers, picture
+from runner import FolderSettings, Result, Statement, between, interval, opening, run, table
 from solver_benchmark.common import median, take_turns
 
 import lqrsim as ls
@@ -44,7 +31,7 @@ SAME = 0.01  # costs that differ by less, as a share, are of the same optimum
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     queries: int = 100
     """How many random starts and goals of each seed."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
@@ -298,4 +285,4 @@ def statements(result: Result) -> list[Statement]:
 
 
 if __name__ == "__main__":
-    run(Config, main, report, statements, __doc__)
+    run(Config, main, report, __doc__, statements=statements)

@@ -10,7 +10,6 @@ the search begins with paths of the joints. MuJoCo's distance between geoms, of 
 right.
 """
 
-import sys
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import tyro
+from runner import FolderSettings, opening, run
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -198,30 +197,29 @@ def distances(plant: ls.Plant, frames: Array) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(FolderSettings):
     out: Path = Path("runs/three_link_arm")
-    """Where the files go."""
+    """Folder for the files."""
     trials: int = 100
     """Disturbed runs."""
     noise: float = 0.05
     """Of each torque, in N m."""
-    quick: bool = False
-    """Ten disturbed runs, and no pictures."""
 
 
 def main(config: Config) -> dict[str, Any]:
     """Solve it, run it, measure it; the numbers."""
     robot = ThreeLinkArm()
     plant = ls.Plant(robot, load(config.out))
-    print(ls.check_plant(robot, plant.scene))
+    check = ls.check_plant(robot, plant.scene)
     solution = ls.smooth(problem(robot, plant.world))
-    print(solution.summary())
     calm = ls.simulate(plant, solution)
     trials = 10 if config.quick else config.trials
     noisy = ls.simulate(plant, solution, disturbances=[ls.disturbances.ControlNoise(config.noise)], trials=trials)
     clear = [distances(plant, frames).min() for frames in (calm.frames[0], *noisy.frames)]
     assert solution.clearance is not None
     found = {
+        "plant": str(check),
+        "solution": solution.summary(),
         "balls": len(robot.balls),
         "missed": LINK.missed,
         "status": str(solution.status),
@@ -239,12 +237,13 @@ def main(config: Config) -> dict[str, Any]:
             solution, {"undisturbed": calm, "disturbed": noisy}, config.out / "arm.png", world=plant.scene.world
         )
         ls.render(calm, config.out / "arm.mp4", insets=("top", "side"))
-    return found
+    return opening(config) | found
 
 
 def report(found: dict[str, Any]) -> str:
-    """What it came to."""
     return f"""\
+{found["plant"]}
+{found["solution"]}
 {found["balls"]} balls, of which the links stick out by {1e3 * found["missed"]:.1f} mm at most
 plan: {found["status"]} after {found["iterations"]} iterations of {found["ms an iteration"]:.1f} ms; the balls are \
 {1e3 * found["planned"]:.0f} mm clear at least
@@ -254,8 +253,4 @@ disturbed: {found["noisy reached"]} of {found["trials"]} reached the goal; by Mu
 
 
 if __name__ == "__main__":
-    try:
-        print(report(main(tyro.cli(Config, description=__doc__))))
-    except ls.InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+    run(Config, main, report, __doc__)

@@ -40,7 +40,7 @@ def benchmark(*arguments: str) -> dict[str, Any]:
         [sys.executable, script, "--quick", "--json", *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return json.loads(done.stdout)["result"]
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def test_benchmark_of_scaling_and_startup(results: dict[str, Any]) -> None:
 
 def test_benchmark_says_what_it_skips(tmp_path: Path) -> None:
     script = import_module("benchmark_solver")
-    with pytest.raises(script.Unavailable, match="name its folder with --reference"):
+    with pytest.raises(script.peers.Unavailable, match="name its folder with --reference"):
         script.speed.load_reference(script.Config(reference=tmp_path))
     assert script.report({"peers": {"skipped": "no such thing"}}) == "peers: skipped: no such thing"
 

@@ -107,9 +107,9 @@ def test_ctrl_c_ends_the_script_too_and_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_every_script_has_its_place_on_the_page() -> None:
-    """A script that reproduces something of the paper, or tells how sure that is, is run by `lqrsim reproduce`."""
+    """A script that reproduces something of the paper is run by `lqrsim reproduce`."""
     made = {path.stem for path in FOLDER.glob("*.py") if "def statements(" in path.read_text(encoding="utf-8")}
-    assert made == set(reproduce.SCRIPTS)
+    assert made <= set(reproduce.SCRIPTS) <= {path.stem for path in FOLDER.glob("*.py")}
 
 
 def same_page(folder: Path) -> dict[str, Any]:
@@ -118,8 +118,8 @@ def same_page(folder: Path) -> dict[str, Any]:
     for name, found in saved["results"].items():
         script = import_module(name)
         assert script.report(found["result"]) == found["report"], name
-        said = [vars(statement) for statement in script.statements(found["result"])]
-        assert said == found["statements"], name
+        statements = script.statements(found["result"]) if hasattr(script, "statements") else []
+        assert [vars(statement) for statement in statements] == found["statements"], name
         for file in found["result"]["figures"]:
             # Of the published page, the pdf files are not in the repository.
             assert file.endswith(".pdf") or (folder / "figures" / file).stat().st_size > 0

@@ -5,11 +5,12 @@ from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
+from runner import Result, counting
 
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.problem.costs import terms_of
-from paper.common import Result, as_in_the_paper, counting, numbers
+from paper.common import as_in_the_paper, numbers
 from paper.homotopy import Way, way
 
 

@@ -5,13 +5,14 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from runner import FolderSettings, Result
 
 from lqrsim.reports.curves import COLOURS, LINES, MARKERS
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress.policies import POLICIES
 from lqrsim.view import style
 from lqrsim.view.style import LIMIT, PLAN, RUNS
-from paper.common import Result, Settings, figure
+from paper.common import figure
 
 NAMES = {"differential_drive": "differential drive", "quadrotor": "quadrotor"}
 ASIDE = {"moderate": -3, "severe": 3}  # points; the last three presets are so close that their names would touch
@@ -21,7 +22,7 @@ WORDS = {
 }  # fmt: skip
 
 
-def draw_together(config: Settings, result: Result) -> None:
+def draw_together(config: FolderSettings, result: Result) -> None:
     with figure(config, result, "stress_test", (10, 4.5)) as drawn:
         both = drawn.subplots(1, 2, sharey=True)
         for axes, (name, robot) in zip(both, result["robots"].items(), strict=True):
@@ -61,7 +62,7 @@ def above(axes: Axes, strength: float, name: str) -> None:
     )  # fmt: skip
 
 
-def draw_alone(config: Settings, result: Result) -> None:
+def draw_alone(config: FolderSettings, result: Result) -> None:
     with figure(config, result, "stress_test_alone", (10, 4.6)) as drawn:
         for axes, (name, robot) in zip(drawn.subplots(1, 2, sharex=True), result["robots"].items(), strict=True):
             draw_halves(axes, robot["alone"])

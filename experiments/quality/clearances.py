@@ -4,10 +4,10 @@ import time
 from typing import Any
 
 import numpy as np
-from reliability.common import progress
+from runner import judge, progress
 
 import lqrsim as ls
-from quality.common import Config, Found, clear, clearance, converged, endings, judge, of_solutions, queries
+from quality.common import Config, Found, clear, clearance, converged, endings, of_solutions, queries
 
 MARGIN = 0.05  # m, on the first seed
 TOLERANCE = 1e-3  # m, at the steps
@@ -53,7 +53,7 @@ def which(solution: ls.Solution) -> int:
     return sum(one.status is not None for one in solution.candidates)
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [
         f"clearance: {'seed':<10} {'converged':>10} {'cost':>8} {'x without':>10} {'violation':>10} {'at steps':>9}"
         f" {'between':>9} {'iterations':>11} {'of all':>7} {'damped':>7} {'ms/query':>9} {'without':>8}"
@@ -91,4 +91,4 @@ def table(found: dict[str, Any]) -> str:
         f"  between the steps, at worst {dip:.2f} mm  {judge(dip >= 1e3 * BETWEEN, f'>= {1e3 * BETWEEN:g} mm')};"
         f" a margin of {max(-dip, 0):.1f} mm would make up for it"
     )
-    return "\n".join(rows + failed)
+    return ["\n".join(rows + failed)]

@@ -10,7 +10,8 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import peers
-from reliability.common import fixed, progress
+from reliability.common import fixed
+from runner import Settings, at_most, progress
 from solver_benchmark.speed import reference_folder
 from tqdm import tqdm
 
@@ -26,7 +27,7 @@ ALL = 100  # queries of a seed that the targets of mean costs are for
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     sections: tuple[Section, ...] = get_args(Section)
     """What to measure."""
     queries: int = ALL
@@ -59,21 +60,16 @@ class Config:
     """Where to write the plans that cost less than the best known, an .npz with seed, query, cost and controls."""
     peers: bool = True
     """Whether other people's solvers are asked, too."""
-    quick: bool = False
-    """4 queries of one seed, 5 worlds, 2 rounds."""
-    json: bool = False
-    """Print everything, query by query, as JSON instead of the tables."""
 
     def bounded(self) -> "Config":
-        """What is left of it if it is to be quick."""
+        """The settings; with `--quick` 4 queries of one seed, 5 worlds, 2 rounds."""
         if not self.quick:
             return self
-        most = {
-            "queries": 4, "rounds": 2, "ipopt_queries": 2, "worlds": 5, "ipopt_worlds": 1, "ipopt_clear_worlds": 0,
-            "limited_worlds": 2, "resolves": 4,
-        }  # fmt: skip
-        few: Any = {name: min(getattr(self, name), count) for name, count in most.items()}
-        return replace(self, seeds=self.seeds[:1], clearance_seeds=self.clearance_seeds[:1], **few)
+        one = replace(self, seeds=self.seeds[:1], clearance_seeds=self.clearance_seeds[:1])
+        return at_most(
+            one, queries=4, rounds=2, ipopt_queries=2, worlds=5, ipopt_worlds=1, ipopt_clear_worlds=0,
+            limited_worlds=2, resolves=4,
+        )  # fmt: skip
 
 
 def queries(count: int, seed: int, limits: tuple[float, float] | None = None) -> list[ls.Problem]:
@@ -200,10 +196,6 @@ def endings(found: Found) -> str:
     """How those ended that did not converge, in words."""
     failed = Counter(status for status in found["status"] if status != "CONVERGED")
     return ", ".join(f"{count} {status}" for status, count in failed.most_common())
-
-
-def judge(met: bool, want: str) -> str:
-    return f"{'met' if met else 'MISSED'}: want {want}"
 
 
 def skips(skipped: dict[str, str]) -> list[str]:

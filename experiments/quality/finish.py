@@ -45,7 +45,7 @@ def compared(one: dict[str, Found]) -> tuple[int, int, int]:
     return int((np.abs(apart) <= SAME).sum()), int((apart < -SAME).sum()), int((apart > SAME).sum())
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [
         f"finish: {'seed':>6} {'finish=':<8} {'failed':>7} {f'iterations to {EXACT:g}: median, mean, most':>40}"
         f" {f'cost the same to {SAME:g}, lower, higher':>40}"
@@ -57,4 +57,4 @@ def table(found: dict[str, Any]) -> str:
             judged = ", ".join(map(str, compared(both))) if name == NEWTON else ""
             failed = len(counts) - converged(one)
             rows.append(f"  {seed:>12} {name:<8} {failed:>7} {said:>40} {judged:>40}  {endings(one)}".rstrip())
-    return "\n".join(rows)
+    return ["\n".join(rows)]

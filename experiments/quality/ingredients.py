@@ -88,7 +88,7 @@ def measure(config: Config) -> dict[str, Any]:
     return found
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [
         f"ingredients: {'':<14} {'mean cost':>10} {'within 1 % of best':>19} {'iterations in all':>18} {'ms/query':>9}"
         f" {'failed':>7}"
@@ -100,4 +100,4 @@ def table(found: dict[str, Any]) -> str:
             f" {one['milliseconds']:>9.1f} {len(one['cost']) - converged(one):>7}  {endings(one)}".rstrip()
         )
     rows.append("  ms/query is time of the processor, one thread")
-    return "\n".join(rows + skips(found["skipped"]))
+    return ["\n".join(rows + skips(found["skipped"]))]

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import peers
-from reliability.common import fixed, progress
+from reliability.common import fixed
+from runner import judge, progress
 
 import lqrsim as ls
 from quality import worlds
-from quality.common import Config, Found, converged, cost, endings, judge, of_solutions, queries, skips, solve
+from quality.common import Config, Found, converged, cost, endings, of_solutions, queries, skips, solve
 
 ROTORS, WHEELS = (1.05, 1.40), (-0.27, 0.27)  # N, and m/s
 NEAR = 0.01
@@ -85,7 +86,7 @@ def compare(pairs: list[tuple[ls.Problem, ls.Solution]], name: str, *, same: boo
     return {f"from_{start}": some for start, some in answers.items()}
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [
         f"limits: {'':<10} {'converged':>10} {'iterations':>11} {'damped':>7} {'within them':>12} {'at them':>8}"
         f" {'(of controls)':>14} {'mean cost':>10} {'policy off plan':>16}"
@@ -122,4 +123,4 @@ def table(found: dict[str, Any]) -> str:
             f"  within 1 % of IPOPT from our plan or lower: {near} of the {active} with controls at their limits"
             f"  {judge(near >= LEAST, f'>= {LEAST}')}"
         )
-    return "\n".join(rows + skips(found["skipped"]))
+    return ["\n".join(rows + skips(found["skipped"]))]

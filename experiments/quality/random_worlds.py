@@ -6,24 +6,12 @@ FDDP knows no limits of the controls; all others keep those of the actuators. No
 from typing import Any, get_args
 
 import numpy as np
-from reliability.common import mean, progress
+from reliability.common import mean
+from runner import judge, progress
 
 import lqrsim as ls
 from quality import worlds
-from quality.common import (
-    Config,
-    Found,
-    clear,
-    clearance,
-    converged,
-    cost,
-    endings,
-    judge,
-    of_solutions,
-    others,
-    skips,
-    solve,
-)
+from quality.common import Config, Found, clear, clearance, converged, cost, endings, of_solutions, others, skips, solve
 
 TOLERANCE = 1e-3  # m, at the steps, where a clearance is kept
 LOWER = 1e-4  # relative, what is a lower mean cost; by so much plans that have settled differ
@@ -81,7 +69,7 @@ def ask(
     return found, skipped
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [
         f"worlds: {'':<26} {'converged':>10} {'clear':>9} {'blocked ones':>13} {'mean cost':>10} {'median':>8}"
         f" {'iterations':>11} {'theirs and ours where both count':>33}"
@@ -111,7 +99,7 @@ def table(found: dict[str, Any]) -> str:
                 for i, status in enumerate(mine["status"])
                 if status != "CONVERGED"
             ]
-    return "\n".join(rows + skips(found["skipped"]))
+    return ["\n".join(rows + skips(found["skipped"]))]
 
 
 def row(robot: str, how: str, who: str, one: Found, both: tuple[float, float, int], blocked: list[bool]) -> str:

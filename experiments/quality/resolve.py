@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from reliability.common import progress
+from runner import progress
 from solver_benchmark.common import median
 
 import lqrsim as ls
@@ -61,7 +61,7 @@ def again(config: Config, problem: ls.Problem, start: ls.Solution) -> dict[str, 
     }
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [
         f"resolve: {'':<22} {'converged':>10} {'(cold)':>8} {'iterations: median, worst':>26} {'cold':>10}"
         f" {'of all starts':>15} {'ratio':>6} {'cost, warm to cold: median, least, worst':>41} {'violation':>10}"
@@ -86,4 +86,4 @@ def table(found: dict[str, Any]) -> str:
         skipped = [one["skipped"] for one in some if "skipped" in one]
         if skipped:
             rows.append(f"  {name}: {len(skipped)} skipped, such as: {skipped[0]}")
-    return "\n".join(rows)
+    return ["\n".join(rows)]

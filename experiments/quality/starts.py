@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 import peers
-from reliability.common import mean, paper_start, progress
+from reliability.common import mean, paper_start
+from runner import judge, progress
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -18,7 +19,6 @@ from quality.common import (
     best_known,
     converged,
     endings,
-    judge,
     of_answers,
     of_solutions,
     others,
@@ -83,7 +83,7 @@ def lowest_plan(one: dict[str, Found], plans: dict[str, list[ls.Solution]], quer
     return one[name]["excess"][query], one[name]["cost"][query], plans[name][query].trajectory.controls
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [
         f"starts: {'seed':>4} {'':<18} {'failed':>7} {'mean cost':>10} {'within 1 % of best':>19} {'iterations':>11}"
         f" {'of all starts':>14}"
@@ -103,7 +103,7 @@ def table(found: dict[str, Any]) -> str:
                 for i, excess in enumerate(one.get("excess", ()))
                 if excess < -LOWER
             ]
-    return "\n".join(rows + verdicts(found) + lower + skips(found["skipped"]))
+    return ["\n".join(rows + verdicts(found) + lower + skips(found["skipped"]))]
 
 
 def nearest(one: Found) -> int:

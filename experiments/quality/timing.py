@@ -5,10 +5,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from runner import judge
 from solver_benchmark.common import median, take_turns
 
 import lqrsim as ls
-from quality.common import NONE, Config, Solve, judge, others, queries, skips
+from quality.common import NONE, Config, Solve, others, queries, skips
 
 OURS: dict[str, dict[str, Any]] = {"smooth, one start": {"starts": 1}, "smooth": {}}
 THEIRS = ("FDDP, hover", "IPOPT, line")
@@ -54,7 +55,7 @@ def theirs(solver: Solve) -> Callable[[ls.Problem], float]:
     return run
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [f"time, one thread: {'queries':>8} {'ms/query':>9} {'(median)':>9}"]
     taken = found["milliseconds"]
     for name, one in taken.items():
@@ -68,4 +69,4 @@ def table(found: dict[str, Any]) -> str:
                 f"  {one} / {other}: {ratio:.3f} (of a query, in the median {np.median(mine / their):.3f})"
                 f"  {judge(ratio <= most, f'<= {most:g}')}"
             )
-    return "\n".join(rows + skips(found["skipped"]))
+    return ["\n".join(rows + skips(found["skipped"]))]

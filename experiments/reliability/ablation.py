@@ -3,7 +3,9 @@
 from itertools import product
 from typing import Any
 
-from reliability.common import Config, cost_from_start, endings, mean, paper_start, progress, queries, solve, summary
+from runner import progress
+
+from reliability.common import Config, cost_from_start, endings, mean, paper_start, queries, solve, summary
 
 PARTS = (("dual", "primal"), ("soft", "fixed"), ("prior", "no prior"), ("safeguard", "bare"))
 
@@ -24,7 +26,7 @@ def measure(config: Config) -> dict[str, Any]:
     return found
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [
         f"ablation: {'':<35} {'failed':>7} {'handed over':>12} {'iterations':>11} {'cost':>8} {'from the start':>15}"
         "   (means of those that converged)"
@@ -41,4 +43,4 @@ def table(found: dict[str, Any]) -> str:
             f" {mean(one['cost'][i] for i in done):>8.2f} {mean(one['cost_from_start'][i] for i in done):>15.2f}"
             f"  {endings(one)}".rstrip()
         )
-    return "\n".join(rows)
+    return ["\n".join(rows)]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
+from runner import Settings, progress
 from tqdm import tqdm
 
 import lqrsim as ls
@@ -17,7 +18,7 @@ Section = Literal["stiff", "fragile", "random", "overhead", "ablation"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     sections: tuple[Section, ...] = get_args(Section)
     """What to measure."""
     queries: int = 100
@@ -34,10 +35,6 @@ class Config:
     """How often each is timed."""
     threads: int | None = None
     """How many solve at once where nothing is timed; by default as many as there are processors."""
-    quick: bool = False
-    """8 queries, a fiftieth of the random problems, 2 rounds."""
-    json: bool = False
-    """Print everything, query by query, as JSON instead of the tables."""
 
     def __post_init__(self) -> None:
         for kind in self.kinds:
@@ -72,10 +69,6 @@ def solve(config: Config, problems: Sequence[ls.Problem], name: str, **options: 
     """`smooth_many`, with a bar."""
     with tqdm(total=len(problems), desc=name, leave=False, delay=2.0, disable=None) as bar:
         return ls.smooth_many(problems, threads=config.threads, progress=lambda *_: bar.update(), **options)
-
-
-def progress(what: Iterable[Any], name: str) -> Iterable[Any]:
-    return tqdm(what, desc=name, leave=False, delay=2.0, disable=None)
 
 
 def summary(solutions: Sequence[ls.Solution]) -> dict[str, Any]:

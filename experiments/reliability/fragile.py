@@ -31,7 +31,7 @@ def along_the_line(problem: ls.Problem, weight: float) -> ls.InitialPrior:
     return ls.InitialPrior(weights, about=(1 - share) * problem.start + share * problem.goal)
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [f"fragile: {'weight':>7} {'safeguard':>10} {'converged':>11} {'mean cost':>10} {'handed over':>12}"]
     for name, one in found.items():
         weight, safeguard = name.split(", ")
@@ -41,4 +41,4 @@ def table(found: dict[str, Any]) -> str:
             f"  {weight:>14} {safeguard:>10} {converged(one):>7}/{count:<3} {mean(costs):>10.2f}"
             f" {sum(one['handed_over']):>12}  {endings(one)}".rstrip()
         )
-    return "\n".join(rows)
+    return ["\n".join(rows)]

@@ -5,9 +5,10 @@ import time
 from typing import Any
 
 import numpy as np
+from runner import progress
 
 import lqrsim as ls
-from reliability.common import Config, paper_start, progress, queries
+from reliability.common import Config, paper_start, queries
 
 
 def measure(config: Config) -> dict[str, Any]:
@@ -51,7 +52,7 @@ def same_bits(one: ls.Solution, other: ls.Solution) -> bool:
     return one.status is other.status and all(np.array_equal(a, b) for a, b in pairs)
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [f"overhead: {'start':<6} {'queries':>8} {'same iterations':>16} {'same bits':>10} {'time, median':>13}"]
     for start, one in found.items():
         calm = [i for i, needed in enumerate(one["needed"]) if not needed]
@@ -63,4 +64,4 @@ def table(found: dict[str, Any]) -> str:
             f"  {start:<14} {len(calm):>8} {same:>16} {bits:>10} {ratio:>12.3f}x  {verdict}: want all the same"
             + (f"; {sum(one['needed'])} more needed it" if any(one["needed"]) else "")
         )
-    return "\n".join(rows)
+    return ["\n".join(rows)]

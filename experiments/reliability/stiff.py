@@ -25,7 +25,7 @@ def measure(config: Config) -> dict[str, Any]:
     return found
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [
         f"stiff: drag/mass dt {'converged':>11} {'iterations':>11} {'handed over':>12} {'iLQR improves at worst':>23}"
     ]
@@ -37,4 +37,4 @@ def table(found: dict[str, Any]) -> str:
             f" {sum(one['handed_over']):>12} {100 * left:>21.4f} %  {verdict}: want all, <= {100 * BOUND:g} %"
             f" {endings(one)}".rstrip()
         )
-    return "\n".join(rows)
+    return ["\n".join(rows)]

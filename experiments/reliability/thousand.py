@@ -18,7 +18,7 @@ def measure(config: Config) -> dict[str, Any]:
     return found
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [
         f"random: {'':<10} {'converged':>11} {'iterations':>11} {'damped':>7} {'handed over':>12}"
         f" {'optimality at worst':>20} {'gap':>8} {'iLQR improves at worst':>23}"
@@ -36,4 +36,4 @@ def table(found: dict[str, Any]) -> str:
     solved = sum(converged(one) for one in found.values())
     handed = sum(sum(one["handed_over"]) for one in found.values())
     rows.append(f"  {solved} of {total} converged, {handed} were handed over to iLQR")
-    return "\n".join(rows)
+    return ["\n".join(rows)]

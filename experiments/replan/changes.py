@@ -5,12 +5,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from paper.common import between, table
 from robust.common import share
+from runner import between, progress, table
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from replan.common import MARGIN, Config, progress, scenario_of, stated
+from replan.common import MARGIN, Config, scenario_of, stated
 
 EVERY = 1 / 30  # s
 JUMP, JUMPS_AT = 1.0, 2.0  # m, s: how far the goal of the quadrotor jumps, and when

@@ -1,12 +1,11 @@
 """Problems and settings that all questions share."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Self
 
 import numpy as np
-from paper.common import FREE, Settings
-from tqdm import tqdm
+from paper.common import FREE
+from runner import FolderSettings, at_most
 
 import lqrsim as ls
 
@@ -16,7 +15,7 @@ MARGIN = 0.02  # m, of the clearance
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     queries: int = 20
     """A start and a goal each."""
     plans: int = 10_000
@@ -28,10 +27,9 @@ class Config(Settings):
     seed: int = 0
     """Of the disturbances."""
 
-
-def few(config: Config) -> Config:
-    """What `--quick` comes to."""
-    return replace(config, queries=1, plans=40, trials=2)
+    def bounded(self) -> Self:
+        """The settings, reduced by `--quick`."""
+        return at_most(self, queries=1, plans=40, trials=2)
 
 
 def scenario_of(robot: str, query: int) -> ls.Scenario:
@@ -62,8 +60,3 @@ def stated(scenario: ls.Scenario, way: str) -> ls.Problem:
         kept = ls.Clearance(scenario.scene.world, radius=robot.radius, margin=MARGIN)
         return replace(problem, constraints=[kept])
     return problem
-
-
-def progress(sequence: Sequence[Any], name: str) -> Any:
-    """The same, with a bar if it takes long."""
-    return tqdm(sequence, desc=name, leave=False, delay=2.0, disable=None)

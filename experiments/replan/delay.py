@@ -4,11 +4,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from paper.common import between, table
 from robust.common import share
+from runner import between, progress, table
 
 import lqrsim as ls
-from replan.common import Config, progress, scenario_of, stated
+from replan.common import Config, scenario_of, stated
 
 EVERY = 1 / 30  # s
 ROOM = 0.2  # m

@@ -3,12 +3,12 @@
 from typing import Any
 
 import numpy as np
-from paper.common import between, table
 from robust.common import ASKED, PRESETS, Reached, reach_exactly, run, share
+from runner import between, progress, table
 
 import lqrsim as ls
 from lqrsim.stress.statistics import compare
-from replan.common import Config, progress
+from replan.common import Config
 
 EVERY = 0.5  # s
 KEPT, NEEDED, ALWAYS = "the first plan", "a new plan where it is needed", "a new plan each time"

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import peers
-from paper.common import table
+from runner import progress, table
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from replan.common import Config, progress, scenario_of, stated
+from replan.common import Config, scenario_of, stated
 
 OURS, ILQR, FDDP, FATROP = "lqrsim, prepare", "lqrsim, ilqr", "Crocoddyl, box-FDDP", "Fatrop, by CasADi"
 HORIZONS = 2  # how long a run is: with a moving horizon the robot is not at its goal after one

@@ -7,12 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from paper.common import table
+from runner import progress, table
 
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.scenes.scene import scene_from_xml
-from replan.common import ROBOTS, WAYS, Config, progress, scenario_of, stated
+from replan.common import ROBOTS, WAYS, Config, scenario_of, stated
 
 # Control period in s and steps, where they are others than the scenario's.
 RATES = {"as planned": (None, None), "100 Hz, 2 s": (0.01, 200)}

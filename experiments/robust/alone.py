@@ -7,14 +7,14 @@ slow the motors. It flies the default plan, as the smoother's policy does, and t
 from typing import Any
 
 import numpy as np
-from paper.common import interval, table
 from paper.stress_figures import NAMES
+from runner import interval, progress, table
 from stress_test import GRID, half_fail, in_words, possible
 
 import lqrsim as ls
 from lqrsim.disturbances import ControlDelay, MeasurementLatency
 from lqrsim.stress.statistics import rate
-from robust.common import ASKED, Config, progress, reached, safe_plan
+from robust.common import ASKED, Config, reached, safe_plan
 
 OWN, DEFAULT, SAFE = "smoother's policy", "offset free, default plan", "offset free, safe plan"
 LATE = (ControlDelay(1), MeasurementLatency(1))

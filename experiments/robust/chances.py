@@ -3,12 +3,12 @@
 from typing import Any
 
 import numpy as np
-from paper.common import interval, table
+from runner import interval, progress, table
 
 import lqrsim as ls
 from lqrsim.stress.statistics import rate
 from robust import common
-from robust.common import Config, progress, run, safe_plan
+from robust.common import Config, run, safe_plan
 
 # In turns. In this order: few plans collide as often as 1e-1 without any clearance, and are not safer than asked.
 ASKED = (1e-2, 1e-3, 1e-4, 1e-1)

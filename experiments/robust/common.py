@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
-from paper.common import Settings, fixed
-from tqdm import tqdm
+from paper.common import fixed
+from runner import FolderSettings, at_most
 
 import lqrsim as ls
 from lqrsim.control.controllers import ControllerLike
@@ -22,7 +22,7 @@ ASKED = {"light": 1e-3, "moderate": 1e-2, "severe": 0.2}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     trials: int = 100
     """Of each query, preset and policy."""
     queries: int = 20
@@ -40,14 +40,9 @@ class Config(Settings):
     seed: int = 0
     """Of the disturbances, as in stress_test.py."""
 
-
-def few(config: Config) -> Config:
-    """What `--quick` comes to."""
-    return replace(
-        config, trials=min(config.trials, 5), queries=min(config.queries, 1), alone=min(config.alone, 3),
-        plans=min(config.plans, 1), particles=min(config.particles, 20), worlds=min(config.worlds, 1),
-        world_trials=min(config.world_trials, 20),
-    )  # fmt: skip
+    def bounded(self) -> Self:
+        """The settings, reduced by `--quick`."""
+        return at_most(self, trials=5, queries=1, alone=3, plans=1, particles=20, worlds=1, world_trials=20)
 
 
 def reach_exactly(problem: ls.Problem) -> ls.Problem:
@@ -92,8 +87,3 @@ def share(successes: Reached) -> list[float]:
     """The share with its exact interval, in percent."""
     one = rate(int(successes.sum()), len(successes))
     return [100 * one.value, 100 * one.low, 100 * one.high]
-
-
-def progress(sequence: Sequence[Any], name: str) -> Any:
-    """The same, with a bar if it takes long."""
-    return tqdm(sequence, desc=name, leave=False, delay=2.0, disable=None)

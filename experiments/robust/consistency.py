@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from paper.common import table
+from runner import table
 from scipy.stats import chi2
 
 import lqrsim as ls

@@ -3,11 +3,11 @@
 from typing import Any
 
 import numpy as np
-from paper.common import between, table
+from runner import between, progress, table
 
 import lqrsim as ls
 from lqrsim.stress.statistics import compare
-from robust.common import Config, progress, reach_exactly, reached, share
+from robust.common import Config, reach_exactly, reached, share
 
 STRENGTHS = (1.0, 2.0, 3.0, 6.0)
 ASKED = 1e-3

@@ -3,14 +3,14 @@
 from typing import Any
 
 import numpy as np
-from paper.common import between, table
 from peers import RotorPy, Unavailable
 from peers.rotorpy import BEST_AT_LIGHT, BEST_AT_MODERATE
+from runner import between, progress, table
 
 import lqrsim as ls
 from lqrsim.control.controllers import ControllerLike
 from lqrsim.stress.statistics import compare
-from robust.common import ASKED, PRESETS, Config, Reached, progress, reached, safe_plan, share
+from robust.common import ASKED, PRESETS, Config, Reached, reached, safe_plan, share
 
 OWN, PLAN, SAFE = "smoother's policy", "default plan", "safe plan"
 POSES = {

@@ -3,11 +3,11 @@
 from typing import Any
 
 import numpy as np
-from paper.common import between, table
+from runner import between, progress, table
 
 import lqrsim as ls
 from lqrsim.disturbances import MassMismatch, MeanWind
-from robust.common import ASKED, Config, progress, reached, run, safe_plan, share
+from robust.common import ASKED, Config, reached, run, safe_plan, share
 
 SPEED = 3.0  # m/s
 MASSES = (0.8, 1.2)

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 from numpy.random import Generator
-from paper.common import table
+from runner import progress, table
 
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.stress.statistics import rate
-from robust.common import Config, progress, run
+from robust.common import Config, run
 
 ASKED = 1e-3
 HALF = 3.0  # m, of the cube

@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
-from tqdm import tqdm
+from runner import Settings, progress
 
 import lqrsim as ls
 
@@ -34,7 +34,7 @@ TARGETS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     sections: tuple[Section, ...] = get_args(Section)
     """What to measure."""
     queries: int = 100
@@ -47,10 +47,6 @@ class Config:
     """Queries a turn, where the time of a single one does not matter."""
     reference: Path | None = None
     """Folder of the C++ reference."""
-    quick: bool = False
-    """8 queries, 2 rounds, small sizes; dynamics by hand with iLQR only."""
-    json: bool = False
-    """Print everything, query by query, as JSON instead of the tables."""
 
 
 def make_problems(config: Config) -> list[ls.Problem]:
@@ -61,10 +57,6 @@ def make_problems(config: Config) -> list[ls.Problem]:
 
 def make_batches(config: Config) -> list[slice]:
     return [slice(first, first + config.batch) for first in range(0, config.queries, config.batch)]
-
-
-def progress(what: Iterable[Any], name: str) -> Iterable[Any]:
-    return tqdm(what, desc=name, leave=False, delay=2.0, disable=None)
 
 
 def take_turns(

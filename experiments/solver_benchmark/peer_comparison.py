@@ -130,7 +130,7 @@ def _rollout(start, gain, offset, p, dt):
     return states, controls
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [f"peers, one thread: {'converged':>9} {'iterations':>11} {'ms/query':>9} {'(mean)':>8} {'mean cost':>10}"]
     for name, one in found.items():
         solved = f"{sum(one['converged'])}/{len(one['converged'])}"
@@ -139,4 +139,4 @@ def table(found: dict[str, Any]) -> str:
             f" {np.mean(one['milliseconds']):>8.1f} {np.mean(one['cost']):>10.2f}"
         )
     rows.append("  ms/query is the median; costs are from exactly the given start, recomputed in the same way for all")
-    return "\n".join(rows)
+    return ["\n".join(rows)]

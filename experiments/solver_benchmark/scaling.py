@@ -13,9 +13,10 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+from runner import progress
 
 import lqrsim as ls
-from solver_benchmark.common import MANY, Config, median, progress
+from solver_benchmark.common import MANY, Config, median
 
 # As many iterations as are asked for, and no safeguard that goes on after.
 SOLVERS: dict[str, Callable[..., ls.Solution]] = {
@@ -116,7 +117,7 @@ def _chain_rate(x: Any, u: Any, p: Any) -> list[Any]:
     return [*speed, *acceleration, *((u[i] - force[i]) / p.lag for i in range(count))]
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [f"scaling: {'states':>8} {'ms/iteration':>13} {'grows as n to the':>18} {'first call s':>13}   (150 steps)"]
     for solver in MANY:
         lines = [line for line in found["states"] if line["solver"] == solver]
@@ -137,7 +138,7 @@ def table(found: dict[str, Any]) -> str:
             )
         powers = [_power(lines[0], lines[-1], "steps", what) for what in ("milliseconds", "bytes")]
         rows.append(f"  {solver:<7} time grows as T to the {powers[0]:.2f}, memory as T to the {powers[1]:.3f}")
-    return "\n".join(rows)
+    return ["\n".join(rows)]
 
 
 def _power(a: dict[str, Any], b: dict[str, Any], along: str, what: str) -> float:

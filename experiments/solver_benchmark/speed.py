@@ -151,7 +151,7 @@ def load_reference(config: Config) -> ModuleType:
     return module
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [f"speed, one thread: {'ms/iteration':>22} {'in the loop':>12} {'iterations':>11} {'mean cost':>10}"]
     for solver in SOLVERS:
         for name in ("reference", "symbolic", "by hand", "compiled level"):
@@ -176,4 +176,4 @@ def table(found: dict[str, Any]) -> str:
             )
     if "reference" in found:
         rows.append(f"  reference: skipped: {found['reference']['skipped']}")
-    return "\n".join(rows)
+    return ["\n".join(rows)]

@@ -9,7 +9,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from solver_benchmark.common import Config, judge, median, progress, take_turns
+from runner import progress
+
+from solver_benchmark.common import Config, judge, median, take_turns
 
 _FIRST = "import lqrsim as ls; assert ls.smooth(ls.scenarios.quadrotor().problem).success"
 
@@ -45,7 +47,7 @@ def _wall(command: list[str], **environment: str) -> float:
     return seconds
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     what = {
         "--help": "lqrsim --help",
         "warm": "import, and solve a known structure",
@@ -60,4 +62,4 @@ def table(found: dict[str, Any]) -> str:
             f"  {what[name]:<38} {one['seconds']:>5.2f} {min(one['all']):>7.2f} {max(one['all']):>7.2f}"
             f"  {judge(one['seconds'], name)}"
         )
-    return "\n".join(rows)
+    return ["\n".join(rows)]

@@ -64,7 +64,7 @@ def _processor_seconds() -> float:
     return (user + nice + system + sum(rest[:3])) / os.sysconf("SC_CLK_TCK")
 
 
-def table(found: dict[str, Any]) -> str:
+def report(found: dict[str, Any]) -> list[str]:
     rows = [f"threads: {'one, s':>12} {'two, s':>8} {'speed-up':>9} {'processors had':>15} {'by others':>10}"]
     for solver, one in found.items():
         busy = one["processors_of_others"] > (os.cpu_count() or 2) - 2 + 0.2  # too few are left for two threads
@@ -75,4 +75,4 @@ def table(found: dict[str, Any]) -> str:
         )
         if not one["same_costs"]:
             rows.append(f"  {solver:<8} COSTS DIFFER between one thread and two")
-    return "\n".join(rows)
+    return ["\n".join(rows)]

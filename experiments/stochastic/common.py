@@ -1,11 +1,11 @@
 """The noises and problems that all sections share, and how two plans are compared on the same trials."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import erfc, sqrt
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from paper.common import Settings
+from runner import FolderSettings, at_most
 
 import lqrsim as ls
 from lqrsim import rotations
@@ -14,7 +14,7 @@ PLACE, WIDTH = (0.6, 0.2), 0.5  # of the oil, in m: on the drive's way
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Settings):
+class Config(FolderSettings):
     trials: int = 10_000
     """Of each plan, by the problem's own model."""
     queries: int = 20
@@ -26,13 +26,9 @@ class Config(Settings):
     seed: int = 0
     """Of what is drawn."""
 
-
-def few(config: Config) -> Config:
-    """What `--quick` comes to."""
-    return replace(
-        config, trials=min(config.trials, 500), queries=min(config.queries, 2), iterated=min(config.iterated, 3),
-        rounds=min(config.rounds, 2),
-    )  # fmt: skip
+    def bounded(self) -> Self:
+        """The settings, reduced by `--quick`."""
+        return at_most(self, trials=500, queries=2, iterated=3, rounds=2)
 
 
 def drive() -> ls.Problem:

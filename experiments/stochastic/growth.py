@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from paper.common import table
+from runner import table
 
 import lqrsim as ls
 from stochastic.common import Config, clearance, drive, gusts, jolts, quadrotor, rotors, slip

@@ -4,7 +4,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from paper.common import fixed, table
+from paper.common import fixed
+from runner import table
 
 import lqrsim as ls
 from stochastic.common import Config, quadrotor, rotors

@@ -4,7 +4,7 @@ import time
 from statistics import median
 from typing import Any
 
-from paper.common import table
+from runner import table
 
 import lqrsim as ls
 from stochastic.common import Config, drive, gusts, jolts, quadrotor, rotors, slip

@@ -14,16 +14,17 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-from tqdm import tqdm
-
 from lqrsim.stress.results import Results
+
+sys.path.append(str(Path(__file__).parents[2] / "experiments"))  # has the runner
+
+from runner import Result, Settings, at_most, opening, progress, run
+
+WANTED = ("every trial once", "tables identical to the bit")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
-    quick: bool = False
-    """Three kills."""
+class Config(Settings):
     kills: int = 20
     """How often the driver is killed."""
     trials: int = 1000
@@ -32,27 +33,19 @@ class Config:
     """Of the moments at which it is killed."""
 
 
-def main(config: Config) -> int:
-    kills, draws = 3 if config.quick else config.kills, random.Random(config.seed)
+def main(config: Config) -> Result:
+    config = at_most(config, kills=3)
+    draws = random.Random(config.seed)
     command = [sys.executable, "-m", "lqrsim.cli", "stress", "quadrotor", "--policies", "smooth", "open_loop"]
-    command += [
-        "--sweep",
-        "scenario",
-        "--strengths",
-        "1",
-        "--trials",
-        str(config.trials),
-        "--shard",
-        str(max(1, config.trials // 25)),
-        "--out",
-    ]
+    command += ["--sweep", "scenario", "--strengths", "1", "--trials", str(config.trials)]
+    command += ["--shard", str(max(1, config.trials // 25)), "--out"]
     with tempfile.TemporaryDirectory() as temporary:
         alone, killed = Path(temporary) / "alone", Path(temporary) / "killed"
         begun = time.monotonic()
         finish([*command, str(alone)])
         seconds = time.monotonic() - begun
         there = []
-        for _ in tqdm(range(kills), desc="killing the driver", leave=False, delay=2.0, disable=None):
+        for _ in progress(range(config.kills), "killing the driver"):
             # Anywhere between the start of the program and its end, so that it also hits the solving and the writing.
             with subprocess.Popen(
                 [*command, str(killed)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -64,9 +57,17 @@ def main(config: Config) -> int:
         same = tables(alone) == tables(killed)
         rows = [sorted(Results(killed).outcomes(cell).trial.tolist()) for cell in Results(killed).cells]
     whole = all(row == list(range(config.trials)) for row in rows)
-    print(f"shards that were there after each of {kills} kills, of {2 * 25}: {' '.join(map(str, there))}")
-    print(f"every trial once: {'yes' if whole else 'NO'}; tables identical to the bit: {'yes' if same else 'NO'}")
-    return 0 if same and whole else 1
+    return opening(config) | {"shards": there, "every trial once": whole, "tables identical to the bit": same}
+
+
+def report(result: Result) -> str:
+    there = result["shards"]
+    shards = f"shards that were there after each of {len(there)} kills, of {2 * 25}: {' '.join(map(str, there))}"
+    return "\n".join([shards, *(f"{what}: {'yes' if result[what] else 'NO'}" for what in WANTED)])
+
+
+def failures(result: Result) -> list[str]:
+    return [what for what in WANTED if not result[what]]
 
 
 def finish(command: list[str]) -> None:
@@ -79,4 +80,4 @@ def tables(folder: Path) -> dict[str, bytes]:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Config)))
+    run(Config, main, report, __doc__, failures=failures)

@@ -12,31 +12,28 @@ known        Problems of which the answer is known beforehand, whole_problems/kn
 certificate  What the certificate costs of a solve, on the paper's queries and on warm starts.
 """
 
-import dataclasses
-import json
 import statistics
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
 import lqrsim as ls
 from lqrsim.machine import processors
 from lqrsim.solvers.attempt import Attempt
-from lqrsim.versions import versions
 
-sys.path.append(str(Path(__file__).parents[2] / "experiments"))  # has the systems and the independent judge
+sys.path.append(str(Path(__file__).parents[2] / "experiments"))  # has the runner, the systems and the independent judge
 
 from oracle import planar_quadrotor
+from runner import Result, Settings, at_most, opening, run
 from whole_problems import known
 from whole_problems.claims import contradictions
 from whole_problems.draws import KINDS, draw, solve
@@ -45,7 +42,7 @@ Section = Literal["drawn", "planar", "known", "certificate"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     sections: tuple[Section, ...] = get_args(Section)
     """What to measure."""
     problems: int = 10_000
@@ -56,16 +53,11 @@ class Config:
     """Of the random problems."""
     queries: int = 100
     """How many of the quadrotor's for what the certificate costs."""
-    quick: bool = False
-    """110 problems, 6 starts and goals, 10 queries."""
-    json: bool = False
-    """Print everything as JSON instead of the tables."""
 
 
-def main(config: Config) -> dict[str, Any]:
-    if config.quick:
-        config = dataclasses.replace(config, problems=min(config.problems, 110), queries=min(config.queries, 10))
-    result: dict[str, Any] = {"config": asdict(config), "versions": versions(), "processors": processors()}
+def main(config: Config) -> Result:
+    config = at_most(config, problems=110, queries=10)
+    result = opening(config)
     for name in config.sections:
         result[name] = {"drawn": _drawn, "planar": _planar, "known": _known, "certificate": _certificate}[name](config)
     return result
@@ -216,12 +208,10 @@ def report(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def failures(result: Result) -> list[str]:
+    rows = [result.get("drawn", {"false": []}), *result.get("planar", {}).values(), *result.get("known", {}).values()]
+    return [false for row in rows for false in row["false"]]
+
+
 if __name__ == "__main__":
-    settings = tyro.cli(Config, description=__doc__)
-    outcome = main(settings)
-    print(json.dumps(outcome) if settings.json else report(outcome))
-    wrong = [
-        *outcome.get("drawn", {}).get("false", []),
-        *(w for name in ("planar", "known") for row in outcome.get(name, {}).values() for w in row["false"]),
-    ]
-    raise SystemExit(1 if wrong else 0)
+    run(Config, main, report, __doc__, failures=failures)

@@ -14,38 +14,29 @@ files   Solutions, rollouts and campaigns with flipped bits, other members, othe
         printed with its number; --sections files --first NUMBER --mutations 1 repeats it.
 """
 
-import dataclasses
-import json
 import sys
-from dataclasses import asdict
-from types import ModuleType
-from typing import Any
+from pathlib import Path
 
-import tyro
+sys.path.append(str(Path(__file__).parents[2] / "experiments"))  # has the runner
+
 from robustness import api, files
-from robustness.common import Config, Section
+from robustness.common import Config
+from runner import Result, Section, measure, opening, report_of, run
 
-from lqrsim.versions import versions
-
-SECTIONS: dict[Section, ModuleType] = {"api": api, "files": files}
-
-
-def main(config: Config) -> dict[str, Any]:
-    if config.quick:
-        quick = {"calls": max(1, config.calls // 50), "mutations": max(1, config.mutations // 50)}
-        config = dataclasses.replace(config, **quick)
-    result: dict[str, Any] = {"config": asdict(config), "versions": versions()}
-    for name in config.sections:
-        result[name] = SECTIONS[name].measure(config)
-    return result
+SECTIONS = {"api": Section(api), "files": Section(files)}
 
 
-def report(result: dict[str, Any]) -> str:
-    return "\n\n".join(section.table(result[name]) for name, section in SECTIONS.items() if name in result)
+def main(config: Config) -> Result:
+    return measure(config.bounded(), SECTIONS, opening(config))
+
+
+def report(result: Result) -> str:
+    return "\n\n".join(report_of(SECTIONS, result))
+
+
+def failures(result: Result) -> list[str]:
+    return [failed for name in SECTIONS if name in result for failed in result[name]["failures"]]
 
 
 if __name__ == "__main__":
-    settings = tyro.cli(Config, description=__doc__)
-    outcome = main(settings)
-    print(json.dumps(outcome) if settings.json else report(outcome))
-    sys.exit(any(outcome[name]["failures"] for name in SECTIONS if name in outcome))
+    run(Config, main, report, __doc__, failures=failures)

@@ -209,7 +209,7 @@ def measure(config: Any) -> dict[str, Any]:
     return {"calls": kinds.total(), "subjects": len(tried), "kinds": dict(kinds), "failures": failures}
 
 
-def table(result: dict[str, Any]) -> str:
+def report(result: dict[str, Any]) -> list[str]:
     """The counts, and each failure with how to repeat it."""
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(result["kinds"].items()))
     lines = [f"api: {result['calls']} hostile calls of {result['subjects']} public callables: {kinds}"]
@@ -217,4 +217,4 @@ def table(result: dict[str, Any]) -> str:
         f"  {one['kind']} at --first {one['number']} --calls 1: {one['subject']}({one['what']}): {one['why']}"
         for one in result["failures"]
     ]
-    return "\n".join([*lines, f"  {len(result['failures'])} raw exceptions, hangs and deaths"])
+    return ["\n".join([*lines, f"  {len(result['failures'])} raw exceptions, hangs and deaths"])]

@@ -3,14 +3,16 @@
 import contextlib
 import signal
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
+
+from runner import Settings
 
 Section = Literal["api", "files"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Settings):
     sections: tuple[Section, ...] = get_args(Section)
     """What to try."""
     calls: int = 20_000
@@ -23,10 +25,11 @@ class Config:
     """Number of the first call or file: --first N --calls 1 repeats call N alone, --first N --mutations 1 file N."""
     only: str = ""
     """Only callables with this in their name."""
-    quick: bool = False
-    """A fiftieth of it."""
-    json: bool = False
-    """Print all that is counted as JSON."""
+
+    def bounded(self) -> "Config":
+        """The settings; with `--quick` a fiftieth of the calls and files."""
+        few = {"calls": max(1, self.calls // 50), "mutations": max(1, self.mutations // 50)}
+        return replace(self, **few) if self.quick else self
 
 
 class Hang(BaseException):

@@ -319,7 +319,7 @@ def measure(config: Config) -> dict[str, Any]:
     return {"counts": counted, "seconds": time.monotonic() - begun, "failures": failures}
 
 
-def table(result: dict[str, Any]) -> str:
+def report(result: dict[str, Any]) -> list[str]:
     """The counts, and each failure with how to repeat it."""
     kinds = ("refused", "identical", "accepted", *FAILURES)
     lines = [f"{'spoilt files of a':<18}{'all':>8}" + "".join(f"{kind:>11}" for kind in kinds)]
@@ -332,4 +332,4 @@ def table(result: dict[str, Any]) -> str:
         f"{one['kind']}: --first {one['number']} --mutations 1: {one['subject']}, {one['what']}: {one['why']}"
         for one in result["failures"]
     ]
-    return "\n".join([*lines, f"{len(result['failures'])} failures in {result['seconds']:.0f} s"])
+    return ["\n".join([*lines, f"{len(result['failures'])} failures in {result['seconds']:.0f} s"])]
