@@ -107,7 +107,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _parse(arguments: list[str]) -> Any:
-    """The command, with its options. With `--json` a usage error is returned as one line, instead of printed in a box."""
+    """Parse the arguments into a command. With `--json` a usage error is returned as a line, not printed in a box."""
     import tyro
 
     from lqrsim.commands import Command
