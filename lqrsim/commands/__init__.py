@@ -4,7 +4,7 @@ Heavy modules are imported inside `run`, so that `--help` answers at once.
 """
 
 import inspect
-from typing import Annotated, Union
+from typing import Annotated, Any, Union
 
 from tyro.conf import subcommand
 
@@ -23,4 +23,4 @@ _ALL = (
 NAMES: dict[type, str] = {kind: kind.__name__.removesuffix("Command").lower() for kind in _ALL}
 # Name -> the first line of its help.
 COMMANDS = {name: (inspect.getdoc(kind) or "").partition("\n")[0] for kind, name in NAMES.items()}
-Command = Union[tuple(Annotated[kind, subcommand(name)] for kind, name in NAMES.items())]  # noqa: UP007 - it is computed
+Command: Any = Union[tuple(Annotated[kind, subcommand(name)] for kind, name in NAMES.items())]  # noqa: UP007 - computed

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -130,7 +130,7 @@ class WrenchNoise(GaussianDisturbance):
     """Base class of random forces and torques, redrawn each control period and held over it."""
 
     along = "xyz"
-    kind: ClassVar[str]  # the field of Effect
+    kind: ClassVar[Literal["force", "torque"]]
     unit: ClassVar[str]
 
     def describe(self, plant: Plant) -> str:
@@ -138,7 +138,11 @@ class WrenchNoise(GaussianDisturbance):
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         vectors = fit(self, self.std, self.along) * normal(generators, plan.steps, 3)
-        return Effect(**{self.kind: lambda step, states: vectors[:, step]})
+
+        def push(step: int, states: Array) -> Array:
+            return vectors[:, step]
+
+        return Effect(force=push) if self.kind == "force" else Effect(torque=push)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         axes = zip(self.along, fit(self, self.std, self.along).tolist(), strict=True)
