@@ -225,7 +225,7 @@ class TestCounts:
             clearance=None, candidates=(), multipliers=(),
         )  # fmt: skip
         line = refusal(lambda: ls.simulate(differential_drive.plant(), endless))
-        assert "10000 control periods of 100 s, which are 120000000 physics steps, want at most 100000000" in line
+        assert "10000 control periods of 100 s, which takes 120000000 physics steps, want at most 100000000" in line
 
 
 class TestDataThatUsersBuild:
