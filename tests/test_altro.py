@@ -126,8 +126,10 @@ def test_quick_run_counts_what_keeps_the_constraints_at_least_cost() -> None:
         assert one["iterations"] > 1
     least = cheapest_double_integrator()
     assert found["double_integrator"]["cost"] == pytest.approx(least, rel=1e-5)
-    counted = sum(one["iterations"] <= one["theirs"] for one in found.values())
+    counted = sum(one["to target"] <= one["theirs"] for one in found.values())
     assert f"or fewer: in {counted} of 2" in said["report"]
+    assert all(1 < one["to target"] <= one["iterations"] for one in found.values())
+    assert [one["target"] for one in found.values()] == [0.74409, 0.02455]
 
 
 def cheapest_double_integrator() -> float:

@@ -83,10 +83,11 @@ from lqrsim.results.hashing import sha256
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import compiled
-from lqrsim.solvers.attempt import Attempt
-from lqrsim.solvers.common import SmootherSettings, Stop
+from lqrsim.solvers.budget import Budget
+from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.initial_guess import resolve
 from lqrsim.solvers.interior_point import Stages
+from lqrsim.solvers.settings import SmootherSettings
 
 MEMORY = 1 << 20  # numbers from which an array is memory at an address, which has no end
 MADE: dict[Any, Entry] = {}  # what was compiled, by all that it depends on
@@ -323,8 +324,8 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
     """
     wanted = settings_of(form=form)
     begin = np.zeros(3) if one.start is None else one.start
-    attempt = Attempt(one, wanted, resolve(start, one), begin, Stop())
-    work, log = attempt.work, np.zeros(3, LOG)
+    run = SolveRun(one, wanted, resolve(start, one), begin, Budget(wanted.max_iterations))
+    work, log = run.work, np.zeros(3, LOG)
     for array in work.multipliers:
         array[0] = penalty
         array[declarations.HEADER :] = 0.5
@@ -337,18 +338,18 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
         return
     for done in range(len(log)):
         work.memory["plan_cost"] = np.inf  # or rounding decides which plan is the best, of two that are as good
-        replay(source, sizes, "smoother", *with_rows(attempt._arguments(done, done + 1, log)), but=but)
-    attempt.roll_out()
+        replay(source, sizes, "smoother", *with_rows(run._arguments(done, done + 1, log)), but=but)
+    run.roll_out()
     work.memory["merit"] = work.memory["plan_cost"]
     work.memory["reach"], work.memory["ilqr_next"] = (1.0, 2.0) if task != "reach" else (0.0, 2.0)
     trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
     log = np.zeros(2, LOG)
     for done in range(2 if task else 0):
-        arguments = attempt._damped_arguments(done, done + 1, log, 2, trial)
+        arguments = run._damped_arguments(done, done + 1, log, 2, trial)
         replay(source, sizes, "smoother", *with_rows(arguments), but=but)
-    found = attempt.result(replace(attempt.termination, outcome=declarations.MAX_ITERATIONS))
+    found = run.result(replace(run.ending, outcome=declarations.MAX_ITERATIONS))
     for check in (declarations.CERTIFY, declarations.EVALUATE) if task else ():
-        arguments = attempt._check_arguments(check, found, work.arrays.to_go, np.zeros(1, CERTIFICATE))
+        arguments = run._check_arguments(check, found, work.arrays.to_go, np.zeros(1, CERTIFICATE))
         replay(source, sizes, "smoother", *with_rows(arguments))
 
 
@@ -464,12 +465,13 @@ class Begun:
 
     def __init__(self, one: ls.Problem, form: str = "dual", start: Any = None, **changed: Any) -> None:
         begin = np.zeros(3) if one.start is None else one.start
-        self.attempt = Attempt(one, settings_of(form=form, **changed), resolve(start, one), begin, Stop())
-        self.work, self.log = self.attempt.work, np.zeros(20, LOG)
+        settings = settings_of(form=form, **changed)
+        self.run = SolveRun(one, settings, resolve(start, one), begin, Budget(settings.max_iterations))
+        self.work, self.log = self.run.work, np.zeros(20, LOG)
         self.source, self.sizes = compiled._with_form(form, "entry_points"), sizes_of(one)
 
     def iterate(self, first: int, last: int, **changed: Any) -> tuple[Any, ...]:
-        given = list(self.attempt._arguments(first, last, self.log))
+        given = list(self.run._arguments(first, last, self.log))
         given[3] = given[3]._replace(**changed)
         return replay(self.source, self.sizes, "smoother", *with_rows(tuple(given)))
 
@@ -477,7 +479,7 @@ class Begun:
         for name, number in memory.items():
             self.work.memory[name] = number
         trial = Motion(np.zeros_like(self.work.states), np.zeros_like(self.work.controls))
-        given = self.attempt._damped_arguments(first, last, self.log, last + 1, trial)
+        given = self.run._damped_arguments(first, last, self.log, last + 1, trial)
         return replay(self.source, self.sizes, "smoother", *with_rows(given))
 
 
@@ -490,9 +492,9 @@ def descended(
     """
     settings = settings_of(form=form, finish="newton", tolerance=tolerance)
     begin = np.zeros(3) if one.start is None else one.start
-    attempt = Attempt(one, settings, resolve(None, one), begin, Stop())
-    attempt.run(1, each=False)
-    work, log, outcome = attempt.work, np.zeros(count, LOG), declarations.RUNNING
+    run = SolveRun(one, settings, resolve(None, one), begin, Budget(settings.max_iterations))
+    run.smooth(1)
+    work, log, outcome = run.work, np.zeros(count, LOG), declarations.RUNNING
     work.memory["merit"], work.memory["share"] = work.memory["plan_cost"], -1.0
     for name, number in memory.items():
         work.memory[name] = number
@@ -504,7 +506,7 @@ def descended(
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     for done in range(count):
         if outcome == declarations.RUNNING:
-            arguments = attempt._newton_arguments(done, done + 1, log, count, trial)
+            arguments = run._newton_arguments(done, done + 1, log, count, trial)
             _, outcome, _, _ = replay(source, sizes, "smoother", *with_rows(arguments), but=but)
     return outcome
 
@@ -564,9 +566,9 @@ class TestRareEnds:
     def test_iterations_that_get_nowhere(self) -> None:
         """The plan has converged; with a tolerance of zero it never settles."""
         one = Begun(problem(), max_iterations=20)
-        *given, log = one.attempt._arguments(0, 19, one.log)
+        *given, log = one.run._arguments(0, 19, one.log)
         given[3] = given[3]._replace(tolerance=0.0)
-        done, outcome, *_ = one.attempt._loop(*given, log)
+        done, outcome, *_ = one.run._loop(*given, log)
         assert outcome == declarations.CYCLING
         one.work.memory["plan_cost"] = 0.0  # or rounding would decide which plan is the best
         assert one.iterate(done, done + 1, tolerance=0.0)[1] == declarations.CYCLING
@@ -596,7 +598,7 @@ class TestRareEnds:
     def test_damped_iterations_that_are_rejected(self) -> None:
         """A merit that no step can have; then with a weight, which grows, and falls again."""
         one = Begun(problem())
-        one.attempt._loop(*one.attempt._arguments(0, 2, one.log))
+        one.run._loop(*one.run._arguments(0, 2, one.log))
         begin = {"reach": 1.0, "ilqr_next": 2.0, "plan_cost": float(one.work.memory["plan_cost"])}
         assert one.damped(0, 3, merit=-1e9, **begin)[1] == declarations.RUNNING
         assert one.log["method"][:3].tolist() == [declarations.REJECTED] * 3

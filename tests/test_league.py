@@ -44,6 +44,7 @@ def test_a_quick_run_counts_what_keeps_the_constraints_at_altros_cost() -> None:
             assert family["targets"][0] == pytest.approx(1.001 * one["cost"][0])
         assert one["target"]["iterations"][0] > 0
         assert f"| {name} | lqrsim | 1 | 1 | 1 |" in said["report"]
+        assert one["cost"][0] <= 1.01 * family["best"][0]
 
 
 def test_an_untouched_plan_is_verified(solved: tuple[ls.Problem, ls.Solution]) -> None:

@@ -11,7 +11,7 @@ from oracle import kkt
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.results.solution_parts import Iteration, Status
-from lqrsim.solvers.multistart import bends, bold, guides, path
+from lqrsim.solvers.multistart import bends, guides, path, reweighted
 
 STARTS = ["straight", *(f"{far} m to the {side}" for far in (1, 2, 3) for side in ("left", "right"))]
 
@@ -159,7 +159,7 @@ def test_the_second_search_may_begin_within_an_obstacle(differential_drive) -> N
     of = differential_drive.problem.from_state((x + 0.1, y, np.pi / 2))
     with pytest.raises(ls.InputError, match="pillar_1"):
         replace(of)
-    harder, (weight,), (final,) = bold(of, 10.0), of.obstacle_costs, [of.final_cost]
+    harder, (weight,), (final,) = reweighted(of, 10.0), of.obstacle_costs, [of.final_cost]
     assert [one.weight for one in harder.obstacle_costs] == [10 * weight.weight]
     np.testing.assert_array_equal(harder.final_cost.terms[0].weight, 10 * final.weight)  # pyright: ignore[reportAttributeAccessIssue]
     solution = ls.smooth(of)

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+from altro_problems import missed
 from peers.box_fddp import BoxFddp
 from peers.shooting import TOLERANCE, Moment, Shooting
 
@@ -53,13 +54,13 @@ def _ours(solver: Callable[..., ls.Solution], problem: ls.Problem, *, compile: b
         solution = solver(problem, start=start, **options)
         seconds = np.cumsum([one.seconds for one in solution.iterations]).tolist()
         moments = [
-            Moment(number, when, one.cost, _missed(one))
+            Moment(number, when, one.cost, missed(one))
             for number, (when, one) in enumerate(zip(seconds, solution.iterations, strict=True), 1)
         ]
         exact = (
             moment
             for moment, one in zip(moments, solution.iterations, strict=True)
-            if solution.success and one.optimality <= TOLERANCE and _missed(one) < VIOLATION
+            if solution.success and one.optimality <= TOLERANCE and missed(one) < VIOLATION
         )
         return Run(
             plan=solution.trajectory, cost=solution.cost, status=solution.status.name, solved=solution.success,
@@ -86,11 +87,6 @@ def _ours_in_free_time(solver: Callable[..., ls.Solution]) -> Solve:
         )  # fmt: skip
 
     return solve
-
-
-def _missed(iteration: ls.types.Iteration) -> float:
-    """By how much constraints are missed; of the interior point, whose plans have gaps at first, the dynamics, too."""
-    return max(iteration.violation, iteration.gap) if iteration.method == "interior point" else iteration.violation
 
 
 def _first(moments: list[Moment], enough: Enough) -> Moment | None:

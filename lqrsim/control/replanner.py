@@ -18,7 +18,7 @@ from lqrsim.results.funnel import Funnel
 from lqrsim.results.hashing import sha256
 from lqrsim.results.plan import Plan
 from lqrsim.results.replan import Replan
-from lqrsim.solvers.common import workers
+from lqrsim.solvers.parallel import workers
 
 MEASURED = "measured"
 Computing = float | str | Callable[[np.random.Generator], float]

@@ -69,6 +69,7 @@ class Status(enum.StrEnum):
     CONVERGED = "converged"
     COST_CONVERGED = "cost converged"
     MAX_ITERATIONS = "max iterations"
+    STALLED = "stalled"
     TIME_LIMIT = "time limit"
     INTERRUPTED = "interrupted"
     INFEASIBLE = "infeasible"
@@ -100,8 +101,12 @@ _STATUS_TEXT = {
         'look at the gap, or solve with stop="optimal"',
     ),
     Status.MAX_ITERATIONS: (
-        "the iteration limit came first, or no step lowered the cost any more",
+        "the iteration limit came first",
         "raise max_iterations if the improvements still shrink; if they do not, try another start",
+    ),
+    Status.STALLED: (
+        "no step makes the plan better, though it is not within tolerance",
+        "try another start; scale states, controls and costs to similar sizes; or accept a larger tolerance",
     ),
     Status.TIME_LIMIT: (
         "the time limit came first; the plan is the best so far",

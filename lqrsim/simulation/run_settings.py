@@ -27,7 +27,7 @@ from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.effects import MakeGenerator, seeded
 from lqrsim.simulation.physics import part_of
 from lqrsim.simulation.plant import MOST_STEPS, Plant
-from lqrsim.solvers.common import check_threads
+from lqrsim.solvers.parallel import check_threads
 
 Progress = Callable[[int, int], object]
 Watch = Callable[[float, Array, npt.NDArray[np.bool_]], object]

@@ -18,8 +18,8 @@ import numpy as np
 from lqrsim.errors import Array
 from lqrsim.kernels.active_set import AIM, CONTROL, EQUALITY, INEQUALITY, KIND, LIMIT, SIZE
 from lqrsim.kernels.records import Motion
-from lqrsim.solvers.common import INSIDE
 from lqrsim.solvers.interior_point import AT_LIMIT, MIXES, REGULARISATION, Measures, Stages
+from lqrsim.solvers.settings import INSIDE
 
 STEPS = 12  # at most: what takes more does not get there
 PIVOTS, FEW = 15, 4  # of the rows in a convex problem, at most; and in one that need not be

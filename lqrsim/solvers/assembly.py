@@ -1,5 +1,6 @@
-"""From what a solver found to the `Solution` that users get."""
+"""Makes a `Solution` from the result of a run."""
 
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -13,35 +14,26 @@ from lqrsim.problem.costs import ObstacleCost
 from lqrsim.problem.problem import Problem
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
-from lqrsim.results.value_functions import Moments, Quadratic
+from lqrsim.results.solution_parts import Candidate, Iteration, Trajectory
+from lqrsim.solvers.engine import RunResult
 from lqrsim.versions import versions
 
 
 def assemble(
     problem: Problem,
+    found: RunResult,
+    log: Sequence[Iteration],
     *,
     solver: str,
     options: dict[str, object],
-    status: Status,
-    detail: str,
-    iterations: tuple[Iteration, ...],
-    states: Array,
-    controls: Array,
-    law: tuple[Array, Array],
-    certificate: Certificate,
-    gap: float,
-    inverse_law: tuple[Array, Array] | None = None,
-    cost_to_go: Quadratic | None = None,
-    cost_to_come: Quadratic | Moments | None = None,
-    multipliers: tuple[Multipliers, ...] = (),
     candidates: tuple[Candidate, ...] = (),
 ) -> Solution:
-    """The Solution of what a solver found, in memory of its own."""
-    states, controls, law = states.copy(), controls.copy(), (law[0].copy(), law[1].copy())
+    """Copy the result of a run into a Solution."""
+    assert found.certificate is not None
+    states, controls, law = found.states.copy(), found.controls.copy(), (found.law[0].copy(), found.law[1].copy())
+    inverse_law = found.values.get("inverse_law")
     if inverse_law is not None:
         inverse_law = inverse_law[0].copy(), inverse_law[1].copy()
-    cost_to_go, cost_to_come = _copied(cost_to_go), _copied(cost_to_come)
     if problem.noise is not None:
         options = options | {"noise": repr(problem.noise), "risk": problem.risk}
 
@@ -59,18 +51,18 @@ def assemble(
     }
     return Solution._assembled(
         later,
-        status=status,
-        detail=detail,
+        status=found.status,
+        detail=found.detail,
         policy=policy(*law, states[:-1]),
-        cost_to_go=cost_to_go,
-        cost_to_come=cost_to_come,
+        cost_to_go=_copied(found.values.get("cost_to_go")),
+        cost_to_come=_copied(found.values.get("cost_to_come")),
         trajectory=Trajectory(states, controls, problem.dt),
-        iterations=iterations,
-        certificate=certificate,
-        gap=gap,
+        iterations=tuple(log),
+        certificate=found.certificate,
+        gap=found.gap,
         solver=solver,
         options=options,
-        multipliers=multipliers,
+        multipliers=found.multipliers,
         candidates=candidates,
         versions=versions(),
         goal=problem.weighed_goal,
@@ -79,14 +71,14 @@ def assemble(
 
 
 def _copied(value: Any) -> Any:
-    """A value function in memory of its own."""
+    """A copy of a value function."""
     if value is None:
         return None
     return type(value)(*(np.array(getattr(value, field.name)) for field in fields(value)))
 
 
 def goal_radius_of(problem: Problem) -> float | None:
-    """The robot's radius, where the goal has a position, and the problem obstacles that know it; None for a point."""
+    """The robot's radius, from its obstacle costs and clearances; None without these, or without a goal position."""
     goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
     if not position or (goal is not None and np.isnan(goal[position]).all()):
         return None
@@ -96,7 +88,7 @@ def goal_radius_of(problem: Problem) -> float | None:
 def clearance_of(problem: Problem, states: Array) -> Array | None:
     """Signed distance to the nearest obstacle minus the robot's radius, (T+1,); None without obstacles.
 
-    Of a robot of several balls it is the least of theirs.
+    For a robot of several collision spheres it is the smallest of theirs.
     """
     space = problem.dynamics.state_coordinates
     place = states[:, list(space.position)]

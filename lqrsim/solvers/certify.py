@@ -1,6 +1,7 @@
-"""The last look before a solver says that it converged: is the plan what the solution claims, by the problem itself?
+"""Certificates: before a solver reports success, its plan is checked against the problem itself.
 
-`certificate.py` works the numbers out, on a path of its own; here they are held against what is claimed.
+`kernels/certificate.py` recomputes cost, dynamics, policy and optimality on a code path of its own; this module
+compares them with what the solver claims.
 """
 
 from collections.abc import Callable
@@ -16,13 +17,13 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Certificate
 from lqrsim.results.value_functions import Quadratic
 
-# What rounding may do. A policy's control is a sum of a few terms, and a step of the dynamics some hundred operations,
-# of which one amplifies what another has rounded.
+# Tolerances for rounding. A policy's control is a sum of a few terms; a step of the dynamics is some hundred
+# operations, which amplify each other's rounding errors.
 LAW, MOTION, COST = 1e-11, 1e-8, 1e-8
-# Costs are sums, of which something remains where all cancels: a share of the parts.
+# Where the terms of a cost cancel, a rounding error remains that is relative to the terms.
 REST = 1e-13
-# The optimality is worked out otherwise than by the method, with gains and Hessians about states that are within the
-# gap's tolerance of the plan: it may come out a little larger.
+# The optimality is computed about the plan, the solver's about states within the gap tolerance of it: the certificate's
+# may be a little larger.
 SLACK = 2.0
 
 
@@ -40,13 +41,13 @@ def certified(
     claimed: float | None,
     tolerance: float | None,
 ) -> tuple[Certificate, str]:
-    """The certificate of a plan, and what of it contradicts a solver that says it converged.
+    """Certify a plan; also return, in words, what contradicts a solver that claims convergence.
 
     Args:
-      work: runs the compiled `certify`: of a task, a cost-to-go, and where to write (1,).
+      work: runs the compiled `certify` for a task and a cost-to-go, and writes its results to an array (1,).
       states: (T+1, n) of the plan. value: the cost-to-go; None where there is none.
       violation: by how much the worst constraint is missed. kept: whether that is within the equalities' tolerance.
-      claimed: the cost that the log ends with; None where success is not claimed, and nothing can contradict it.
+      claimed: the last cost in the log; None where the solver does not claim success.
       tolerance: of the optimality; None where only the cost was asked for.
     """
     numbers, n = np.zeros(1, CERTIFICATE), states.shape[1]
@@ -75,7 +76,7 @@ def _parts(value: Quadratic) -> tuple[Array, Array, Array]:
 
 
 def certificate_of(problem: Problem, found: np.void, states: Array, *, violation: float) -> Certificate:
-    """The certificate of a plan with states (T+1, n), given what `certificate.certify` wrote."""
+    """Make the certificate of a plan with states (T+1, n) from the numbers that `certificate.certify` wrote."""
     cost, scale, motion, law, limits, decrease = (float(found[name]) for name in CERTIFICATE.names or ())
     start = 0.0
     if isinstance(problem.initial, FixedState):
@@ -92,10 +93,10 @@ def certificate_of(problem: Problem, found: np.void, states: Array, *, violation
 def faults(
     certificate: Certificate, *, claimed: float, rest: float, tolerance: float | None, kept: bool = False
 ) -> str:
-    """What of it contradicts a solver that says it converged; empty where nothing does.
+    """List what contradicts a claim of convergence, in words; empty if nothing does.
 
     Args:
-      claimed: the cost that the log ends with. rest: what rounding may leave of a cost where all of it cancels.
+      claimed: the cost that the log ends with. rest: the rounding error of a cost whose terms cancel.
       tolerance: of the optimality; None where only the cost was asked for.
       kept: whether the violation is that of equalities within their tolerance.
     """

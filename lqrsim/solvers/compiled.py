@@ -1,8 +1,8 @@
-"""From a problem to its compiled passes and back: addresses of what the problem brings, and its numbers.
+"""The compiled passes of a problem, and their arguments: addresses of the problem's functions, and its numbers.
 
-The passes and iterations are compiled once for a size. Dynamics, each term of a cost, each constraint and the noise are
-compiled on their own, behind the C signatures of `codegen/compiled_module.py`, and the passes call them by their
-addresses. Everything that is a number (goal, weights, masses, obstacles, horizon) is an argument.
+Passes and iterations are compiled once per size. Dynamics, each cost term, each constraint and the noise are compiled
+separately, behind the C signatures of `codegen/compiled_module.py`, and called by address.
+Everything that is a number (goal, weights, masses, obstacles, horizon) is an argument.
 """
 
 import functools
@@ -42,7 +42,7 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import NoiseTerm, numbers_of
 from lqrsim.problem.problem import FixedState, Problem
 
-# The forms of the cost-to-come, and what brings each.
+# The forms of the cost-to-come, and the kernels of each.
 FORMS = {"dual": cost_to_come_dual, "primal": cost_to_come_primal}
 _OF_FORM = (
     "initial_cost_to_come", "linearize", "forward_jacobian", "riccati_forward", "smoothed_state", "previous_state",
@@ -50,7 +50,7 @@ _OF_FORM = (
 
 
 def core(problem: Problem, form: str = "dual") -> CompiledModule:
-    """The compiled passes and iterations for problems of this size; `kernels/entry_points.py` has what they offer."""
+    """The compiled passes and iterations for problems of this size; see `kernels/entry_points.py`."""
     noisy = problem.noise_term is not None
     sizes = _sizes(problem.dynamics)
     what = f"{sizes['N']} states and {sizes['M']} controls{' with noise' if noisy else ''}"
@@ -59,7 +59,7 @@ def core(problem: Problem, form: str = "dual") -> CompiledModule:
 
 
 def linear_quadratic(n: int, m: int, form: str) -> CompiledModule:
-    """Those for linear-quadratic problems of that size; see `kernels/linear_quadratic_passes.py`."""
+    """The compiled passes for linear-quadratic problems of that size; see `kernels/linear_quadratic_passes.py`."""
     what = f"linear-quadratic problems, {n} states and {m} controls"
     return module_of(_with_form(form, "linear_quadratic_passes"), what, N=n, M=m, W=n + m, NOISY=0)
 
@@ -76,7 +76,7 @@ def _sizes(dynamics: Dynamics) -> dict[str, int]:
 
 
 def structure(problem: Problem) -> tuple[Any, ...]:
-    """What problems have in common that are solved without compiling anything between them."""
+    """A key that is equal for problems that share all their compiled code."""
     costs = tuple(tuple((term.code, term.nonconvex_in) for term in problem.terms(field)) for field in _FIELDS)
     constraints = tuple((one.code, one.uses_control, one.equality, one.balls) for one in problem.constraint_terms)
     term = problem.noise_term
@@ -88,11 +88,11 @@ _FIELDS = ("initial", "stage_cost", "final_cost")
 
 
 def arguments(problem: Problem, *, multipliers: Sequence[Array] = (), second_order: bool = False) -> ProblemModel:
-    """The problem as the passes take it; compiles what it brings, if that is new.
+    """The arguments of the passes; compiles the problem's functions if they are new.
 
     Args:
       multipliers: of each constraint, as `augmented_lagrangian.py` has them; by default none act.
-      second_order: whether second derivatives of the dynamics are wanted, too.
+      second_order: whether the passes need second derivatives of the dynamics.
     """
     multipliers = multipliers or [no_multipliers(problem, term) for term in problem.constraint_terms]
     pairs = list(zip(problem.constraint_terms, multipliers, strict=True))
@@ -107,21 +107,21 @@ def arguments(problem: Problem, *, multipliers: Sequence[Array] = (), second_ord
 
 
 def dynamics_model(dynamics: Dynamics, *, second_order: bool = False) -> DynamicsModel:
-    """Dynamics as compiled code takes them, with second derivatives where these are wanted."""
+    """The dynamics' functions and parameters for compiled code."""
     advance, step_jacobian = dynamics.compiled.addresses("advance", "step_jacobian")
     curvature = dynamics.step_curvature if second_order else 0.0
     return DynamicsModel(advance, step_jacobian, curvature, numbers(dynamics))
 
 
 def numbers(part: Dynamics | CostTerm | ConstraintTerm) -> Array:
-    """The numbers that a part reads: the addresses of its functions, then its own."""
+    """The data of a part for compiled code: the addresses of its functions, then its numbers."""
     if not part.functions:
         return part.data
     return np.concatenate([[address_of(function) for function in part.functions], part.data])
 
 
 def cost_terms(problem: Problem, field: str) -> list[CostTerm]:
-    """The terms of a cost in the order of `CostModel`: those that may be indefinite come first."""
+    """The terms of a cost, those that may be indefinite first, as `CostModel` has them."""
     return sorted(problem.terms(field), key=lambda term: term.nonconvex_in is None)
 
 
@@ -181,7 +181,7 @@ def _noise(problem: Problem, term: NoiseTerm) -> NoiseModel:
 
 
 def noisy_costs(problem: Problem, start: Array, policy: Policy, draws: Array) -> Array:
-    """What runs of a policy from a state (n,) cost, (K,), the noise drawn: (K, T, size)."""
+    """Costs (K,) of runs of a policy from a state (n,), with noise samples (K, T, size)."""
     assert problem.noise_term is not None
     costs, steps = np.empty(len(draws)), problem.steps
     flat = draws.reshape(-1, draws.shape[2])
@@ -191,7 +191,7 @@ def noisy_costs(problem: Problem, start: Array, policy: Policy, draws: Array) ->
 
 
 def costs_module(problem: Problem) -> CompiledModule:
-    """`kernels/model_functions.py` for Python to call."""
+    """The compiled `kernels/model_functions.py`, which evaluates costs and constraints for Python."""
     sizes = _sizes(problem.dynamics)
     return module_of(source_of(model_functions), f"costs of {sizes['N']} states and {sizes['M']} controls", **sizes)
 
@@ -205,7 +205,7 @@ def costs_of(problem: Problem, states: Array, controls: Array) -> Array:
 
 
 class CostsByStep:
-    """The parts of `costs_of` of a problem, one step at a time."""
+    """Evaluates a problem's costs one step at a time."""
 
     def __init__(self, problem: Problem) -> None:
         self._module, self._steps, self._model = costs_module(problem), problem.steps, arguments(problem)
@@ -215,7 +215,7 @@ class CostsByStep:
         return self._each(t, states, controls, self._model.stage)
 
     def final(self, states: Array, controls: Array) -> Array:
-        """Final costs (K,) of states (K, n) that controls (K, m) led to."""
+        """Final costs (K,) of states (K, n), reached by controls (K, m)."""
         return self._each(self._steps, states, controls, self._model.final)
 
     def _each(self, t: int, states: Array, controls: Array, cost: CostModel) -> Array:
@@ -227,10 +227,10 @@ class CostsByStep:
 def rollout(
     problem: Problem, gain: Array, offset: Array, state: Array, *, dt: float | None = None
 ) -> tuple[Array, Array]:
-    """Where the laws u_t = gain_t x + offset_t lead from a state, by the model.
+    """Roll out the policy u_t = gain_t x + offset_t from a state, by the model.
 
-    Gains (T, m, n), offsets (T, m); returns states (T+1, n) and controls (T, m). T is the number of laws, and `dt` how
-    long each is in force, by default the problem's control period.
+    Gains (T, m, n), offsets (T, m); returns states (T+1, n) and controls (T, m). `dt` is the control period in seconds,
+    by default the problem's.
     """
     model = arguments(problem)
     model = model if dt is None else model._replace(dt=float(dt))
@@ -242,7 +242,7 @@ def rollout(
 
 
 def no_multipliers(problem: Problem, term: ConstraintTerm, tolerance: float = 0.0, price: float = np.inf) -> Array:
-    """Those of a constraint that does not act yet; see `kernels/augmented_lagrangian.py`."""
+    """The multipliers of a constraint that does not act yet; see `kernels/augmented_lagrangian.py`."""
     # A fixed start cannot change; its control can.
     first = 1 if isinstance(problem.initial, FixedState) and not term.uses_control else 0
     first, spare = problem.steps if term.final_only else first, 0.0 if term.equality else tolerance

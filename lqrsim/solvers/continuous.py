@@ -107,12 +107,12 @@ def _model(stage: Stage, n: int, m: int) -> Model:
 
 
 def _end(field: str, cost: Quadratic, n: int) -> Array:
-    """An initial or final cost as V (n+1, n+1). Raises InputError if it is none of n states."""
+    """An initial or final cost as V (n+1, n+1). Raises InputError unless it is a quadratic of n states."""
     return bordered(*check_end(field, cost, n))
 
 
 def _check_minimum(backward: Pass, forward: Pass) -> None:
-    """Look at the total cost wherever a pass stopped. Raises IntegrationFailure where it has no single minimum."""
+    """Check that the total cost has one minimum at every step of the passes. Raises IntegrationFailure."""
     times = np.union1d(backward.times, forward.times)
     total = backward.at(times)[0] + forward.at(times)[0]
     spectrum = np.linalg.eigvalsh(total[:, :-1, :-1])
@@ -204,7 +204,7 @@ class _Limits(NamedTuple):
 
 
 def _initial_guess(problem: Problem, start: npt.ArrayLike | InitialPrior | None) -> tuple[Array, InitialPrior | None]:
-    """The control (m,) that the first pass applies, and the prior. Raises InputError for what is neither."""
+    """The control (m,) of the first pass, and the prior. Raises InputError."""
     prior = start.fitting(problem) if isinstance(start, InitialPrior) else None
     if prior is not None and prior.obstacles:
         raise InputError(f"start: got a prior with shares of the obstacles {prior.obstacles}, want one without, here")
@@ -217,7 +217,7 @@ def _initial_guess(problem: Problem, start: npt.ArrayLike | InitialPrior | None)
 def _iterate(
     solver: "_Smoother", limits: _Limits, functions: list[UserFunction], callback: Callable[[Iteration], object] | None
 ) -> tuple[list[Iteration], Status, str]:
-    """Iterate until a limit is met: the log, how it ended, and where, if it is not converged."""
+    """Iterate until convergence or a limit; return the log, the status, and where it failed."""
     iterations: list[Iteration] = []
     for number in range(1, limits.max_iterations + 1):
         clock, last = time.perf_counter(), number == limits.max_iterations
@@ -245,11 +245,11 @@ def _iterate(
 
 
 class _Smoother:
-    """The passes of one iteration after another, and what each leaves to the next.
+    """Runs the iterations, and keeps the state between them.
 
     Attributes:
       forward, backward: the passes of the last iteration of which both were completed; None before.
-      where: what was under way when there was failure.
+      where: the pass that is under way.
       cost, gap: of the last rollout; see `Iteration`.
     """
 
@@ -289,7 +289,7 @@ class _Smoother:
         self._to_go, self.forward, self.backward = go, come, go
 
     def rollout(self) -> IntegrationFailure | None:
-        """Run the new policy and set `cost` and `gap`, which are infinite if it escapes; returns how it did."""
+        """Run the new policy and set `cost` and `gap`; infinite if it diverges. Returns the failure, if any."""
         assert self.forward is not None
         try:
             self.cost, self._states = self.system.rollout(self._x_hat, self._to_go, self._tolerances)
@@ -323,7 +323,7 @@ def _at(where: str, failure: IntegrationFailure) -> str:
 
 
 def _raise_interrupts(functions: list[UserFunction]) -> None:
-    """Raise what is not an error, such as Ctrl-C, that compiled code met in a function of Python's."""
+    """Raise Ctrl-C and the like, if one of the functions that compiled code called got it."""
     for function in functions:
         if function.raised is not None and not isinstance(function.raised, Exception):
             raise function.raised

@@ -1,6 +1,7 @@
 """Iterative LQR with line search: the baseline that the paper compares with."""
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 
@@ -24,27 +25,22 @@ from lqrsim.results.solution_parts import Status
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import assemble
+from lqrsim.solvers.budget import Budget, Callback
 from lqrsim.solvers.certify import certified
-from lqrsim.solvers.common import (
-    Callback,
-    Settings,
-    all_driven_by,
-    check_callback,
-    check_outcome,
-    check_problem,
-    check_threads,
-    iterate,
-    solve_all,
-)
+from lqrsim.solvers.engine import RunResult, check_finite_at_start, iterate
 from lqrsim.solvers.initial_guess import InitialPrior, StartLike, resolve
+from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
 from lqrsim.solvers.risk import named
+from lqrsim.solvers.settings import Settings, check_callback, check_problem, settings_from
+
+TOLERANCE = 1e-4  # by default
 
 
 def ilqr(
     problem: Problem,
     *,
     stop: str = "optimal",
-    tolerance: float = 1e-4,
+    tolerance: float = TOLERANCE,
     max_iterations: int = 500,
     time_limit: float | None = None,
     start: StartLike = None,
@@ -84,35 +80,27 @@ def ilqr(
     problem = problem.driven_by(noise, risk)
     _check(problem, settings)
     with problem.dynamics.solving(check_threads(None)):
-        return _solve(problem, settings, each=True, callback=callback)
+        return _solve(problem, settings, attentive=True, callback=callback)
 
 
 def ilqr_many(
     problems: Iterable[Problem],
     *,
     threads: int | None = None,
-    stop: str = "optimal",
-    tolerance: float = 1e-4,
-    max_iterations: int = 500,
-    time_limit: float | None = None,
-    start: StartLike = None,
+    progress: Callable[[int, int], object] | None = None,
     noise: Noise | None = None,
     risk: float | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    **options: Any,
 ) -> list[Solution]:
     """Solve many problems as `ilqr` does, on several threads; see `smooth_many`.
 
     Args:
       problems: of one structure or of many; each structure is compiled once.
       threads: how many to use; by default all processors that this process may run on.
-      stop: as in `ilqr`, for all.
-      tolerance: as in `ilqr`, for all.
-      max_iterations: as in `ilqr`, for all.
-      time_limit: as in `ilqr`, for all.
-      start: as in `ilqr`, for all.
-      noise: as in `ilqr`, for all.
-      risk: as in `ilqr`, for all.
       progress: called with the numbers of solved and of all problems, as each solve ends.
+      noise: as in `ilqr`, for all problems.
+      risk: as in `ilqr`, for all problems.
+      options: other keyword arguments of `ilqr`, except `callback`, for all problems.
 
     Returns:
       One Solution per problem, in their order.
@@ -120,9 +108,7 @@ def ilqr_many(
     Raises:
       InputError: an argument is not as described; a problem that is refused is named by its place in the list.
     """
-    settings = Settings(
-        stop=stop, tolerance=tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start
-    )
+    settings = settings_from(Settings, "ilqr_many", {"tolerance": TOLERANCE, **options})
     return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)
 
 
@@ -146,12 +132,14 @@ def _check(problem: Problem, settings: Settings) -> None:
         )
 
 
-def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callback | None = None) -> Solution:
-    """Solve; with `each`, a look after each iteration (see `iterate`)."""
+def _solve(
+    problem: Problem, settings: Settings, *, attentive: bool = False, callback: Callback | None = None
+) -> Solution:
+    """Solve; `attentive`: see `Budget`."""
     assert problem.start is not None
     assert settings.tolerance is not None
     initial_guess = resolve(settings.start, problem)
-    if initial_guess.prior is not None:  # of a function, too
+    if initial_guess.prior is not None:  # a function may return one
         raise InputError(_NO_PRIOR)
     start, control = problem.start.copy(), initial_guess.offset[0].copy()
     check_functions(problem, start, control)
@@ -164,39 +152,38 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
         start=start, policy=policy, to_go=go, plan=plan, trial=Motion(states.copy(), controls.copy()), damping=zeros(1),
         certificate=zeros(1, CERTIFICATE),
     )  # fmt: skip
-    log = zeros(settings.max_iterations + 1, LOG)
+    most = settings.max_iterations
+    rows = zeros(most + 1, LOG)
     options = IterationSettings(
-        steps=steps, max_iterations=settings.max_iterations, tolerance=settings.tolerance, gap_tolerance=0.0,
+        steps=steps, max_iterations=most, tolerance=settings.tolerance, gap_tolerance=0.0,
         optimal=settings.stop == "optimal", fixed=True, guided=False, prior_iterations=0,
     )  # fmt: skip
     model = compiled.arguments(problem)
-    stop = settings.stop_early()
-    loop = compiled.core(problem).lay_out("ilqr", declarations.ITERATE, 0, 0, options, model, work, log)
-    termination = iterate(
-        problem,
-        lambda first, last: loop(declarations.ITERATE, first, last, options, model, work, log),
-        log, settings.max_iterations, each=each, stop=stop, callback=callback,
+    loop = compiled.core(problem).lay_out("ilqr", declarations.ITERATE, 0, 0, options, model, work, rows)
+    budget = Budget(most, callback=callback, attentive=attentive)
+    budget.stop.begin(settings.time_limit)
+    ending = iterate(
+        problem, lambda first, last: loop(declarations.ITERATE, first, last, options, model, work, rows), rows,
+        first=0, last=most, budget=budget,
     )  # fmt: skip
-    termination = check_outcome(problem, termination, start, control, refuse=each)
-    whole = termination.iterations != () and termination.failed < 0
-    if termination.outcome == declarations.TIMED_OUT:  # the last backward pass was about the trajectory before
-        count = len(termination.iterations)
-        *_, failed = loop(declarations.ITERATE, count, count, options, model, work, log)
+    done = len(budget.log)
+    ending = check_finite_at_start(problem, ending, rows["cost"][:done], start, control, refuse=attentive)
+    whole = done > 0 and ending.failed < 0
+    if ending.outcome == declarations.TIMED_OUT:  # the last backward pass was about the previous trajectory
+        *_, failed = loop(declarations.ITERATE, done, done, options, model, work, rows)
         whole = failed < 0 and np.isfinite(states).all()
-    if not whole:
-        policy.gain[:] = (
-            0  # without a pass about the trajectory there is no feedback; what is left is to play the controls
-        )
+    if not whole:  # without a pass about the trajectory the policy has no feedback
+        policy.gain[:] = 0
     offset = controls - np.einsum("tij,tj->ti", policy.gain, states[:-1]) if whole else controls.copy()
-    status, detail = termination.status, termination.detail(problem.steps)
+    status, detail = ending.status, ending.detail(steps)
 
     def check(task: int, to_go: CostToGo, out: StructuredArray) -> None:
         checked = work._replace(policy=Policy(policy.gain, offset), to_go=to_go, certificate=out)
-        loop(task, 0, 0, options, model, checked, log)
+        loop(task, 0, 0, options, model, checked, rows)
 
+    value = Quadratic(*go) if whole else None
     certificate, wrong = certified(
-        problem, check, states, Quadratic(*go) if whole else None, violation=0.0,
-        claimed=termination.iterations[-1].cost if status.success else None,
+        problem, check, states, value, violation=0.0, claimed=budget.log[-1].cost if status.success else None,
         tolerance=settings.tolerance if status is Status.CONVERGED else None,
     )  # fmt: skip
     if wrong:
@@ -205,12 +192,12 @@ def _solve(problem: Problem, settings: Settings, *, each: bool, callback: Callba
 
         def fails(risk: float) -> int:
             model.noise.risk[0] = risk
-            return loop(declarations.ITERATE, 1, 1, options, model, work, log)[3]
+            return loop(declarations.ITERATE, 1, 1, options, model, work, rows)[3]
 
         detail = "; ".join(part for part in (named(fails, problem.risk, steps), detail) if part)
-    solution = assemble(
-        problem, solver="ilqr", options=settings.options(initial_guess), status=status, detail=detail,
-        iterations=termination.iterations, states=states, controls=controls, law=(policy.gain, offset),
-        certificate=certificate, gap=0.0, cost_to_go=Quadratic(*go) if whole else None,
+    found = RunResult(
+        status=status, detail=detail, states=states, controls=controls, law=(policy.gain, offset),
+        cost=certificate.cost, violation=0.0, gap=0.0, values={"cost_to_go": value}, certificate=certificate,
     )  # fmt: skip
-    return stop.finish(solution)
+    solution = assemble(problem, found, budget.log, solver="ilqr", options=settings.options(initial_guess))
+    return budget.stop.finish(solution)

@@ -12,7 +12,7 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.problem.problem import Problem
-from lqrsim.solvers.workspace import Workspace
+from lqrsim.solvers.engine import Workspace
 
 STATIONARY = 5e-3  # slope that may be left, relative to what cancels
 AT_LIMIT = 1e-4  # of a control's range, which a barrier may have left, and which could lessen nothing that matters

@@ -1,4 +1,4 @@
-"""What a solver may begin with: nothing, controls, a prior, a policy, a trajectory or a solution."""
+"""Where a solver starts: from nothing, controls, a prior, a policy, a trajectory or another plan."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 class InitialPrior:
     """`1/2 (x - about)' diag(weight) (x - about)` at all steps but the first, in the first iterations only.
 
-    It is no part of the cost: it keeps the first linearisations of the smoother sensible, and so has a say in which
-    local optimum is found.
+    It is not part of the cost. It keeps the first linearisations of the smoother reasonable, and thereby influences
+    which local optimum is found.
 
     Args:
       weight: (n,) not negative.
-      iterations: how many it acts in.
-      about: where it is zero: (n,), or (T+1, n) for a trajectory to be drawn to.
-      obstacles: the shares of the obstacle costs that the first iterations see, one an iteration; then it is all.
-      controls: what the first pass applies, (m,) or (T, m); by default the problem's nominal control.
+      iterations: the number of iterations in which it acts.
+      about: the state (n,), or trajectory (T+1, n), at which the prior is zero.
+      obstacles: fractions of the obstacle costs in the first iterations, one per iteration; afterwards it is 1.
+      controls: the controls (m,) or (T, m) of the first pass; by default the problem's nominal control.
     """
 
     def __init__(
@@ -102,23 +102,23 @@ class InitialPrior:
         return self
 
 
-# Controls (m,) or (T, m), or what has more to say; or a function that makes one of these for a problem.
+# Controls (m,) or (T, m), or something that says more; or a function that makes one of these for a problem.
 Beginning = npt.ArrayLike | InitialPrior | AffinePolicy | Trajectory | Plan | None
 StartLike = Beginning | Callable[[Problem], Beginning]
 
 
 @dataclass(frozen=True)
 class InitialGuess:
-    """The beginning of the first pass.
+    """What the first pass starts from.
 
     Attributes:
       gain, offset: (T, m, n) and (T, m), the policy to begin with.
-      cost_to_go: what is known of it; None for nothing.
-      trajectory: what the first pass linearises about, feasible or not; None to leave that to the policy.
-      summary: what a solution's options say of it.
-      prior: what acts in the first iterations besides the cost.
-      multipliers: of the constraints, where they are known.
-      found: what the interior point came to already, in the iterations of `log`; what is left is to look at it.
+      cost_to_go: the cost-to-go, if known.
+      trajectory: the trajectory that the first pass linearises about, feasible or not; None for the policy's.
+      summary: its entry in the options of a solution.
+      prior: added to the cost in the first iterations.
+      multipliers: of the constraints, if known.
+      found: a result that the interior point already has, after the iterations in `log`; it is only finished.
     """
 
     gain: Array
@@ -133,7 +133,7 @@ class InitialGuess:
 
     @property
     def digest(self) -> str:
-        """Hash of all that the first pass begins with."""
+        """Hash of everything that the first pass starts from."""
         parts: dict[str, object] = {"gain": self.gain, "offset": self.offset}
         for name, one in (("cost_to_go", self.cost_to_go), ("trajectory", self.trajectory)):
             parts |= {} if one is None else {f"{name}.{part}": value for part, value in vars(one).items()}
@@ -147,9 +147,9 @@ class InitialGuess:
         return sha256(*(part for name, array in arrays for part in (f"{name} {array.shape}", array)))
 
     def rolled_out(self, problem: Problem, x: Array) -> "InitialGuess":
-        """With the trajectory of the policy from a state (n,): what a backward pass that comes first is about.
+        """The same with the trajectory of its policy from a state (n,), about which a backward pass can begin.
 
-        Where it leaves all numbers, the last state and control stay: the trajectory need not be feasible.
+        Where the rollout is not finite, the last finite state and control are repeated: it need not be feasible.
         """
         states, controls = [x], []
         with np.errstate(all="ignore"):
@@ -164,10 +164,10 @@ class InitialGuess:
         return replace(self, trajectory=Trajectory(np.array(states), np.array(controls), problem.dt))
 
     def penalised(self, problem: Problem, penalty: float | None) -> "InitialGuess":
-        """With this penalty of all constraints from the first iteration on; None for as it is.
+        """The same with this penalty for all constraints from the first iteration on; unchanged for None.
 
         Raises:
-          InputError: there are no constraints, or there is a prior, which is for the iterations without them.
+          InputError: there are no constraints, or there is a prior, whose iterations are without constraints.
         """
         if penalty is None:
             return self
@@ -181,12 +181,12 @@ class InitialGuess:
 
 
 def is_function(start: object) -> TypeGuard[Callable[[Problem], Beginning]]:
-    """Whether it makes a start for a problem. An AffinePolicy can be called, too, but is a start."""
+    """Whether a start is a function of the problem. An AffinePolicy is callable, too, but is itself a start."""
     return callable(start) and not isinstance(start, AffinePolicy)
 
 
 def resolve(start: "StartLike | InitialGuess", problem: Problem) -> InitialGuess:
-    """The beginning that a caller asked for; by default the problem's nominal control, held.
+    """The initial guess for what a caller gave as a start; by default the problem's nominal control, held.
 
     Raises:
       InputError: it does not fit the problem.

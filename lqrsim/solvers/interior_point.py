@@ -26,7 +26,7 @@ from lqrsim.kernels.records import ActiveRows, ConstraintRows, CostToGo, Limits,
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Iteration
 from lqrsim.solvers import compiled
-from lqrsim.solvers.common import INSIDE
+from lqrsim.solvers.settings import INSIDE
 
 INTERIOR = "interior point"  # what its iterations are called
 MIXES = (0.0, 0.03, 0.1, 0.25, 0.5, 1.0)  # shares of the projected Hessian, tried in turn

@@ -103,15 +103,15 @@ def smooth_lq(
     )
 
 
-# What is said to be solved is so to this share of the cost, and of the range of each state.
+# Relative accuracy of cost and states that a solved problem must have.
 ACCURACY = 1e-6
 
-# What `lq_passes` says of a pass that failed.
+# The passes that `lq_passes` numbers.
 _WHICH = ("backward pass", "forward pass", "minimum of the total cost")
 
 
 class _Passes(NamedTuple):
-    """What the passes leave.
+    """Results of the passes.
 
     Attributes:
       law, inverse_law: gain (T, m, n) and offset (T, m).
@@ -129,7 +129,7 @@ class _Passes(NamedTuple):
 
 
 def _passes(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Quadratic, form: str) -> _Passes:
-    """One pass backward and one forward. Raises InputError for an end, or an A, that the form does not take."""
+    """Do one backward and one forward pass. Raises InputError for an end cost, or an A, that the form cannot handle."""
     A, B, c, Q, P, R, q, r, constant = parts
     steps, n, m = B.shape
     check_memory("stage: steps", steps, 8 * (6 * n * n + 5 * m * n + 3 * m * m))
@@ -155,7 +155,7 @@ def _passes(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Qu
 
 
 def _start(passes: _Passes, initial: Quadratic | FixedState) -> tuple[Array, str]:
-    """The state of least total cost at 0, and why there is none; empty if there is one."""
+    """The state of least total cost at step 0; also why there is none, empty if there is one."""
     if passes.failure or isinstance(initial, FixedState):
         return passes.x_hat[0], passes.failure
     # With every step of the cost-to-go definite, this alone says that there is one minimum.
@@ -167,7 +167,7 @@ def _start(passes: _Passes, initial: Quadratic | FixedState) -> tuple[Array, str
 
 
 def _off_plan(parts: tuple[Array, ...], passes: _Passes, states: Array) -> tuple[float, float]:
-    """How far x_hat is from the plan's states, and from steps of the dynamics: see `Iteration`, gap and residual."""
+    """Gap and dynamics residual of x_hat; see `Iteration`."""
     A, B, c = parts[:3]
     x_hat, (gain, offset) = passes.x_hat, passes.law
     scale = np.maximum(np.ptp(states, axis=0), 1.0)
@@ -199,7 +199,7 @@ def _parts(stage: Stage) -> tuple[Array, ...]:
 
 
 def _size(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Quadratic) -> float:
-    """What the parts of the cost are at the origin: of what cancels there, some rounding remains."""
+    """Size of the cost's terms at the origin. Where they cancel, a rounding error relative to this remains."""
     size = float(np.abs(parts[-1]).sum()) + abs(float(final.constant))
     return size + (abs(float(initial.constant)) if isinstance(initial, Quadratic) else 0.0)
 
@@ -218,7 +218,7 @@ def _digest(parts: tuple[Array, ...], initial: Quadratic | FixedState, final: Qu
 
 
 def _initial_cost_to_come(initial: Quadratic | FixedState, n: int, form: str) -> tuple[Array, Array, float]:
-    """The cost-to-come at 0, as the form has it."""
+    """The cost-to-come at step 0: (hessian, gradient, constant), or in the dual form (covariance, mean, constant)."""
     if isinstance(initial, FixedState):
         if form == "primal":
             raise InputError(
@@ -240,7 +240,7 @@ def _initial_cost_to_come(initial: Quadratic | FixedState, n: int, form: str) ->
 
 
 def _inverse(A: Array, B: Array, c: Array) -> tuple[Array, Array]:
-    """The steps backwards, (T, n, n + m) and (T, n): x_t = Abar x_{t+1} + Bbar u_t + cbar."""
+    """The inverse dynamics x_t = Abar x_{t+1} + Bbar u_t + cbar, as [Abar Bbar] (T, n, n+m) and cbar (T, n)."""
     condition = np.linalg.cond(A)
     if not condition.max() < 1e12:
         step = int(np.argmax(condition))
@@ -250,7 +250,7 @@ def _inverse(A: Array, B: Array, c: Array) -> tuple[Array, Array]:
 
 
 def _rollout(parts: tuple[Array, ...], law: tuple[Array, Array], start: Array) -> tuple[Array, Array, float]:
-    """States and controls of the policy, and what the stages cost."""
+    """States and controls of the policy, and the sum of the stage costs."""
     A, B, c, Q, P, R, q, r, constant = parts
     steps, n, m = B.shape
     states, controls, spent = np.zeros((steps + 1, n)), np.zeros((steps, m)), 0.0

@@ -7,7 +7,6 @@ paths, bent to the sides, lead to other optima. Which start is best shows after 
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import numpy as np
 
@@ -17,12 +16,13 @@ from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, ter
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
-from lqrsim.results.solution_parts import Candidate
+from lqrsim.results.solution_parts import Candidate, Status
 from lqrsim.solvers.assembly import clearance_of
-from lqrsim.solvers.attempt import Attempt, AttemptResult
-from lqrsim.solvers.common import Callback, SmootherSettings, Stop, workers
+from lqrsim.solvers.budget import Callback
+from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, resolve
-from lqrsim.solvers.strategy import finish, refine
+from lqrsim.solvers.parallel import workers
+from lqrsim.solvers.strategy import Known, finish, refine
 
 # `python experiments/benchmark_quality.py --sections ingredients` shows what each of these choices brings.
 STARTS = 7
@@ -36,7 +36,7 @@ HALVE, CHOOSE = 3, 4  # the iterations after which half of the starts are left, 
 SWAYS, SWAY = (1, 2, 4, 8), 0.3
 IDLE = 1e-6  # how far controls may be from the nominal ones to be none, relative to these and at least 1
 # Where what these lead to is poor: how much heavier obstacles and goal are made to find another way.
-BOLD = (10.0, 100.0)
+HEAVIER = (10.0, 100.0)
 
 
 def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior | None]]:
@@ -65,7 +65,7 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
     return found
 
 
-def bold(problem: Problem, times: float) -> Problem:
+def reweighted(problem: Problem, times: float) -> Problem:
     """The same with obstacles and goal that weigh more: it goes round and gets there, whatever the controls cost.
 
     Only numbers change, so nothing is compiled; the constraints are there, and are not made to act.
@@ -81,7 +81,7 @@ def bold(problem: Problem, times: float) -> Problem:
     return problem.with_costs(stage_cost=CostSum(tuple(stage)), final_cost=CostSum(tuple(final)))
 
 
-def swayed(problem: Problem, cycles: int) -> Array:
+def sinusoidal_controls(problem: Problem, cycles: int) -> Array:
     """Controls (T, m) that sway about the nominal ones so often, each a while after the one before it."""
     space, nominal = problem.control_coordinates, problem.nominal_control
     actuators = problem.dynamics.control_coordinates
@@ -174,46 +174,52 @@ def path(start: Array, goal: Array, bend: Array, steps: int) -> Array:
 
 
 class Search:
-    """Several attempts, run a few iterations each, and the most promising to their end.
+    """Several runs, a few iterations each, and the most promising to its end.
 
     Attributes:
-      best: the attempt that found the best so far, and what it found.
+      best: the run that found the best so far, and what it found.
     """
 
-    def __init__(self, names: Sequence[str], attempts: Sequence[Attempt], *, each: bool, callback: Callback | None):
-        self._named = list(zip(names, attempts, strict=True))
-        self._each, self._callback = each, callback
-        self._finished: list[tuple[Attempt, AttemptResult]] = []
+    def __init__(self, names: Sequence[str], runs: Sequence[SolveRun], callback: Callback | None, threads: int) -> None:
+        self._named = list(zip(names, runs, strict=True))
+        self._callback, self._threads, self._known = callback, threads, Known()
+        self._problem, self._settings = runs[0].problem, runs[0].settings
+        self._start, self._budget = runs[0].work.start.copy(), runs[0].budget
+        self._finished: list[tuple[SolveRun, RunResult]] = []
 
     @property
-    def best(self) -> tuple[Attempt, AttemptResult]:
+    def best(self) -> tuple[SolveRun, RunResult]:
         return self._finished[0]
 
-    def run(self, threads: int) -> None:
+    def run(self) -> None:
         """Choose one and finish it; with constraints, others too, as long as they could do better."""
-        chosen, *others = choose([attempt for _, attempt in self._named], self._advance, threads)
+        chosen, *others = choose([run for _, run in self._named], self._threads)
         self._finish(chosen)
-        if chosen.problem.constraints:
-            # Constraints can make the best way round the worst, or close it. What the others cost without them is about
-            # the least that they can cost with them.
-            for attempt in sorted(others, key=lambda attempt: attempt.cost):
-                best = self.best[1]
-                if attempt.stop.due or best.final or (best.success and not attempt.cost < best.cost):
-                    break
-                self._finish(attempt)
+        if not chosen.problem.constraints:
+            return
+        # Constraints can make the best way round the worst, or close it. What the others cost without them is about the
+        # least that they can cost with them.
+        for run in sorted(others, key=lambda run: run.cost):
+            best = self.best[1]
+            if self._budget.stop.due or best.final or (best.success and not run.cost < best.cost):
+                break
+            if self._finish(run).final and best.status is Status.INFEASIBLE:
+                break
 
-    def poor(self, problem: Problem) -> bool:
+    @property
+    def is_unacceptable(self) -> bool:
         """Whether the best plan so far is one that nobody would want: far from the goal, or through an obstacle.
 
         Far is further than the robot's radius, or, without a position, than what counts as reached; through is deeper
         than half of the radius, or of that of the largest ball.
         """
+        problem = self._problem
         space = problem.dynamics.state_coordinates
         if _pull(problem) == 0 or problem.goal is None:
-            return self._idle(problem)
-        (attempt, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
+            return self._idle()
+        (run, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
         if not found.success:
-            return attempt.iterations_left(found.iterations) > 0
+            return run.budget.left > 0 and found.status is not Status.INFEASIBLE
         if space.position:
             place = list(space.position)
             arrived = np.linalg.norm(found.states[-1, place] - problem.goal[place]) <= max(radius, 1e-3)
@@ -225,100 +231,105 @@ class Search:
         clearance = clearance_of(problem, found.states)
         return clearance is not None and not clearance.min() >= -0.5 * radius
 
-    def _idle(self, problem: Problem) -> bool:
+    def _idle(self) -> bool:
         """Whether what was found is to do nothing: at rest no control helps by itself, and some may together."""
-        found, nominal = self.best[1], problem.nominal_control
+        found, nominal = self.best[1], self._problem.nominal_control
         off = np.abs(found.controls - nominal).max()
         return found.success and found.cost > 0 and off <= IDLE * max(1.0, np.abs(nominal).max())
 
-    def widen(self, problem: Problem, settings: SmootherSettings, start: Array, stop: Stop, threads: int) -> None:
-        """Look for another way round: of bold plans, go on from the best by steps that lower the true cost alone."""
-        if _pull(problem) == 0:
-            controls = [swayed(problem, cycles) for cycles in SWAYS]
-            attempts = [Attempt(problem, settings, resolve(one, problem), start, stop) for one in controls]
-            named = dict(zip(map(id, attempts), SWAYS, strict=True))
-            chosen = choose(attempts, self._advance, threads)[0]
-            self._named.append((f"controls that sway {named[id(chosen)]} times", chosen))
-            found, best = finish(chosen, each=self._each, callback=self._callback), self.best[1]
-            # Even one that is not at its end is better than to do nothing.
-            better = found.violation <= best.violation and found.cost < best.cost
-            self._finished.insert(0 if better else len(self._finished), (chosen, found))
-            return
-        for times in BOLD:
-            harder = bold(problem, times)
-            attempts = [
-                Attempt(harder, settings, resolve(guide, harder), start, stop) for _, guide in guides(harder, None)
-            ]
-            boldest = choose(attempts, self._advance, threads)[0].finish(each=False)
-            if stop.due:
-                break
-            initial_guess = InitialGuess(
-                boldest.law[0].copy(), boldest.law[1].copy(), None, None, f"a plan {times:g} times as bold"
-            )
-            attempt = Attempt(problem, settings, initial_guess, start, stop)
-            self._named.append((f"a plan for {times:g} times the weight of obstacles and goal", attempt))
-            found, best = refine(attempt, each=self._each, callback=self._callback), self.best[1]
-            # The same optimum once more, a little different within the tolerances, is no other way.
-            other = found.rank < best.rank and (not best.success or found.cost < best.cost - 1e-3 * abs(best.cost))
-            self._finished.insert(0 if other else len(self._finished), (attempt, found))
+    def widen(self) -> None:
+        """Look for another way round, or, where there is nothing to go round, for controls that lead anywhere."""
+        if _pull(self._problem) == 0:
+            self._try_sinusoidal_controls()
+        else:
+            for times in HEAVIER:
+                self._try_reweighted(times)
 
-    def calm(self, problem: Problem, settings: SmootherSettings, start: Array, stop: Stop, threads: int) -> None:
-        """Where the risk was too high on the way: search without a risk, and go on from that plan."""
-        if all(attempt.termination.outcome != declarations.RISK_TOO_HIGH for _, attempt in self._named):
+    def _try_sinusoidal_controls(self) -> None:
+        problem = self._problem
+        runs = [self._another(resolve(sinusoidal_controls(problem, cycles), problem)) for cycles in SWAYS]
+        named = dict(zip(map(id, runs), SWAYS, strict=True))
+        chosen = choose(runs, self._threads)[0]
+        self._named.append((f"controls that sway {named[id(chosen)]} times", chosen))
+        found, best = self._to_its_end(chosen, finish, Known()), self.best[1]
+        # Even one that is not at its end is better than to do nothing.
+        better = found.violation <= best.violation and found.cost < best.cost
+        self._finished.insert(0 if better else len(self._finished), (chosen, found))
+
+    def _try_reweighted(self, times: float) -> None:
+        """Of plans for heavier obstacles, go on from the best by steps that lower the true cost alone."""
+        if self._budget.stop.due:
             return
-        calm = dataclasses.replace(problem, risk=0.0)
-        attempts = [Attempt(calm, settings, attempt.initial_guess, start, stop) for _, attempt in self._named]
-        found = finish(choose(attempts, self._advance, threads)[0], each=self._each)
-        if not found.success or stop.due:
+        heavier = reweighted(self._problem, times)
+        runs = [self._another(resolve(guide, heavier), heavier) for _, guide in guides(heavier, None)]
+        try:
+            boldest = choose(runs, self._threads)[0].solve()
+        except InputError:  # its cost is not finite at the start, though the true one is
+            return
+        if self._budget.stop.due:
+            return
+        summary = f"a plan for {times:g} times the weight of obstacles and goal"
+        run = self._another(InitialGuess(boldest.law[0].copy(), boldest.law[1].copy(), None, None, summary))
+        self._named.append((summary, run))
+        found, best = self._to_its_end(run, refine, self._known), self.best[1]
+        # The same optimum once more, a little different within the tolerances, is no other way.
+        other = found.rank < best.rank and (not best.success or found.cost < best.cost - 1e-3 * abs(best.cost))
+        self._finished.insert(0 if other else len(self._finished), (run, found))
+
+    def retry_without_risk(self) -> None:
+        """Where the risk was too high on the way: search without a risk, and go on from that plan."""
+        if all(run.ending.outcome != declarations.RISK_TOO_HIGH for _, run in self._named):
+            return
+        riskless = dataclasses.replace(self._problem, risk=0.0)
+        runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
+        found = finish(choose(runs, self._threads)[0], Known())
+        if not found.success or self._budget.stop.due:
             return
         summary = "a plan without a risk"
         initial_guess = InitialGuess(
             found.law[0].copy(), found.law[1].copy(), found.values["cost_to_go"], None, summary,
             multipliers=found.multipliers,
         )  # fmt: skip
-        attempt = Attempt(problem, settings, initial_guess, start, stop)
-        self._named.append((summary, attempt))
-        self._finished.append((attempt, finish(attempt, each=self._each, callback=self._callback)))
-        self._finished.sort(key=lambda pair: pair[1].rank)
+        run = self._another(initial_guess)
+        self._named.append((summary, run))
+        self._finish(run)
 
     def candidates(self) -> tuple[Candidate, ...]:
         """What was tried, where it was more than one."""
-        results = {id(attempt): found for attempt, found in self._finished}
-        found = [attempt.candidate(name, results.get(id(attempt))) for name, attempt in self._named]
+        results = {id(run): found for run, found in self._finished}
+        found = [run.candidate(name, results.get(id(run))) for name, run in self._named]
         return tuple(found) if len(found) > 1 else ()
 
-    def _advance(self, attempt: Attempt, *, last: int) -> None:
-        attempt.run(last, each=self._each)
+    def _another(self, initial_guess: InitialGuess, problem: Problem | None = None) -> SolveRun:
+        problem = self._problem if problem is None else problem
+        return SolveRun(problem, self._settings, initial_guess, self._start, self._budget.another())
 
-    def _finish(self, attempt: Attempt) -> None:
-        if self._callback is not None:
-            for iteration in attempt.termination.iterations:
-                try:
-                    self._callback(iteration)
-                except BaseException as error:
-                    attempt.stop.error = error
-                    break
-        self._finished.append((attempt, finish(attempt, each=self._each, callback=self._callback)))
+    def _finish(self, run: SolveRun) -> RunResult:
+        found = self._to_its_end(run, finish, self._known)
+        self._finished.append((run, found))
         self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equals, the first
+        return found
+
+    def _to_its_end(self, run: SolveRun, how: Callable[[SolveRun, Known], RunResult], known: Known) -> RunResult:
+        """Run to the end; report all its iterations to the callback, also those before."""
+        run.budget.report_to(self._callback)
+        return how(run, known)
 
 
-def choose(attempts: Sequence[Attempt], advance: Callable[..., None], threads: int) -> list[Attempt]:
-    """Run the attempts a few iterations, the worse ones fewer, and return them with the most promising first.
+def choose(runs: Sequence[SolveRun], threads: int) -> list[SolveRun]:
+    """Run each a few iterations, the worse ones fewer, and return them with the most promising first.
 
     What they are judged by is the true cost of the plan that each has so far.
-
-    Args:
-      advance: `advance(attempt, last=...)` runs one up to so many iterations. threads: how many at once.
     """
-    left, dropped = list(attempts), []
+    left, dropped = list(runs), []
     for last, keep in ((HALVE, max(len(left) // 2, 1)), (CHOOSE, 1)):
         if len(left) > 1:
             if threads > 1:
                 with workers(threads, functions_of(left[0].problem)) as pool:
-                    list(pool.map(partial(advance, last=last), left))
+                    list(pool.map(lambda run, last=last: run.smooth(last), left))
             else:
-                for attempt in left:
-                    advance(attempt, last=last)
-            left.sort(key=lambda attempt: attempt.cost)  # a stable sort: of equals, the first
+                for run in left:
+                    run.smooth(last)
+            left.sort(key=lambda run: run.cost)  # a stable sort: of equals, the first
             left, dropped = left[:keep], left[keep:] + dropped
     return left + dropped

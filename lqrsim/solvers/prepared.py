@@ -1,4 +1,4 @@
-"""Solving again and again in real time: all is compiled beforehand, and each solve ends in time with what it has."""
+"""Repeated solves in real time: everything is compiled beforehand, and each solve ends by its deadline."""
 
 import time
 from dataclasses import replace
@@ -20,16 +20,17 @@ from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled
 from lqrsim.solvers.active_set import ActiveSet
 from lqrsim.solvers.assembly import goal_radius_of
-from lqrsim.solvers.attempt import Attempt, AttemptResult
-from lqrsim.solvers.common import SmootherSettings, Stop, check_problem, raised_by
-from lqrsim.solvers.constrained import satisfy
+from lqrsim.solvers.augmented_lagrangian import satisfy
+from lqrsim.solvers.budget import Budget, Stop
+from lqrsim.solvers.engine import RunResult, SolveRun, raised_by
 from lqrsim.solvers.initial_guess import InitialGuess
 from lqrsim.solvers.interior_point import INTERIOR, InteriorPoint, Measures, Stages, iteration_of
+from lqrsim.solvers.settings import SmootherSettings, check_problem
 from lqrsim.solvers.strategy import LITTLE
 
-SLOPES = 1e-6  # of a Lagrangian, relative to the cost; what they promise is about the square of that
-BEGINNING = 15.0  # times as long as models of a plan, what the interior point takes for its first iteration
-ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
+SLOPES = 1e-6  # of the Lagrangian, relative to the cost; the promised decrease of the cost is about the square of that
+BEGINNING = 15.0  # duration of the interior point's first iteration, relative to that of making the models about a plan
+ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
 
 
 def prepare(
@@ -41,10 +42,10 @@ def prepare(
     max_iterations: int = 100,
     finish: str | None = "newton",
 ) -> "PreparedSolver":
-    """Compile all that solving problems of this structure can need, now: nothing is compiled while a robot runs.
+    """Compile everything that problems of this structure need, so that nothing is compiled while a robot runs.
 
     Args:
-      problem: what is to be solved again and again, with other states, goals, obstacles and parameters.
+      problem: one of the problems; others may have other states, goals, obstacles and parameters.
       tolerance: as in `smooth`; with constraints by default 1e-6, of the slopes of the Lagrangian in the controls,
         times their ranges and relative to the cost.
       gap_tolerance: as in `smooth`.
@@ -60,21 +61,20 @@ def prepare(
       InputError: an argument is not as described.
     """
     settings = SmootherSettings(
-        form="dual", first_pass="forward", safeguard=True, stop="optimal", tolerance=tolerance,
-        gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=None, start=None, starts=1,
+        tolerance=tolerance, gap_tolerance=gap_tolerance, max_iterations=max_iterations, starts=1,
         constraint_tolerance=constraint_tolerance, finish=finish,
     )  # fmt: skip
-    if tolerance is None and getattr(problem, "constraints", ()) and settings.newton(problem):
+    if tolerance is None and getattr(problem, "constraints", ()) and settings.second_order(problem):
         settings = replace(settings, tolerance=SLOPES)
     return PreparedSolver(problem, settings)
 
 
 class PreparedSolver:
-    """Solves problems of one structure, from one state after the other; `prepare` makes it.
+    """Solves problems of one structure from one state after another; `prepare` makes it.
 
     Attributes:
-      problem: what is solved by default.
-      settings: as `prepare` was told.
+      problem: the problem that is solved by default.
+      settings: the options given to `prepare`.
     """
 
     def __init__(self, problem: Problem, settings: SmootherSettings) -> None:
@@ -86,8 +86,8 @@ class PreparedSolver:
         self._states = problem.dynamics.state_coordinates
         self._controls = problem.applied_coordinates
         self._structure = compiled.structure(problem)
-        self._pace, self._closing = 0.0, 0.0  # s, of a slow iteration, and of what follows the last one
-        self._idle: list[Stages] = []  # whose memory waits for the next solve
+        self._pace, self._closing = 0.0, 0.0  # seconds of a slow iteration, and of the work after the last one
+        self._idle: list[Stages] = []  # memory for the next solve
         self._compile()
 
     def _compile(self) -> None:
@@ -95,31 +95,32 @@ class PreparedSolver:
         state = np.zeros(n) if self.problem.start is None else self.problem.start.copy()
         control = self.problem.nominal_control.copy()
         law = np.zeros((steps, m, n)), np.tile(control, (steps, 1))
-        attempt = Attempt(self.problem, self.settings, InitialGuess(*law, None, None, ""), state, Stop())
-        attempt.roll_out()
+        guess, budget = InitialGuess(*law, None, None, ""), Budget(self.settings.max_iterations)
+        run = SolveRun(self.problem, self.settings, guess, state, budget)
+        run.roll_out()
         compiled.rollout(self.problem, *law, state)
-        attempt.work.constraint_values(*attempt.work.plan)
+        run.work.constraint_values(*run.work.plan)
         for which in range(len(self.problem.constraint_terms)):
-            attempt.work.constraint_slope(which, 0, state, control, 0)
-        if self.problem.constraints and attempt.newton:
-            stages, plan = Stages(self.problem), Motion(*attempt.work.plan)
-            _Neighbour(attempt, stages, plan, _Best(attempt)).find()
-            # What that can do without, another solve may need.
+            run.work.constraint_slope(which, 0, state, control, 0)
+        if self.problem.constraints and run.second_order:
+            stages, plan = Stages(self.problem), Motion(*run.work.plan)
+            _Neighbour(run, stages, plan, _Best(run)).find()
+            # Another solve may need what this one did not.
             stages.convexify(plan)
             stages.change(worst=False)
             with np.errstate(all="ignore"):
                 InteriorPoint(self.problem, plan, stages=stages).run(
-                    tolerance=attempt.final, violation=attempt.settings.missed(self.problem), most=1
+                    tolerance=run.final, violation=run.settings.missed(self.problem), most=1
                 )
 
     def _stages_of(self, problem: Problem) -> Stages:
         try:
             return self._idle.pop().renewed(problem)
-        except IndexError:  # others are at work in the memory that there is
+        except IndexError:  # other threads use all there are
             return Stages(problem)
 
     def check(self, problem: Problem) -> Problem:
-        """Check that solving a problem compiles nothing: only numbers may differ from the prepared one.
+        """Check that a problem needs no compiling: only numbers may differ from the prepared one.
 
         Args:
           problem: to be solved.
@@ -147,14 +148,14 @@ class PreparedSolver:
         after: int = 0,
         time_limit: float | None = None,
     ) -> Replan:
-        """Solve from a state, beginning with a law: the answer is no worse than to go on with that; see `Replan`.
+        """Solve from a state, starting from a plan. The answer is no worse than going on with that plan; see `Replan`.
 
         Args:
-          state: (n,) where the plan is to begin.
-          start: the law, of as many steps as are left of the problem: `before.shifted(k)`.
-          problem: what to solve, the start apart; the prepared one, or one with other numbers.
-          after: how many steps of it are over: what is left is solved.
-          time_limit: seconds from this call to its end. An iteration that would probably end later is not begun.
+          state: (n,) the state to plan from.
+          start: a plan with as many steps as the problem has left: `before.shifted(k)`.
+          problem: the problem to solve from that state; by default the prepared one.
+          after: the number of steps that are over; the rest is solved.
+          time_limit: seconds from this call to its return. An iteration that would probably end later is not begun.
 
         Returns:
           A Replan.
@@ -165,30 +166,34 @@ class PreparedSolver:
         clock = time.perf_counter()
         problem = (self.problem if problem is None else self.check(problem)).from_state(state, after=after)
         check_kind("start", start, (Plan, InitialGuess), "a Plan, such as a Solution or a Replan")
-        stop = Stop() if time_limit is None else Stop(clock + check_number("time_limit", time_limit, above=0.0))
-        stop.reserve = self._pace + self._closing
+        stop = Stop(reserve=self._pace + self._closing)
+        if time_limit is not None:
+            stop.deadline = clock + check_number("time_limit", time_limit, above=0.0)
+        budget = Budget(self.settings.max_iterations, stop, attentive=True)
         guess = start if isinstance(start, InitialGuess) else _initial_guess(start, problem)
-        attempt = Attempt.lent(problem, self.settings, guess, np.asarray(state, dtype=np.float64), stop)
-        best = _Best(attempt)
+        run = SolveRun.lent(problem, self.settings, guess, np.asarray(state, dtype=np.float64), budget)
+        best = _Best(run)
         with problem.dynamics.solving(1):
-            if problem.constraints and attempt.newton:
+            if problem.constraints and run.second_order:
                 stages = self._stages_of(problem)
-                neighbour = _Neighbour(attempt, stages, _plan_of(start, best), best, self._closing)
+                neighbour = _Neighbour(run, stages, _plan_of(start, best), best, self._closing)
                 found, ended = neighbour.find(), neighbour.ended
                 self._idle.append(stages)
             else:
-                found = _run(attempt, best)
+                found = _solve(run, best)
                 ended = time.perf_counter()
-        iterating = best.rolling_out + sum(one.seconds for one in found.iterations)
-        self._pace = max(0.5 * self._pace, max((one.seconds for one in found.iterations), default=0.0))
+        seconds = [one.seconds for one in budget.log]
+        self._pace = max(0.5 * self._pace, max(seconds, default=0.0))
         best.consider(found)
-        answer = self._answer(problem, best, found, clock, iterating)
-        attempt.give_back()  # but not where something was raised
+        answer = self._answer(problem, best, found, budget, clock, best.rolling_out + sum(seconds))
+        run.give_back()  # not after an exception
         self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
         return answer
 
-    def _answer(self, problem: Problem, best: "_Best", found: AttemptResult, clock: float, iterating: float) -> Replan:
-        # The next solve writes over the memory that this one has worked in.
+    def _answer(
+        self, problem: Problem, best: "_Best", found: RunResult, budget: Budget, clock: float, iterating: float
+    ) -> Replan:
+        # The next solve overwrites this memory.
         states, controls, gain, offset = (array.copy() for array in (*best.plan, *best.law))
         value = best.cost_to_go
         if value is not None:
@@ -201,15 +206,16 @@ class PreparedSolver:
             status=found.status, detail=found.detail, improved=best.improved, policy=policy,
             trajectory=Trajectory(states, controls, problem.dt), cost=best.cost, before=best.before,
             violation=best.violation, cost_to_go=value, multipliers=best.multipliers,
-            goal=problem.weighed_goal, goal_radius=goal_radius_of(problem), iterations=len(found.iterations),
+            goal=problem.weighed_goal, goal_radius=goal_radius_of(problem), iterations=len(budget.log),
             seconds=time.perf_counter() - clock, iterating=iterating,
         )  # fmt: skip
 
 
 def _plan_of(start: Plan | InitialGuess, best: "_Best") -> Motion:
-    """Where a law leads, but for the last state: a horizon that moves has a last step that the law was not made for.
+    """The plan to start from: the rollout of the old policy, but with the old plan's last state.
 
-    Where that misses constraints, the plan that the law belongs to, but for where it begins.
+    A horizon that moves along has a last step for which the old policy was not made. Where the rollout violates
+    constraints, it is the old plan itself, from the new state.
     """
     plan = Motion(*(array.copy() for array in best.plan))
     if isinstance(start, InitialGuess) or start.trajectory.states.shape != plan.states.shape:
@@ -222,7 +228,7 @@ def _plan_of(start: Plan | InitialGuess, best: "_Best") -> Motion:
 
 
 def _initial_guess(start: Plan, problem: Problem) -> InitialGuess:
-    """The law to begin with, and what is known of its cost-to-go and of the multipliers."""
+    """The policy to start from, with its cost-to-go and multipliers as far as they are known."""
     n, m, steps = len(problem.dynamics.state_coordinates), len(problem.dynamics.control_coordinates), problem.steps
     law = start.policy
     gain, offset = (
@@ -235,32 +241,33 @@ def _initial_guess(start: Plan, problem: Problem) -> InitialGuess:
     return InitialGuess(in_c_order(gain), in_c_order(offset), start.cost_to_go, None, "", multipliers=multipliers)
 
 
-def _run(attempt: Attempt, best: "_Best") -> AttemptResult:
-    """The method, its safeguard and what else keeps the constraints, until it converges or has to stop."""
+def _solve(run: SolveRun, best: "_Best") -> RunResult:
+    """Smoothing, its safeguard and the augmented Lagrangian, until they converge or have to stop."""
+    run.budget.report_to(best)
     try:
-        if attempt.initial_guess.multipliers:
-            return satisfy(attempt, None, each=True, callback=best)
-        found = attempt.finish(each=True, callback=best, look_back=False)
-        if attempt.problem.constraints and found.success and not attempt.stop.due:
-            found = satisfy(attempt, found, each=True, callback=best)
+        if run.initial_guess.multipliers:
+            return satisfy(run, None)
+        found = run.solve(look_back=False)
+        if run.problem.constraints and found.success and not run.budget.stop.due:
+            found = satisfy(run, found)
         return found
     except InputError as error:  # a function that is not finite at the start
-        return replace(_unchanged(attempt, best), status=Status.NOT_FINITE, detail=str(error))
+        return replace(_unchanged(best), status=Status.NOT_FINITE, detail=str(error))
 
 
-def _unchanged(attempt: Attempt, best: "_Best") -> AttemptResult:
-    """What there is before the first iteration."""
-    return AttemptResult(
-        status=Status.TIME_LIMIT, detail="", iterations=(), states=best.plan[0], controls=best.plan[1], law=best.law,
+def _unchanged(best: "_Best") -> RunResult:
+    """The result before the first iteration."""
+    return RunResult(
+        status=Status.TIME_LIMIT, detail="", states=best.plan[0], controls=best.plan[1], law=best.law,
         cost=np.inf, violation=np.inf, gap=np.nan,
     )  # fmt: skip
 
 
 class _Neighbour:
-    """The optimum with constraints that is next to the plan of a law: by its active set, or by the interior point.
+    """Finds the constrained optimum next to a plan, by Newton steps with its active set or by the interior point.
 
     Args:
-      attempt: with the law and multipliers to begin with. stages: of its problem.
+      run: with the law and multipliers to begin with. stages: of its problem.
       plan: states and controls that the law belongs to, the first state being the start.
       best: the plan that the law leads to. closing: how long what follows the last iteration takes, in s.
 
@@ -268,95 +275,87 @@ class _Neighbour:
       ended: when the last iteration did.
     """
 
-    def __init__(self, attempt: Attempt, stages: Stages, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
-        self._attempt, self._stages, self._plan, self._best = attempt, stages, plan, best
-        self._closing = closing
-        self._allowed = attempt.settings.missed(attempt.problem)
-        self._iterations: list[Iteration] = []
+    def __init__(self, run: SolveRun, stages: Stages, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
+        self._run, self._stages, self._plan, self._best = run, stages, plan, best
+        self._closing, self._budget = closing, run.budget
+        self._allowed = run.settings.missed(run.problem)
         self.ended, self._cost = time.perf_counter(), np.inf
         self._out_of_time = False
 
-    def find(self) -> AttemptResult:
+    def find(self) -> RunResult:
         """Run until it converges or has to stop."""
-        attempt = self._attempt
+        run, budget = self._run, self._budget
         if self._late(0.0):
-            return _unchanged(attempt, self._best)
+            return _unchanged(self._best)
         if not np.isfinite(self._best.cost):
             detail = "the law that it begins with leads to infinity"
-            return replace(_unchanged(attempt, self._best), status=Status.NOT_FINITE, detail=detail)
-        known = tuple(one.values for one in attempt.initial_guess.multipliers)
-        for function in functions_of(attempt.problem):
+            return replace(_unchanged(self._best), status=Status.NOT_FINITE, detail=detail)
+        known = tuple(one.values for one in run.initial_guess.multipliers)
+        for function in functions_of(run.problem):
             function.forget()
         with np.errstate(all="ignore"):
             active = ActiveSet(self._stages, self._plan, known, self._allowed)
             self.ended = time.perf_counter()
-            solved = self._run(active)
-            if not (solved or active.hopeless or self._late(BEGINNING * active.looking)) and self._left:
+            solved = self._solve(active)
+            if not (solved or active.hopeless or self._late(BEGINNING * active.looking)) and budget.left:
                 point = InteriorPoint(
-                    attempt.problem, Motion(*(array.copy() for array in self._best.plan)), barrier=LITTLE[0],
+                    run.problem, Motion(*(array.copy() for array in self._best.plan)), barrier=LITTLE[0],
                     room=LITTLE[1], multipliers=known, stages=self._stages,
                 )  # fmt: skip
 
                 def watch(measures: Measures) -> bool:
                     self._log(measures, INTERIOR)
-                    return self._late(self._iterations[-1].seconds) or not self._left
+                    return self._late(budget.log[-1].seconds) or not budget.left
 
-                found = point.run(tolerance=attempt.final, violation=self._allowed, most=self._left, watch=watch)
+                found = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)
                 if found.solved or not np.isfinite(active.measures.cost):
                     active = ActiveSet(self._stages, found.plan, found.multipliers, self._allowed)
-                    solved = self._run(active)
-            self.ended = time.perf_counter()  # also of a step that was left
+                    solved = self._solve(active)
+            self.ended = time.perf_counter()  # also of an abandoned step
             return self._result(active, solved)
 
-    def _run(self, active: ActiveSet) -> bool:
-        """Take the steps of an active set; whether it is solved. One that would end too late is left halfway."""
+    def _solve(self, active: ActiveSet) -> bool:
+        """Take the steps of an active set; return whether they converge. A step that would be too late is abandoned."""
 
         def watch(measures: Measures) -> bool:
             self._log(measures, "active set")
-            return self._late(active.looking) or not self._left
+            return self._late(active.looking) or not self._budget.left
 
-        return active.run(self._attempt.final, watch, self._late)
+        return active.run(self._run.final, watch, self._late)
 
     def _late(self, seconds: float) -> bool:
-        """Whether what takes so long would end too late; then it all ends."""
-        self._out_of_time |= time.perf_counter() + seconds + self._closing >= self._attempt.stop.deadline
+        """Whether something that takes so long would end too late; if so, the solve ends."""
+        self._out_of_time |= time.perf_counter() + seconds + self._closing >= self._budget.stop.deadline
         return self._out_of_time
-
-    @property
-    def _left(self) -> int:
-        return self._attempt.iterations_left(tuple(self._iterations))
 
     def _log(self, measures: Measures, method: str) -> None:
         now = time.perf_counter()
-        self._iterations.append(replace(iteration_of(measures, self._cost, now - self.ended), method=method))
+        self._budget.record(replace(iteration_of(measures, self._cost, now - self.ended), method=method))
         self.ended, self._cost = now, measures.cost
 
-    def _result(self, active: ActiveSet, solved: bool) -> AttemptResult:
-        """Where the plan leads with a policy about it."""
-        attempt, work = self._attempt, self._attempt.work
+    def _result(self, active: ActiveSet, solved: bool) -> RunResult:
+        """The rollout of the plan with a policy about it."""
+        problem = self._run.problem
         if not np.isfinite(active.measures).all():
             status = Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
-            detail, done = raised_by(functions_of(attempt.problem)), tuple(self._iterations)
-            return replace(_unchanged(attempt, self._best), status=status, detail=detail, iterations=done)
+            return replace(_unchanged(self._best), status=status, detail=raised_by(functions_of(problem)))
         plan, gain, cost, values = active.carried_out()
-        terms = attempt.problem.constraint_terms
-        pairs = zip(terms, values, strict=True)
+        pairs = zip(problem.constraint_terms, values, strict=True)
         solved = solved and all(
             violation_of(term, one) <= allowed_violation(term, self._allowed) for term, one in pairs
         )
         status = Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
         offset = plan.controls - np.einsum("tij,tj->ti", gain, plan.states[:-1])
-        return AttemptResult(
-            status=Status.CONVERGED if solved else status, detail=detail, iterations=tuple(self._iterations),
-            states=plan.states, controls=plan.controls, law=(gain, offset), cost=cost,
-            violation=work.violation(values), gap=np.nan,
+        return RunResult(
+            status=Status.CONVERGED if solved else status, detail=detail, states=plan.states, controls=plan.controls,
+            law=(gain, offset), cost=cost, violation=self._run.work.violation(values), gap=np.nan,
             multipliers=tuple(Multipliers(*one) for one in active.multipliers()),
         )  # fmt: skip
 
 
 class _Best:
-    """The best plan so far, which is at first that of the law that the solve began with; called after each iteration.
+    """The best plan so far, at first the one that the solve starts from. It is called after each iteration.
 
     Attributes:
       plan: states and controls. law: gain and offset. cost_to_go: of the law; None where that is not known.
@@ -364,10 +363,10 @@ class _Best:
       improved: whether it is another than the first. rolling_out: how long it took to see where that leads, in s.
     """
 
-    def __init__(self, attempt: Attempt) -> None:
-        self._attempt, self._work, guess = attempt, attempt.work, attempt.initial_guess
+    def __init__(self, run: SolveRun) -> None:
+        self._run, self._work, guess = run, run.work, run.initial_guess
         clock = time.perf_counter()
-        attempt.roll_out()
+        run.roll_out()
         self.rolling_out = time.perf_counter() - clock
         values = self._work.constraint_values(self._work.states, self._work.controls)
         self.cost, self.violation = float(self._work.memory["plan_cost"]), self._work.violation(values)
@@ -375,30 +374,30 @@ class _Best:
         self.plan = self._work.states.copy(), self._work.controls.copy()
         self.law, self.cost_to_go, self.multipliers = (guess.gain, guess.offset), guess.cost_to_go, guess.multipliers
         self.improved = False
-        # Equalities are never kept but within a tolerance.
-        allowed = attempt.settings.missed(attempt.problem)
-        self._none = max((allowed_violation(term, allowed) for term in attempt.problem.constraint_terms), default=0.0)
+        # Equalities are kept only within a tolerance.
+        allowed = run.settings.missed(run.problem)
+        self._none = max((allowed_violation(term, allowed) for term in run.problem.constraint_terms), default=0.0)
         self._copies: tuple[Array, ...] = ()
 
     def __call__(self, iteration: Iteration) -> None:
-        if iteration.optimality < self._attempt.final and iteration.violation == 0:
-            return  # the last, most likely, and considered as such
+        if iteration.optimality < self._run.final and iteration.violation == 0:
+            return  # probably the last one; `consider` sees it
         if iteration.method in ("smooth", "newton") and self._beaten_by(iteration.cost, iteration.violation):
             arrays = self._work.arrays
             if iteration.method == "newton":
-                there = *arrays.plan, *self._attempt.law_about_plan()
+                there = *arrays.plan, *self._run.law_about_plan()
             else:
                 there = *arrays.rollout, *arrays.kept, *arrays.to_go
-            # The next iteration writes over these; and what is allocated anew each time is slow to write to.
+            # The next iteration overwrites these. Copies are allocated once, since writing to new memory is slow.
             if not self._copies:
                 self._copies = tuple(np.empty_like(array) for array in (*arrays.plan, *arrays.kept, *arrays.to_go))
-            copies = self._copies[: len(there)]  # about Newton's plans the cost-to-go is worked out at the end
+            copies = self._copies[: len(there)]  # the cost-to-go about Newton's plans is computed at the end
             for copy, array in zip(copies, there, strict=True):
                 np.copyto(copy, array)
             self._keep(iteration.cost, iteration.violation, copies)
 
-    def consider(self, found: AttemptResult) -> None:
-        """What it ended with: that, if it converged and is as good; and if it is better in any case."""
+    def consider(self, found: RunResult) -> None:
+        """Take the final result if it converged and is as good as the best, or if it is better."""
         as_good = found.success and not self._better(self.cost, self.violation, found.cost, found.violation)
         if as_good or self._beaten_by(found.cost, found.violation):
             there = found.states, found.controls, *found.law, *(self._work.arrays.to_go if found.values else ())

@@ -4,6 +4,10 @@ Each constraint that is missed costs its size times a price, smoothed by a logar
 limits of controls are kept by a barrier of their own. Steps are those of Newton's method in the Riccati recursion, and
 are followed in closed loop, so that every plan is a motion, and each costs less than the one before. It comes closer
 from afar than the interior point, which lets states part from the dynamics, and finishes slowly, which that does not.
+
+Far from where it is kept, a constraint's price is straight: it has no curvature, and a step to the minimum of the model
+goes anywhere. So curvature is added, that of the parabola which touches the price and is nowhere below it, and changes
+of controls are weighed; less of both where steps are taken in full, more where they are not.
 """
 
 from collections.abc import Callable
@@ -23,29 +27,33 @@ ARMIJO, SHORTEST = 1e-4, 1e-6
 INSIDE = 0.01  # of the way to a limit, what is left by a step
 EDGE = 0.01  # of the range, how far inside of the limits controls begin
 WEIGHTS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)  # on changes of controls, relative to cost and price
+DAMPING, LIGHT, HEAVY = 0.1, 1e-3, 1e6  # the same where the damping is 1; how small it may grow from, and how large be
+LONG, SHORT, TIMES = 0.4, 0.2, 4.0  # parts of a step with which the damping falls or grows, and by what
+WIDE = 1e3  # times what the barrier's parameter says of a multiplier, what it may be
+CLOSE, PATIENCE = 1e-4, 2  # what may be missed, relative to the rows' sizes, so often in a row that this is its end
+LEVEL, FINER = 1e-4, 0.1  # of the merit, a promised decrease that is next to nothing; and by what that falls
 
 
 @dataclass(frozen=True)
 class Restored:
-    """What it came to: a motion; of each constraint the share of its price that it pays (T+1, rows), from -1 to 1.
-
-    `settled` is whether the parameter of the barrier fell all the way.
-    """
+    """A motion. `settled`: whether what it misses is stationary. `near`: whether it misses next to nothing."""
 
     plan: Motion
-    shares: list[Array]
     settled: bool
+    near: bool
 
 
 def restore(
     stages: Stages, plan: Motion, sizes: Sizes, *, price: float, most: int,
-    watch: Callable[[float, float, float], bool],
+    watch: Callable[[float, float, float], bool], stationary: Callable[[Motion, list[Array]], bool],
 ) -> Restored | None:  # fmt: skip
     """Go down from a motion (states (T+1, n), controls (T, m)).
 
     Args:
       price: of missing a constraint by its size, in units of the typical cost. most: iterations.
       watch: called with cost, violation and promised decrease, relative to the merit, after each; True ends it.
+      stationary: asked, where there is next to nothing to gain, whether what a motion misses is stationary; given of
+        each constraint the share of its price that it pays (T+1, rows), from -1 to 1. True ends it.
     """
     live = stages.live
     size = np.broadcast_to(sizes.rows, live.shape)[live]
@@ -68,7 +76,10 @@ def restore(
         total = cost + float(np.where(limit, inside, paid).sum())
         return total if np.isfinite(total) else np.inf
 
-    settled = False
+    diagonal = np.arange(stages.n, stages.n + stages.m)
+    lowest = np.where(equality, -highest, 0.0)
+    settled, damping, close, level, dual = False, 1.0, 0, LEVEL, None
+    count = len(stages.problem.constraint_terms)
     force = np.zeros(len(size))
     costates = np.zeros((stages.steps + 1, stages.n))
     for _ in range(most):
@@ -80,11 +91,16 @@ def restore(
         while True:
             slack, excess = _slacks(numbers, highest, equality, parameter)
             room = np.where(limit, numbers, slack)
-            lowest = np.where(equality, -highest, 0.0)
             force = lowest + parameter / room
-            curvature = np.where(limit, parameter / room**2, 1 / (slack**2 / parameter + excess**2 / parameter))
+            dual = force if dual is None else dual
+            low = np.clip(dual - lowest, parameter / room / WIDE, parameter / room * WIDE)
+            high = np.clip(highest - dual, parameter / excess / WIDE, parameter / excess * WIDE)
+            own = np.where(limit, low / room, 1 / (room / low + excess / high))
+            chord = parameter / (slack * np.where(equality, 2 * excess, slack + excess))
+            curvature = np.where(limit, own, own + min(damping, 1.0) * np.maximum(chord - own, 0.0))
             gradient = stages.models.gradient - stages.pull(force)
             barrier = stages.curvature(curvature)
+            barrier[:, diagonal, diagonal] += damping * DAMPING * price * sizes.cost / sizes.controls**2 / stages.steps
             if not _direction(stages, barrier, gradient, sizes, price):
                 return None
             joined = stages.joined()
@@ -105,19 +121,29 @@ def restore(
                     taken = tried
                     break
             part /= 2
-        missed = float(np.where(limit, 0.0, np.where(equality, np.abs(numbers), -numbers)).max(initial=0.0))
+        moved = np.matmul(stages.slopes, joined[:, :, None])[:, :, 0][live]
+        aim = force - curvature * moved  # what multipliers come to, with the whole step
+        dual = dual + part * (aim - dual)
+        if part > LONG:
+            damping /= TIMES
+        elif part < SHORT:
+            damping = min(max(TIMES * damping, LIGHT), HEAVY)
+        short = np.where(limit, 0.0, np.where(equality, np.abs(numbers), -numbers))
+        missed, near = float(short.max(initial=0.0)), float((short / size).max(initial=0.0)) < CLOSE
+        close = close + 1 if near else 0
         promised = -0.5 * slope / max(abs(now), 1e-300)
-        if watch(cost, missed, promised):
+        if watch(cost, missed, promised) or close == PATIENCE:
             break
-        if parameter <= least and (taken is None or -slope < LAST * parameter):
-            settled = -slope < len(size) * parameter
-            break
-        if taken is None:
+        if not near and 2 * promised < level and damping < 1:
+            shares = stages.spread(np.where(limit, 0.0, np.clip(aim, lowest, highest) / highest))
+            settled = stationary(plan, [shares[:, stages.owners == k] for k in range(count)])
+            if settled:
+                break
+            level *= FINER
+        if taken is None or (parameter <= least and -slope < LAST * parameter):
             break
         plan = taken
-    shares = stages.spread(np.where(limit, 0.0, force / highest))
-    count = len(stages.problem.constraint_terms)
-    return Restored(plan, [shares[:, stages.owners == k].copy() for k in range(count)], settled)
+    return Restored(plan, settled, close > 0)
 
 
 def _slacks(numbers: Array, highest: Array, equality: Array, parameter: float) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""The differential equations behind `continuous.py`: of Riccati, and of a problem's motion and cost, through SciPy.
+"""The differential equations behind `continuous.py`, integrated by SciPy: Riccati's, and a problem's dynamics and cost.
 
 In the coordinates (x, 1) the three equations for S, **s** and s are one. With
 
@@ -29,29 +29,29 @@ from lqrsim.solvers.initial_guess import InitialPrior
 
 NO_MINIMUM = "S + Sbar is not positive definite"
 
-# Evaluations of one right-hand side, some seconds' worth: more are a motion that escapes or far too stiff.
+# Most evaluations of one right-hand side, a few seconds: a motion that needs more diverges or is far too stiff.
 _EVALUATIONS = 100_000
 
-# The dense output of DOP853 is of degree 7 over each step: eight points, ends included, say all of it.
+# The dense output of DOP853 is a polynomial of degree 7 per step, which eight points determine.
 _NODES = 0.5 * (1.0 - np.cos(np.pi * np.arange(8) / 7))
 _FIT = np.linalg.inv(np.vander(_NODES))
 
 
 class Tolerances(NamedTuple):
-    """How accurately to integrate, relative and absolute."""
+    """Relative and absolute tolerance of the integration."""
 
     rtol: float
     atol: float
 
 
 def tolerances_of(rtol: float, atol: float) -> Tolerances:
-    """Those two, if they can be met. Raises InputError."""
-    # Below a hundred roundings SciPy would warn and take what it thinks best.
+    """Check the tolerances. Raises InputError."""
+    # SciPy replaces a smaller one, with a warning.
     return Tolerances(check_number("rtol", rtol, at_least=1e-13), check_number("atol", atol, above=0.0))
 
 
 class IntegrationFailure(Exception):
-    """Why an integration cannot go on: ends as the status of the solve, never reaches a caller."""
+    """An integration failed. It becomes the status of the solve, and never reaches the caller."""
 
     def __init__(self, status: Status, why: str, t: float) -> None:
         super().__init__(why)
@@ -132,7 +132,7 @@ def riccati_pass(
     """
     n = len(end) - 1
     sign = 1.0 if backward else -1.0
-    rows, columns = np.triu_indices(n + 1)  # only these are integrated, so V stays symmetric
+    rows, columns = np.triu_indices(n + 1)  # only the upper triangle is integrated, so V stays symmetric
     spread = np.zeros((n + 1, n + 1), dtype=np.intp)
     spread[rows, columns] = spread[columns, rows] = np.arange(len(rows))
     corner = rows * (n + 1) + columns
@@ -167,12 +167,12 @@ def riccati_pass(
 def integrate(
     rate: Callable[[float, Array], Array], start: Array, span: tuple[float, float], tolerances: Tolerances
 ) -> Any:
-    """What `solve_ivp` returns, with dense output, for `rate(t, y)` from y = `start` over `span`.
+    """Run `solve_ivp` with dense output for `rate(t, y)` from y = `start` over `span`.
 
-    Where the rate cannot be had, a shorter step is tried, for the step may only have been too bold.
+    Where the rate cannot be evaluated, a shorter step is tried.
 
     Raises:
-      IntegrationFailure: that did not help.
+      IntegrationFailure: shorter steps fail, too.
     """
     last: list[IntegrationFailure] = []
     count = 0
@@ -190,7 +190,7 @@ def integrate(
             return out
         except IntegrationFailure as failure:
             last[:] = [failure]
-            return np.full_like(y, math.nan)  # which SciPy takes for an error that is too large
+            return np.full_like(y, math.nan)  # SciPy takes this for too large an error
 
     with np.errstate(all="ignore"):
         guarded(span[0], start)
@@ -218,7 +218,7 @@ def _pieces(found: Any, sample: Callable[[float, Array], Array]) -> PPoly:
 
 
 class System:
-    """A problem in continuous time: its functions, compiled, and its stage cost a second."""
+    """A problem in continuous time: its compiled functions, with the stage cost per second."""
 
     def __init__(self, problem: Problem) -> None:
         costs, data, dynamics = compiled.costs_module(problem), compiled.arguments(problem), problem.dynamics
@@ -227,7 +227,7 @@ class System:
         self.knots = np.linspace(0.0, self.horizon, problem.steps + 1)
         self._last, self._data = max(problem.steps - 1, 1), data
         self._none = np.zeros(m)
-        # Compiled code writes to these, and to the same entries of the Jacobians each time.
+        # Buffers that compiled code writes to.
         self._f, self._fx, self._fu = np.zeros(n), np.zeros((n, n)), np.zeros((n, m))
         self._hessian, self._gradient = np.zeros((n + m, n + m)), np.zeros(n + m)
         joint = self._hessian, self._gradient
@@ -238,7 +238,7 @@ class System:
         self._quadratize = costs.lay_out("cost_quadratic", self._f, self._none, 1, data.stage, *joint)
 
     def _expand(self, t: float, x: Array, u: Array) -> float:
-        """Expand dynamics and stage cost about (x, u), in place; returns the cost a second. All are per second."""
+        """Expand dynamics and stage cost about (x, u), in place; returns the cost. All are per second."""
         self._linearize(x, u, self._parameters, self._f, self._fx, self._fu)
         step = min(max(int(t / self.dt), 1), self._last)
         value = self._quadratize(x, u, step, self._data.stage, self._hessian, self._gradient)
@@ -278,10 +278,10 @@ class System:
         return about
 
     def rollout(self, start: Array, policy: Pass, tolerances: Tolerances) -> tuple[float, PPoly]:
-        """Run a policy under the true dynamics: its true cost, and the states (n,) as a function of time.
+        """Run a policy under the true dynamics; return its cost, and its states (n,) as a function of time.
 
         Raises:
-          IntegrationFailure: it escapes, or leaves where the dynamics and the cost are finite.
+          IntegrationFailure: the motion diverges, or dynamics or cost are not finite.
         """
 
         def rate(t: float, y: Array) -> Array:
@@ -295,7 +295,7 @@ class System:
         return float(cost), _pieces(found, lambda t, y: y[: self.n])
 
     def decrease(self, states: PPoly, policy: Pass, tolerances: Tolerances) -> float:
-        """How much less a linear-quadratic model about a rollout of the policy promises to cost.
+        """The decrease of cost that a linear-quadratic model about a rollout promises.
 
         Raises:
           IntegrationFailure: the model has no minimum.
@@ -303,7 +303,7 @@ class System:
         still, no_control = np.zeros(self.n), np.zeros(self.m)
 
         def deviation(t: float, _: Array) -> Model:
-            """The model in x less the rollout's, and of cost less its own: no constants to cancel."""
+            """The model in deviations from the rollout, so that no constants cancel."""
             x, law = states(t), policy.at(t)[1]
             self._expand(t, x, law[:, :-1] @ x + law[:, -1])
             return homogeneous(self._fx, self._fu, still, self._hessian, self._gradient, 0.0, still, no_control)

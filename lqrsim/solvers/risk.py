@@ -1,4 +1,4 @@
-"""How high the risk can be: above that, the expectation of exp(risk * cost) does not exist."""
+"""The largest risk for which the expectation of exp(risk * cost) exists."""
 
 from collections.abc import Callable
 
@@ -7,11 +7,12 @@ import numpy as np
 from lqrsim.errors import InputError, check_kind
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
-from lqrsim.solvers.attempt import Attempt, AttemptResult
-from lqrsim.solvers.common import SmootherSettings, Stop, check_problem
+from lqrsim.solvers.budget import Budget
+from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.initial_guess import resolve
+from lqrsim.solvers.settings import SmootherSettings, check_problem
 
-DIGITS = 1e-12  # to which it is found, relatively
+DIGITS = 1e-12  # relative accuracy
 
 Fails = Callable[[float], int]  # the step at which a backward pass fails with a risk, or -1
 
@@ -40,39 +41,36 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
     wanted = (problem.steps, len(problem.control_coordinates), len(problem.dynamics.state_coordinates))
     if (got := (*plan.controls.shape, plan.states.shape[1])) != wanted:
         raise InputError(f"solution: got a plan of {got} steps, controls and states, want {wanted}")
-    settings = SmootherSettings(
-        form="dual", first_pass="forward", safeguard=True, stop="optimal", tolerance=1e-4, gap_tolerance=1e-3,
-        max_iterations=1, time_limit=None, start=plan, starts=None, constraint_tolerance=1e-3,
-    )  # fmt: skip
-    attempt = Attempt(problem, settings, resolve(plan.controls, problem), plan.states[0].copy(), Stop())
-    attempt.work.plan.states[:], attempt.work.plan.controls[:] = plan.states, plan.controls
-    if attempt.fails_at(0.0) >= 0:
+    settings = SmootherSettings(tolerance=1e-4, max_iterations=1, start=plan, constraint_tolerance=1e-3)
+    run = SolveRun(problem, settings, resolve(plan.controls, problem), plan.states[0].copy(), Budget(1))
+    run.work.plan.states[:], run.work.plan.controls[:] = plan.states, plan.controls
+    if run.fails_at(0.0) >= 0:
         raise InputError("solution: got a plan about which no backward pass succeeds, want one that converged")
     high = 1e-6 / max(abs(solution.cost), 1e-100) if np.isfinite(solution.cost) else 1.0
-    while attempt.fails_at(high) < 0:
+    while run.fails_at(high) < 0:
         high *= 2
         if high > 1e200:
             return float("inf")
-    return _bisect(attempt.fails_at, high)
+    return _bisect(run.fails_at, high)
 
 
 def named(fails: Fails, risk: float, steps: int) -> str:
-    """What there is to say of a risk that was too high: where, and what would do; nothing where it cannot be told."""
+    """Say at which step a risk is too high, and which one is not; empty if that cannot be told."""
     failed = fails(risk)
     if failed < 0 or fails(0.0) >= 0:
         return ""
-    most = _bisect(fails, risk) * (1 - 1e-5)  # what is said works, though it is rounded
+    most = _bisect(fails, risk) * (1 - 1e-5)  # so that the rounded number works, too
     return f"about the best plan risk {risk:g} is too high at step {failed} of {steps}, and at most {most:.5g} will do"
 
 
-def name_risk(attempt: Attempt, found: AttemptResult) -> str:
+def name_risk(run: SolveRun, found: RunResult) -> str:
     """The detail of an answer whose risk was too high."""
-    problem, work = attempt.problem, attempt.work
+    problem, work = run.problem, run.work
     if not np.isfinite(work.memory["plan_cost"]):
         work.plan.states[:], work.plan.controls[:] = work.states, work.controls
     if not np.isfinite(work.plan.states).all():
         return found.detail
-    return "; ".join(part for part in (named(attempt.fails_at, problem.risk, problem.steps), found.detail) if part)
+    return "; ".join(part for part in (named(run.fails_at, problem.risk, problem.steps), found.detail) if part)
 
 
 def _bisect(fails: Fails, high: float) -> float:

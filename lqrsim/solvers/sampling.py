@@ -1,4 +1,4 @@
-"""What runs of a policy cost under a problem's noise, by the problem's own model: what the expected cost is held to."""
+"""Costs of sampled runs under a problem's noise, with which expected costs can be compared."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from lqrsim.kernels.records import Policy
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
 from lqrsim.solvers import compiled
-from lqrsim.solvers.common import check_problem
+from lqrsim.solvers.settings import check_problem
 
 MOST_TRIALS = 10_000_000
 

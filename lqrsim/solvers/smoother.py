@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,27 +12,19 @@ from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Iteration, Status
+from lqrsim.results.solution_parts import Status
 from lqrsim.solvers.assembly import assemble
-from lqrsim.solvers.attempt import Attempt
-from lqrsim.solvers.common import (
-    Callback,
-    SmootherSettings,
-    Stop,
-    all_driven_by,
-    check_attempts,
-    check_callback,
-    check_problem,
-    check_threads,
-    solve_all,
-)
+from lqrsim.solvers.budget import Budget, Callback, Stop
+from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.free_duration import find_duration, settled
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
 from lqrsim.solvers.interior_point import Measures, iteration_of
 from lqrsim.solvers.multistart import STARTS, Search, check_starts, guides
+from lqrsim.solvers.parallel import all_driven_by, check_threads, solve_all
 from lqrsim.solvers.risk import name_risk
+from lqrsim.solvers.settings import SmootherSettings, check_callback, check_problem, check_runs, settings_from
 
-# Of a free duration: how often shorter ones are tried, by how much, and with how many iterations.
+# For a free duration: how often a shorter one is tried, by what factor, and with how many iterations.
 SHORTENED, SHORTER, TRIES = 3, 0.9, 150
 
 
@@ -123,31 +116,17 @@ def smooth(
     check_problem(problem)
     problem = problem.driven_by(noise, risk)
     _check(problem, settings)
-    threads = check_threads(threads)
-    return _solve(problem, settings, each=True, threads=threads, callback=callback)
+    return _solve(problem, settings, attentive=True, threads=check_threads(threads), callback=callback)
 
 
 def smooth_many(
     problems: Iterable[Problem],
     *,
     threads: int | None = None,
-    form: str = "dual",
-    first_pass: str = "forward",
-    safeguard: bool = True,
-    stop: str = "optimal",
-    tolerance: float | None = None,
-    gap_tolerance: float = 1e-3,
-    max_iterations: int = 500,
-    time_limit: float | None = None,
-    start: StartLike = None,
-    starts: int | None = None,
-    constraint_tolerance: float | None = None,
-    penalty: float | None = None,
-    finish: str | None = "newton",
-    elastic: float | None = None,
+    progress: Callable[[int, int], object] | None = None,
     noise: Noise | None = None,
     risk: float | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    **options: Any,
 ) -> list[Solution]:
     """Solve many problems as `smooth` does, on several threads, without Python between the iterations.
 
@@ -158,36 +137,19 @@ def smooth_many(
     Args:
       problems: of one structure or of many; each structure is compiled once.
       threads: how many to use; by default all processors that this process may run on.
-      form: as in `smooth`, for all.
-      first_pass: as in `smooth`, for all.
-      safeguard: as in `smooth`, for all.
-      stop: as in `smooth`, for all.
-      tolerance: as in `smooth`, for all.
-      gap_tolerance: as in `smooth`, for all.
-      max_iterations: as in `smooth`, for all.
-      time_limit: as in `smooth`, for all.
-      start: as in `smooth`, for all.
-      starts: as in `smooth`, for all.
-      constraint_tolerance: as in `smooth`, for all.
-      penalty: as in `smooth`, for all.
-      finish: as in `smooth`, for all.
-      elastic: as in `smooth`, for all.
-      noise: as in `smooth`, for all.
-      risk: as in `smooth`, for all.
-      progress: called with how many are done, of how many, as each one ends.
+      progress: called with the numbers of solved and of all problems, as each solve ends.
+      noise: as in `smooth`, for all problems.
+      risk: as in `smooth`, for all problems.
+      options: other keyword arguments of `smooth`, except `callback`, for all problems.
 
     Returns:
-      One Solution a problem, in their order.
+      One Solution per problem, in their order.
 
     Raises:
       InputError: an argument is not as described; a problem that is refused is named by its place in the list. One that
         is only not finite at its start ends as NOT_FINITE, and its detail says where.
     """
-    settings = SmootherSettings(
-        form=form, first_pass=first_pass, safeguard=safeguard, stop=stop, tolerance=tolerance,
-        gap_tolerance=gap_tolerance, max_iterations=max_iterations, time_limit=time_limit, start=start, starts=starts,
-        constraint_tolerance=constraint_tolerance, penalty=penalty, finish=finish, elastic=elastic,
-    )  # fmt: skip
+    settings = settings_from(SmootherSettings, "smooth_many", options)
     return solve_all(all_driven_by(problems, noise, risk), settings, _check, _solve, threads=threads, progress=progress)
 
 
@@ -195,72 +157,66 @@ def _solve(
     problem: Problem,
     settings: SmootherSettings,
     *,
-    each: bool,
+    attentive: bool = False,
     threads: int = 1,
     callback: Callback | None = None,
 ) -> Solution:
-    """Solve; with `each`, a look after each iteration (see `iterate`)."""
+    """Solve; `attentive`: see `Budget`."""
     if problem.duration is not None:
-        return _solve_for_duration(problem, settings, each=each, threads=threads, callback=callback)
+        return _solve_for_duration(problem, settings, attentive=attentive, threads=threads, callback=callback)
     given = [("", settings.start)] if settings.start is not None else guides(problem, settings.starts)
     start = np.zeros(len(problem.dynamics.state_coordinates)) if problem.start is None else problem.start.copy()
     first = resolve(given[0][1], problem).penalised(problem, settings.penalty)
     check_functions(problem, start, first.offset[0].copy())
-    initial_guesses = [first, *(resolve(one, problem) for _, one in given[1:])]
-    attempts = [Attempt.lent(problem, settings, initial_guess, start, Stop()) for initial_guess in initial_guesses]
-    stop = settings.stop_early()  # from now on: compiling does not count
-    for attempt in attempts:
-        attempt.stop = stop
-    search = Search([name for name, _ in given], attempts, each=each, callback=callback)
-    with problem.dynamics.solving(threads if len(attempts) == 1 else 1):
-        search.run(threads)
+    stop = Stop()
+    runs = [
+        SolveRun.lent(problem, settings, guess, start, Budget(settings.max_iterations, stop, attentive=attentive))
+        for guess in (first, *(resolve(one, problem) for _, one in given[1:]))
+    ]
+    stop.begin(settings.time_limit)  # compiling, which comes before, does not count
+    search = Search([name for name, _ in given], runs, callback, threads)
+    with problem.dynamics.solving(threads if len(runs) == 1 else 1):
+        search.run()
         default = settings.start is None and settings.starts is None and settings.safeguard
-        if default and not stop.due and search.poor(problem):
-            search.widen(problem, settings, start, stop, threads)
+        if default and not stop.due and search.is_unacceptable:
+            search.widen()
         if problem.risk > 0 and settings.safeguard and not stop.due:
-            search.calm(problem, settings, start, stop, threads)
-        chosen, found = search.best
-    assert found.certificate is not None
+            search.retry_without_risk()
+    chosen, found = search.best
     detail = name_risk(chosen, found) if found.status is Status.RISK_TOO_HIGH else found.detail
+    tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.missed(problem)}
     solution = assemble(
-        problem, solver="smooth",
-        options=settings.options(chosen.initial_guess)
-        | {"tolerance": chosen.final, "constraint_tolerance": settings.missed(problem)},
-        status=found.status,
-        detail=detail, iterations=found.iterations, states=found.states, controls=found.controls,
-        law=found.law,
-        certificate=found.certificate, gap=found.gap, candidates=search.candidates(), multipliers=found.multipliers,
-        **found.values,
+        problem, replace(found, detail=detail), chosen.budget.log, solver="smooth",
+        options=settings.options(chosen.initial_guess) | tolerances, candidates=search.candidates(),
     )  # fmt: skip
-    for attempt in attempts:
-        attempt.give_back()
+    for run in runs:
+        run.give_back()
     return stop.finish(solution)
 
 
 def _solve_for_duration(
-    problem: Problem, settings: SmootherSettings, *, each: bool, threads: int, callback: Callback | None
+    problem: Problem, settings: SmootherSettings, *, attentive: bool, threads: int, callback: Callback | None
 ) -> Solution:
     """Solve for the stated duration, then for the best one near that, and then to the end with it.
 
     Where time costs, shorter durations are tried, too, for they may lead another way round.
     """
-    stop, log = settings.stop_early(), list[Iteration]()
-    clock = time.perf_counter()
+    budget = Budget(settings.max_iterations, callback=callback)
+    budget.stop.begin(settings.time_limit)
+    log, clock = budget.log, time.perf_counter()
 
     def watch(measures: Measures) -> bool:
         nonlocal clock
         now, before = time.perf_counter(), log[-1].cost if log else np.inf
-        log.append(iteration_of(measures, before, now - clock))
+        budget.record(iteration_of(measures, before, now - clock))
         clock = now
-        if callback is not None:
-            callback(log[-1])
-        return stop.due
+        return budget.stop.due
 
     assert problem.duration is not None
     stated, first, best = problem.steps * problem.dt, None, None
     for attempt in range(SHORTENED + 1 if problem.time_weight > 0 else 1):
         tries = settings if first is None else replace(settings, max_iterations=min(TRIES, settings.max_iterations))
-        begin = _solve(settled(problem, stated), tries, each=each, threads=threads, callback=callback)
+        begin = _solve(settled(problem, stated), tries, attentive=attentive, threads=threads, callback=callback)
         first = begin if first is None else first
         if attempt and not begin.success:
             break
@@ -271,27 +227,32 @@ def _solve_for_duration(
             violation=settings.missed(problem),
             watch=watch,
         )
-        if stop.due or ended is None or (best is not None and not ended[1].measures.cost < best[1].measures.cost):
+        if (
+            budget.stop.due
+            or ended is None
+            or (best is not None and not ended[1].measures.cost < best[1].measures.cost)
+        ):
             break
         best = ended
         stated = max(SHORTER * best[0].steps * best[0].dt, problem.duration[0])
     assert first is not None
     if best is None:
-        status = Status.TIME_LIMIT if stop.due else Status.MAX_ITERATIONS
+        status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS
         detail = f"no better duration than {stated:g} s was found; {first.detail}".removesuffix("; ")
-        return replace(first, status=status, detail=detail, iterations=(*first.iterations, *log))
+        return budget.stop.finish(replace(first, status=status, detail=detail, iterations=(*first.iterations, *log)))
     ordinary, found = best
     m, n = first.trajectory.controls.shape[1], first.trajectory.states.shape[1]
     guess = InitialGuess(
         np.zeros((ordinary.steps, m, n)), found.plan.controls, None, None,
         f"a plan of {ordinary.steps * ordinary.dt:.6g} s", found=found, log=tuple(log),
     )  # fmt: skip
-    return _solve(ordinary, replace(settings, start=guess, starts=None), each=each, callback=callback)
+    settings = replace(settings, start=guess, starts=None)
+    return budget.stop.finish(_solve(ordinary, settings, attentive=attentive, callback=callback))
 
 
 def _check(problem: Problem, settings: SmootherSettings) -> None:
     check_problem(problem)
-    if settings.elastic is not None and not (problem.constraints and settings.newton(problem)):
+    if settings.elastic is not None and not (problem.constraints and settings.second_order(problem)):
         if problem.constraints:
             why = 'finish="newton" and stop="optimal"'
             why = (
@@ -301,10 +262,10 @@ def _check(problem: Problem, settings: SmootherSettings) -> None:
             )
             raise InputError(f"elastic: got {settings.elastic:g}, want {why} beside it")
         raise InputError(f"elastic: got {settings.elastic:g} for a problem without constraints, want None")
-    if problem.duration is not None and not settings.newton(problem):
+    if problem.duration is not None and not settings.second_order(problem):
         raise InputError('duration: got one without the interior point, want finish="newton" and stop="optimal"')
     several = settings.start is None and len(problem.obstacle_costs) > 0
-    check_attempts(problem, settings.starts or (STARTS if several else 1))
+    check_runs(problem, settings.starts or (STARTS if several else 1))
     if settings.form == "primal" and problem.dynamics.discrete:
         raise InputError(f"form: got 'primal' for {problem.dynamics.name}, whose steps have no inverse, want 'dual'")
     if settings.form == "primal" and isinstance(problem.initial, FixedState):

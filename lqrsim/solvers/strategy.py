@@ -1,6 +1,6 @@
 """What a solve from one start tries, top to bottom, until something converges.
 
-Without constraints: the method, Newton's where it has found the valley, the safeguard where it fails; see `Attempt`.
+Without constraints: the method, Newton's where it has found the valley, the safeguard where it fails; see `SolveRun`.
 With constraints, whatever comes first is followed by the interior point, which has the end:
 
     the plan of another solution, with its multipliers;
@@ -19,7 +19,7 @@ Problems with noise and constraints, those of an MJCF, and `finish=None` have th
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -28,16 +28,15 @@ from lqrsim.errors import Array
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajectory
-from lqrsim.solvers import compiled, constrained
-from lqrsim.solvers.attempt import Attempt, AttemptResult
-from lqrsim.solvers.common import Callback, check_outcome
+from lqrsim.solvers import augmented_lagrangian, compiled
+from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
+from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.infeasibility import Evidence, evidence
 from lqrsim.solvers.interior_point import INTERIOR, Found, InteriorPoint, Measures, Sizes, Stages, iteration_of
-from lqrsim.solvers.multipliers import AugmentedLagrangian
 from lqrsim.solvers.restoration import Restored, restore
 
 FAR = 100.0  # times what may be missed: then the price is too low, or there is no way to keep all
-STARTS = 2  # from which what is missed has to be stationary, before that is called infeasible
+STARTS, SURE = 2, 4  # from which what is missed has to be stationary, to be called infeasible; and not to try others
 AUGMENTED = 100  # iterations of the augmented Lagrangian
 OPENING, GUIDED = 10, 60  # iterations of smoothing at most before constraints come in; and with an ObstacleCost
 MOST, RESTORED = 300, 150  # of the interior point from one plan; and of a descent at one price
@@ -51,78 +50,87 @@ ROUNDING = 1e-9  # of a cost: two plans that differ by less are as good
 AT_LIMIT = 1e-9  # of its range, within which a control that presses against its limit is put there
 
 
-def finish(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
-    """Run an attempt to its end, certified."""
-    if attempt.initial_guess.found is not None:
-        return Ladder(attempt, each=each, callback=callback).climb()
-    if not attempt.problem.constraints:
-        return attempt.certified(_without_constraints(attempt, each=each, callback=callback))
-    if not attempt.newton:
-        return constrained.finish(attempt, each=each, callback=callback)
-    return Ladder(attempt, each=each, callback=callback).climb()
+@dataclass
+class Known:
+    """What the runs of one search know of each other's results.
+
+    Attributes:
+      evidence: plans whose violation is stationary. from_start: whether the start itself was tried.
+    """
+
+    evidence: list[tuple[Evidence, RunResult]] = field(default_factory=list)
+    from_start: bool = False
 
 
-def refine(attempt: Attempt, *, each: bool, callback: Callback | None = None) -> AttemptResult:
-    """Run an attempt to its end from where its first policy leads, and stay on that way round; certified."""
-    if not (attempt.problem.constraints and attempt.newton):
-        return constrained.refine(attempt, each=each, callback=callback)
-    return Ladder(attempt, each=each, callback=callback).climb(stay=True)
+def finish(run: SolveRun, known: Known) -> RunResult:
+    """Run to the end; certified. `known` is what other runs of the search found."""
+    if run.initial_guess.found is not None:
+        return Ladder(run, known).climb()
+    if not run.problem.constraints:
+        return run.certified(_without_constraints(run))
+    return Ladder(run, known).climb() if run.second_order else augmented_lagrangian.finish(run)
 
 
-def _without_constraints(attempt: Attempt, *, each: bool, callback: Callback | None) -> AttemptResult:
+def refine(run: SolveRun, known: Known) -> RunResult:
+    """Run to the end from where the first policy leads, and stay on that way round; certified."""
+    if run.problem.constraints and run.second_order:
+        return Ladder(run, known).climb(stay=True)
+    return augmented_lagrangian.refine(run)
+
+
+def _without_constraints(run: SolveRun) -> RunResult:
     """The method; where controls stand at limits and it does not settle soon, or it fails, the interior point."""
-    problem = attempt.problem
+    problem, budget = run.problem, run.budget
     space = problem.control_coordinates
-    if not attempt.newton or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
-        return attempt.finish(each=each, callback=callback)
-    attempt.run(min(OPENING, attempt.settings.max_iterations), each=each, callback=callback)
-    controls = attempt.work.plan.controls
+    if not run.second_order or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
+        return run.solve()
+    run.smooth(OPENING)
+    controls = run.work.plan.controls
     pressed = ((controls <= space.low) | (controls >= space.high)).any()
-    if attempt.termination.outcome == declarations.RUNNING and pressed and np.isfinite(attempt.cost):
-        ladder = Ladder(attempt, each=each, callback=callback)
-        found = ladder.from_plan(attempt.termination.iterations, attempt.work.plan)
+    if run.ending.outcome == declarations.RUNNING and pressed and np.isfinite(run.cost):
+        found = Ladder(run, Known()).from_plan(run.work.plan)
         if found is not None:
             return found
-    found = attempt.finish(each=each, callback=callback)
-    if found.success or attempt.stop.due or attempt.iterations_left(found.iterations) < 2:
+    found = run.solve()
+    if found.success or budget.stop.due or budget.left < 2:
         return found
-    ladder = Ladder(attempt, each=each, callback=callback)
-    plan = attempt.work.plan if np.isfinite(found.cost) else ladder.start()
-    return ladder.from_plan(found.iterations, plan) or found
+    ladder = Ladder(run, Known())
+    plan = run.work.plan if np.isfinite(found.cost) else ladder.start()
+    return ladder.from_plan(plan) or found
 
 
 class Ladder:
     """The ways to a plan that keeps constraints, one after the other."""
 
-    def __init__(self, attempt: Attempt, *, each: bool, callback: Callback | None) -> None:
-        self._attempt, self._problem, self._each, self._callback = attempt, attempt.problem, each, callback
-        self._allowed = attempt.settings.missed(attempt.problem)
+    def __init__(self, run: SolveRun, known: Known) -> None:
+        self._run, self._problem, self._budget = run, run.problem, run.budget
+        self._allowed = run.settings.missed(run.problem)
         clock = time.perf_counter()
-        self._stages = Stages(attempt.problem)
-        attempt.stop.deadline += time.perf_counter() - clock  # compiling does not count
-        self._iterations: tuple[Iteration, ...] = attempt.initial_guess.log
-        self._best: AttemptResult | None = None
-        self._given: AttemptResult | None = None
+        self._stages = Stages(run.problem)
+        run.budget.stop.deadline += time.perf_counter() - clock  # compiling does not count
+        self._budget.log[:0] = run.initial_guess.log
+        self._best: RunResult | None = None
+        self._given: RunResult | None = None
         self._valley: Motion | None = None
         # Whether smoothing and its search have gone round obstacles, which are then to be passed on that side.
-        self._guided = any(cost.weight for cost in attempt.problem.obstacle_costs)
-        self._evidence: list[tuple[Evidence, AttemptResult]] = []
-        if attempt.settings.penalty is None:
+        self._guided = any(cost.weight for cost in run.problem.obstacle_costs)
+        self._known = known
+        if run.settings.penalty is None:
             self._without_multipliers()
 
     def _without_multipliers(self) -> None:
         """Have the augmented Lagrangian add nothing to the cost."""
-        for array in self._attempt.work.multipliers:
+        for array in self._run.work.multipliers:
             array[0], array[declarations.HEADER :] = 0.0, 0.0
 
-    def climb(self, *, stay: bool = False) -> AttemptResult:
+    def climb(self, *, stay: bool = False) -> RunResult:
         """Try one after the other; with `stay`, only what begins where the first policy leads."""
-        guess = self._attempt.initial_guess
+        guess = self._run.initial_guess
         start = self.start()
         given = guess.trajectory is not None or guess.gain.any() or stay
-        if (given or self._attempt.settings.start is not None) and start.violation <= self._allowed:
+        if (given or self._run.settings.start is not None) and start.violation <= self._allowed:
             self._given = start  # never left behind
-        rungs: list[Callable[[], AttemptResult | None]] = []
+        rungs: list[Callable[[], RunResult | None]] = []
         if guess.found is not None:
             rungs.append(lambda: self._answered(guess.found))
         if guess.multipliers and any(one.values.any() for one in guess.multipliers):
@@ -135,145 +143,143 @@ class Ladder:
             rungs.append(lambda: self._interior(_plan(guess.trajectory or start), near))
         if not stay:
             rungs += [self._from_valley, self._augmented, lambda: self._at_a_price(self._valley)]
-        rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._at_a_price(_plan(start))]
+        if stay or not self._known.from_start:  # all runs of a search have the same start
+            rungs += [lambda: self._interior(_plan(start), MUCH), lambda: self._from_start(start)]
         for rung in rungs:
             found = rung()
             if found is not None and found.success:
                 if not self._worse(found):
                     break
                 self._best = None  # what was given is better
-            if self._attempt.stop.due or not self._attempt.iterations_left(self._iterations):
+            if self._budget.over:
                 break
         return self._answer(start)
 
-    def from_plan(self, iterations: tuple[Iteration, ...], plan: Motion | AttemptResult) -> AttemptResult | None:
-        """From a plan, which took these iterations; None where that leads nowhere."""
-        kept = self._attempt.kept()
-        self._iterations = iterations
+    def from_plan(self, plan: Motion | RunResult) -> RunResult | None:
+        """From a plan, by the interior point; None where that leads nowhere, and smoothing can go on."""
+        checkpoint, begin = self._run.checkpoint(), len(self._budget.log)
         found = self._interior(_plan(plan), MUCH)
         if found is not None and found.success:
-            return replace(found, iterations=self._iterations)
-        self._attempt.go_on(kept, self._iterations)
+            return found
+        self._run.go_on(checkpoint, self._budget.log[begin:])
         return None
 
-    def _from_valley(self) -> AttemptResult | None:
-        attempt = self._attempt
-        most = min(GUIDED if self._guided else OPENING, attempt.iterations_left(self._iterations))
-        attempt.run(most, each=self._each, callback=self._callback)
-        termination = check_outcome(
-            self._problem, attempt.termination, attempt.work.start, attempt.initial_guess.offset[0], refuse=self._each
-        )
-        self._iterations += termination.iterations
-        settled = termination.success or termination.outcome == declarations.IN_VALLEY
-        plan = attempt.work.arrays.rollout if settled else attempt.work.plan  # which is the one of least cost
-        if termination is not attempt.termination or not np.isfinite(attempt.work.memory["plan_cost"]):
+    def _from_start(self, start: RunResult) -> RunResult | None:
+        self._known.from_start = True
+        return self._at_a_price(_plan(start))
+
+    def _from_valley(self) -> RunResult | None:
+        """From where smoothing leads without the constraints."""
+        run = self._run
+        run.smooth(GUIDED if self._guided else OPENING)
+        ending = run.checked_ending()
+        settled = ending.success or ending.outcome == declarations.IN_VALLEY
+        plan = run.work.arrays.rollout if settled else run.work.plan  # which is the one of least cost
+        if ending is not run.ending or not np.isfinite(run.work.memory["plan_cost"]):
             return None
-        self._valley = Motion(plan.states.copy(), plan.controls.copy())
-        if attempt.stop.due:
+        self._valley = _plan(plan)
+        if self._budget.stop.due:
             return None
-        if termination.outcome != declarations.IN_VALLEY or (not self._guided and termination.iterations[-1].violation):
+        if ending.outcome != declarations.IN_VALLEY or (not self._guided and self._budget.log[-1].violation):
             return self._interior(self._valley, MUCH)
         # Its bottom: the answer, if that keeps the constraints; or, with what keeps clear of obstacles, next to it.
-        kept = attempt.kept()
-        found = attempt.descend(self._iterations, each=self._each, callback=self._callback)
-        self._iterations = found.iterations
+        checkpoint = run.checkpoint()
+        found = run.newton()
         if found.success and found.violation == 0:
             return self._note(found)
-        bottom = Motion(found.states.copy(), found.controls.copy()) if found.success else self._valley
-        attempt.go_on(kept, termination.iterations)
-        return None if attempt.stop.due else self._interior(bottom, LITTLE if self._guided else MUCH)
+        bottom = _plan(found) if found.success else self._valley
+        run.go_on(checkpoint)
+        return None if self._budget.stop.due else self._interior(bottom, LITTLE if self._guided else MUCH)
 
-    def _refined(self) -> AttemptResult | None:
+    def _refined(self) -> RunResult | None:
         """From where steps lead that lower the augmented Lagrangian alone."""
-        attempt, settings = self._attempt, self._attempt.settings
-        attempt.settings = replace(settings, max_iterations=min(AUGMENTED, settings.max_iterations))
-        found = constrained.refine(attempt, each=self._each, callback=self._callback)
-        attempt.settings, self._iterations = settings, (*self._iterations, *found.iterations)
-        plan = Motion(found.states.copy(), found.controls.copy())
-        self._without_multipliers()
-        if attempt.stop.due or not np.isfinite(found.cost) or not np.isfinite(plan.states).all():
-            return None
-        return self._interior(plan, LITTLE)
+        with self._budget.limited(AUGMENTED):
+            found = augmented_lagrangian.refine(self._run)
+        return self._after_multipliers(found)
 
-    def _augmented(self) -> AttemptResult | None:
+    def _augmented(self) -> RunResult | None:
         """From what the augmented Lagrangian comes to, which stays in the valley that smoothing has chosen."""
-        attempt, settings = self._attempt, self._attempt.settings
-        if self._valley is None or settings.elastic is not None or not self._guided:
+        run = self._run
+        if self._valley is None or run.settings.elastic is not None or not self._guided:
             return None
-        most = min(len(self._iterations) + AUGMENTED, settings.max_iterations)
-        attempt.settings = replace(settings, max_iterations=most)
-        before = replace(attempt.result(attempt.termination), iterations=self._iterations)
-        found = constrained.satisfy(attempt, before, each=self._each, callback=self._callback)
-        attempt.settings, self._iterations = settings, found.iterations
-        plan = Motion(found.states.copy(), found.controls.copy())
+        with self._budget.limited(AUGMENTED):
+            found = augmented_lagrangian.satisfy(run, run.result(run.ending))
+        return self._after_multipliers(found)
+
+    def _after_multipliers(self, found: RunResult) -> RunResult | None:
+        """The interior point from the plan that the method of multipliers came to."""
+        plan = _plan(found)
         self._without_multipliers()
-        if attempt.stop.due or not np.isfinite(found.cost) or not np.isfinite(plan.states).all():
+        if self._budget.stop.due or not np.isfinite(found.cost) or not np.isfinite(plan.states).all():
             return None
         return self._interior(plan, LITTLE)
 
-    def _at_a_price(self, plan: Motion | None) -> AttemptResult | None:
+    def _at_a_price(self, plan: Motion | None) -> RunResult | None:
         """With constraints that may be missed; and from where that leads, without."""
-        if plan is None or self._attempt.settings.elastic is not None:
+        if plan is None or self._run.settings.elastic is not None:
             return None
         for price in PRICES:
-            priced, sizes = self._restore(plan, price)
+            priced = self._restore(plan, price)
             if priced is None:
                 return None
             plan = priced.plan
-            there = self._note(self._result(plan.states, plan.controls, self._without_gains(plan)))
-            missed = there.violation > FAR * self._allowed
-            if missed and price == PRICES[-1] and priced.settled and self._look_for_evidence(priced, there, sizes):
+            self._note(self._result(plan.states, plan.controls, self._without_gains(plan)))
+            if priced.settled:
                 return None
-            if not missed or price == PRICES[-1]:
+            if priced.near or price == PRICES[-1]:
                 found = self._interior(plan, MUCH)
                 if found is not None and found.success:
                     return found
         return None
 
-    def _restore(self, plan: Motion, price: float) -> tuple[Restored | None, Sizes]:
+    def _restore(self, plan: Motion, price: float) -> Restored | None:
         """Descent at a price, with a line of the log each."""
-        stop, left = self._attempt.stop, self._attempt.iterations_left(self._iterations) - 1
+        budget, left = self._budget, self._budget.left - 1
         before, clock, slow = np.inf, time.perf_counter(), 0
 
         def watch(cost: float, violation: float, promised: float) -> bool:
             nonlocal before, clock, slow
             now = time.perf_counter()
             improvement = (before - cost) / max(abs(cost), 1e-300)
-            self._iterations += (Iteration(cost, improvement, 0.0, promised, 0.0, violation, now - clock, RESTORATION),)
+            budget.record(Iteration(cost, improvement, 0.0, promised, 0.0, violation, now - clock, RESTORATION))
             slow = slow + 1 if violation <= self._allowed and abs(improvement) < SLOW else 0
             before, clock = cost, now
-            if self._callback is not None:
-                self._callback(self._iterations[-1])
-            return stop.due or slow == PATIENCE
+            return budget.stop.due or slow == PATIENCE
 
         sizes = self._stages.sizes(plan)
-        if left < 1 or stop.due:
-            return None, sizes
+        if left < 1 or budget.stop.due:
+            return None
         try:
             with np.errstate(all="ignore"):
-                return restore(self._stages, plan, sizes, price=price, most=min(RESTORED, left), watch=watch), sizes
-        except BaseException as error:  # as above
-            stop.error = error
-            return None, sizes
+                return restore(
+                    self._stages, plan, sizes, price=price, most=min(RESTORED, left), watch=watch,
+                    stationary=lambda plan, shares: self._look_for_evidence(plan, shares, sizes),
+                )  # fmt: skip
+        except BaseException as error:  # Ctrl-C: raised again when there is a solution
+            budget.stop.error = error
+            return None
 
-    def _look_for_evidence(self, priced: Restored, there: AttemptResult, sizes: Sizes) -> bool:
-        """Whether what is missed there is stationary; if so it is kept."""
-        rows = [sizes.rows[self._stages.owners == k] for k in range(len(priced.shares))]
+    def _look_for_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
+        """Whether the violation of a plan is stationary; if so, that is kept as evidence."""
+        there = self._result(plan.states, plan.controls, self._without_gains(plan))
+        if not there.violation > FAR * self._allowed:
+            return False
+        rows = [sizes.rows[self._stages.owners == k] for k in range(len(shares))]
         found = evidence(
-            self._problem, self._attempt.work, there.states, there.controls, shares=priced.shares, sizes=rows,
+            self._problem, self._run.work, there.states, there.controls, shares=shares, sizes=rows,
             allowed=self._allowed, control_size=sizes.controls, state_size=sizes.states,
         )  # fmt: skip
         if found is not None:
-            self._evidence.append((found, there))
+            self._known.evidence.append((found, there))
         return found is not None
 
     def _interior(
         self, plan: Motion, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()
-    ) -> AttemptResult | None:
+    ) -> RunResult | None:
         """The interior point from a plan, and what becomes of it."""
-        return self._answered(self._run(plan, barrier, multipliers=multipliers))
+        return self._answered(self._iterate(plan, barrier, multipliers=multipliers))
 
-    def _answered(self, found: Found | None) -> AttemptResult | None:
+    def _answered(self, found: Found | None) -> RunResult | None:
         """What becomes of what the interior point came to."""
         if found is None or not np.isfinite(found.plan.states).all():
             return None
@@ -281,47 +287,47 @@ class Ladder:
             return self._note(result)
         return self._note(self._rolled_out(found.plan, found.gain))
 
-    def _run(self, plan: Motion, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()) -> Found | None:
+    def _iterate(
+        self, plan: Motion, barrier: tuple[float, float], *, multipliers: tuple[Array, ...] = ()
+    ) -> Found | None:
         """Iterations of the interior point, with a line of the log each; None where they were interrupted."""
-        stop, left = self._attempt.stop, self._attempt.iterations_left(self._iterations) - 1
-        if left < 1 or stop.due:
+        budget, left = self._budget, self._budget.left - 1
+        if left < 1 or budget.stop.due:
             return None
         before, clock = np.inf, time.perf_counter()
 
         def watch(measures: Measures) -> bool:
             nonlocal before, clock
             now = time.perf_counter()
-            self._iterations += (iteration_of(measures, before, now - clock),)
+            budget.record(iteration_of(measures, before, now - clock))
             before, clock = measures.cost, now
-            if self._callback is not None:
-                self._callback(self._iterations[-1])
-            return stop.due
+            return budget.stop.due
 
         try:
             with np.errstate(all="ignore"):
                 point = InteriorPoint(
-                    self._problem, plan, barrier=barrier[0], room=barrier[1], price=self._attempt.settings.price,
+                    self._problem, plan, barrier=barrier[0], room=barrier[1], price=self._run.settings.price,
                     multipliers=multipliers, stages=self._stages,
                 )  # fmt: skip
                 return point.run(
-                    tolerance=self._attempt.final, violation=self._allowed, most=min(MOST, left),
+                    tolerance=self._run.final, violation=self._allowed, most=min(MOST, left),
                     near=barrier is LITTLE, watch=watch,
                 )  # fmt: skip
-        except BaseException as error:  # the callback's, or Ctrl-C: raised again when there is a solution
-            stop.error = error
+        except BaseException as error:  # Ctrl-C: raised again when there is a solution
+            budget.stop.error = error
             return None
 
-    def start(self) -> AttemptResult:
+    def start(self) -> RunResult:
         """Where the policy leads that it all begins with."""
-        work = self._attempt.work
-        guess = self._attempt.initial_guess
+        work = self._run.work
+        guess = self._run.initial_guess
         states, controls = compiled.rollout(self._problem, guess.gain, guess.offset, work.start.copy())
         return self._result(states, controls, (guess.gain, guess.offset))
 
     def _without_gains(self, plan: Motion) -> tuple[Array, Array]:
         return np.zeros((*plan.controls.shape, plan.states.shape[1])), plan.controls
 
-    def _rolled_out(self, plan: Motion, gain: Array) -> AttemptResult:
+    def _rolled_out(self, plan: Motion, gain: Array) -> RunResult:
         """Where a plan leads with gains about it; or without, if that misses less."""
         candidates = []
         for gains in (gain, np.zeros_like(gain)):
@@ -330,22 +336,22 @@ class Ladder:
             candidates.append(self._result(states, controls, (gains.copy(), offset)))
         return min(candidates, key=lambda one: (not np.isfinite(one.cost), one.violation, one.cost))
 
-    def _result(self, states: Array, controls: Array, law: tuple[Array, Array]) -> AttemptResult:
+    def _result(self, states: Array, controls: Array, law: tuple[Array, Array]) -> RunResult:
         """A plan that has not converged."""
         cost, _ = self._stages.trial(Motion(in_c_order(states), in_c_order(controls)))
-        work = self._attempt.work
+        work = self._run.work
         violation = work.violation(work.constraint_values(states, controls)) if np.isfinite(states).all() else np.inf
-        return AttemptResult(
-            status=Status.MAX_ITERATIONS, detail="", iterations=(), states=states, controls=controls, law=law,
+        return RunResult(
+            status=Status.MAX_ITERATIONS, detail="", states=states, controls=controls, law=law,
             cost=cost if np.isfinite(cost) else np.inf, violation=violation, gap=np.nan,
         )  # fmt: skip
 
-    def _kept(self, found: Found) -> AttemptResult | None:
+    def _kept(self, found: Found) -> RunResult | None:
         """The end: controls at their limits are put there, and Newton's method makes policy and value functions.
 
         Its cost has the augmented Lagrangian at the multipliers that were found, about which the plan is a minimum.
         """
-        attempt, work, stages = self._attempt, self._attempt.work, self._stages
+        work, stages = self._run.work, self._stages
         low, high = stages.low, stages.high
         controls, gain = found.plan.controls.copy(), found.gain.copy()
         for side, sign in ((low, -1.0), (high, 1.0)):
@@ -369,19 +375,17 @@ class Ladder:
             array[declarations.HEADER :] = np.where(acts, force, 0.0).ravel()
         work.plan.states[...], work.plan.controls[...] = states, controls
         work.memory["plan_cost"] = self._stages.trial(Motion(in_c_order(states), in_c_order(controls)))[0]
-        lagrangian, before = AugmentedLagrangian(attempt), self._iterations
+        lagrangian = AugmentedLagrangian(self._run)
         lagrangian.evaluate(*work.plan)
-        result = self._descend(lagrangian)
-        for _ in range(UPDATES):
-            if lagrangian.kept or not result.success:
-                break
-            lagrangian.update(growth=1.0)
-            result = self._descend(lagrangian)
-        if len(self._iterations) == len(before) + 1 and before:  # no step: a look at the plan
-            last = self._iterations[-1]
-            self._iterations = (*before[:-1], replace(last, method=INTERIOR, seconds=last.seconds + before[-1].seconds))
+        with self._budget.joined_with_last(INTERIOR):
+            result = self._newton(lagrangian)
+            for _ in range(UPDATES):
+                if lagrangian.kept or not result.success:
+                    break
+                lagrangian.update(growth=1.0)
+                result = self._newton(lagrangian)
         detail = ""
-        if attempt.settings.elastic is not None and result.violation > 0:
+        if self._run.settings.elastic is not None and result.violation > 0:
             detail = f"elastic: {lagrangian.worst()}"
         result = replace(result, detail=detail, multipliers=self._pressing(lagrangian, found, result))
         if result.success and lagrangian.kept:
@@ -389,11 +393,9 @@ class Ladder:
         self._without_multipliers()
         return replace(result, status=Status.MAX_ITERATIONS)
 
-    def _pressing(
-        self, lagrangian: AugmentedLagrangian, found: Found, result: AttemptResult
-    ) -> tuple[Multipliers, ...]:
+    def _pressing(self, lagrangian: AugmentedLagrangian, found: Found, result: RunResult) -> tuple[Multipliers, ...]:
         """The multipliers, without what is left of the barrier on rows that have more to spare than they press."""
-        values = self._attempt.work.constraint_values(result.states, result.controls)
+        values = self._run.work.constraint_values(result.states, result.controls)
         multipliers = []
         for k, one in enumerate(lagrangian.multipliers()):
             size = found.row_size[self._stages.owners == k]
@@ -401,44 +403,46 @@ class Ladder:
             multipliers.append(replace(one, values=np.where(idle, 0.0, one.values)))
         return tuple(multipliers)
 
-    def _descend(self, lagrangian: AugmentedLagrangian) -> AttemptResult:
+    def _newton(self, lagrangian: AugmentedLagrangian) -> RunResult:
         """Newton's method from the plan in the memory, with these multipliers."""
-        result = self._attempt.descend(self._iterations, each=self._each, callback=None, added=lagrangian.added())
-        self._iterations = result.iterations
+        result = self._run.newton(added=lagrangian.added())
         lagrangian.evaluate(result.states, result.controls)
         return result
 
-    def _note(self, found: AttemptResult) -> AttemptResult:
+    def _note(self, found: RunResult) -> RunResult:
         """Keep it, if it is the best so far, in memory of its own."""
         if self._best is None or found.rank < self._best.rank:
             law = found.law[0].copy(), found.law[1].copy()
             self._best = replace(found, states=found.states.copy(), controls=found.controls.copy(), law=law)
         return found
 
-    def _worse(self, found: AttemptResult) -> bool:
+    def _worse(self, found: RunResult) -> bool:
         """Whether a plan costs more than one that was given and keeps the constraints."""
         return self._given is not None and found.cost > self._given.cost + ROUNDING * abs(self._given.cost)
 
-    def _answer(self, start: AttemptResult) -> AttemptResult:
+    def _answer(self, start: RunResult) -> RunResult:
         """The best of all, certified."""
-        attempt = self._attempt
+        run, stop = self._run, self._budget.stop
         best = start if self._best is None else self._best
-        priced = self._attempt.settings.elastic is not None and best.success
+        priced = run.settings.elastic is not None and best.success
         if self._given is not None and not priced and (best.violation > self._allowed or self._worse(best)):
             best = self._given
         if not best.success and self._problem.constraints:
-            lagrangian = AugmentedLagrangian(attempt)
+            lagrangian = AugmentedLagrangian(run)
             lagrangian.evaluate(best.states, best.controls)
-            status, detail = Status.MAX_ITERATIONS, lagrangian.worst()
-            if len(self._evidence) >= STARTS and best.violation > self._allowed:
-                least, best = min(self._evidence, key=lambda pair: pair[0].missed)
+            status = Status.STALLED if self._budget.left > 1 else Status.MAX_ITERATIONS
+            detail = lagrangian.worst()
+            if len(self._known.evidence) >= STARTS and best.violation > self._allowed:
+                least, best = min(self._known.evidence, key=lambda pair: pair[0].missed)
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()
                 status = Status.INFEASIBLE
                 detail += f"; against it stand {least.against}" if least.against else ""
-            best = replace(best, status=Status.TIME_LIMIT if attempt.stop.due else status, detail=detail)
-        return attempt.certified(replace(best, iterations=self._iterations))
+            status = Status.TIME_LIMIT if stop.due else status
+            sure = status is Status.INFEASIBLE and len(self._known.evidence) >= SURE
+            best = replace(best, status=status, detail=detail, final=sure)
+        return run.certified(best)
 
 
-def _plan(of: AttemptResult | Trajectory | Motion) -> Motion:
+def _plan(of: RunResult | Trajectory | Motion) -> Motion:
     return Motion(of.states.copy(), of.controls.copy())

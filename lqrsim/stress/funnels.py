@@ -32,7 +32,7 @@ from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import seeded
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.start_at import simulate_from
-from lqrsim.solvers.common import check_threads
+from lqrsim.solvers.parallel import check_threads
 from lqrsim.stress.levels import BATCH, MOST_TRIALS, FoundLevel, LevelTest, find_level, smallest_test
 from lqrsim.stress.multilevel_splitting import Progress
 from lqrsim.stress.statistics import CONFIDENCE, Estimate

@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 import lqrsim as ls
 from lqrsim.machine import processors
-from lqrsim.solvers.attempt import Attempt
+from lqrsim.solvers.engine import SolveRun
 
 sys.path.append(str(Path(__file__).parents[2] / "experiments"))  # has the runner, the systems and the independent judge
 
@@ -159,9 +159,9 @@ def _certificate(config: Config) -> dict[str, Any]:
     problems = [
         replace(problem, initial=ls.FixedState(problem.start)) for problem in problems if problem.start is not None
     ]
-    certified, spent = Attempt.certified, 0.0
+    certified, spent = SolveRun.certified, 0.0
 
-    def timed(self: Attempt, found: Any) -> Any:
+    def timed(self: SolveRun, found: Any) -> Any:
         nonlocal spent
         clock = time.perf_counter()
         answer = certified(self, found)
@@ -169,7 +169,7 @@ def _certificate(config: Config) -> dict[str, Any]:
         return answer
 
     shares: dict[str, list[float]] = {"search": [], "hover": [], "warm": []}
-    Attempt.certified = timed  # pyright: ignore[reportAttributeAccessIssue]
+    SolveRun.certified = timed  # pyright: ignore[reportAttributeAccessIssue]
     try:
         for problem in tqdm(problems, desc="certificate", leave=False, disable=None):
             solution = ls.smooth(problem, threads=1)
@@ -179,7 +179,7 @@ def _certificate(config: Config) -> dict[str, Any]:
                 ls.smooth(problem, start=start, threads=1)
                 shares[name].append(spent / (time.perf_counter() - clock))
     finally:
-        Attempt.certified = certified  # pyright: ignore[reportAttributeAccessIssue]
+        SolveRun.certified = certified  # pyright: ignore[reportAttributeAccessIssue]
     return {name: statistics.median(values) for name, values in shares.items()}
 
 

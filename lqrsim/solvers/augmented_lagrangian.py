@@ -1,0 +1,386 @@
+"""Constraints by the method of multipliers: from the optimum without them to one that keeps them.
+
+The smoother minimises the augmented Lagrangian, roughly; then the multipliers are updated, and the penalty grows where
+the violation has not halved; and again. Updating after every iteration would make plans that slide along an obstacle
+swing to and fro, since the model leaves out how an obstacle curves. Where undamped iterations do not settle, the
+safeguard's damped ones minimise each augmented Lagrangian.
+
+It serves problems that the interior point does not take: noise with constraints, an MJCF's dynamics, `finish=None`; and
+is one rung of the ladder among obstacles, see `strategy.py`. The compiled part is `kernels/augmented_lagrangian.py`.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from lqrsim.errors import Array
+from lqrsim.kernels import declarations
+from lqrsim.kernels.records import LOG
+from lqrsim.problem.constraints import ConstraintTerm, allowed_violation, violation_of
+from lqrsim.problem.costs import CostSum, ObstacleCost, terms_of
+from lqrsim.problem.problem import Problem
+from lqrsim.results.solution_parts import Multipliers, Status
+from lqrsim.results.value_functions import Moments
+from lqrsim.solvers.engine import RunResult, SolveRun
+from lqrsim.solvers.initial_guess import InitialGuess
+
+PENALTY = 8.0  # initial penalty, relative to what it costs to change the constraint's value
+GROWTH, LARGEST = 5.0, 1e4  # factor by which the penalty grows, and in all before it is given up
+STUCK = 3  # how often in a row the penalty may grow to no avail
+ITERATIONS, ROUNDS = 100, 30  # undamped iterations in all; rounds of damped ones
+ROUGH, ROUGH_GAP, PATIENCE = 1e-3, 3e-3, 15  # what is settled well enough to update the multipliers, and when anyway
+ROUGHEST_GAP = 3e-2  # the same gap of damped iterations, which come to their minimum slowly
+STALE, CLOSER = 40, 0.9  # undamped iterations that come no closer before they are given up; what counts as closer
+
+
+def finish(run: SolveRun) -> RunResult:
+    """Run to the end, with the method, its safeguard and these iterations; certified."""
+    if run.initial_guess.multipliers and run.run_opening_pass():
+        found = satisfy(run, None)
+        if found.success or run.budget.over:
+            return run.certified(found)
+        # What is known of another problem does not help here.
+        run = _again(run, run.problem, dataclasses.replace(run.initial_guess, multipliers=()))
+    run, found = _with_constraints(run, run.solve())
+    return run.certified(found)
+
+
+def _again(run: SolveRun, problem: Problem, initial_guess: InitialGuess) -> SolveRun:
+    """Another run, with what is left of the budget."""
+    return SolveRun(problem, run.settings, initial_guess, run.work.start, run.budget)
+
+
+def _with_constraints(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResult]:
+    """Go on from what was found without the constraints; also which run has the answer in its memory."""
+    if run.budget.over:
+        if found.success and not run.work.keeps(run.work.constraint_values(found.states, found.controls)):
+            status = Status.TIME_LIMIT if run.budget.stop.due else Status.MAX_ITERATIONS
+            found = dataclasses.replace(found, status=status, detail="before the constraints could be met")
+        return run, found
+    if found.success:
+        return run, satisfy(run, found)
+    return _first_feasible(run, found)
+
+
+def satisfy(run: SolveRun, found: RunResult | None) -> RunResult:
+    """Go on from what was found without the constraints, or, without it, from the multipliers of another solution."""
+    lagrangian = AugmentedLagrangian(run)
+    if found is None:
+        run.roll_out()
+        lagrangian.evaluate(run.work.states, run.work.controls)
+    else:
+        lagrangian.evaluate(found.states, found.controls)
+        if lagrangian.kept:
+            return found
+        lagrangian.start()
+        # These will be overwritten.
+        found = dataclasses.replace(found, states=found.states.copy(), controls=found.controls.copy())
+    undamped = _undamped(run, lagrangian, known=found is None)
+    if undamped.success or not run.settings.safeguard or run.budget.over:
+        return undamped
+    return _damped(run, lagrangian, found, undamped)
+
+
+def _first_feasible(run: SolveRun, found: RunResult) -> tuple[SolveRun, RunResult]:
+    """First a plan that keeps the constraints, without the cost of obstacles; then the cost comes in.
+
+    For where not even the problem without the constraints is solved: deep within obstacles, they cost beyond numbers.
+    """
+    problem, budget = run.problem, run.budget
+    if not (run.settings.safeguard and any(cost.weight for cost in problem.obstacle_costs)):
+        return run, found
+    costs = [cost.weighing(0.0) if isinstance(cost, ObstacleCost) else cost for cost in terms_of(problem.stage_cost)]
+    plain = problem.with_costs(stage_cost=CostSum(tuple(costs)))
+    without = _again(run, plain, dataclasses.replace(run.initial_guess, prior=None))
+    with budget.without_costs():
+        kept = without.solve()
+        if kept.success and not budget.over:
+            kept = satisfy(without, kept)
+    if not kept.success or budget.over:
+        # Of the plan, only what the constraints say is known: its certificate tells the cost.
+        status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS if kept.success else kept.status
+        return run, dataclasses.replace(kept, status=status, final=not kept.success, values={})
+    initial_guess = dataclasses.replace(
+        run.initial_guess, gain=kept.law[0].copy(), offset=kept.law[1].copy(), trajectory=None, prior=None,
+        cost_to_go=kept.values.get("cost_to_go"), multipliers=kept.multipliers,
+    )  # fmt: skip
+    run = _again(run, problem, initial_guess)
+    if kept.multipliers:
+        return run, satisfy(run, None)
+    found = run.solve()
+    return run, satisfy(run, found) if found.success and not budget.over else found
+
+
+def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool) -> RunResult:
+    """Undamped iterations, and updated multipliers in between; these are `known` at first from another solution."""
+    work, log, most = run.work, run.budget.log, run.settings.gap_tolerance
+    work.memory["plan_cost"] = -np.inf  # of lower cost is not better now
+    rows = np.zeros(min(ITERATIONS, max(run.budget.left, 1)), LOG)
+    done, since, stale, nearest = 0, 0, 0, np.inf
+    while True:
+        begin = len(log)
+        ending = run.smooth_with_constraints(rows, done, done + 1)
+        done, since = done + len(log) - begin, since + 1
+        stopped = ending.pass_failed or ending.outcome in (declarations.CYCLING, declarations.TIMED_OUT)
+        if stopped or len(log) == begin or not np.isfinite(log[-1].cost):
+            break
+        last = log[-1]
+        lagrangian.evaluate(work.states, work.controls)
+        settled = ending.outcome in (declarations.CONVERGED, declarations.COST_CONVERGED)
+        if done == len(rows) or (settled and lagrangian.solved):
+            break
+        # From the optimum without constraints they soon settle, or cycle: then damped ones are far quicker.
+        off = max(last.gap / most, last.violation / run.settings.missed(run.problem))
+        stale = 0 if off < CLOSER * nearest else stale + 1
+        nearest = min(off, nearest)
+        if stale == STALE and not known and run.settings.safeguard:
+            break
+        rough = abs(last.improvement) < ROUGH and last.gap < ROUGH_GAP
+        if settled or rough or since == PATIENCE:
+            since = 0
+            lagrangian.update()
+    found = run.result(ending)
+    detail = found.detail or ("" if found.success else f"with constraints; {lagrangian.worst()}")
+    if found.success and not lagrangian.solved:
+        found = dataclasses.replace(found, status=Status.MAX_ITERATIONS)
+        detail = f"{done} iterations with constraints: {lagrangian.worst()}"
+    return dataclasses.replace(found, detail=detail, multipliers=lagrangian.multipliers())
+
+
+def _damped(
+    run: SolveRun, lagrangian: "AugmentedLagrangian", found: RunResult | None, undamped: RunResult
+) -> RunResult:
+    """The safeguard: from the plan without constraints or the last one with them, whichever is the better beginning."""
+    work = run.work
+    plans = [(work.states, work.controls, undamped.cost)]
+    plans += [(found.states, found.controls, found.cost)] if found is not None else []
+    plans = [plan for plan in plans if np.isfinite(plan[2])]
+    if not plans:
+        return undamped
+    lagrangian.evaluate(*plans[-1][:2])
+    lagrangian.start()
+    merits = []
+    for *plan, cost in plans:
+        lagrangian.evaluate(*plan)
+        merits.append(cost + lagrangian.added())
+    states, controls, cost = plans[int(np.argmin(merits))]
+    work.plan[0][:], work.plan[1][:] = states, controls
+    work.memory["plan_cost"] = cost
+    return _rounds(run, lagrangian, "the undamped method failed with the constraints")
+
+
+def refine(run: SolveRun) -> RunResult:
+    """Run to the end by steps that lower the cost alone, from where the first policy leads; certified.
+
+    So it stays on the way round that it begins with, which undamped iterations would leave.
+    """
+    run.roll_out()
+    cost = float(run.work.memory["plan_cost"])
+    optimality = run.linearize_about_plan() if np.isfinite(cost) else np.nan
+    if not np.isfinite(optimality):
+        return run.certified(run.solve())
+    if not run.problem.constraints:
+        run.work.memory["merit"] = cost
+        damped = run.damped()
+        return run.certified(run.damped_result(damped, damped.status, damped.detail(run.problem.steps)))
+    lagrangian = AugmentedLagrangian(run)
+    lagrangian.evaluate(*run.work.plan)
+    lagrangian.start()
+    return run.certified(_rounds(run, lagrangian, ""))
+
+
+def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunResult:
+    """Damped iterations from the plan in the memory and updates of the multipliers, until the constraints are met."""
+    work, budget = run.work, run.budget
+    lagrangian.evaluate(*work.plan)
+    rounds, rough = 0, True
+    while True:
+        rounds += 1
+        work.memory["merit"] = work.memory["plan_cost"] + lagrangian.added()
+        # Until the multipliers are about right, there is no point in a minimum to all its digits.
+        ending = run.damped(least=(ROUGH, ROUGHEST_GAP) if rough else (0.0, 0.0))
+        lagrangian.evaluate(*work.plan)
+        if ending.success and lagrangian.solved:
+            if not rough:
+                found = run.damped_result(ending, ending.status, why)
+                return dataclasses.replace(found, multipliers=lagrangian.multipliers())
+            if not budget.over:
+                rough = False
+                continue
+        if rounds == ROUNDS or lagrangian.grown > LARGEST or lagrangian.stuck == STUCK or budget.over:
+            break
+        lagrangian.update()
+        rough = rough and lagrangian.stuck == 0 and not lagrangian.nearly
+    status, detail = Status.MAX_ITERATIONS, f"{why}; {lagrangian.worst()}".removeprefix("; ")
+    if not lagrangian.kept and not lagrangian.nearly and (lagrangian.stuck == STUCK or lagrangian.grown > LARGEST):
+        status, detail = Status.INFEASIBLE, lagrangian.worst()
+    if budget.stop.due:
+        status = Status.TIME_LIMIT
+    found = run.damped_result(ending, status, detail)
+    return dataclasses.replace(found, multipliers=lagrangian.multipliers())
+
+
+def _forces(term: ConstraintTerm, array: Array, values: Array) -> Array:
+    """What the multipliers become: lambda - mu d, of inequalities not below 0; 0 where they do not act."""
+    acting = np.where(np.isinf(values), 0.0, values)
+    forces = np.clip(array[declarations.HEADER :] - array[0] * acting, -array[4] if term.equality else 0.0, array[4])
+    return np.where(np.isinf(values), 0.0, forces)
+
+
+def _missed(term: ConstraintTerm, array: Array, values: Array) -> float:
+    """By how much a constraint is missed, or an inequality's multipliers are off, at most."""
+    if term.equality:
+        return float(np.abs(values).max(initial=0.0))
+    forces = array[declarations.HEADER :] / array[0] if array[0] > 0 else 0.0
+    return float(np.abs(np.minimum(values, forces)).max(initial=0.0))
+
+
+class AugmentedLagrangian:
+    """The multipliers of all constraints, in the memory that the compiled loops read.
+
+    Inequalities and equalities each have a tolerance, and their penalties grow on their own.
+
+    Attributes:
+      kept: whether the plan that was evaluated last keeps the constraints.
+      solved: whether it does so as well as is aimed at: inequalities with the tolerance to spare, and where more than
+        that is left, with a multiplier that is not off by more: `|min(d, lambda / mu)|`; equalities `|d|`.
+      nearly: whether it would if equalities could be missed by as much as inequalities have to spare.
+      grown: by how much a penalty has grown. stuck: how often in a row that did not help.
+    """
+
+    def __init__(self, run: SolveRun) -> None:
+        self._problem, self._work = run.problem, run.work
+        self._terms = run.problem.constraint_terms
+        self._near = tolerance = run.settings.missed(run.problem)
+        # Of inequalities and of equalities, if there are any.
+        self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in self._terms}
+        self.kept = self.solved = self.nearly = False
+        self._restart()
+        self._first = [array[0] for array in self._work.multipliers]  # zero, but for those of another solution
+
+    def _restart(self) -> None:
+        self._grown, self._last = dict.fromkeys(self._tolerance, 1.0), dict.fromkeys(self._tolerance, np.inf)
+        self.stuck = 0
+
+    @property
+    def grown(self) -> float:
+        return max(self._grown.values())
+
+    def evaluate(self, states: Array, controls: Array) -> None:
+        """Evaluate the constraints of a plan."""
+        self._plan = states, controls
+        stated = self._work.constraint_values(states, controls)
+        self.kept = self._work.keeps(stated)
+        self._values = [values.ravel() - array[3] for values, array in zip(stated, self._work.multipliers, strict=True)]
+        missed = zip(self._terms, self._each(_missed), strict=True)
+        self.solved = all(off <= self._tolerance[term.equality] for term, off in missed)
+        pairs = zip(self._terms, stated, strict=True)
+        beyond = max((violation_of(term, values) - term.equality * self._near for term, values in pairs), default=0.0)
+        self.nearly = not self.kept and beyond <= 0
+
+    def start(self) -> None:
+        """No multipliers, and a penalty for each constraint that fits what it costs to change it."""
+        self._restart()
+        for which, (array, values) in enumerate(zip(self._work.multipliers, self._values, strict=True)):
+            array[declarations.HEADER :] = 0.0
+            if not self._first[which] > 0:
+                # Only now: once there is a penalty, it is what the passes say of curvature.
+                self._first[which] = PENALTY * self._curvature(which) if len(values) else 1.0
+            array[0] = self._first[which]
+
+    def update(self, growth: float = GROWTH) -> None:
+        """Take the forces for the multipliers; let the penalty grow where that helps too little."""
+        for term, array, values in self._constraints():
+            array[declarations.HEADER :] = _forces(term, array, values)
+        missed = dict.fromkeys(self._tolerance, -np.inf)
+        for term, _, values in self._constraints():
+            short = np.abs(values).max(initial=0.0) if term.equality else -values.min(initial=np.inf)
+            missed[term.equality] = max(missed[term.equality], short)
+        worst = max(missed, key=lambda kind: missed[kind])
+        # Equalities that are nearly kept can be: what they wait for is a better minimum.
+        near = {kind: kind and short <= self._near for kind, short in missed.items()}
+        self.stuck = self.stuck + 1 if missed[worst] > 0.9 * self._last[worst] and not near[worst] else 0
+        for kind, tolerance in self._tolerance.items():
+            more = growth * self._grown[kind] <= LARGEST or not near[kind]
+            if more and missed[kind] > max(0.5 * self._last[kind], tolerance):
+                self._grown[kind] *= growth
+                for term, array, _ in self._constraints():
+                    array[0] *= growth if term.equality == kind else 1.0
+        self._last = missed
+
+    def added(self) -> float:
+        """What the augmented Lagrangian adds to the cost of the plan."""
+
+        def one(term: ConstraintTerm, array: Array, values: Array) -> float:
+            known, acting = array[declarations.HEADER :], np.where(np.isinf(values), 0.0, values)
+            forces = _forces(term, array, values)
+            return float((forces @ (2 * (known - array[0] * acting) - forces) - known @ known) / (2 * array[0]))
+
+        return sum(self._each(one))
+
+    def multipliers(self) -> tuple[Multipliers, ...]:
+        """As a solution has them: with the last plan taken into account."""
+
+        def one(term: ConstraintTerm, array: Array, values: Array) -> Multipliers:
+            return Multipliers(_forces(term, array, values).reshape(self._problem.steps + 1, -1), float(array[0]))
+
+        return tuple(self._each(one))
+
+    def worst(self) -> str:
+        """Which constraint is missed most, by how much and when."""
+        if self.kept and not self._work.priced:
+            return "the plan keeps the constraints, but there are better ones"
+        missed = [
+            (np.abs(values) if term.equality else -(values + array[3])).max(initial=-np.inf)
+            for term, array, values in self._constraints()
+        ]
+        beyond = [one - allowed_violation(term, self._near) for one, term in zip(missed, self._terms, strict=True)]
+        which = int(np.argmax(beyond))
+        step, row = divmod(self._worst_of(which), self._terms[which].rows)
+        time = step * self._problem.dt
+        return f"{self._terms[which].describe(row)} is missed by {missed[which]:.2g} at {time:.2f} s (step {step})"
+
+    def _constraints(self) -> Iterator[tuple[ConstraintTerm, Array, Array]]:
+        """Of each what it is, its multipliers, and its numbers as they are aimed at."""
+        return zip(self._terms, self._work.multipliers, self._values, strict=True)
+
+    def _each(self, function: Callable[[ConstraintTerm, Array, Array], "float | Multipliers"]) -> list:
+        return [function(*one) for one in self._constraints()]
+
+    def _worst_of(self, which: int) -> int:
+        """Which of a constraint's numbers is missed most; of equals the first, or an equality's last, which acts."""
+        values = self._values[which]
+        if self._terms[which].equality:
+            return len(values) - 1 - int(np.abs(values[::-1]).argmax())
+        return int(values.argmin())
+
+    def _curvature(self, which: int) -> float:
+        """What it costs to change what is missed most: of an equality the most that it costs for any of its numbers."""
+        step, row = divmod(self._worst_of(which), self._terms[which].rows)
+        rows = range(self._terms[which].rows) if self._terms[which].equality else (row,)
+        return max(self._curvature_of(which, step, row) for row in rows)
+
+    def _curvature_of(self, which: int, step: int, row: int) -> float:
+        """What it costs to change one of a constraint's numbers: twice the total cost of a change by 1 unit.
+
+        `1 / n' (S + Sbar)^-1 n` of its slope n: the curvature of the total cost, the rest of the trajectory giving way.
+        """
+        states, controls = self._plan
+        n, steps = states.shape[1], len(controls)
+        slope = self._work.constraint_slope(which, row, states[step], controls[min(step, steps - 1)], step)
+        values = self._work.value_functions()
+        go, come = values["cost_to_go"], values["cost_to_come"]
+        try:
+            if isinstance(come, Moments):
+                given = np.linalg.solve(np.eye(n) + come.covariance[step] @ go.hessian[step], come.covariance[step])
+            else:
+                given = np.linalg.inv(go.hessian[step] + come.hessian[step])
+        except np.linalg.LinAlgError:
+            return 1.0
+        spread = np.zeros((len(slope), len(slope)))
+        gain = self._work.arrays.policy.gain[min(step, steps - 1)]
+        spread[:n, :n], spread[n:, n:] = given, gain @ given @ gain.T
+        spread[:n, n:], spread[n:, :n] = given @ gain.T, gain @ given
+        response = float(slope @ spread @ slope)
+        return 1 / response if response > 0 else 1.0

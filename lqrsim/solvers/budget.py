@@ -1,0 +1,141 @@
+"""What a solve may take: time, iterations, and how it learns that the caller wants it to end."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Iteration, Status
+
+Callback = Callable[[Iteration], object]
+
+
+@dataclass
+class Stop:
+    """Why a solve ends early: a deadline on the clock of `time.perf_counter`, or an exception.
+
+    What the callback raises, and Ctrl-C, end a solve as a deadline does: with the best plan so far. `finish` raises the
+    exception again, with that plan as its `solution`.
+    """
+
+    deadline: float = np.inf
+    error: BaseException | None = None
+    # How long the next iteration may take, in s: one that would end after the deadline is not begun.
+    reserve: float = 0.0
+
+    def begin(self, seconds: float | None) -> None:
+        """Have a deadline so many seconds from now; None for no deadline."""
+        self.deadline = np.inf if seconds is None else time.perf_counter() + seconds
+
+    @property
+    def due(self) -> bool:
+        return self.error is not None or time.perf_counter() + self.reserve >= self.deadline
+
+    def finish(self, solution: Solution) -> Solution:
+        """Return the solution; or raise what ended the solve, with the solution attached."""
+        if self.error is None:
+            return solution
+        with contextlib.suppress(AttributeError, TypeError):  # an exception that takes no attributes
+            self.error.solution = replace(solution, status=Status.INTERRUPTED)  # pyright: ignore[reportAttributeAccessIssue]
+            self.error.add_note("lqrsim: the best plan so far is this exception's `solution`")
+        raise self.error
+
+
+class Budget:
+    """Iterations, time and callback of one run. Runs of one solve share a `Stop`; each has its own iterations.
+
+    Attributes:
+      log: the iterations so far, by whatever method.
+      stop: the deadline, or what the callback raised.
+      attentive: whether compiled code returns now and then, to heed Ctrl-C. Where many problems are solved at once, it
+        does not.
+    """
+
+    def __init__(
+        self, most: int, stop: Stop | None = None, *, callback: Callback | None = None, attentive: bool = False
+    ) -> None:
+        self._most, self._callback = most, callback
+        self.stop, self.attentive = Stop() if stop is None else stop, attentive
+        self.log: list[Iteration] = []
+
+    def another(self) -> "Budget":
+        """The same for another run, which has as many iterations."""
+        return Budget(self._most, self.stop, callback=self._callback, attentive=self.attentive)
+
+    @property
+    def left(self) -> int:
+        """How many iterations may follow."""
+        return max(self._most - len(self.log), 0)
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing may follow."""
+        return self.stop.due or not self.left
+
+    @property
+    def watched(self) -> bool:
+        """Whether there is a callback."""
+        return self._callback is not None
+
+    def record(self, iteration: Iteration) -> None:
+        """Add an iteration to the log, and tell the callback."""
+        self.log.append(iteration)
+        self._tell((iteration,))
+
+    def report_to(self, callback: Callback | None) -> None:
+        """Have a callback from now on, which is told of the iterations so far at once."""
+        self._callback = callback
+        self._tell(self.log)
+
+    def _tell(self, iterations: Iterable[Iteration]) -> None:
+        if self._callback is None:
+            return
+        try:
+            for iteration in iterations:
+                self._callback(iteration)
+        except BaseException as error:  # Ctrl-C, too; raised again when there is a solution
+            self.stop.error = error
+
+    @contextlib.contextmanager
+    def limited(self, most: int) -> Iterator[None]:
+        """For a while: at most so many further iterations."""
+        before, self._most = self._most, min(self._most, len(self.log) + most)
+        try:
+            yield
+        finally:
+            self._most = before
+
+    @contextlib.contextmanager
+    def without_costs(self) -> Iterator[None]:
+        """For a while: the costs of iterations are those of another problem, and are not logged."""
+        begin, callback = len(self.log), self._callback
+
+        def hidden(iteration: Iteration) -> Iteration:
+            return replace(iteration, cost=np.nan, improvement=np.nan)
+
+        self._callback = None if callback is None else lambda iteration: callback(hidden(iteration))
+        try:
+            yield
+        finally:
+            self._callback = callback
+            self.log[begin:] = [hidden(iteration) for iteration in self.log[begin:]]
+
+    @contextlib.contextmanager
+    def joined_with_last(self, method: str) -> Iterator[None]:
+        """For a while: a single iteration that follows is a look at the plan, and counts as part of the last one.
+
+        The callback is told at the end.
+        """
+        begin, callback, self._callback = len(self.log), self._callback, None
+        try:
+            yield
+        finally:
+            self._callback = callback
+            if begin and len(self.log) == begin + 1:
+                last, look = self.log[-2:]
+                self.log[begin - 1 :] = [replace(look, method=method, seconds=last.seconds + look.seconds)]
+            else:
+                self._tell(self.log[begin:])

@@ -1,0 +1,799 @@
+"""One run of the solver from one start: memory, smoothing, Newton's method at the end, and the safeguard."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from lqrsim.codegen.user_functions import UserFunction
+from lqrsim.errors import Array, InputError
+from lqrsim.kernels import declarations, records
+from lqrsim.kernels.records import (
+    CERTIFICATE,
+    LOG,
+    MEMORY,
+    CostModel,
+    CostToCome,
+    CostToGo,
+    IterationSettings,
+    Motion,
+    Policy,
+    Prior,
+    SmootherGains,
+    StructuredArray,
+)
+from lqrsim.problem.constraints import allowed_violation, violation_of
+from lqrsim.problem.derivative_check import check_start, functions_of
+from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.results.solution_parts import Candidate, Certificate, Iteration, Multipliers, Status, Trajectory
+from lqrsim.results.value_functions import Moments, Quadratic
+from lqrsim.solvers import compiled
+from lqrsim.solvers.budget import Budget
+from lqrsim.solvers.certify import certified
+from lqrsim.solvers.initial_guess import InitialGuess
+from lqrsim.solvers.settings import INSIDE, SmootherSettings
+
+_METHODS = {
+    declarations.SMOOTH: "smooth",
+    declarations.DAMPED: "damped",
+    declarations.REJECTED: "rejected",
+    declarations.ILQR: "ilqr",
+    declarations.NEWTON: "newton",
+}
+_STATUS = {
+    declarations.RUNNING: Status.MAX_ITERATIONS,  # as many iterations as were asked for
+    declarations.CONVERGED: Status.CONVERGED,
+    declarations.COST_CONVERGED: Status.COST_CONVERGED,
+    declarations.MAX_ITERATIONS: Status.MAX_ITERATIONS,
+    declarations.DIVERGED: Status.DIVERGED,
+    declarations.NOT_POSITIVE_DEFINITE: Status.NOT_POSITIVE_DEFINITE,
+    declarations.NOT_FINITE: Status.NOT_FINITE,
+    declarations.NO_START: Status.NOT_FINITE,
+    declarations.STALLED: Status.STALLED,
+    declarations.CYCLING: Status.STALLED,
+    declarations.NO_PROGRESS: Status.STALLED,
+    declarations.TIMED_OUT: Status.TIME_LIMIT,
+    declarations.RISK_TOO_HIGH: Status.RISK_TOO_HIGH,
+    declarations.IN_VALLEY: Status.MAX_ITERATIONS,
+}
+ATTENTION = 0.1  # s, after which compiled code returns to heed Ctrl-C
+MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # runs whose memory waits for the next solve, and bytes of each
+# Newton's method takes over where the states of least total cost are so near to the rollout, relative to its range:
+# smoothing has then found the valley, and what is left is the way along it. Damped iterations, which come there slowly,
+# end where the cost falls by less than NEARLY, twice, with a gap below NEAR.
+VALLEY, NEARLY, NEAR = 0.2, 1e-2, 0.1
+_idle: "list[SolveRun]" = []
+_lending = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How iterations ended: the kernel's outcome, and what users read of it.
+
+    Attributes:
+      outcome: of `kernels/declarations.py`. done: how many iterations there are, those before included.
+      failed: the step of the pass that failed, or -1. backward: whether that was a backward pass.
+      raised: what a user's function raised, if one did.
+    """
+
+    outcome: int
+    done: int = 0
+    failed: int = -1
+    backward: bool = False
+    raised: str = ""
+
+    @property
+    def status(self) -> Status:
+        return _STATUS[self.outcome]
+
+    @property
+    def success(self) -> bool:
+        return self.status.success
+
+    @property
+    def pass_failed(self) -> bool:
+        """Whether a pass of one more iteration failed."""
+        return self.outcome in (
+            declarations.NOT_POSITIVE_DEFINITE, declarations.NOT_FINITE, declarations.RISK_TOO_HIGH
+        )  # fmt: skip
+
+    def detail(self, steps: int) -> str:
+        """Where it ended, of so many steps, and what a user's function raised there."""
+        raised = "" if self.success or self.outcome == declarations.TIMED_OUT else self.raised
+        return ": ".join(part for part in (self._place(steps), raised) if part)
+
+    def _place(self, steps: int) -> str:
+        if self.pass_failed:
+            if self.done and self.failed < 0:
+                return ""
+            which = "backward" if self.backward else "forward"
+            return f"{which} pass of iteration {self.done + 1}, step {self.failed} of {steps}"
+        if self.outcome == declarations.NO_START:
+            return "rollout of the initial controls"
+        if self.outcome == declarations.CYCLING:
+            return "the iterations repeat themselves"
+        if self.outcome == declarations.NO_PROGRESS:
+            return "the least cost so far no longer falls"
+        return "the line search found no lower cost" if self.outcome == declarations.STALLED else ""
+
+
+def iterate(
+    problem: Problem,
+    run: Callable[[int, int], tuple[int, int, bool, int]],
+    rows: StructuredArray,
+    *,
+    first: int,
+    last: int,
+    budget: Budget,
+    violation: Callable[[], float] = lambda: 0.0,
+) -> Ending:
+    """Run a loop of `kernels/iterations.py` until it ends, there are `last` rows, or the budget is over.
+
+    Args:
+      problem: whose functions may raise meanwhile.
+      run: runs the iterations from its first argument up to its second, or fewer.
+      rows: (any,) `LOG`, where `run` writes.
+      first: the row that comes next. last: how many rows there are to be, as far as the budget allows.
+      budget: whose log the iterations join. Compiled code returns after each iteration where there is a callback, a
+        deadline or a constraint to look at, and otherwise after `ATTENTION` if the budget is attentive. The seconds of
+        an iteration are the average of those between two returns.
+      violation: by how much the constraints are missed by what `run` found last.
+    """
+    functions, stop = functions_of(problem), budget.stop
+    single = (
+        (budget.attentive and (budget.watched or bool(functions)))
+        or bool(problem.constraints)
+        or stop.deadline < np.inf
+    )
+    bite = 1 if budget.attentive or single else last
+    for function in functions:
+        function.forget()
+    outcome, backward, failed, done = declarations.RUNNING, False, -1, first
+    last = min(last, first + budget.left)
+    while outcome == declarations.RUNNING and done < last:
+        if stop.due:
+            outcome = declarations.TIMED_OUT
+            break
+        clock, begin = time.perf_counter(), done
+        try:
+            done, outcome, backward, failed = run(begin, min(begin + bite, last))
+            for function in functions:
+                if function.raised is not None and not isinstance(function.raised, Exception):
+                    stop.error = function.raised  # Ctrl-C
+            missed = violation() if done > begin else 0.0
+        except BaseException as error:  # Ctrl-C: raised again when there is a solution
+            stop.error, outcome = error, declarations.TIMED_OUT
+            break
+        seconds = (time.perf_counter() - clock) / max(done - begin, 1)
+        if budget.attentive and not single:
+            bite = max(1, int(ATTENTION / max(seconds, 1e-9)))
+        for i, row in enumerate(rows[begin:done].tolist(), begin + 1):
+            cost, improvement, gap, optimality, residual, method = row
+            found = missed if i == done or not problem.constraints else float("nan")
+            budget.record(
+                Iteration(cost, improvement, gap, optimality, residual, found, seconds, _METHODS[int(method)])
+            )
+        if stop.error is not None:
+            outcome = declarations.TIMED_OUT
+    return Ending(outcome, len(budget.log), failed, backward, raised_by(functions))
+
+
+def raised_by(functions: Iterable[UserFunction]) -> str:
+    """What the functions have raised, in words."""
+    raised = [f"{f.name} raised {type(f.raised).__name__}: {f.raised}" for f in functions if f.raised is not None]
+    return "; ".join(raised)
+
+
+def check_finite_at_start(
+    problem: Problem, ending: Ending, costs: Array, x: Array, u: Array, *, refuse: bool
+) -> Ending:
+    """Find the cause if the first iteration is not finite: a function that is not finite at the start (x, u).
+
+    `costs` are those of the iterations so far.
+
+    Raises:
+      InputError: there is one, and `refuse` is set; otherwise the returned ending names it.
+    """
+    lost = not len(costs) and ending.status is Status.NOT_FINITE
+    if lost or (len(costs) and not np.isfinite(costs[0])):
+        try:
+            check_start(problem, x, u)
+        except InputError as error:
+            if refuse:
+                raise
+            return replace(ending, outcome=declarations.NOT_FINITE, raised=str(error))
+    return ending
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunResult:
+    """Result of a run, from which `assemble` makes a `Solution`.
+
+    Attributes:
+      cost: of the plan, as the log has it; infinite where there is no plan.
+      law: gain (T, m, n) and offset (T, m). values: cost-to-go, cost-to-come and inverse law, as `assemble` takes them.
+      final: whether another start cannot do better.
+    """
+
+    status: Status
+    detail: str
+    states: Array
+    controls: Array
+    law: tuple[Array, Array]
+    cost: float
+    violation: float
+    gap: float
+    values: dict[str, Any] = field(default_factory=dict)
+    multipliers: tuple[Multipliers, ...] = ()
+    certificate: Certificate | None = None
+    final: bool = False
+
+    @property
+    def rank(self) -> tuple[bool, bool, float, float]:
+        """The smaller, the better: success first, then INFEASIBLE before others, then the violation, then the cost."""
+        missed = 0.0 if self.success else float(f"{self.violation:.2g}")
+        return not self.success, self.status is not Status.INFEASIBLE, missed, self.cost
+
+    @property
+    def success(self) -> bool:
+        return self.status.success
+
+
+class SolveRun:
+    """Iterated LQR smoothing from one start, in whatever state it is.
+
+    Attributes:
+      initial_guess: where it starts from. work: its memory. budget: its iterations and its time.
+      ending: how smoothing stands; the outcome is RUNNING until it has ended.
+      second_order: whether Newton's method has the last iterations. final, rough: the tolerances of the answer, and of
+        what smoothing comes to; see `SmootherSettings`.
+    """
+
+    def __init__(
+        self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget
+    ) -> None:
+        self.problem, self.settings = problem, settings
+        if settings.first_pass == "backward" and (initial_guess.gain.any() or problem.dynamics.discrete):
+            initial_guess = initial_guess.rolled_out(problem, start)
+        self.work = Workspace(problem, settings, initial_guess, start)
+        self._rows = np.zeros(max(budget.left, 1), LOG)
+        self._begin(initial_guess, budget)
+        self._loop = self.work.core.lay_out("smoother", *self._arguments(0, 0, self._rows))
+
+    @classmethod
+    def lent(
+        cls, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget
+    ) -> "SolveRun":
+        """A run in memory that an earlier solve gave back, if there is some: allocating takes time.
+
+        It overwrites what the earlier solve returned, which therefore has to be copied before.
+        """
+        core, steps = compiled.core(problem, settings.form), problem.steps
+        if settings.first_pass == "forward":
+            with _lending:
+                for run in reversed(_idle):
+                    if run.work.core is core and run.problem.steps == steps:
+                        _idle.remove(run)
+                        run.problem, run.settings = problem, settings
+                        break
+                else:
+                    run = None
+            if run is not None:
+                run.work.begin(problem, settings, initial_guess, start)
+                if len(run._rows) != max(budget.left, 1):
+                    run._rows = np.zeros(max(budget.left, 1), LOG)
+                run._begin(initial_guess, budget)
+                return run
+        return cls(problem, settings, initial_guess, start, budget)
+
+    def give_back(self) -> None:
+        """Leave the memory to another solve."""
+        if self.problem.steps * self.problem.bytes_per_step <= LARGEST_KEPT:
+            with _lending:
+                _idle.append(self)
+                del _idle[:-MOST_KEPT]
+
+    def _begin(self, initial_guess: InitialGuess, budget: Budget) -> None:
+        self.initial_guess, self.budget = initial_guess, budget
+        self._row = 0  # of smoothing, which comes next
+        self._last: Iteration | None = None  # of smoothing
+        self.work.memory["watched"] = float(self.settings.safeguard)
+        self.ending = Ending(declarations.RUNNING)
+        settings, problem = self.settings, self.problem
+        self.second_order = settings.second_order(problem)
+        self.final, self.rough = settings.final(problem), settings.rough(problem)
+        self._valley = VALLEY if self.second_order else 0.0
+        self._shares = initial_guess.prior.obstacles if initial_guess.prior is not None else ()
+
+    @property
+    def cost(self) -> float:
+        """True cost of the last rollout; infinite where there is none, or a pass failed."""
+        return np.inf if self.ending.pass_failed else _cost_of(self._last)
+
+    def smooth(self, last: int) -> None:
+        """Go on until smoothing has done `last` iterations, or ends."""
+        if self.ending.outcome != declarations.RUNNING:
+            return
+        if not self._row and not self.run_opening_pass():
+            return
+        begin, first = len(self.budget.log), self._row
+        self.ending = iterate(
+            self.problem, lambda first, last: self._loop(*self._arguments(first, last, self._rows)), self._rows,
+            first=first, last=min(last, len(self._rows)), budget=self.budget, violation=self._violation,
+        )  # fmt: skip
+        self._row += self._count(begin)
+        if self.ending.outcome == declarations.TIMED_OUT and not self._row:
+            self.roll_out()
+
+    def smooth_with_constraints(self, rows: StructuredArray, first: int, last: int) -> Ending:
+        """More iterations, in rows of their own; a prior acts no longer."""
+        self.work.memory["watched"] = 0.0  # with constraints the least cost is no measure
+        begin = len(self.budget.log)
+        ending = iterate(
+            self.problem, lambda first, last: self._loop(*self._arguments(first, last, rows, again=True)), rows,
+            first=first, last=last, budget=self.budget, violation=self._violation,
+        )  # fmt: skip
+        self._count(begin)
+        return ending
+
+    def _count(self, begin: int) -> int:
+        """How many iterations of smoothing have joined the log, which had `begin`."""
+        added = len(self.budget.log) - begin
+        if added:
+            self._last = self.budget.log[-1]
+        return added
+
+    def roll_out(self) -> None:
+        """Roll out the initial guess, before any iteration; the states and controls are in `work`."""
+        self._loop(*self._arguments(0, 0, self._rows))
+
+    def solve(self, *, look_back: bool = True) -> RunResult:
+        """Smooth; from the valley on take Newton's steps; where the method fails, the safeguard's.
+
+        With `look_back`, a run that is stopped answers with its best plan, which takes another pass to make a policy.
+        """
+        self.smooth(len(self._rows))
+        if self.ending.outcome == declarations.IN_VALLEY:
+            checkpoint, begin = self.checkpoint(), len(self.budget.log)
+            found = self.newton()
+            if found.success or self.budget.over:
+                return found
+            self.go_on(checkpoint, self.budget.log[begin:])
+            self.smooth(len(self._rows))
+        ending = self.checked_ending()
+        lost = ending is not self.ending  # a function that is not finite at the start: nothing can help
+        found = self.result(ending)
+        if lost or (found.success and not self.second_order):
+            return found
+        if ending.outcome == declarations.TIMED_OUT or (self.settings.safeguard and not self.budget.left):
+            return self.best(found) if look_back else found
+        if found.success:
+            return self.newton()
+        return self.safeguard(found) if self.settings.safeguard else found
+
+    def checked_ending(self) -> Ending:
+        """How smoothing ended; NOT_FINITE if a function is not finite at the start.
+
+        Raises:
+          InputError: so it is, and the budget is attentive.
+        """
+        start, control = self.work.start, self.initial_guess.offset[0]
+        return check_finite_at_start(
+            self.problem, self.ending, self._rows["cost"][: self._row], start, control, refuse=self.budget.attentive
+        )
+
+    def newton(self, *, detail: str = "", added: float = 0.0) -> RunResult:
+        """Newton's method from the best plan so far; `added` is what constraints add to its cost."""
+        work, last = self.work, self.budget.left
+        rows, trial = np.zeros(max(last, 1), LOG), Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
+        work.memory["merit"], work.memory["share"] = work.memory["plan_cost"] + added, -1.0
+        ending = iterate(
+            self.problem, lambda first, to: self._loop(*self._newton_arguments(first, to, rows, last, trial)), rows,
+            first=0, last=last, budget=self.budget, violation=lambda: self._violation_of(work.plan),
+        )  # fmt: skip
+        if ending.outcome == declarations.STALLED:
+            detail = f"{detail}; Newton's method comes no further".removeprefix("; ")
+        return self.damped_result(ending, ending.status, detail)
+
+    def checkpoint(self) -> list[Array]:
+        """A copy of the state of smoothing."""
+        return [array.copy() for array in self._going_on]
+
+    def go_on(self, checkpoint: list[Array], others: Sequence[Iteration] = ()) -> None:
+        """Have smoothing go on from a checkpoint, and not stop in the valley.
+
+        Iterations of other methods that came to nothing count as smoothing's: it is to make progress from there.
+        """
+        for array, copy in zip(self._going_on, checkpoint, strict=True):
+            array[...] = copy
+        for row, one in zip(self._rows[self._row :], others, strict=False):
+            row["cost"], row["improvement"], row["gap"], row["optimality"] = one.cost, one.improvement, one.gap, np.nan
+        self._row = min(self._row + len(others), len(self._rows))
+        self._valley = 0.0
+        self.ending = replace(self.ending, outcome=declarations.RUNNING)
+
+    @property
+    def _going_on(self) -> tuple[Array, ...]:
+        arrays = self.work.arrays
+        return *arrays.policy, *arrays.kept, *arrays.to_go, arrays.x_hat
+
+    def result(self, ending: Ending) -> RunResult:
+        """Result of smoothing, with its ending."""
+        work, last = self.work, self._last
+        return RunResult(
+            status=ending.status, detail=ending.detail(self.problem.steps), states=work.states, controls=work.controls,
+            law=work.arrays.kept, cost=_cost_of(last), violation=np.inf if last is None else last.violation,
+            gap=np.nan if last is None else last.gap,
+            values={} if ending.pass_failed or last is None else work.value_functions(),
+        )  # fmt: skip
+
+    def best(self, found: RunResult) -> RunResult:
+        """The best plan so far in place of the last one, with a policy and value functions about it."""
+        cost = float(self.work.memory["plan_cost"])
+        if not np.isfinite(cost) or (not cost < found.cost and found.values):
+            return found
+        optimality = self.linearize_about_plan()
+        detail = f"{found.detail}; the plan is the best so far" if found.detail else "the plan is the best so far"
+        status = Status.MAX_ITERATIONS if found.status is Status.DIVERGED else found.status  # this plan has not
+        return self._about_plan(optimality, status, detail)
+
+    def linearize_about_plan(self) -> float:
+        """Compute policy and value functions about the plan in memory; return its optimality, NaN if that fails."""
+        work, rows = self.work, np.full(1, np.nan, LOG)
+        trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
+        work.memory["merit"] = work.memory["plan_cost"]
+        self._loop(*self._damped_arguments(0, 0, rows, 1, trial))
+        return float(rows["optimality"][0])
+
+    def fails_at(self, risk: float) -> int:
+        """The step at which a pass about the plan in the memory fails with another risk, or -1; with noise only.
+
+        Overwrites the arrays of the passes.
+        """
+        work, rows = self.work, np.full(1, np.nan, LOG)
+        trial, own = Motion(np.zeros_like(work.states), np.zeros_like(work.controls)), self.problem.risk
+        work.model.noise.risk[0] = risk
+        *_, failed = self._loop(*self._damped_arguments(0, 0, rows, 1, trial))
+        work.model.noise.risk[0] = own
+        return failed
+
+    def safeguard(self, found: RunResult) -> RunResult:
+        """Damped iterations from the best plan so far, after smoothing failed."""
+        work, detail = self.work, f"the undamped method failed ({found.detail or found.status.meaning})"
+        work.memory["merit"] = work.memory["plan_cost"]
+        damped = None
+        for least in ((NEARLY, NEAR), (0.0, 0.0)) if self.second_order else ((0.0, 0.0),):
+            damped = self.damped(least=least)
+            if not (self.second_order and damped.success) or self.budget.over:
+                break
+            found = self.newton(detail=detail)
+            if found.success or self.budget.over:
+                return found
+        assert damped is not None
+        if not np.isfinite(work.memory["plan_cost"]):
+            # Nothing leads anywhere: report how it failed.
+            given_up = found.status in (Status.MAX_ITERATIONS, Status.STALLED)
+            return replace(found, status=Status.DIVERGED if given_up else found.status, detail=detail, values={})
+        if self.second_order and damped.success:
+            return found
+        status = damped.status
+        if damped.outcome == declarations.STALLED:
+            status, detail = self.ending.status, f"{detail}; from the best plan, no step lowers the cost any more"
+        return self.damped_result(damped, status, detail)
+
+    def law_about_plan(self) -> tuple[Array, Array]:
+        """Gain and offset of the policy about the plan in memory."""
+        gain, (states, controls) = self.work.arrays.policy.gain, self.work.plan
+        return gain, controls - np.einsum("tij,tj->ti", gain, states[:-1])
+
+    def damped(self, *, least: tuple[float, float] = (0.0, 0.0)) -> Ending:
+        """Damped iterations from the plan, whose cost and merit are in the memory; see `kernels/damped_iterations.py`.
+
+        The tolerances of cost and gap are at least `least`.
+        """
+        work, last = self.work, self.budget.left
+        rows, memory = np.zeros(max(last, 1), LOG), work.memory
+        memory["reach"], memory["weight"], memory["small_changes"] = 1.0, 0.0, 0.0
+        memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
+        trial = Motion(np.zeros_like(work.states), np.zeros_like(work.controls))
+        return iterate(
+            self.problem, lambda first, to: self._loop(*self._damped_arguments(first, to, rows, last, trial, least)),
+            rows, first=0, last=last, budget=self.budget, violation=lambda: self._violation_of(work.plan),
+        )  # fmt: skip
+
+    def damped_result(self, ending: Ending, status: Status, detail: str) -> RunResult:
+        """Result of damped iterations or Newton's: the plan, with policy and value functions about it."""
+        if ending.outcome in (declarations.RUNNING, declarations.TIMED_OUT):  # stopped, and did not look back
+            return self.best(
+                RunResult(
+                    status=status, detail=detail, states=self.work.states, controls=self.work.controls,
+                    law=self.work.arrays.kept, cost=np.inf, violation=np.inf, gap=np.nan,
+                )
+            )  # fmt: skip
+        optimality = self.budget.log[-1].optimality if self.budget.log else np.nan
+        return self._about_plan(optimality, status, detail)
+
+    def _about_plan(self, optimality: float, status: Status, detail: str) -> RunResult:
+        """The plan in memory, with the last policy and value functions about it."""
+        work = self.work
+        states, controls = work.plan
+        values, law, gap = {}, work.arrays.policy, float(work.memory["final_gap"])
+        if not np.isfinite(optimality):  # there is no model about the plan, nor a policy
+            law, gap = (np.zeros_like(work.arrays.policy.gain), controls.copy()), np.nan
+        else:
+            values = work.value_functions()
+            if not gap < self.settings.gap_tolerance:
+                # As from iLQR, whose steps need neither of these.
+                values["cost_to_come"] = values["inverse_law"] = None
+                off, gap = gap, np.nan
+                detail += (
+                    f"; the states of least total cost are {off:.1g} off the plan, so the cost-to-come is left out"
+                )
+        return RunResult(
+            status=status, detail=detail.removeprefix("; "), states=states, controls=controls, law=law,
+            cost=float(work.memory["plan_cost"]), violation=self._violation_of(work.plan), gap=gap, values=values,
+        )  # fmt: skip
+
+    def certified(self, found: RunResult) -> RunResult:
+        """The result with its certificate; NOT_CERTIFIED if that contradicts a success."""
+        values = self.work.constraint_values(found.states, found.controls)
+        violation = self.work.violation(values)
+        value = found.values.get("cost_to_go")
+        certificate, wrong = certified(
+            self.problem, lambda task, to_go, out: self._loop(*self._check_arguments(task, found, to_go, out)),
+            found.states, value, violation=violation, kept=self.work.keeps(values),
+            claimed=self.budget.log[-1].cost if found.success else None,
+            tolerance=self.final if found.status is Status.CONVERGED else None,
+        )  # fmt: skip
+        cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
+        found = replace(found, certificate=certificate, cost=cost, violation=violation)
+        if not wrong:
+            return found
+        return replace(found, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
+
+    def candidate(self, name: str, found: RunResult | None) -> Candidate:
+        """This run as a candidate of a search; `found` is its result if it was run to its end."""
+        states, controls = (self.work.states, self.work.controls) if found is None else (found.states, found.controls)
+        plan = Trajectory(states.copy(), controls.copy(), self.problem.dt)
+        cost, status = (self.cost, None) if found is None else (found.cost, found.status)
+        return Candidate(name, cost, len(self.budget.log), status, plan)
+
+    def run_opening_pass(self) -> bool:
+        """Do the backward pass that comes before the first iteration, if any; return whether it succeeded."""
+        if self.settings.first_pass == "forward":
+            return True
+        self.roll_out()  # before its arrays are overwritten
+        work = self.work
+        arrays, homotopy_scaled = work.arrays, work.model._replace(stage=work.homotopy_scaled(self._obstacle_share(0)))
+        failed, good = work.core.opening_pass(
+            self.problem.steps, self.initial_guess.trajectory is not None, arrays.guess, work.prior, homotopy_scaled,
+            arrays.policy, arrays.to_go,
+        )  # fmt: skip
+        if failed >= 0:
+            outcome = declarations.NOT_POSITIVE_DEFINITE if good else declarations.NOT_FINITE
+            self.ending = Ending(outcome, failed=failed, backward=True)
+        return failed < 0
+
+    def _arguments(self, first: int, last: int, rows: StructuredArray, *, again: bool = False) -> tuple[Any, ...]:
+        """Arguments of the loop for iterations from `first` up to `last`; one at a time during a homotopy."""
+        settings, work = self.settings, self.work
+        share = 1.0 if again else self._obstacle_share(first)
+        tolerance, valley = self.rough, 0.0 if again else self._valley
+        if share != 1:
+            last = min(last, first + 1)
+            tolerance = valley = 0.0  # a part of the cost must not converge
+        guided = self.initial_guess.trajectory is not None and settings.first_pass == "forward" and not again
+        prior, count = (work.no_prior, 0) if again else (work.prior, work.prior_iterations)
+        options = self._settings(len(rows), tolerance, settings.gap_tolerance)._replace(
+            guided=guided, prior_iterations=count, valley=valley
+        )
+        arrays = work.arrays._replace(homotopy_scaled=work.homotopy_scaled(share), prior=prior)
+        return declarations.ITERATE, first, last, options, work.model, arrays, work.memory_rows, rows
+
+    def _damped_arguments(
+        self,
+        first: int,
+        last: int,
+        rows: StructuredArray,
+        most: int,
+        trial: Motion,
+        least: tuple[float, float] = (0.0, 0.0),
+    ) -> tuple[Any, ...]:
+        """Arguments for at most `most` damped iterations; `trial` is scratch memory."""
+        settings, work = self.settings, self.work
+        options = self._settings(most, max(self.rough, least[0]), max(settings.gap_tolerance, least[1]))
+        arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
+        return declarations.DAMP, first, last, options, work.model, arrays, work.memory_rows, rows
+
+    def _newton_arguments(
+        self, first: int, last: int, rows: StructuredArray, most: int, trial: Motion
+    ) -> tuple[Any, ...]:
+        """Arguments for at most `most` Newton iterations; `trial` is scratch memory."""
+        settings, work = self.settings, self.work
+        options = self._settings(most, self.final, settings.gap_tolerance)
+        arrays = work.arrays._replace(prior=work.no_prior, rollout=trial)
+        return declarations.FINISH, first, last, options, work.model, arrays, work.memory_rows, rows
+
+    def _check_arguments(
+        self, task: int, found: RunResult, to_go: CostToGo, certificate: StructuredArray
+    ) -> tuple[Any, ...]:
+        """Arguments for certifying a plan and its policy with this cost-to-go."""
+        settings, work = self.settings, self.work
+        arrays = work.arrays._replace(
+            to_go=to_go, rollout=Motion(found.states, found.controls),
+            kept=Policy(*found.law), certificate=certificate,
+        )  # fmt: skip
+        options = self._settings(0, self.final, settings.gap_tolerance)
+        return task, 0, 0, options, work.model, arrays, work.memory_rows, self._rows
+
+    def _settings(self, most: int, tolerance: float, gap_tolerance: float) -> IterationSettings:
+        """Settings of the kernels for at most `most` iterations."""
+        return IterationSettings(
+            steps=self.problem.steps, max_iterations=most, tolerance=float(tolerance),
+            gap_tolerance=float(gap_tolerance), optimal=self.settings.stop == "optimal", fixed=self.work.fixed,
+            guided=False, prior_iterations=0,
+        )  # fmt: skip
+
+    def _obstacle_share(self, iteration: int) -> float:
+        """Fraction of the obstacle costs in an iteration."""
+        return self._shares[iteration] if iteration < len(self._shares) else 1.0
+
+    def _violation(self) -> float:
+        return self._violation_of((self.work.states, self.work.controls))
+
+    def _violation_of(self, plan: tuple[Array, Array]) -> float:
+        return self.work.violation(self.work.constraint_values(*plan)) if self.problem.constraints else 0.0
+
+
+class Workspace:
+    """The memory of a run: what its iterations read and write.
+
+    Attributes:
+      arrays: what is in `records.SmootherArrays`. model: the problem's numbers.
+      memory: what one iteration of the safeguard leaves to the next, a row of `MEMORY`; memory_rows: (1,) that row.
+      multipliers: of each constraint, as `augmented_lagrangian.py` has them; changes act at once.
+      core: the compiled iterations. fixed: whether the start is given exactly. dual: which form it is.
+    """
+
+    def __init__(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
+        n, steps, zeros = len(start), problem.steps, np.zeros
+        m = initial_guess.offset.shape[1]
+        self.dual = settings.form == "dual"
+        self.core, self._costs = compiled.core(problem, settings.form), compiled.costs_module(problem)
+        self.no_prior = Prior(zeros(n), zeros((steps + 1, n)))
+        self.memory_rows = zeros(1, MEMORY)
+        self.memory = self.memory_rows[0]
+        kept = steps if self.dual else 1  # the primal form finds its way back without
+
+        def plan() -> Motion:
+            return Motion(zeros((steps + 1, n)), zeros((steps, m)))
+
+        def policy() -> Policy:
+            return Policy(zeros((steps, m, n)), zeros((steps, m)))
+
+        self.multipliers: list[Array] = []
+        self.arrays = records.SmootherArrays(
+            start=zeros(n), x_hat=zeros(n), x_hats=zeros((steps + 1, n)), policy=policy(),
+            to_go=CostToGo(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
+            to_come=CostToCome(zeros((steps + 1, n, n)), zeros((steps + 1, n)), zeros(steps + 1)),
+            smoothing=SmootherGains(zeros((kept, n, n)), zeros((kept, n)), zeros((steps, m, n)), zeros((steps, m))),
+            homotopy_scaled=None, prior=self.no_prior, guess=plan(), plan=plan(), rollout=plan(), kept=policy(),
+            certificate=zeros(1, CERTIFICATE),
+        )  # fmt: skip
+        self.begin(problem, settings, initial_guess, start)
+
+    def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
+        """Begin a solve, also after another one of the same size with as many steps."""
+        self._problem, self._tolerance, steps = problem, settings.missed(problem), problem.steps
+        self._exact, self.priced = settings.second_order(problem), np.isfinite(settings.price)
+        self.fixed = isinstance(problem.initial, FixedState)
+        self.prior, self.prior_iterations = self.no_prior, 0
+        if initial_guess.prior is not None:
+            about = np.broadcast_to(initial_guess.prior.about, (steps + 1, len(start))).copy()
+            self.prior = Prior(initial_guess.prior.weight.copy(), about)
+            self.prior_iterations = initial_guess.prior.iterations
+        spare = INSIDE * self._tolerance if self._exact else self._tolerance
+        multipliers = [compiled.no_multipliers(problem, one, spare, settings.price) for one in problem.constraint_terms]
+        for array, known in zip(multipliers, initial_guess.multipliers, strict=False):
+            array[0], array[declarations.HEADER :] = known.penalty, known.values.ravel()
+        self.multipliers = multipliers
+        self.model = compiled.arguments(problem, multipliers=multipliers, second_order=settings.second_order(problem))
+        arrays = self.arrays = self.arrays._replace(homotopy_scaled=self.model.stage, prior=self.prior)
+        # Everything else is written before it is read.
+        self.memory_rows[...] = 0.0
+        arrays.start[...] = arrays.x_hat[...] = start
+        arrays.policy.gain[...], arrays.policy.offset[...] = initial_guess.gain, initial_guess.offset
+        value = initial_guess.cost_to_go
+        known = (0.0, 0.0, 0.0) if value is None else (value.hessian, value.gradient, value.constant)
+        for array, given in zip(arrays.to_go, known, strict=True):
+            array[...] = given
+        # Without a trajectory: the start state, and the controls with which the dynamics can run backwards.
+        plan = initial_guess.trajectory
+        for array in (arrays.guess, arrays.plan):
+            array.states[...] = start if plan is None else plan.states
+            array.controls[...] = initial_guess.offset if plan is None else plan.controls
+
+    @property
+    def start(self) -> Array:
+        """The start state, (n,)."""
+        return self.arrays.start
+
+    @property
+    def plan(self) -> Motion:
+        """The best plan so far."""
+        return self.arrays.plan
+
+    @property
+    def states(self) -> Array:
+        """States of the last rollout, (T+1, n)."""
+        return self.arrays.rollout.states
+
+    @property
+    def controls(self) -> Array:
+        """Controls of the last rollout, (T, m)."""
+        return self.arrays.rollout.controls
+
+    def value_functions(self) -> dict[str, Any]:
+        """Cost-to-go, cost-to-come and inverse law of the last passes, for `assemble`."""
+        to_go, to_come = Quadratic(*self.arrays.to_go), self.arrays.to_come
+        inverse = self.arrays.smoothing.control_gain, self.arrays.smoothing.control
+        if not self.dual:
+            return {"cost_to_go": to_go, "cost_to_come": Quadratic(*to_come), "inverse_law": inverse}
+        covariance, mean, _ = to_come
+        law = None
+        if not self.fixed:  # or the first covariances are singular
+            # u = gain costate + offset, where the costate at a state of arrival x is -covariance^-1 (x - mean).
+            with contextlib.suppress(np.linalg.LinAlgError):
+                gain = -np.linalg.solve(covariance[1:], np.swapaxes(inverse[0], 1, 2))
+                gain = np.ascontiguousarray(np.swapaxes(gain, 1, 2))
+                law = gain, inverse[1] - np.einsum("tij,tj->ti", gain, mean[1:])
+        return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_law": law}
+
+    def homotopy_scaled(self, share: float) -> CostModel:
+        """The stage cost with that share of what the homotopy scales; see `CostTerm.factor`."""
+        if share == 1:
+            return self.model.stage
+        data = list(self.model.stage.data)
+        for i, term in enumerate(compiled.cost_terms(self._problem, "stage_cost")):
+            if term.factor is not None:
+                data[i] = data[i].copy()
+                data[i][len(term.functions) + term.factor] *= share
+        return self.model.stage._replace(data=tuple(data))
+
+    def constraint_values(self, states: Array, controls: Array) -> list[Array]:
+        """Values of each constraint, (T+1, rows): d >= 0 or d = 0; infinite or zero where it does not act."""
+        values = [np.empty(len(multipliers) - declarations.HEADER) for multipliers in self.multipliers]
+        if values:
+            constraints = self.model.stage.constraints
+            self._costs.evaluate_constraints(self._problem.steps, states, controls, constraints, tuple(values))
+        return [one.reshape(self._problem.steps + 1, -1) for one in values]
+
+    def constraint_slope(self, which: int, row: int, x: Array, u: Array, step: int) -> Array:
+        """Gradient (n+m,) of one of a constraint's numbers."""
+        slope = np.zeros(len(x) + len(u))
+        self._costs.slope_of_constraint(which, row, x, u, step, self.model.stage.constraints, slope)
+        return slope
+
+    def violation(self, values: list[Array]) -> float:
+        """The largest violation of a constraint, given their values; infinite if one is NaN."""
+        terms = self._problem.constraint_terms
+        return max((violation_of(term, one) for term, one in zip(terms, values, strict=True)), default=0.0)
+
+    def keeps(self, values: list[Array]) -> bool:
+        """Whether a plan with these values keeps all constraints within their tolerance.
+
+        Elastic constraints, which have a price, count as kept.
+        """
+        pairs = zip(self._problem.constraint_terms, values, strict=True)
+        allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)
+        return self.priced or all(violation_of(term, one) <= allowed(term) for term, one in pairs)
+
+
+def _cost_of(iteration: Iteration | None) -> float:
+    """Its cost; infinite where there is none, or it is not known."""
+    return iteration.cost if iteration is not None and np.isfinite(iteration.cost) else np.inf

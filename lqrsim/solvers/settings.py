@@ -1,0 +1,159 @@
+"""The options of the solvers, with defaults and checks."""
+
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+
+from lqrsim.errors import (
+    InputError,
+    check_count,
+    check_flag,
+    check_function,
+    check_kind,
+    check_memory,
+    check_name,
+    check_number,
+)
+from lqrsim.problem.problem import Problem
+from lqrsim.solvers import compiled
+from lqrsim.solvers.budget import Callback
+from lqrsim.solvers.initial_guess import InitialGuess, StartLike, is_function
+
+MOST_STARTS = 10_000
+ROUGH, FINE = 1e-4, 1e-8  # default tolerances of smoothing and of Newton's method
+INSIDE = 1e-3  # how far constraints that press are kept inside, as a share of the tolerance, to leave room for rounding
+MISSED, SPARED = 1e-6, 1e-3  # default tolerances of constraints: interior point, augmented Lagrangian
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Options that all solvers have; see `ilqr`."""
+
+    stop: str = "optimal"
+    tolerance: float | None = None
+    max_iterations: int = 500
+    time_limit: float | None = None
+    start: StartLike | InitialGuess = None
+
+    def __post_init__(self) -> None:
+        check_name("stop", self.stop, ("optimal", "cost"))
+        if is_function(self.start):
+            check_function("start", self.start, "a function of a Problem, or what it returns", arguments=1)
+        # Plain Python numbers: NumPy's are other types for the compiler, and JSON cannot have them.
+        if self.tolerance is not None:
+            object.__setattr__(self, "tolerance", check_number("tolerance", self.tolerance, above=0.0))
+        # A log of that length takes 48 MB.
+        most = check_count("max_iterations", self.max_iterations, at_most=1_000_000)
+        object.__setattr__(self, "max_iterations", most)
+        if self.time_limit is not None:
+            object.__setattr__(self, "time_limit", check_number("time_limit", self.time_limit, above=0.0))
+
+    @property
+    def core_form(self) -> str:
+        """The form of the compiled passes."""
+        return "dual"
+
+    def options(self, start: InitialGuess) -> dict[str, object]:
+        """The options that a solution records."""
+        return {field.name: getattr(self, field.name) for field in fields(self)} | {"start": start.summary}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmootherSettings(Settings):
+    """Options of `smooth`."""
+
+    gap_tolerance: float = 1e-3
+    form: str = "dual"
+    first_pass: str = "forward"
+    safeguard: bool = True
+    starts: int | None = None
+    constraint_tolerance: float | None = None
+    penalty: float | None = None
+    finish: str | None = "newton"
+    elastic: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.elastic is not None:
+            object.__setattr__(self, "elastic", check_number("elastic", self.elastic, above=0.0))
+        if self.finish is not None:
+            check_name("finish", self.finish, ("newton",))
+        if self.starts is not None:
+            object.__setattr__(self, "starts", check_count("starts", self.starts, at_most=MOST_STARTS))
+            if self.starts > 1 and self.start is not None:
+                raise InputError(f"starts: got {self.starts} beside a start, want one of the two")
+        object.__setattr__(self, "gap_tolerance", check_number("gap_tolerance", self.gap_tolerance, above=0.0))
+        if self.constraint_tolerance is not None:
+            number = check_number("constraint_tolerance", self.constraint_tolerance, above=0.0)
+            object.__setattr__(self, "constraint_tolerance", number)
+        if self.penalty is not None:
+            object.__setattr__(self, "penalty", check_number("penalty", self.penalty, above=0.0))
+            if self.start is None:
+                raise InputError(f"penalty: got {self.penalty:g} without a start, want start=... beside it")
+        check_name("form", self.form, tuple(compiled.FORMS))
+        check_name("first_pass", self.first_pass, ("forward", "backward"))
+        object.__setattr__(self, "safeguard", check_flag("safeguard", self.safeguard))
+
+    @property
+    def core_form(self) -> str:
+        return self.form
+
+    def second_order(self, problem: Problem) -> bool:
+        """Whether Newton's method has the last iterations. With stop="cost", the paper's test ends the paper's method.
+
+        The steps of an MJCF have no second derivatives, and without these an iteration of smoothing is worth several of
+        Newton's; see `experiments/convergence.py`. Nor has the expected cost of noise.
+        """
+        exact = not problem.dynamics.discrete and not (problem.constraints and problem.noise_term is not None)
+        return self.finish is not None and self.stop == "optimal" and exact
+
+    @property
+    def price(self) -> float:
+        """Price of violating constraints, in cost per unit; infinite unless they are elastic."""
+        return np.inf if self.elastic is None else self.elastic
+
+    def missed(self, problem: Problem) -> float:
+        """Tolerance of constraints: the allowed violation, or the margin that the augmented Lagrangian aims at."""
+        return self.constraint_tolerance or (MISSED if self.second_order(problem) else SPARED)
+
+    def final(self, problem: Problem) -> float:
+        """Tolerance of the optimality."""
+        return self.tolerance or (FINE if self.second_order(problem) else ROUGH)
+
+    def rough(self, problem: Problem) -> float:
+        """Tolerance at which smoothing ends, coarser where Newton's method follows."""
+        final = self.final(problem)
+        return max(final, ROUGH) if self.second_order(problem) else final
+
+
+S = TypeVar("S", bound=Settings)
+
+
+def settings_from(kind: type[S], function: str, options: dict[str, Any]) -> S:
+    """Make settings from keyword arguments.
+
+    Raises:
+      InputError: one is not as described.
+      TypeError: there is no such argument.
+    """
+    names = [field.name for field in fields(kind)]
+    for name in options:
+        if name not in names:
+            raise TypeError(f"{function}() got an unexpected keyword argument {name!r}, want {', '.join(names)}")
+    return kind(**options)
+
+
+def check_callback(callback: Callback | None) -> None:
+    """Raises InputError unless it is None or callable with one argument."""
+    check_function("callback", callback, "a function of an Iteration", arguments=1)
+
+
+def check_runs(problem: Problem, starts: int) -> None:
+    """Raises InputError if the arrays of so many starts do not fit into memory."""
+    check_memory("starts", starts, problem.steps * problem.bytes_per_step)
+
+
+def check_problem(problem: Problem) -> None:
+    """Raises InputError unless it is a problem."""
+    check_kind("problem", problem, Problem, "a Problem, such as scenario.problem")
