@@ -206,7 +206,7 @@ def test_finished_is_finished(reference: Results, monkeypatch: pytest.MonkeyPatc
         raise AssertionError
 
     before = {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
-    monkeypatch.setattr(trials, "work", never)
+    monkeypatch.setattr(trials.Job, "work", never)
     run_campaign(CAMPAIGN, reference.folder)
     run_campaign(replace(CAMPAIGN, time_limit=1.0), reference.folder)  # not a part of what is asked
     assert before == {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
