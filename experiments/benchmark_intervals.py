@@ -1,4 +1,4 @@
-"""How often intervals hold what they are of: differences of two policies on the same trials, and rare failures.
+"""How often intervals cover the true value: differences of two policies on the same trials, and rare failures.
 
     python experiments/benchmark_intervals.py            # everything, some minutes
     python experiments/benchmark_intervals.py --quick    # bounded, and coarse

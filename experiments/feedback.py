@@ -1,4 +1,4 @@
-"""What the feedback is worth: the policy against its own plan without feedback, in MuJoCo, under the same disturbances.
+"""The value of feedback: the policy against its plan without feedback, in MuJoCo, under the same disturbances.
 
     python experiments/feedback.py            # 200 trials of each
     python experiments/feedback.py --quick    # 4
@@ -19,7 +19,7 @@ from runner import FolderSettings, Result, Statement, interval, opening, progres
 
 import lqrsim as ls
 from lqrsim.stress.statistics import compare, rate
-from lqrsim.view import obstacle_plots
+from lqrsim.view import figure_parts
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 
 FEEDBACK, OPEN_LOOP = "with feedback", "open loop"
@@ -135,15 +135,15 @@ def draw_paths(
         for number, scenario in enumerate(scenarios):
             place = list(scenario.robot.dynamics.state_coordinates.position)
             plan = rollouts[scenario.name][FEEDBACK].plan.states[:, place]
-            low, high = obstacle_plots.bounds(plan, scenario.scene.world, 0.5 if len(place) == 3 else 0.0)
+            low, high = figure_parts.bounds(plan, scenario.scene.world, 0.5 if len(place) == 3 else 0.0)
             if len(place) == 3:
                 axes = drawn.add_subplot(grid[number], projection="3d")
                 assert isinstance(axes, Axes3D)
-                obstacle_plots.draw_in_space(axes, scenario.scene.world, low, high)
+                figure_parts.draw_in_space(axes, scenario.scene.world, low, high)
                 axes.set(xticks=(-2, 0, 2), yticks=(-2, 0, 2), zticks=(-2, 0, 2))
             else:
                 axes = drawn.add_subplot(grid[number])
-                obstacle_plots.draw_in_plane(axes, scenario.scene.world.seen_by("xy"), low, high, scenario.robot.radius)
+                figure_parts.draw_in_plane(axes, scenario.scene.world.seen_by("xy"), low, high, scenario.robot.radius)
             for name in (OPEN_LOOP, FEEDBACK):
                 draw_runs(axes, rollouts[scenario.name][name], config.paths, name)
             axes.plot(*plan.T, color=PLAN, label="plan")
@@ -204,7 +204,7 @@ def report(result: Result) -> str:
 
 
 def cells(robot: dict[str, Any]) -> str:
-    """The robot's table."""
+    """Rows of the robot's table."""
     rows = []
     for strength, cell in robot["strengths"].items():
         for policy in LOOK:

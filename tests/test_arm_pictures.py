@@ -12,7 +12,7 @@ from planar_arm import LINK, PlanarArm
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.results.ball_record import BallRecord
+from lqrsim.results.rollout import BallRecord
 from lqrsim.view import style, viewer
 from lqrsim.view.plots import MOMENTS, _path_of_balls
 from lqrsim.view.viewer_base import Viewer

@@ -354,7 +354,7 @@ def with_u(x, u, p):
             "got 3 points, want 1",
         ),
         (lambda: ls.ObstacleCost(WORLD, radius=0.1, balls=THREE), "ObstacleCost: got radius and balls, want one"),
-        (lambda: ls.Clearance(WORLD), "Clearance: got neither radius nor balls, want one"),
+        (lambda: ls.Clearance(WORLD), "Clearance: got none of radius, balls and geoms, want one"),
         (lambda: ls.ObstacleCost(WORLD, balls=[0.1]), "ObstacleCost: balls: got"),  # pyright: ignore
         (lambda: ls.ObstacleCost(WORLD, radius=0.1).bind(ARM.dynamics), "without a position, want .* or balls="),
         (lambda: ls.Capsule(1.0, 0.1, 0.0), "Capsule: tolerance: got 0"),

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
-from lqrsim.view import cameras, gl, marker
+from lqrsim.view import cameras, gl
 from lqrsim.view.cameras import Camera
+from lqrsim.view.decorative_geoms import MARK_RGB, draw_mark, mark_radius
 from lqrsim.view.video import encoder
 from lqrsim.view.video_metadata import Pane, VideoMetadata, digest, read
 
@@ -96,7 +97,7 @@ def metadata(rollout: ls.Rollout) -> VideoMetadata:
         Pane(320, 0, 320, 240, trial=1, camera=cameras.side(rollout)),
         Pane(0, 240, 640, 240),
     )
-    return VideoMetadata((digest(rollout),), (marker.radius(rollout),), Fraction(30000, 1001), 0.5, 3, panes)
+    return VideoMetadata((digest(rollout),), (mark_radius(rollout),), Fraction(30000, 1001), 0.5, 3, panes)
 
 
 def test_footage_survives_its_file(rollout: ls.Rollout, tmp_path: Path) -> None:
@@ -166,9 +167,9 @@ def test_mark_is_seen_where_the_robot_is_whatever_hides_it(kind: str, rollout: l
             mujoco.mj_forward(model, data)
             renderer.update_scene(data)
             centre = data.body(rollout.body).xpos
-            marker.draw(renderer.scene, camera, centre, marker.radius(rollout))
+            draw_mark(renderer.scene, camera, centre, mark_radius(rollout))
             camera.place(renderer.scene, size[0] / size[1])
-            rows, columns = np.nonzero((renderer.render() == 255 * np.array(marker.COLOUR)).all(axis=2))
-            assert len(rows) == pytest.approx(np.pi * (marker.radius(rollout) * size[1] / camera.height) ** 2, rel=0.15)
+            rows, columns = np.nonzero((renderer.render() == 255 * np.array(MARK_RGB)).all(axis=2))
+            assert len(rows) == pytest.approx(np.pi * (mark_radius(rollout) * size[1] / camera.height) ** 2, rel=0.15)
             seen = np.array([columns.mean(), rows.mean()]) + 0.5
             np.testing.assert_allclose(seen, camera.project(centre, size), rtol=0, atol=0.3)

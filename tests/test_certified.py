@@ -15,8 +15,6 @@ from lqrsim.results.solution_parts import Certificate, Iteration, Status
 from lqrsim.solvers import certify
 from lqrsim.solvers.certify import faults
 
-pytestmark = pytest.mark.timeout(900)  # what is not cached is compiled first
-
 GOOD = Certificate(
     cost=36.0, start=0.0, dynamics_residual=1e-15, policy_residual=1e-15, limits=0.0, violation=0.0, optimality=1e-6
 )

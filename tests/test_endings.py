@@ -28,8 +28,7 @@ from lqrsim.disturbances import (
 )
 from lqrsim.errors import InputError
 from lqrsim.reports.page import report
-from lqrsim.results.goal import OF_RANGE, Target
-from lqrsim.results.trial_outcome import endings
+from lqrsim.results.goal import OF_RANGE, Target, endings
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.simulation.plant import Plant
@@ -170,7 +169,7 @@ def test_no_tube_is_predicted_of_where_a_robot_without_a_position_is(arm: Plant,
     run = ls.simulate(arm, swing)
     with pytest.raises(ls.InputError, match=r"state_coordinates\.position: got none"):
         tube.added_to(run)
-    with pytest.raises(ls.InputError, match="tube: got one of a robot without a position"):
+    with pytest.raises(ls.InputError, match=r"tube: got shape .*, want None without a position"):
         replace(run, tube=np.zeros((41, 2, 2)))
 
 
@@ -396,7 +395,7 @@ def by_hand(rollout: ls.Rollout, table: Outcomes, k: int) -> None:
     assert table.ended[k] == min(first, rollout.plan.horizon)
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(
     st.sampled_from([0.0, 0.5, 2.0, 1e6, 1e13]), st.sampled_from([0.0, 1.9]), st.integers(0, 1000), st.booleans(),
     st.sampled_from([1, 5]),

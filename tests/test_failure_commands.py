@@ -262,7 +262,7 @@ def test_ctrl_c_is_one_line_and_leaves_nothing(command: str, own: str, tmp_path:
         while "a trial draws" not in process.stdout.readline():
             assert process.poll() is None
         process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=60)
+        _, error = process.communicate(timeout=600)
     assert process.returncode == 130
     assert error.splitlines()[-1] == "lqrsim: stopped"
     assert not (tmp_path / "out").exists()

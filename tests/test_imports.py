@@ -1,6 +1,7 @@
 """The architecture: no import runs up a floor, and nothing heavy is imported before it is needed."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -40,10 +41,10 @@ FLOORS_WITHIN = {
     "kernels": (("declarations",), ("linear_algebra", "rotation_ratios", "runge_kutta", "signed_distance")),
     "scenes": (("world",),),
     "results": (
-        ("schema", "hashing", "ball_record", "coordinates", "solution_parts", "trial_outcome", "value_functions"),
+        ("fields", "schema", "hashing", "coordinates", "solution_parts", "value_functions"),
         ("archive", "goal", "notebook", "policy"),
         ("plan",),
-        ("replan", "solution"),
+        ("solution",),
         ("rollout",),
     ),
     "codegen": (
@@ -56,6 +57,7 @@ FLOORS_WITHIN = {
     ),
     "problem": (
         ("dynamics", "linear_quadratic"),
+        ("collision_geoms",),
         ("collision_spheres", "noise"),
         ("costs",),
         ("constraints",),
@@ -105,6 +107,7 @@ def floor(module: str) -> tuple[int, int]:
     return numbers[0], len(inner)
 
 
+@functools.cache
 def imports(path: Path) -> list[str]:
     """Every module that a file imports, in functions too; those under `if TYPE_CHECKING:` excepted."""
     tree = ast.parse(path.read_text(encoding="utf-8"))

@@ -164,7 +164,7 @@ def test_verify(printed: Any, tmp_path: Path) -> None:
 
 def test_stress_report_and_replay(printed: Any, tmp_path: Path) -> None:
     folder = tmp_path / "campaign"
-    asked = ["--policies", "smooth", "open_loop", "--strengths", "0", "2", "--trials", "6", "--workers", "1"]
+    asked = ["--policies", "smooth", "open_loop", "--strengths", "0", "2", "--trials", "6", "--workers", "0"]
     campaign = printed("stress", "differential_drive", *asked, "--out", str(folder))["campaign"]
     results = ls.stress.Results(folder)
     assert campaign["complete"] is True

@@ -45,7 +45,6 @@ def assert_is_oracles(solution: ls.Solution, numbers: Any, problem: ls.Problem, 
     assert solution.cost == pytest.approx(cost, rel=1e-9)
 
 
-@pytest.mark.timeout(300)  # on a machine that has compiled nothing yet
 @pytest.mark.parametrize(("fixed", "form"), FORMS)
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), strength=st.floats(0.0, 0.3))

@@ -74,8 +74,9 @@ def test_a_solution_that_failed_shows_its_remedy(solution: ls.Solution) -> None:
     assert failed.status.name in html
     assert failed.status.remedy in "".join(parsed(html).itertext())
     nowhere = np.full_like(solution.trajectory.states, np.nan)
-    broken = replace(solution, trajectory=Trajectory(nowhere, solution.trajectory.controls, solution.trajectory.dt))
-    assert "nan" not in broken._repr_html_().lower()
+    plan = Trajectory(nowhere, solution.trajectory.controls, solution.trajectory.dt)
+    broken = replace(solution, status=ls.Status.NOT_FINITE, trajectory=plan)
+    assert "nan" not in broken._repr_html_().lower().replace(ls.Status.NOT_FINITE.meaning.lower(), "")
     parsed(broken._repr_html_())
 
 

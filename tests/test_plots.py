@@ -12,7 +12,7 @@ import pytest
 import lqrsim as ls
 from lqrsim.disturbances import ControlNoise, ForceNoise
 from lqrsim.view import style
-from lqrsim.view.obstacle_plots import surface
+from lqrsim.view.figure_parts import surface
 from lqrsim.view.plots import plot_run
 
 

@@ -176,24 +176,25 @@ def test_the_hash_is_what_the_page_says(saved: Path) -> None:
     ("changes", "message"),
     [
         ({"version": 2}, "of version 2, want version 1"),
-        ({"format": "lqrsim solution"}, "holds a 'lqrsim solution', want a 'lqrsim policy'"),
-        ({"kind": "magic"}, "meta.kind: got 'magic', want one of: affine, output feedback"),
-        ({"kind": "affine"}, "meta.measured: got none of output feedback, or some of an affine policy"),
-        ({"measured": None}, "meta.measured: got none of output feedback, or some"),
-        ({"measured": 3}, "meta.measured: got 3, want an object"),
-        ({"measured": lambda one: one | {"names": ["a"], "units": [""]}}, r"sensor: got shape|correction: got shape"),
+        ({"format": "lqrsim solution"}, "holds a 'lqrsim solution', want a 'lqrsim output feedback policy'"),
+        ({"measured_coordinates": 3}, "measured_coordinates: got 3, want an object"),
+        ({"measured_coordinates": None}, "measured_coordinates: got None, want an object"),
+        (
+            {"measured_coordinates": lambda one: one | {"names": ["a"], "units": [""], "low": [], "high": []}},
+            r"correction: got shape \(12, 3, 2\), want \(T, Z, Y\) = \(12, 3, 1\)",
+        ),
         ({"dt": -1.0}, "dt: got -1.0"),
         ({"more": 1}, "meta: got 'more', want no other than"),
         ({"gain": None}, "gain: got none, want it"),
-        ({"bomb": np.zeros(2)}, "'bomb': got it, want only what belongs to this policy"),
+        ({"bomb": np.zeros(2)}, "'bomb': got an unknown array, want only those of its format"),
         ({"gain": lambda a: a[:-1].copy()}, "got shape"),
         ({"gain": lambda a: a.astype(int)}, "gain: got numbers of type <i8, want <f8"),
-        ({"gain": lambda a: a * np.nan}, "gain: got nan at index"),
-        ({"drift": lambda a: a + np.inf}, "drift: got inf at index"),
-        ({"nominal": lambda a: a + np.inf}, "nominal: got"),
+        ({"gain": lambda a: a * np.nan}, r"gain\[0, 0, 0\]: got nan, want a finite number"),
+        ({"drift": lambda a: a + np.inf}, r"drift\[0, 0\]: got inf, want a finite number"),
+        ({"nominal": lambda a: a + np.inf}, r"nominal\[0, 0\]: got inf"),
         ({"transition": lambda a: a[:, :-1].copy()}, "transition: got shape"),
         ({"sensor": lambda a: a[..., :1].copy()}, "sensor: got shape"),
-        ({"controls": lambda one: one | {"low": [5.0]}}, "limits of u0: got 5 to 2"),
+        ({"control_coordinates": lambda one: one | {"low": [5.0]}}, "limits of u0: got 5 to 2"),
     ],
 )
 def test_a_spoilt_policy_gets_one_line(saved: Path, changes: dict[str, Any], message: str) -> None:
@@ -241,9 +242,11 @@ def test_what_is_no_measurement_is_refused(law: ls.OffsetFree, arguments: Any, s
 
 
 def test_a_policy_that_was_made_by_hand_is_checked(law: ls.OffsetFree, tmp_path: Path) -> None:
-    with pytest.raises(ls.InputError, match=r"OutputFeedbackPolicy: input: got shape \(12, 3\), want \(12, 3, 1\)"):
+    with pytest.raises(
+        ls.InputError, match=r"OutputFeedbackPolicy: input: got shape \(12, 3\), want \(T, Z, m\) = \(12, 3, 1\)"
+    ):
         replace(law.policy, input=np.zeros((12, 3)))
-    with pytest.raises(ls.InputError, match="OutputFeedbackPolicy: drift: got numbers that are not finite"):
+    with pytest.raises(ls.InputError, match=r"OutputFeedbackPolicy: drift\[0, 0\]: got nan, want"):
         replace(law.policy, drift=np.full((12, 3), np.nan))
     other = linear([[0.0]], [[1.0]], [[1.0]], steps=3).solution.policy
     with pytest.raises(ls.InputError, match=r"policy: got .*, which holds a 'lqrsim solution'"):

@@ -13,9 +13,8 @@ from matplotlib.figure import Figure
 import lqrsim as ls
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.view.ellipsoids import Ellipsoids
-from lqrsim.view.obstacle_plots import draw_projected
+from lqrsim.view.figure_parts import draw_projected, draw_tube
 from lqrsim.view.policy_plot import draw, strength
-from lqrsim.view.prediction_plots import draw_tube
 
 
 def drawn(solution: ls.Solution, scenario: ls.Scenario, tube: Tube | None = None) -> Figure:

@@ -27,7 +27,7 @@ SWEEPS = {
     "measurements": (MeasurementNoise((0.05, 0.05, 0.1)),),
 }
 STRENGTHS = (0.0, 1.0, 4.0)
-TRIALS = 12
+TRIALS = 6
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
         scenario="differential_drive", sweeps=SWEEPS, strengths=STRENGTHS, policies=("smooth", "open_loop"),
         trials=TRIALS, seed=3, shard=5,
     )  # fmt: skip
-    return run_campaign(campaign, tmp_path_factory.mktemp("campaigns") / "a test", workers=1)
+    return run_campaign(campaign, tmp_path_factory.mktemp("campaigns") / "a test", workers=0)
 
 
 class Page(HTMLParser):

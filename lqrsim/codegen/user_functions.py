@@ -73,6 +73,7 @@ class UserFunction:
       entries: what each returned value is for, as messages name it; without, the value is returned bare.
       columns: the values are returned as rows of so many, or, with 0, one after the other.
       with_control: whether it is called with u at all; without, it is `function(x, p)`.
+      is_memory: whether the address is that of numbers, and no function's.
     """
 
     function: Callable[..., Any]
@@ -87,6 +88,7 @@ class UserFunction:
     unused: tuple[tuple[int, str], ...] = ()
     columns: int = 0
     with_control: bool = True
+    is_memory: bool = False
     held: list[tuple[Any, int]] = field(default_factory=list, init=False, repr=False, compare=False)
     stopped: threading.Event = field(default_factory=threading.Event, init=False, repr=False, compare=False)
     _thread: threading.local = field(default_factory=threading.local, init=False, repr=False, compare=False)

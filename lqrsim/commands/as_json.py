@@ -139,7 +139,7 @@ def of_verification(found: "Verification") -> Object:
 
 def of_campaign(results: "Results") -> Object:
     """The outcomes of each cell of a campaign so far."""
-    from lqrsim.results.trial_outcome import OUTCOMES
+    from lqrsim.results.goal import OUTCOMES
     from lqrsim.stress.analysis import success
 
     cells = []

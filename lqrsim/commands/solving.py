@@ -103,9 +103,7 @@ class Solve:
         console.check_output("--out", folder)
         problem = scenario.problem
         if self.clearance is not None:
-            balls = scenario.robot.balls
-            radius = scenario.robot.radius if balls is None else None
-            kept = Clearance(scenario.scene.world, radius=radius, balls=balls, margin=self.clearance)
+            kept = Clearance(scenario.scene.world, **scenario.robot.shape, margin=self.clearance)
             problem = replace(problem, constraints=[*problem.constraints, kept])
         if self.control_limits is not None:
             problem = replace(problem, control_limits=self.control_limits)

@@ -17,8 +17,12 @@ from lqrsim.errors import Array, InputError
 from lqrsim.problem.clearance import Clearance
 from lqrsim.problem.collision_spheres import SphereCenters, bind_outline, evaluate_slopes
 from lqrsim.problem.costs import ObstacleCost
+from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import Problem
 from lqrsim.scenes.world import World
+
+NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(64)
+FAR = 12.0  # standard deviations of clearance, with which the chance of a collision is below 1e-32
 
 
 class Spread(NamedTuple):
@@ -38,12 +42,14 @@ class Surroundings:
     """What a robot must not touch.
 
     Attributes:
+      dynamics: of the problem.
       worlds: with what is to be kept from each: the costs and constraints that say so, each kind once.
       seen: the worlds as the robot sees them. places: of those that are kept from balls, where these are.
       place: which states are its position. position: these, or, with balls, all that move it.
       std: of where an obstacle is, in m.
     """
 
+    dynamics: Dynamics
     worlds: tuple[ObstacleCost | Clearance, ...]
     seen: tuple[World, ...]
     places: tuple[SphereCenters | None, ...]
@@ -57,30 +63,41 @@ class Surroundings:
         space, worlds = problem.dynamics.state_coordinates, []
         clearances = [one for one in problem.constraints if isinstance(one, Clearance)]
         for one in (*problem.obstacle_costs, *clearances):
-            kind = id(one.world), one.radius, id(one.balls)
-            if not any((id(other.world), other.radius, id(other.balls)) == kind for other in worlds):
+            kind = id(one.world), one.radius, id(one.balls), id(one.geoms)
+            if not any(kind == (id(other.world), other.radius, id(other.balls), id(other.geoms)) for other in worlds):
                 worlds.append(one)
         if any(one.moving for one in worlds):
             raise InputError(
                 "problem: got obstacles that move, want none: chances of collision are for obstacles that stand still"
             )
-        bound = [bind_outline("problem", one.balls, problem.dynamics, one.world) for one in worlds]
+        bound = [
+            (None, one.world)
+            if one.geoms is not None
+            else bind_outline("problem", one.balls, problem.dynamics, one.world)
+            for one in worlds
+        ]
         found = [(one, places, seen) for one, (places, seen) in zip(worlds, bound, strict=True) if len(seen)]
         moving = space.position
-        if any(places is not None for _, places, _ in found):
-            own = [places.depends_on if places is not None else space.position for _, places, _ in found]
+        if any(places is not None or one.geoms is not None for one, places, _ in found):
+            own = [
+                tuple(range(one.geoms.bind(problem.dynamics, one.world, 0.0).moved))
+                if one.geoms is not None
+                else places.depends_on
+                if places is not None
+                else space.position
+                for one, places, _ in found
+            ]
             moving = tuple(sorted({i for indices in own for i in indices}))
         kept, of_balls, seen = (tuple(part) for part in zip(*found, strict=True)) if found else ((), (), ())
-        return cls(kept, seen, of_balls, space.position, moving, std)
+        return cls(problem.dynamics, kept, seen, of_balls, space.position, moving, std)
 
     def keep_away(self, margin: Array) -> list[Clearance]:
         """Constraints that keep a margin from each obstacle, (T+1, O)."""
         kept, first = [], 0
         for one, seen in zip(self.worlds, self.seen, strict=True):
             own = margin[:, first : first + len(seen)]
-            kept.append(
-                Clearance(one.world, radius=one.radius if one.balls is None else None, balls=one.balls, margin=own)
-            )
+            radius = one.radius if one.balls is None and one.geoms is None else None
+            kept.append(Clearance(one.world, radius=radius, balls=one.balls, geoms=one.geoms, margin=own))
             first += len(seen)
         return kept
 
@@ -103,6 +120,9 @@ class Surroundings:
     def _of_one(
         self, one: ObstacleCost | Clearance, seen: World, places: SphereCenters | None, states: Array
     ) -> tuple[Array, Array]:
+        if one.geoms is not None:
+            distances, slopes = one.geoms.slopes(self.dynamics, one.world, states)
+            return distances, slopes[..., list(self.position)]
         if one.balls is None or places is None:
             distances, across = distances_with_normals(seen, states[:, list(self.place)])
             normals = np.zeros((*distances.shape, len(self.position)))
@@ -144,9 +164,11 @@ def collision_chance(
 def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, float]:
     """The same of clearances in standard deviations (T+1, O), and the correlation of each with that before (T, O)."""
     each = ndtr(-margin)
-    # Who is in collision at a knot and was not at the one before.
-    begins = each[1:] - both_below(-margin[1:], -margin[:-1], correlation)
-    expected = each[0].sum() + np.maximum(begins, 0.0).sum()
+    begins, near = np.zeros_like(correlation), margin[1:] < FAR
+    # In collision at a knot and not at the one before.
+    before = both_below(-margin[1:][near], -margin[:-1][near], correlation[near])
+    begins[near] = np.maximum(each[1:][near] - before, 0.0)
+    expected = each[0].sum() + begins.sum()
     return np.minimum(each.sum(axis=1), 1.0), float(-np.expm1(-expected))
 
 
@@ -155,16 +177,15 @@ def both_below(first: Array, second: Array, correlation: Array) -> Array:
 
     Plackett's integral over the correlation's angle, by Gauss and Legendre's rule.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(64)
     # Near 1 the integrand is steep: from there it is done from the other end, where it is min(a, b).
     angle = np.arcsin(correlation)
     start = np.where(np.abs(correlation) > 0.95, np.sign(correlation) * np.pi / 2, 0.0)
-    at = start[..., None] + (angle - start)[..., None] * (nodes + 1) / 2
+    at = start[..., None] + (angle - start)[..., None] * (NODES + 1) / 2
     a, b = first[..., None], second[..., None]
     cosine, sine = np.cos(at), np.sin(at)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         exponent = -(a * a + b * b - 2 * a * b * sine) / (2 * np.maximum(cosine, 1e-150) ** 2)
-    total = (np.exp(np.nan_to_num(exponent, nan=-np.inf)) @ weights) * (angle - start) / (4 * np.pi)
+    total = (np.exp(np.nan_to_num(exponent, nan=-np.inf)) @ NODE_WEIGHTS) * (angle - start) / (4 * np.pi)
     independent = ndtr(first) * ndtr(second)
     same, opposite = ndtr(np.minimum(first, second)), np.maximum(ndtr(first) - ndtr(-second), 0.0)
     return total + np.where(start > 0, same, np.where(start < 0, opposite, independent))

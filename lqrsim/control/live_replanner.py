@@ -11,7 +11,7 @@ import numpy.typing as npt
 from lqrsim.control.replan_rule import ActivePlan, ReplanLog, ReplanRule, SolveRequest
 from lqrsim.errors import Array, InputError, check_flag, check_function, check_kind, check_number, vectors_of
 from lqrsim.problem.problem import Problem
-from lqrsim.results.replan import Replan
+from lqrsim.results.plan import Replan
 
 SPARE = 0.5e-3  # s, between the end of a solve and its deadline: for handing the answer over
 

@@ -19,7 +19,7 @@ from lqrsim.control.policy_of_filter import policy_of
 from lqrsim.control.replan_rule import ReplanRule
 from lqrsim.control.replanned import ReplannedRun
 from lqrsim.control.sensors import Sensors, sensor_of
-from lqrsim.control.tolerances import Prediction, choose_tolerances, with_filter
+from lqrsim.control.tolerances import Prediction, choose_tolerances, reach_of, unit_means, with_filter
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of
 from lqrsim.control.uncertainty import PerEntry, Uncertainty, per_entry
 from lqrsim.errors import Array, InputError, check_flag, check_kind, check_number
@@ -31,7 +31,11 @@ from lqrsim.results.plan import Plan
 from lqrsim.results.solution import Solution
 
 MEMORY = 5.0  # s
-INEXACT = 0.02  # how far a control is off from its command, at least, relative to the tolerated effort
+# The least errors that a filter assumes, relative to the tolerated effort: of each control; and of each state's
+# prediction, as if so much effort had moved it. A model is never exact: what acts does not act evenly over a control
+# period, integration has errors, and the gains are those about the plan. With exact sensors a filter that does not
+# know this reads unknowns from the last digits of its prediction errors.
+INEXACT = 0.02
 
 
 class OffsetFree(Controller):
@@ -109,7 +113,7 @@ class OffsetFree(Controller):
         self.replan_always = check_flag("OffsetFree: replan_always", replan_always)
         sensor = sensor_of(sensors, problem.dynamics.state_coordinates)
         efforts = effort_of(effort, problem.dynamics)
-        self.model = PlanModel.of(problem.dynamics, plan, for_filter(uncertainty, memory, efforts, problem), sensor)
+        self.model = for_filter(PlanModel.of(problem.dynamics, plan, uncertainty, sensor), memory, efforts)
         check_observable("OffsetFree", self.model)
         self._rule = None if replan_every is None else self._replan_rule(replan_every)
         self.filter = kalman_filter(self.model)
@@ -133,7 +137,7 @@ class OffsetFree(Controller):
         low, high = np.array(controls.low), np.array(controls.high)
         surroundings = Surroundings.of(self.problem, self.uncertainty.obstacles)
 
-        def predicted(tried: Weights) -> Prediction:
+        def predicted(tried: Weights) -> list[Prediction]:
             radius = self.solution.goal_radius
             return with_filter(self.model, self.filter, tried, (low, high), surroundings, radius)
 
@@ -195,11 +199,20 @@ class OffsetFree(Controller):
         return self._law.coordinates
 
 
-def for_filter(uncertainty: Uncertainty, memory: float, effort: Array, problem: Problem) -> Uncertainty:
-    """What a filter is to believe: see `Uncertainty.steady`; and that no command is carried out exactly.
+def for_filter(model: PlanModel, memory: float, effort: Array) -> PlanModel:
+    """The model that a filter assumes: see `Uncertainty.steady`; with the least errors that it never goes below.
 
-    Without that, a filter that is told of no noise would listen to no measurement.
+    Args:
+      model: with the uncertainty as stated.
+      memory: seconds.
+      effort: of the controls, (m,).
     """
-    stated = per_entry("Uncertainty: control", uncertainty.control, problem.dynamics.control_coordinates)
-    wrong = np.hypot(stated, INEXACT * effort)
-    return replace(uncertainty.steady(memory), control=tuple(wrong.tolist()))
+    stated, space = model.uncertainty, model.dynamics.state_coordinates
+    moved = unit_means(space.units, reach_of(model, effort, 2)[2])
+    control = per_entry("Uncertainty: control", stated.control, model.dynamics.control_coordinates)
+    error = per_entry("Uncertainty: model_error", stated.model_error, space)
+    assumed = replace(
+        stated.steady(memory), control=tuple(np.maximum(control, INEXACT * effort).tolist()),
+        model_error=tuple(np.maximum(error, INEXACT * moved).tolist()),
+    )  # fmt: skip
+    return replace(model, uncertainty=assumed)

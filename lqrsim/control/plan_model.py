@@ -19,7 +19,16 @@ from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.control.law import turning_of
 from lqrsim.control.sensors import Sensor, sensor_of
-from lqrsim.control.uncertainty import GAIN, OFFSET, Uncertainty, Unknown, per_entry, shaping_filter
+from lqrsim.control.uncertainty import (
+    GAIN,
+    OFFSET,
+    ShapingFilter,
+    Uncertainty,
+    Unknown,
+    per_entry,
+    shaping_filter,
+    triangular_root,
+)
 from lqrsim.errors import Array
 from lqrsim.kernels import estimation
 from lqrsim.kernels.records import AngularStates, DynamicsModel, Predictor, SensorModel
@@ -106,7 +115,7 @@ class PlanModel:
     @cached_property
     def own_states(self) -> list[range]:
         """Which of the unknowns' states are those of each remembered one."""
-        ends = np.cumsum([0, *(len(part[0]) for part in self._filters)])
+        ends = np.cumsum([0, *(len(part.output) for part in self._filters)])
         return [range(first, end) for first, end in pairwise(ends.tolist())]
 
     @property
@@ -123,19 +132,19 @@ class PlanModel:
         return tuple(dict.fromkeys(name for name in named if name in self.dynamics.parameters))
 
     @cached_property
-    def _filters(self) -> list[tuple[Array, Array, Array, Array]]:
+    def _filters(self) -> list[ShapingFilter]:
         return [shaping_filter(one, self.plan.dt) for one in self.remembered]
 
     @cached_property
     def transition(self) -> Array:
         """Of the unknowns' states, (D, D)."""
-        return _diagonal([part[0] for part in self._filters])
+        return _diagonal([part.transition for part in self._filters])
 
     @cached_property
     def output(self) -> Array:
         """From the unknowns' states to values of the parameters, and the gain and the offset of each control."""
         columns = [
-            self._column(one)[:, None] * part[2] for one, part in zip(self.remembered, self._filters, strict=True)
+            self._column(one)[:, None] * part.output for one, part in zip(self.remembered, self._filters, strict=True)
         ]
         return np.concatenate([np.zeros((len(self.parameters) + 2 * self.m, 0)), *columns], axis=1)
 
@@ -272,39 +281,46 @@ class PlanModel:
         self.compiled.sensor_slopes(len(H), in_c_order(self.plan.states), self.compiled_sensor, H)
         return H
 
-    # Noise.
+    # Noise, as square roots: a root times its transpose is the covariance.
 
     @cached_property
-    def start(self) -> Array:
-        """Covariance of z at the start, (Z, Z)."""
+    def start_root(self) -> Array:
+        """Of the covariance of z at the start, (Z, Z)."""
         std = per_entry("Uncertainty: start", self.uncertainty.start, self.dynamics.state_coordinates)
         at_rest = np.zeros((self.lagging, self.lagging))
-        return _diagonal([np.diag(std**2), at_rest, *(part[3] for part in self._filters)])
+        return _diagonal([np.diag(std), at_rest, *(part.start for part in self._filters)])
+
+    @cached_property
+    def process_root(self) -> Array:
+        """Of the covariance of w, (T, Z, Z), lower triangular."""
+        n, first, steps = self.n, self.n + self.lagging, self.plan.steps
+        states, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
+        commanded = self.G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
+        white = [one.std * self._column(one) for one in self.uncertainty.unknowns if one.white]
+        pushed = np.zeros((steps, self.size, len(white)))
+        if white:
+            pushed[:, :n] = self.effects @ np.array(white).T
+        error = np.zeros((self.size, n))
+        error[range(n), range(n)] = per_entry("Uncertainty: model_error", self.uncertainty.model_error, states)
+        fresh = np.zeros((self.size, self.size - first))
+        fresh[first:] = _diagonal([part.noise for part in self._filters])
+        own = [np.tile(one, (steps, 1, 1)) for one in (error, fresh)]
+        return triangular_root(np.concatenate([commanded, pushed, *own], axis=2))
 
     @cached_property
     def process_noise(self) -> Array:
         """Covariance of w, (T, Z, Z)."""
-        n, white = self.n, [one for one in self.uncertainty.unknowns if one.white]
-        std = per_entry("Uncertainty: control", self.uncertainty.control, self.dynamics.control_coordinates)
-        commanded = self.G * std  # before the lag: what the actuators have reached keeps some of it
-        noise = commanded @ commanded.transpose(0, 2, 1)
-        for one in white:
-            onto = self.effects @ (one.std * self._column(one))
-            noise[:, :n, :n] += onto[:, :, None] * onto[:, None, :]
-        first = n + self.lagging
-        noise[:, first:, first:] = _diagonal([part[1] for part in self._filters])
-        return noise
+        return self.process_root @ self.process_root.transpose(0, 2, 1)
 
     @cached_property
-    def shown_noise(self) -> Array:
-        """Variance of the noise on each state that is shown, (n,)."""
-        space = self.dynamics.state_coordinates
-        return per_entry("Uncertainty: measurement", self.uncertainty.measurement, space) ** 2
+    def shown_std(self) -> Array:
+        """Standard deviation of the noise on each state that is shown, (n,)."""
+        return per_entry("Uncertainty: measurement", self.uncertainty.measurement, self.dynamics.state_coordinates)
 
     @cached_property
-    def measurement_noise(self) -> Array:
-        """Covariance of v, (T+1, Y, Y)."""
-        return (self.H * self.shown_noise) @ self.H.transpose(0, 2, 1)
+    def measurement_root(self) -> Array:
+        """Of the covariance of v, (T+1, Y, n)."""
+        return self.H * self.shown_std
 
 
 def _diagonal(blocks: list[Array]) -> Array:

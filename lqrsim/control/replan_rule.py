@@ -24,8 +24,7 @@ from lqrsim.errors import (
 )
 from lqrsim.problem.problem import Problem
 from lqrsim.results.funnel import Funnel
-from lqrsim.results.plan import Plan
-from lqrsim.results.replan import Replan
+from lqrsim.results.plan import Plan, Replan
 from lqrsim.results.solution_parts import HORIZONS
 from lqrsim.solvers import compiled
 from lqrsim.solvers.initial_guess import InitialGuess

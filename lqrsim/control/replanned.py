@@ -117,7 +117,7 @@ class ReplannedRun(ControllerRun):
         self.plans[trial][step] = solution.trajectory
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
         # The filter begins with a measurement that is taken in already.
-        kalman = kalman_filter(about, law.filter.corrected[done])
+        kalman = kalman_filter(about, law.filter.corrected_root[done])
         run.law, run.first = FilterLaw.of(solution, about, kalman, law.weights, granted), step
 
 

@@ -16,8 +16,7 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.hashing import sha256
-from lqrsim.results.plan import Plan
-from lqrsim.results.replan import Replan
+from lqrsim.results.plan import Plan, Replan
 from lqrsim.solvers.parallel import workers
 
 MEASURED = "measured"

@@ -56,21 +56,24 @@ class Choice:
 
 
 def choose_tolerances(
-    model: PlanModel, predicted: Callable[[Weights], Prediction], effort: Array, at_end: float
+    model: PlanModel, predicted: Callable[[Weights], list[Prediction]], effort: Array, at_end: float
 ) -> Choice:
     """The tolerances for a law about a plan.
 
     Args:
-      predicted: what becomes of a law with such weights.
-      effort: what may be added to each control, (m,). at_end: as in `track`.
+      predicted: predicts for each of C weights what their law leads to.
+      effort: what may be added to each control, (m,).
+      at_end: as in `track`.
     """
-    reach, found = reach_of(model, effort, PERIODS[-1]), list[Choice]()
-    for periods in PERIODS:
-        if periods > max(model.plan.steps // 2, PERIODS[0]):
-            break
-        tolerate = _of_units(model.dynamics.state_coordinates.units, reach[periods])
-        weights = Weights.of(tuple(tolerate.tolist()), effort, model.dynamics, at_end=at_end)
-        found.append(Choice(tolerate, periods * model.plan.dt, weights, predicted(weights)))
+    longest = max(model.plan.steps // 2, PERIODS[0])
+    reach, units = reach_of(model, effort, PERIODS[-1]), model.dynamics.state_coordinates.units
+    tried = {periods: unit_means(units, reach[periods]) for periods in PERIODS if periods <= longest}
+    each = [Weights.of(tuple(one.tolist()), effort, model.dynamics, at_end=at_end) for one in tried.values()]
+    all_weights = Weights(np.array([one.state for one in each]), each[0].control, np.array([one.end for one in each]))
+    found = [
+        Choice(tolerate, periods * model.plan.dt, weights, prediction)
+        for (periods, tolerate), weights, prediction in zip(tried.items(), each, predicted(all_weights), strict=True)
+    ]
     # What is a thousandth of the plan's extent is narrow enough.
     extent = float(np.ptp(model.plan.states, axis=0).max()) or 1.0
     narrowest = max(min(one.predicted.width for one in found), 1e-3 * extent)
@@ -95,7 +98,7 @@ def reach_of(model: PlanModel, effort: Array, periods: int) -> dict[int, Array]:
     return reach
 
 
-def _of_units(units: tuple[str, ...], numbers: Array) -> Array:
+def unit_means(units: tuple[str, ...], numbers: Array) -> Array:
     """The same for all states of a unit: the rms of theirs."""
     squares = {unit: [number**2 for number, own in zip(numbers, units, strict=True) if own == unit] for unit in units}
     return np.array([np.sqrt(np.mean(squares[unit])) for unit in units])
@@ -126,30 +129,44 @@ def prediction_of(
 def with_filter(
     model: PlanModel, kalman: KalmanFilter, weights: Weights, limits: tuple[Array, Array], surroundings: Surroundings,
     radius: float | None,
-) -> Prediction:  # fmt: skip
-    """Of a law that follows a filter's estimates.
+) -> list[Prediction]:  # fmt: skip
+    """Predictions for the laws of C weights that follow a filter's estimates.
 
     The filter is taken to be right about the noise: then its error is independent of what it estimates, and there is
     less to compute than in `loop_moments.py`.
     """
-    n, steps = model.n, model.plan.steps
+    n, own, steps, count = model.n, model.n + model.lagging, model.plan.steps, len(weights.state)
     gain, offset = tracking_laws(model, weights)
-    estimate, mean = np.zeros((model.size, model.size)), np.zeros(model.size)
-    covariance, across, means = np.empty((steps + 1, n, n)), np.empty((steps, n, n)), np.empty((steps + 1, n))
-    beyond = np.zeros(model.m)
+    learned = kalman.gain @ kalman.innovation @ kalman.gain.transpose(0, 2, 1)
+    unlearned = model.F[:, :n] @ kalman.corrected[:-1, :, :n]
+    # Covariance and mean of the estimate's deviation from the plan.
+    estimate, mean = np.zeros((count, model.size, model.size)), np.zeros((count, model.size))
+    covariance, across = np.empty((count, steps + 1, n, n)), np.empty((count, steps, n, n))
+    means, beyond = np.empty((count, steps + 1, n)), np.zeros((count, model.m))
     for t in range(steps + 1):
-        K = kalman.gain[t]
-        covariance[t], means[t] = estimate[:n, :n] + kalman.predicted[t, :n, :n], mean[:n]
-        estimate = estimate + K @ kalman.innovation[t] @ K.T
+        covariance[:, t], means[:, t] = estimate[:, :n, :n] + kalman.predicted[t, :n, :n], mean[:, :n]
+        estimate += learned[t]
         if t == steps:
             break
-        law, F, G = gain[t], model.F[t], model.G[t]
-        std = np.sqrt(np.maximum((law @ estimate @ law.T).diagonal(), 0.0))
-        slope, level, left = limited(model.plan.controls[t] + offset[t] + law @ mean, std, *limits)
+        law, F, G = gain[:, t], model.F[t], model.G[t, :own]
+        response = law @ estimate
+        std = np.sqrt(np.maximum((response * law).sum(axis=2), 0.0))
+        planned = model.plan.controls[t]
+        slope, level, left = limited(planned + offset[:, t] + (law @ mean[:, :, None])[:, :, 0], std, *limits)
         beyond += (1 - slope) / steps
-        M = F + G @ (slope[:, None] * law)
+        # M estimate M' of M = F + G slope law. Of G only the rows of the state and the actuators are not zero.
+        law = slope[:, :, None] * law
+        moved = F @ estimate
+        moved[:, :own] += G @ (slope[:, :, None] * response)
         # The true state is the estimate and its error, of which the control moves the first alone.
-        across[t] = (M @ estimate + F @ kalman.corrected[t])[:n, :n]
-        estimate = M @ estimate @ M.T + (G * left) @ G.T
-        mean = F @ mean + G @ (level - model.plan.controls[t]) + model.c[t]
-    return prediction_of(model, means, covariance, across, float(beyond.mean()), surroundings, radius)
+        across[:, t] = moved[:, :n, :n] + unlearned[t]
+        estimate = moved @ F.T
+        estimate[:, :, :own] += moved @ law.transpose(0, 2, 1) @ G.T
+        estimate[:, :own, :own] += (G * left[:, None, :]) @ G.T
+        mean = mean @ F.T + model.c[t]
+        mean[:, :own] += (level - planned) @ G.T
+    saturation = beyond.mean(axis=1).tolist()
+    return [
+        prediction_of(model, means[i], covariance[i], across[i], saturation[i], surroundings, radius)
+        for i in range(count)
+    ]

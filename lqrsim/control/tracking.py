@@ -70,12 +70,16 @@ def track(
         limits = np.array(space.low), np.array(space.high)
         surroundings = Surroundings.of(problem, uncertainty.obstacles)
 
-        def predicted(tried: Weights) -> Prediction:
+        def predicted(tried: Weights) -> list[Prediction]:
             moments, n = Loop(truth, *tracking_laws(model, tried), None, *limits).moments(), model.n
-            return prediction_of(
-                truth, moments.mean[:, :n], moments.covariance[:, :n, :n], moments.across,
-                float(moments.saturation.mean()), surroundings, solution.goal_radius,
-            )  # fmt: skip
+            saturation = moments.saturation.mean(axis=(1, 2)).tolist()
+            return [
+                prediction_of(
+                    truth, moments.mean[i, :, :n], moments.covariance[i, :, :n, :n], moments.across[i],
+                    saturation[i], surroundings, solution.goal_radius,
+                )
+                for i in range(len(saturation))
+            ]  # fmt: skip
 
         weights = choose_tolerances(model, predicted, efforts, at_end).weights
     gain, offset = _laws(problem, solution, model, weights, risk)

@@ -32,7 +32,9 @@ class Weights:
     """What deviations from a plan cost: 1 for what is just tolerated.
 
     Attributes:
-      state: the diagonal of Q, (n,). control: of R, (m,). end: of Q_T, (n,).
+      state: the diagonal of Q, (n,); or of several to compare, (C, n).
+      control: of R, (m,).
+      end: of Q_T, likewise.
     """
 
     state: Array
@@ -94,43 +96,41 @@ class Averse:
 
 
 def tracking_laws(model: PlanModel, weights: Weights, averse: Averse | None = None) -> tuple[Array, Array]:
-    """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m)."""
+    """The laws u = gain_t z + offset_t in deviations from the plan: (T, m, Z) and (T, m); of C weights (C, T, m, Z)."""
     n, m, steps = model.n, model.m, model.plan.steps
     own = n + model.lagging  # what the controls can do something about
     F, G, c = model.F[:, :own, :own], model.G[:, :own], model.c[:, :own]
     E = model.F[:, :own, own:]
-    Q, R = np.zeros((own, own)), np.diag(weights.control)
-    Q[range(n), range(n)] = weights.state
-    undo = R @ _undoing(model, weights)
-    gain, offset = np.empty((steps, m, model.size)), np.empty((steps, m))
-    # The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a); what d alone costs changes no law.
-    S, D, s = np.zeros((own, own)), np.zeros((own, E.shape[2])), np.zeros(own)
-    S[range(n), range(n)] = weights.end
+    many = weights.state.shape[:-1]
+    Q, R = np.zeros((*many, own, own)), np.diag(weights.control)
+    Q[..., range(n), range(n)] = weights.state
+    undo = np.moveaxis(R @ _undoing(model, weights), -3, 0)
+    gain, offset = np.empty((*many, steps, m, model.size)), np.empty((*many, steps, m))
+    # The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a); what d alone costs changes no law. W is (S, D, s).
+    S, ahead = np.zeros((*many, own, own)), np.zeros((*many, own, E.shape[2] + 1))
+    S[..., range(n), range(n)] = weights.end
     for t in range(steps - 1, -1, -1):
         if averse is not None:
-            S, s = averse.worst(t, S, s)
-        SF, ahead = S @ F[t], S @ E[t] + D
-        slope = S @ c[t] + s
-        to_control = G[t].T
-        right = np.concatenate([to_control @ SF, to_control @ ahead + undo[t], (to_control @ slope)[:, None]], axis=1)
-        law = -np.linalg.solve(R + to_control @ S @ G[t], right)
-        gain[t], offset[t] = law[:, :-1], law[:, -1]
-        left = F[t].T
-        cross = SF.T @ G[t]
-        S = Q + left @ SF + cross @ law[:, :own]
-        S = 0.5 * (S + S.T)
-        D = left @ ahead + cross @ law[:, own:-1]
-        s = left @ slope + cross @ law[:, -1]
+            S, ahead[..., -1] = averse.worst(t, S, ahead[..., -1])
+        slope = S @ np.concatenate([F[t], E[t], c[t][:, None]], axis=1)
+        slope[..., own:] += ahead
+        right = G[t].T @ slope
+        right[..., own:-1] += undo[t]
+        law = -np.linalg.solve(R + G[t].T @ S @ G[t], right)
+        gain[..., t, :, :], offset[..., t, :] = law[..., :-1], law[..., -1]
+        left = F[t].T @ slope + np.swapaxes(slope[..., :own], -1, -2) @ G[t] @ law
+        S, ahead = Q + left[..., :own], left[..., own:]
+        S = 0.5 * (S + np.swapaxes(S, -1, -2))
     return gain, offset
 
 
 def _undoing(model: PlanModel, weights: Weights) -> Array:
     """M, (T, m, D): the controls that undo, in one step and as far as they can, what the unknowns do."""
     B = model.jacobian[:, :, model.n :]
-    weighed = B.transpose(0, 2, 1) * weights.state
+    weighed = B.transpose(0, 2, 1) * weights.state[..., None, None, :]
     curve = weighed @ B
-    curve += 1e-9 * np.trace(curve, axis1=1, axis2=2)[:, None, None] * np.eye(model.m) + 1e-300 * np.eye(model.m)
-    return np.linalg.solve(curve, weighed @ model.E)
+    least = 1e-9 * np.trace(curve, axis1=-2, axis2=-1) + 1e-300
+    return np.linalg.solve(curve + least[..., None, None] * np.eye(model.m), weighed @ model.E)
 
 
 def check_plan(who: str, problem: Problem, solution: Solution) -> None:

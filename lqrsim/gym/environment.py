@@ -12,7 +12,7 @@ from lqrsim.gym.episode import Episode, Resettable
 from lqrsim.gym.task import Actions, Disturbances, Task
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.view.live_picture import LivePicture
+from lqrsim.view.picture import LivePicture
 
 RENDER_MODES = ("rgb_array",)
 

@@ -1,6 +1,7 @@
-"""A constraint whose numbers share the places of balls: these are worked out once a step. The kernels' subset.
+"""A constraint whose rows share numbers, such as the places of balls: they are worked out once a step.
 
-The constraint's own functions get these and their derivatives in place of the state and the control.
+The constraint's own functions get these and their derivatives in place of the state and the control. The kernels'
+subset.
 """
 
 from lqrsim.kernels.augmented_lagrangian import augment as augment_places
@@ -10,7 +11,7 @@ from lqrsim.kernels.declarations import N, places, places_jacobian, stack
 from lqrsim.kernels.declarations import constraint_slope as slope_of_places
 from lqrsim.kernels.linear_algebra import clear
 
-PLACES = 3  # coordinates of all balls
+PLACES = 3  # how many numbers they share
 
 
 def augment(x, u, t, data, multipliers, hessian, gradient):

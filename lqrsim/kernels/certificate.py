@@ -15,7 +15,7 @@ from lqrsim.kernels.declarations import (
     stack,
 )
 from lqrsim.kernels.linear_algebra import cholesky, cholesky_solve
-from lqrsim.kernels.model_functions import cost_added, cost_quadratic, noise_quadratic, step_jacobian
+from lqrsim.kernels.model_functions import augment_cost, cost_alone, cost_quadratic, noise_quadratic, step_jacobian
 from lqrsim.kernels.records import Limits, LinearStep, NextStep, QuadraticStage
 
 
@@ -45,8 +45,9 @@ def certify(settings, own, plan, policy, to_go, model, found):
         size[i], beyond[i], nowhere[i] = 1.0, 0.0, 0.0
         for t in range(steps + 1):
             size[i] = max(size[i], abs(states[t, i]))
-    cost = cost_quadratic(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
-    cost -= cost_added(states[steps], none, steps, model.final)
+    # What constraints add is never part of the sum: a large penalty would leave its rounding.
+    cost = cost_alone(states[steps], none, steps, model.final, 0.0, stage.hessian, stage.gradient)
+    augment_cost(states[steps], none, steps, model.final, stage.hessian, stage.gradient)
     scale = scale_of(states[steps], none, stage)
     for i in range(N):
         costate[i] = stage.gradient[i]
@@ -56,8 +57,8 @@ def certify(settings, own, plan, policy, to_go, model, found):
     for t in range(steps - 1, -1, -1):
         x, u = states[t], plan.controls[t]
         step_jacobian(x, u, model, model.dt, arrived, step.jacobian)
-        cost += cost_quadratic(x, u, t, model.stage, stage.hessian, stage.gradient)
-        cost -= cost_added(x, u, t, model.stage)
+        cost += cost_alone(x, u, t, model.stage, 0.0, stage.hessian, stage.gradient)
+        augment_cost(x, u, t, model.stage, stage.hessian, stage.gradient)
         if NOISY:  # of the policy as it is, the slope ahead is the costate
             slope = NextStep(
                 step.jacobian,

@@ -29,14 +29,16 @@ from lqrsim.kernels.rotation_ratios import sine_ratio
 # mj_forwardSkip and the integrator; the last is 0 where parts of a step cannot be had on their own. TIMESTEP: of the
 # physics, in s. NV, NA: degrees of freedom and actuators' states. JOINTS: how many; ACTUATORS: where the list of those
 # is that the controls are for. TEAM, JOB: where threads that help find what to do, 0 without any; YIELD: the address of
-# what lets others run; KINEMATICS, RESET: of mj_kinematics and mj_resetData. TABLE: the joints' kind and places in qpos
-# and qvel, three numbers each.
+# what lets others run; KINEMATICS, RESET, COMPOS, JAC, DISTANCE: of mj_kinematics, mj_resetData, mj_comPos, mj_jac and
+# mj_geomDistance; DISTANCE_MODEL: the model that distances are of. TABLE: the joints' kind and places in qpos and qvel,
+# three numbers each.
 WRENCH, FLAGS, SLOTS, COUNT, MODEL, STEP, FORWARD, INTEGRATE = 0, 6, 7, 8, 9, 10, 11, 12
 TIMESTEP, NV, NA, JOINTS, ACTUATORS, TEAM, JOB, YIELD, KINEMATICS = 13, 14, 15, 16, 17, 18, 19, 20, 21
-RESET, TABLE = 22, 23
+RESET, COMPOS, JAC, DISTANCE, DISTANCE_MODEL, TABLE = 22, 23, 24, 25, 26, 27
 
 # What a slot has of each of its two MjData: addresses.
-SLOT, DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, SIZE = 20, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10
+SLOT, SIZE = 24, 12
+DATA, QPOS, QVEL, ACT, CTRL, WARM, QACC, PUSH, XPOS, XMAT, GEOM_XPOS, GEOM_XMAT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
 
 # The words that a team shares: whether somebody has it, the next column to do with the number of the job above it, how
 # many are done, whether to stop, how many helpers there are.
@@ -208,7 +210,7 @@ def steps_in(x, u, p, h, z):
 
 
 def take_slot(p):
-    """A slot that no other thread has."""
+    """Claim a free slot."""
     slot, count = 0, int(p[COUNT])
     while claim(p[FLAGS], slot) == 0:
         slot = (slot + 1) % count

@@ -52,7 +52,13 @@ def cost_quadratic(x, u, t, cost, hessian, gradient):
 
 def cost_of_order(x, u, t, cost, share, hessian, gradient):
     """The same with a Hessian that is that share of the way from the projected one to the true one."""
-    total, constraints, projected = 0.0, cost.constraints, stack(W, W)
+    own = cost_alone(x, u, t, cost, share, hessian, gradient)
+    return own + augment_cost(x, u, t, cost, hessian, gradient)
+
+
+def cost_alone(x, u, t, cost, share, hessian, gradient):
+    """The same without what is added for constraints."""
+    total, projected = 0.0, stack(W, W)
     clear(hessian, W, W)
     for i in range(W):
         gradient[i] = 0.0
@@ -69,6 +75,12 @@ def cost_of_order(x, u, t, cost, share, hessian, gradient):
                 for i in range(W):
                     for j in range(W):
                         hessian[i, j] = share * hessian[i, j] + (1 - share) * projected[i, j]
+    return total
+
+
+def augment_cost(x, u, t, cost, hessian, gradient):
+    """Add the quadratic model of what the augmented Lagrangian adds for constraints; return its value."""
+    total, constraints = 0.0, cost.constraints
     for k in range(constraints.size):
         total += call_for_value(
             constraints.functions[k, AUGMENT],

@@ -20,6 +20,13 @@ def cosine_ratio(s: float) -> float:
     return 0.5 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56 * (1 - s / 90 * (1 - s / 132 * (1 - s / 182))))))
 
 
+def cubic_ratio(s: float) -> float:
+    """(x - sin x) / x^3."""
+    if s > 0.25:
+        return (1 - sine_ratio(s)) / s
+    return 1 / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72 * (1 - s / 110 * (1 - s / 156 * (1 - s / 210))))))
+
+
 def cotangent_ratio(s: float) -> float:
     if s > 0.25:
         return (1 - sine_ratio(s) / (2 * cosine_ratio(s))) / s

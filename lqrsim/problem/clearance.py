@@ -5,7 +5,8 @@ import numpy.typing as npt
 
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_array, check_count, check_number, excerpt, real
-from lqrsim.kernels import ball_clearance, clearance
+from lqrsim.kernels import ball_clearance, clearance, distance_constraint
+from lqrsim.problem.collision_geoms import CollisionGeoms
 from lqrsim.problem.collision_spheres import CollisionSpheres, bind_outline, check_outline
 from lqrsim.problem.constraints import Constraint, ConstraintTerm
 from lqrsim.problem.dynamics import Dynamics
@@ -21,8 +22,9 @@ class Clearance(Constraint):
 
     Args:
       world: the obstacles; a robot in the plane sees them as for an ObstacleCost.
-      radius: of the robot in metres, as for an ObstacleCost; either this or `balls`.
-      balls: the robot's balls, as for an ObstacleCost; either this or `radius`.
+      radius: of the robot in metres, as for an ObstacleCost; one of this, `balls` and `geoms`.
+      balls: the robot's balls, as for an ObstacleCost.
+      geoms: what collides of a robot from an MJCF, as for an ObstacleCost: one distance for each body and obstacle.
       margin: in metres; a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O).
     """
 
@@ -32,12 +34,13 @@ class Clearance(Constraint):
         *,
         radius: float | None = None,
         balls: CollisionSpheres | None = None,
+        geoms: CollisionGeoms | None = None,
         margin: float | npt.ArrayLike = 0.0,
     ) -> None:
         if not isinstance(world, World):
             raise InputError(f"Clearance: world: got {excerpt(world)}, want a World, such as scene.world")
-        self.world, self.balls = world, balls
-        self.radius = check_outline("Clearance", radius, balls)
+        self.world, self.balls, self.geoms = world, balls, geoms
+        self.radius = check_outline("Clearance", radius, balls, geoms)
         given = real("Clearance: margin", margin)
         if given.ndim == 0:
             self.margin: float | Array = check_number("Clearance: margin", margin)
@@ -50,8 +53,19 @@ class Clearance(Constraint):
         steps = check_count("steps", steps, at_least=0)
         if not isinstance(self.margin, np.ndarray):
             return self
-        left = self.margin[min(steps, len(self.margin) - 1) :]
-        return Clearance(self.world, radius=self.radius if self.balls is None else None, balls=self.balls, margin=left)
+        return self.keeping(self.margin[min(steps, len(self.margin) - 1) :])
+
+    def keeping(self, margin: float | npt.ArrayLike) -> "Clearance":
+        """The same constraint with another margin.
+
+        Args:
+          margin: as of a Clearance.
+
+        Returns:
+          A Clearance.
+        """
+        radius = self.radius if self.balls is None and self.geoms is None else None
+        return Clearance(self.world, radius=radius, balls=self.balls, geoms=self.geoms, margin=margin)
 
     @property
     def moving(self) -> bool:
@@ -61,16 +75,18 @@ class Clearance(Constraint):
         return self._bind_at(dynamics, np.zeros(len(np.atleast_1d(self.margin))))
 
     def _bind_at(self, dynamics: Dynamics, times: Array) -> ConstraintTerm:
-        balls = self.balls
-        places, world = bind_outline("Clearance", balls, dynamics, self.world)
-        tables = world.tables(times)
         margins = np.atleast_1d(self.margin).reshape(np.shape(self.margin)[0] if np.ndim(self.margin) else 1, -1)
+        world = self.world if self.geoms is not None else bind_outline("Clearance", self.balls, dynamics, self.world)[1]
         if len(margins) not in (1, len(times)):
             want = f"one, or one for each of {len(times)} knots"
             raise InputError(f"Clearance: margin: got {len(margins)} numbers, want {want}")
         if margins.shape[1] not in (1, len(world)):
             want = f"{len(world)}, one an obstacle: {', '.join(world.names)}"
             raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
+        if self.geoms is not None:
+            return _bind_geoms(self.geoms, dynamics, world, margins)
+        balls, tables = self.balls, world.tables(times)
+        places, _ = bind_outline("Clearance", balls, dynamics, self.world)
 
         def describe(row: int) -> str:
             ball, place = divmod(row, len(world))
@@ -92,6 +108,31 @@ class Clearance(Constraint):
             data=np.concatenate([places.data, own]),
             rows=len(balls) * len(world),
             describe=describe,
-            balls=len(balls),
+            shared=3 * len(balls),
             functions=places.functions,
         )
+
+
+def _bind_geoms(geoms: CollisionGeoms, dynamics: Dynamics, world: World, margins: Array) -> ConstraintTerm:
+    """The constraint at a simulator's distances, whose margins are (1 or T + 1, 1 or O)."""
+    found = geoms.bind(dynamics, world, float(margins.max()) + 2 * geoms.size)
+    if -1 in found.obstacles and margins.shape[1] > 1:
+        want = f"one number for a knot, as there are {len(world)} obstacles"
+        raise InputError(f"Clearance: margin: got {margins.shape[1]} numbers for a knot, want {want}")
+
+    def describe(row: int) -> str:
+        number = found.obstacles[row]
+        own = margins[:, number % margins.shape[1]]
+        low, high = f"{own.min():g}", f"{own.max():g}"
+        said, what = low if low == high else f"{low} to {high}", f"obstacle {world.names[number]!r}"
+        return f"a clearance of {said} m of {found.parts[row]!r} to {what if number >= 0 else 'all obstacles'}"
+
+    rows, numbers = len(found.parts), np.maximum(found.obstacles, 0)
+    return ConstraintTerm(
+        source=found.filling(source_of(distance_constraint, AT=found.numbers, ROWS=max(1, rows))),
+        data=np.concatenate([found.data, margins.shape, numbers, margins.ravel()]),
+        rows=rows,
+        describe=describe,
+        shared=max(1, rows),
+        functions=found.functions,
+    )

@@ -27,6 +27,7 @@ from lqrsim.errors import (
     vectors_of,
 )
 from lqrsim.kernels import ball_places, function_places, place_differences
+from lqrsim.problem.collision_geoms import CollisionGeoms
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.world import SPACE, World
@@ -308,19 +309,24 @@ class CollisionSpheres:
         return dynamics.state_coordinates.in_world(found[..., :2]) if places.in_plane else found
 
 
-def check_outline(field: str, radius: float | None, balls: CollisionSpheres | None) -> float:
-    """The radius of what an obstacle is kept clear of, checked; of balls, that of the largest.
+def check_outline(
+    field: str, radius: float | None, balls: CollisionSpheres | None, geoms: CollisionGeoms | None = None
+) -> float:
+    """The radius of what an obstacle is kept clear of, checked; of balls, that of the largest; of geoms, 0.
 
     Raises:
-      InputError: it is negative, these are no balls, or neither or both of them are given.
+      InputError: it is negative, these are no balls or geoms, or it is not one of the three.
     """
-    if balls is None and radius is not None:
-        return check_number(f"{field}: radius", radius, at_least=0.0)
     check_kind(f"{field}: balls", balls, (CollisionSpheres, type(None)), "CollisionSpheres(places, radii)")
-    if balls is None or radius is not None:
-        given = "neither radius nor balls" if balls is None else "radius and balls"
-        raise InputError(f"{field}: got {given}, want one of them: radius=robot.radius or balls=robot.balls")
-    return float(balls.radii.max())
+    check_kind(f"{field}: geoms", geoms, (CollisionGeoms, type(None)), "those of a robot from an MJCF, robot.geoms")
+    given = [name for name, one in (("radius", radius), ("balls", balls), ("geoms", geoms)) if one is not None]
+    if len(given) != 1:
+        got = " and ".join(given) or "none of radius, balls and geoms"
+        wanted = "one of them: radius=robot.radius, balls=robot.balls or geoms=robot.geoms"
+        raise InputError(f"{field}: got {got}, want {wanted}")
+    if radius is not None:
+        return check_number(f"{field}: radius", radius, at_least=0.0)
+    return float(balls.radii.max()) if balls is not None else 0.0
 
 
 def bind_outline(

@@ -49,9 +49,9 @@ class ConstraintTerm:
       uses_control: whether they depend on u; if so, they do not act at the last step, which has none.
       equality: whether they are to be zero.
       final_only: whether they act at the last step alone.
-      balls: of how many balls the numbers are, whose places all of them share; mostly none. With it the source defines
-        `places` and `places_jacobian`, too, as `SphereCenters` has them, and `value` and `slope` get the places
-        (3 balls,) and their derivatives (3 balls, n) in place of x and u.
+      shared: how many numbers all rows share, such as the places of balls; they are worked out once a step. With it the
+        source defines `places` and `places_jacobian`, too, as `SphereCenters` has them, and `value` and `slope` get
+        these numbers (shared,) and their derivatives (shared, n) in place of x and u.
       functions: what the source calls with `call`; their addresses come first in the data that it is given.
     """
 
@@ -62,14 +62,14 @@ class ConstraintTerm:
     uses_control: bool = False
     equality: bool = False
     final_only: bool = False
-    balls: int = 0
+    shared: int = 0
     functions: tuple[UserFunction, ...] = ()
 
     @functools.cached_property
     def code(self) -> Source:
         """The source, checked. Raises InputError."""
-        of_balls = {"places": 3, "places_jacobian": 4} if self.balls else {}
-        return check_source("ConstraintTerm", self.source, {"value": 5, "slope": 6, **of_balls})
+        of_all = {"places": 3, "places_jacobian": 4} if self.shared else {}
+        return check_source("ConstraintTerm", self.source, {"value": 5, "slope": 6, **of_all})
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", check_array("ConstraintTerm: data", self.data, (None,), infinite=True))
@@ -79,7 +79,7 @@ class ConstraintTerm:
             object.__setattr__(self, name, check_flag(f"ConstraintTerm: {name}", getattr(self, name)))
         if self.uses_control and self.final_only:
             raise InputError("ConstraintTerm: final_only: got True with uses_control, want one: the end has no control")
-        object.__setattr__(self, "balls", check_count("ConstraintTerm: balls", self.balls, at_least=0))
+        object.__setattr__(self, "shared", check_count("ConstraintTerm: shared", self.shared, at_least=0))
         _ = self.code
         functions = check_items("ConstraintTerm: functions", self.functions, UserFunction, "a tuple of UserFunction")
         object.__setattr__(self, "functions", functions)
@@ -128,7 +128,7 @@ class SymbolicConstraint(Constraint):
     """A constraint stated as a formula.
 
     One that depends on the control acts at the steps that have one, so not at the last; one of the state alone acts at
-    the last, too, but not at a start that is given exactly, about which nothing can be done.
+    the last, too, but not at a start that is given exactly, which cannot change.
 
     Args:
       function: `function(x, u, p)` of SymPy symbols, as in `Dynamics`; returns one expression, or a list of them, that

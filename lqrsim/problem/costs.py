@@ -28,10 +28,13 @@ from lqrsim.errors import (
     check_weight,
     excerpt,
 )
-from lqrsim.kernels import ball_cost, cost_differences, function_cost, obstacle_cost, quadratic_cost
+from lqrsim.kernels import ball_cost, cost_differences, distance_cost, function_cost, obstacle_cost, quadratic_cost
+from lqrsim.problem.collision_geoms import CollisionGeoms
 from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters, bind_outline, check_outline
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.scenes.world import World
+
+FAR = 16.0  # over the sharpness of an ObstacleCost: from where on geoms cost nothing, and before it exp(-FAR)
 
 
 @dataclass(frozen=True)
@@ -188,8 +191,9 @@ class ObstacleCost(Cost):
     Args:
       world: the obstacles.
       radius: of the robot at its position, in metres.
-      balls: the robot in its place, as `robot.balls`; one of the two. With balls the attribute `radius` is that of the
-        largest.
+      balls: the robot in its place, as `robot.balls`. With balls the attribute `radius` is that of the largest.
+      geoms: what collides of a robot from an MJCF, as `robot.geoms`, at MuJoCo's distances: the sum is over its bodies
+        and the obstacles, and what is farther away than 16 / sharpness costs nothing. One of radius, balls and geoms.
       sharpness: in 1/m.
       weight: cost of touching one obstacle, with one ball, for one step.
     """
@@ -200,13 +204,14 @@ class ObstacleCost(Cost):
         *,
         radius: float | None = None,
         balls: CollisionSpheres | None = None,
+        geoms: CollisionGeoms | None = None,
         sharpness: float = 10.0,
         weight: float = 1.0,
     ) -> None:
         if not isinstance(world, World):
             raise InputError(f"ObstacleCost: world: got {excerpt(world)}, want a World, such as scene.world")
-        self.world, self.balls = world, balls
-        self.radius = check_outline("ObstacleCost", radius, balls)
+        self.world, self.balls, self.geoms = world, balls, geoms
+        self.radius = check_outline("ObstacleCost", radius, balls, geoms)
         self.sharpness = check_number("ObstacleCost: sharpness", sharpness, above=0.0)
         self.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
 
@@ -219,8 +224,10 @@ class ObstacleCost(Cost):
         Returns:
           An ObstacleCost.
         """
-        radius = self.radius if self.balls is None else None
-        return ObstacleCost(self.world, radius=radius, balls=self.balls, sharpness=self.sharpness, weight=weight)
+        radius = self.radius if self.balls is None and self.geoms is None else None
+        return ObstacleCost(
+            self.world, radius=radius, balls=self.balls, geoms=self.geoms, sharpness=self.sharpness, weight=weight
+        )
 
     @property
     def moving(self) -> bool:
@@ -230,6 +237,8 @@ class ObstacleCost(Cost):
         return self._bind_at(dynamics, np.zeros(1))
 
     def _bind_at(self, dynamics: Dynamics, times: Array) -> CostTerm:
+        if self.geoms is not None:
+            return self._bind_geoms(self.geoms, dynamics)
         places, world = bind_outline("ObstacleCost", self.balls, dynamics, self.world)
         tables = world.tables(times)
         if self.balls is not None and places is not None:
@@ -238,6 +247,19 @@ class ObstacleCost(Cost):
         first = [self.radius, self.sharpness, self.weight, len(world), len(tables)]
         data = np.concatenate([first, tables.ravel()])
         return CostTerm(source_of(obstacle_cost, AXES=position), data, nonconvex_in=position, factor=2)
+
+    def _bind_geoms(self, geoms: CollisionGeoms, dynamics: Dynamics) -> CostTerm:
+        reach = FAR / self.sharpness
+        found = geoms.bind(dynamics, self.world, reach)
+        kernel = source_of(distance_cost, AT=found.numbers, ROWS=max(1, len(found.parts)), MOVED=found.moved)
+        return CostTerm(
+            found.filling(kernel),
+            np.concatenate([found.data, [self.sharpness, self.weight, reach]]),
+            nonconvex_in=tuple(range(found.moved)),
+            factor=len(found.data) + 1,
+            functions=found.functions,
+            exact_hessian=False,
+        )
 
     def _bind_balls(self, balls: CollisionSpheres, places: SphereCenters, tables: Array) -> CostTerm:
         own = np.concatenate([[self.sharpness, self.weight, tables.shape[1], len(tables)], balls.radii, tables.ravel()])

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lqrsim.codegen.plain import plain_functions
-from lqrsim.codegen.user_functions import UserFunction, brief, plain_calls
+from lqrsim.codegen.user_functions import UserFunction, address_of, brief, plain_calls
 from lqrsim.errors import Array, InputError, check_count, check_number, check_seed, check_text, excerpt, real, shaped
 from lqrsim.problem.constraints import ConstraintTerm
 from lqrsim.problem.costs import CostTerm, terms_of
@@ -92,7 +92,8 @@ def _run_plainly(term: CostTerm | ConstraintTerm, n: int, m: int) -> tuple[dict[
     wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]
     calls = plain_calls(term.functions, parameters)
     names = plain_functions(term.code, {"N": n, "M": m, "W": n + m}, wanted, calls)
-    return names, np.concatenate([np.arange(len(term.functions), dtype=np.float64), term.data])
+    places = [address_of(one) if one.is_memory else float(i) for i, one in enumerate(term.functions)]
+    return names, np.concatenate([places, term.data])
 
 
 def _constraints(
@@ -104,9 +105,9 @@ def _constraints(
         names, data = _run_plainly(term, n, m)
 
         def given(x: Array, u: Array, term: ConstraintTerm = term, names: Any = names, data: Array = data) -> Any:
-            if not term.balls:
+            if not term.shared:
                 return x, u
-            at, moves = np.zeros(3 * term.balls), np.zeros((3 * term.balls, n))
+            at, moves = np.zeros(term.shared), np.zeros((term.shared, n))
             names["places_jacobian"](x, data, at, moves)
             return at, moves
 

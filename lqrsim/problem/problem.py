@@ -20,6 +20,7 @@ from lqrsim.errors import (
     check_number,
     excerpt,
 )
+from lqrsim.problem.collision_geoms import CollisionGeoms
 from lqrsim.problem.collision_spheres import evaluate
 from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all, goals_of
 from lqrsim.problem.costs import ControlCost, Cost, CostTerm, ObstacleCost, QuadraticCost, terms_of
@@ -27,6 +28,7 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.hashing import sha256
+from lqrsim.scenes.world import World
 
 
 @dataclass(frozen=True)
@@ -389,6 +391,9 @@ class Problem:
             return
         space = self.dynamics.state_coordinates
         for cost in self.obstacle_costs:
+            if cost.geoms is not None:
+                self._check_start_of(cost.geoms, cost.world)
+                continue
             if cost.balls is None:
                 world = cost.world.moved(self.begin).seen_by(space.plane, space.offset)
                 places = self.start[None, list(space.position)]
@@ -408,6 +413,17 @@ class Problem:
                         f"initial: got {what} at ({where}) m, {-distances.min():.3g} m inside obstacle {name!r},"
                         f" want it clear of obstacles by {whose} of {radius:g} m"
                     )
+
+    def _check_start_of(self, geoms: CollisionGeoms, world: World) -> None:
+        """Raises InputError if a geom is in an obstacle where the robot starts."""
+        if len(world) and self.start is not None:
+            distances = geoms.clearances(self.dynamics, world, self.start)
+            if distances.min() < 0:
+                name = world.names[int(distances.argmin())]
+                raise InputError(
+                    f"initial: got a start {-distances.min():.3g} m inside obstacle {name!r}, want it clear; or, where"
+                    f" that is none, obstacles= of the robot without it"
+                )
 
 
 def _check_within_reach(limits: Coordinates, actuators: Coordinates) -> None:

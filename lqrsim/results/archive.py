@@ -1,13 +1,14 @@
-"""Arrays by name and one JSON text in a file: NumPy's .npz, with a hash of all of it inside.
+"""Arrays by name and one JSON text in a file: NumPy's .npz, with a hash of its content.
 
-What is read may be anyone's bytes. Nothing in it is run, nothing is unpacked before its size is known to be that of the
-array it says it is, and whatever a parser makes of it, it is refused in one line.
+A file may come from anyone. Nothing in it is run, nothing is unpacked before its size is known to fit the shape that it
+states, and whatever a parser raises becomes one line.
 """
 
 import contextlib
 import os
 import re
 import secrets
+import time
 import zipfile
 from collections.abc import Iterator, Mapping
 from math import prod
@@ -23,11 +24,13 @@ from lqrsim.results.schema import canonical, parse
 
 Arrays = dict[str, npt.NDArray[Any]]
 META, DIGEST = "meta", "sha256"
+UNFINISHED = ".unfinished-"  # how the name of a file begins that is still written
+ABANDONED = 24 * 3600.0  # s after its last change; nothing takes so long to write
 
-# What is read is at most so large, in bytes, or so many times larger than its file.
+# The most that is read, in bytes, or relative to the size of the file.
 _LARGEST_TEXT = 1 << 26
 _LARGE, _TIMES = 1 << 30, 100
-# How NumPy begins an array of numbers or a text; nothing else is parsed.
+# NumPy's header of an array of numbers, or of a text; no other is parsed.
 _HEADER = re.compile(
     rb"\{'descr': '(<f8|<i8|\|b1|<U[0-9]{1,9})', 'fortran_order': False,"
     rb" 'shape': \(([0-9]{1,18}(?:, [0-9]{1,18})*,?)?\), \} *\n"
@@ -35,18 +38,18 @@ _HEADER = re.compile(
 
 
 class Header(NamedTuple):
-    """What an array says of itself: NumPy's name of its numbers, and its shape."""
+    """The header of an array: NumPy's name of its numbers, and its shape."""
 
     dtype: str
     shape: tuple[int, ...]
 
 
 class Other(InputError):
-    """A file that is whole, but not what was asked for."""
+    """A file that is intact, but of another format or version."""
 
 
 def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> str:
-    """SHA-256 of the content: of the JSON text, but for the hash in it, and of each array with its name and shape."""
+    """SHA-256 of the JSON text without the hash in it, and of each array with its name, type and shape."""
     parts: list[str | npt.NDArray[Any]] = [canonical({name: value for name, value in meta.items() if name != DIGEST})]
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -55,7 +58,7 @@ def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> s
 
 
 def write(path: Path, arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> None:
-    """Write them, sealed; the file is whole or not there. Raises InputError where it cannot be written."""
+    """Write arrays and text with their hash, all or nothing. Raises InputError if that fails."""
     text = np.array(canonical({**meta, DIGEST: digest(arrays, meta)}))
     if text.nbytes > _LARGEST_TEXT:
         raise InputError(f"output: got {text.nbytes:,} bytes of text for {path}, want at most {_LARGEST_TEXT:,}")
@@ -66,14 +69,15 @@ def write(path: Path, arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str,
             with unfinished.open("wb") as file:
                 save(file, allow_pickle=False, **whole)
             if sum(array.nbytes for array in whole.values()) < _limit(unfinished.stat().st_size):
-                break  # else it compressed so well that it would look like a bomb
+                break  # otherwise it is compressed so well that reading would refuse it as a zip bomb
 
 
 class Archive:
     """A file that is open for reading.
 
     Attributes:
-      meta: the JSON text, still as it was read. headers: of each array, none of which has been read yet.
+      meta: the object of the JSON text, unchecked.
+      headers: of each array; the arrays have not been read yet.
     """
 
     def __init__(self, archive: zipfile.ZipFile, size: int) -> None:
@@ -82,24 +86,24 @@ class Archive:
         for member in archive.infolist():
             name = member.filename.removesuffix(".npy")
             if name == member.filename or member.orig_filename != member.filename:
-                raise InputError(f"{excerpt(member.orig_filename)}: got a part of that name, want arrays alone")
+                raise InputError(f"{excerpt(member.orig_filename)}: got a part of that name, want arrays only")
             if name in self._members:
                 raise InputError(f"{excerpt(name)}: got it twice, want it once")
             if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or member.flag_bits & 0x1:
-                raise InputError(f"{excerpt(name)}: got it packed in another way, want it deflated or stored")
+                raise InputError(f"{excerpt(name)}: got another compression, want deflated or stored")
             self._members[name] = member
         if META not in self._members:
             raise InputError(f"{META}: got none, want it")
         if (total := sum(member.file_size for member in self._members.values())) > _limit(size):
-            raise InputError(f"size: got {total:,} bytes in a file of {size:,}, want no more than they can come from")
+            raise InputError(f"size: got {total:,} bytes, want at most {_limit(size):,} in a file of {size:,}")
         self.headers = {name: self._header(name) for name in self._members if name != META}
         self.meta = self._text()
 
     def arrays(self) -> Arrays:
-        """All of them. Raises InputError unless they and the text are those that were written."""
+        """All arrays. Raises InputError unless the hash of the content is the one in the file."""
         found = {name: self._array(name) for name in self.headers}
         if self.meta.get(DIGEST) != digest(found, self.meta):
-            raise InputError(f"{DIGEST}: got another than that of the content, want a file that has not been changed")
+            raise InputError(f"{DIGEST}: got another hash than that of the content, want an unchanged file")
         return found
 
     def _header(self, name: str) -> Header:
@@ -108,12 +112,12 @@ class Archive:
             length = int.from_bytes(start[8:10], "little")
             match = _HEADER.fullmatch(file.read(length)) if start[:8] == b"\x93NUMPY\x01\x00" else None
         if match is None:
-            raise InputError(f"{excerpt(name)}: got no array of numbers as lqrsim writes them, want one")
+            raise InputError(f"{excerpt(name)}: got no array as lqrsim writes it, want one")
         shape = tuple(int(length) for length in (match[2] or b"").decode().replace(",", " ").split())
         dtype = match[1].decode()
         bytes_each = 4 * int(dtype[2:]) if dtype.startswith("<U") else int(dtype[2:])
         if 10 + length + prod(shape) * bytes_each != self._members[name].file_size or len(shape) > 32:
-            raise InputError(f"{excerpt(name)}: got a size that is not that of its shape {excerpt(shape)}, want it so")
+            raise InputError(f"{excerpt(name)}: got a size that does not fit its shape, want that of {excerpt(shape)}")
         return Header(dtype, shape)
 
     def _text(self) -> dict[str, Any]:
@@ -128,19 +132,19 @@ class Archive:
     def _array(self, name: str) -> npt.NDArray[Any]:
         with self._archive.open(self._members[name]) as file:
             array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=1000)
-            if file.read(1):  # its end, where its check sum is looked at
-                raise InputError(f"{excerpt(name)}: got more than its shape takes, want no more")
+            if file.read(1):  # reads to the end, where zipfile compares the check sum
+                raise InputError(f"{excerpt(name)}: got more bytes than its shape takes, want as many")
         if array.dtype == bool and (array.view(np.uint8) > 1).any():
-            raise InputError(f"{excerpt(name)}: got what is neither true nor false, want one of them")
+            raise InputError(f"{excerpt(name)}: got a bool that is neither true nor false, want one of them")
         return array
 
 
 @contextlib.contextmanager
 def opened(path: Path, kind: str | None, versions: Mapping[str, int]) -> Iterator[Archive]:
-    """A file of this kind, or of any in `versions`, while the block lasts; whatever it raises, the file is to blame.
+    """Open a file of this kind, or of any in `versions`; all that the block raises is put down to the file.
 
     Raises:
-      InputError: no such file; not of this kind or version; or anything in it is not as it was written.
+      InputError: the file does not exist, has another kind or version, or is damaged.
     """
     field = kind or "path"
     with blamed(path, field), path.open("rb") as file, zipfile.ZipFile(file) as archive:
@@ -159,9 +163,9 @@ def opened(path: Path, kind: str | None, versions: Mapping[str, int]) -> Iterato
 
 @contextlib.contextmanager
 def blamed(path: Path, kind: str) -> Iterator[None]:
-    """Turns whatever is raised while `path` is read into one line about it.
+    """Turn whatever is raised while `path` is read into one line about the file.
 
-    It is right to catch everything here, and only here: what a parser raises of foreign bytes is without end.
+    Parsers raise exceptions of all kinds for foreign bytes, so that everything is caught here, and only here.
     """
     if not os.path.isfile(path):  # not the method, which raises for names that are too long
         raise InputError(f"{kind}: got {excerpt_of(path)}, want a file that exists")
@@ -177,28 +181,31 @@ def blamed(path: Path, kind: str) -> Iterator[None]:
 
 
 def excerpt_of(path: Path) -> str:
-    """A path for a message, cut in the middle where it gets long."""
+    """A path for a message; a long one is cut in the middle."""
     name = str(path)
     return name if len(name) <= 200 else f"{name[:80]}...{name[-80:]}"
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A name to write to, which takes the place of `path` when the block ends, and disappears if it fails.
+    """A temporary file to write to, which replaces `path` when the block ends and is removed if the block fails.
+
+    Files that a killed process has left beside it are removed, once they are a day old.
 
     Raises:
       InputError: the folder or the file cannot be written, the disk is full, or `path` is no regular file.
     """
-    # What a link points to is replaced, not the link.
+    # The target of a link is replaced, not the link.
     target = Path(os.path.realpath(check_path("output", path)))
     if target.exists() and not target.is_file():
         what = "a folder" if target.is_dir() else "neither a file nor a folder"
-        raise InputError(f"output: got {excerpt_of(path)}, which is {what}, want the name of a file")
-    # A name of its own, so that two writers cannot meet, and known before the file is there, so that Ctrl-C at any
-    # moment removes it; the suffix stays, for it says the format.
-    unfinished = target.parent / f".unfinished-{secrets.token_hex(8)}{path.suffix}"
+        raise InputError(f"output: got {excerpt_of(path)}, which is {what}, want the name of a regular file")
+    # A random name, so that two writers do not collide, and known before the file exists, so that Ctrl-C at any moment
+    # removes it. The suffix stays, for writers choose the format by it.
+    unfinished = target.parent / f"{UNFINISHED}{secrets.token_hex(8)}{path.suffix}"
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        _remove_abandoned(target.parent)
         unfinished.touch(exist_ok=False)
         yield unfinished
         unfinished.replace(target)
@@ -206,10 +213,19 @@ def replacing(path: Path) -> Iterator[Path]:
         reason = error.strerror or error
         raise InputError(f"output: got {excerpt_of(path)}, want a file that can be written ({reason})") from None
     finally:
-        with contextlib.suppress(OSError):  # that is told already
+        with contextlib.suppress(OSError):  # the error that matters has been raised already
             unfinished.unlink(missing_ok=True)
 
 
+def _remove_abandoned(folder: Path) -> None:
+    """Remove what killed processes have left: files of `replacing` that nobody has written to for a day."""
+    oldest = time.time() - ABANDONED
+    for path in folder.glob(f"{UNFINISHED}{'[0-9a-f]' * 16}*"):
+        with contextlib.suppress(OSError):  # another process may have removed it
+            if path.stat(follow_symlinks=False).st_mtime < oldest:
+                path.unlink()
+
+
 def _limit(size: int) -> int:
-    """How many bytes may come from a file of so many."""
+    """The most bytes that a file of this size may hold."""
     return max(_LARGE, _TIMES * size)

@@ -1,4 +1,4 @@
-"""What the numbers of a state or control vector mean: names, units, limits, and which of them wrap."""
+"""The meaning of a state or control vector: names, units, limits, and which entries wrap."""
 
 import re
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ from lqrsim.errors import (
 from lqrsim.scenes.world import PLANES, SPACE
 
 _FROM_ABOVE = ("xy", "yx")
-_UPWARD = ("height", "altitude", "elevation", "vertical")  # names of what is hardly a plane from above
+_UPWARD = ("height", "altitude", "elevation", "vertical")  # such a name does not fit a plane seen from above
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,16 +31,14 @@ class Coordinates:
     """The meaning of the entries of a vector.
 
     Attributes:
-      names: one name an entry.
-      units: one unit an entry ("" where there is none).
+      names: of the entries.
+      units: of the entries; "" for none.
       position: indices of the 2 (planar) or 3 (spatial) entries that are the position in the world, in metres; or none.
-      plane: the world's axes along which the position is measured, in its order: "xyz" for one in space, "" without
-        one. Of a planar one two of x, y and z; where it is not given, it follows from the names that end in these
-        letters or have one on its own, as (x, z), (p_x, p_z) or (x_tip, z_tip), and is "xy" where no name says
-        anything.
-      offset: where the plane is along the third axis, in metres: the y of "xz". Vertical planes have one, 0 unless it
-        is given. Horizontal ones have none unless it is given: without it the world is seen from above. See
-        `World.seen_by`.
+      plane: the world's axes along which the position is measured, in its order: "xyz" for a spatial position, ""
+        without a position, and two of x, y and z for a planar one. By default it follows from names that end in these
+        letters or have one standing alone, as (x, z), (p_x, p_z) or (x_tip, z_tip), and is "xy" if no name tells it.
+      offset: place of the plane along the third axis, in metres: the y of "xz". A vertical plane has an offset, 0 by
+        default. A horizontal one has none by default: the world is then seen from above. See `World.seen_by`.
       angles: indices of the entries that are angles in radians, equal up to whole turns.
       rotation_vectors: index of the first of each three entries that are a rotation vector, axis times angle in rad.
       low: lower limit of each entry, (len(names),); -inf where there is none.
@@ -59,12 +57,14 @@ class Coordinates:
 
     def __post_init__(self) -> None:
         for field, least in (("names", False), ("units", True)):
-            given = check_items(field, getattr(self, field), str, "a tuple of texts, one an entry", at_most=10_000)
+            given = check_items(
+                field, getattr(self, field), str, "a tuple of texts, one for each entry", at_most=10_000
+            )
             one_by_one = tuple(check_text(field, text, "texts", at_most=200, empty=least) for text in given)
             object.__setattr__(self, field, one_by_one)
         size = len(self.names)
         if not size:
-            raise InputError("names: got none, want one an entry, at least one")
+            raise InputError("names: got none, want at least one")
         for field in ("position", "angles", "rotation_vectors"):
             given = check_items(field, getattr(self, field), (int, np.integer), "a tuple of indices", at_most=size)
             counted = tuple(check_count(field, index, at_least=0) for index in given)
@@ -109,7 +109,7 @@ class Coordinates:
         return len(self.names)
 
     def _plane(self) -> str:
-        """What `plane` is: as given, from the names, or the default. Raises InputError where these contradict."""
+        """The plane: as given, from the names, or the default. Raises InputError if these contradict each other."""
         check_kind("plane", self.plane, str, f"one of: {', '.join(PLANES)}")
         names = tuple(self.names[index] for index in self.position)
         said = "".join(_letter(name) for name in names)
@@ -117,7 +117,7 @@ class Coordinates:
         if len(names) == 3:
             if self.plane not in ("", SPACE):
                 raise InputError(
-                    f"plane: got {excerpt(self.plane)} for the position ({listed}), want none: it is in space"
+                    f"plane: got {excerpt(self.plane)} for the position ({listed}), want none: the position is spatial"
                 )
             if sorted(said) == sorted(SPACE) and said != SPACE:
                 want = ", ".join(names[said.index(letter)] for letter in SPACE)
@@ -136,19 +136,19 @@ class Coordinates:
             return said
         if said != "??" or any(word in name.lower() for word in _UPWARD for name in names):
             raise InputError(
-                f"plane: got none for the position ({listed}), whose names do not tell it, want one of:"
+                f"plane: got none for the position ({listed}), whose names do not tell the plane, want one of:"
                 f" {', '.join(PLANES)}"
             )
         return "xy"
 
     @property
     def world_axes(self) -> tuple[int, ...]:
-        """Along which of the world's axes, 0 to 2, each entry of the position is."""
+        """The world's axis, 0 to 2, of each entry of the position."""
         return tuple(SPACE.index(letter) for letter in self.plane)
 
     @property
     def from_above(self) -> bool:
-        """Whether the position is in a horizontal plane of no certain height: on whatever the robot stands on."""
+        """Whether the position is in a horizontal plane without a height: that of the ground under the robot."""
         return len(self.position) == 2 and self.offset is None
 
     def in_world(self, places: npt.ArrayLike, *, height: float = 0.0) -> Array:
@@ -156,7 +156,7 @@ class Coordinates:
 
         Args:
           places: (..., d), d position coordinates in metres.
-          height: in metres, of those that are seen from above; the rest have their own.
+          height: in metres, of positions in a horizontal plane without a height.
 
         Returns:
           Points (..., 3).
@@ -166,14 +166,14 @@ class Coordinates:
         """
         height = check_number("height", height)
         if not self.position:
-            raise InputError("places: got them for coordinates without a position, want position=(names) with these")
+            raise InputError("places: got positions, but the coordinates have none, want position=(names) with them")
         places = vectors_of("places", places, len(self.position))
         points = np.full((*places.shape[:-1], 3), height if self.offset is None else self.offset)
         points[..., list(self.world_axes)] = places
         return points
 
     def of_world(self, points: npt.ArrayLike) -> Array:
-        """Positions (..., 2 or 3) of points (..., 3) in the world; what is across the plane is left out.
+        """Positions (..., 2 or 3) of points (..., 3) in the world, projected onto the plane.
 
         Args:
           points: (..., 3), in metres.
@@ -229,7 +229,7 @@ class Coordinates:
         return self.nearest(vector, near) - vectors_of("near", near, len(self))
 
     def limited(self, low: npt.ArrayLike, high: npt.ArrayLike) -> "Coordinates":
-        """The same with other limits, each a number or one an entry.
+        """The same coordinates with other limits, each a number or one for each entry.
 
         Args:
           low: lower limits, a number or (n,).
@@ -239,7 +239,7 @@ class Coordinates:
           Coordinates with these limits.
 
         Raises:
-          InputError: not numbers, or not in order.
+          InputError: a limit is not a number, or the lower is not below the upper.
         """
         try:
             sides = [np.broadcast_to(numbers_of("control_limits", side), len(self)) for side in (low, high)]
@@ -255,16 +255,16 @@ class Coordinates:
         return replace(self, low=tuple(sides[0].tolist()), high=tuple(sides[1].tolist()))
 
     def within(self, other: "Coordinates") -> "Coordinates":
-        """The same with limits that are also the other's.
+        """The same coordinates with the narrower of both limits.
 
         Args:
-          other: as many entries, with limits.
+          other: coordinates of as many entries.
 
         Returns:
           Coordinates with the narrower limits.
 
         Raises:
-          InputError: they have another number of entries, or nothing is within both limits.
+          InputError: the numbers of entries differ, or nothing is within both limits.
         """
         check_kind("other", other, Coordinates, f"Coordinates of {len(self)} entries")
         if len(other) != len(self):
@@ -273,7 +273,7 @@ class Coordinates:
         return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def clip(self, vector: npt.ArrayLike) -> Array:
-        """`vector` (..., n) held within the limits.
+        """`vector` (..., n) clipped to the limits.
 
         Args:
           vector: (..., n).
@@ -285,7 +285,7 @@ class Coordinates:
 
 
 def _letter(name: str) -> str:
-    """Which of the world's axes a name says: the letter in which it ends, or the one that is on its own; or `?`."""
+    """The axis that a name tells: the letter x, y or z in which it ends or that stands alone in it; `?` if none."""
     if name[-1:].lower() in tuple(SPACE):
         return name[-1].lower()
     alone = set(re.findall(r"(?<![a-z])[xyz](?![a-z])", name.lower()))
@@ -293,7 +293,7 @@ def _letter(name: str) -> str:
 
 
 def _nearest_rotation_vector(vector: Array, near: Array) -> Array:
-    """Of the vectors `(angle + 2 pi k) axis`, which are all one rotation, the one nearest to `near`; both (..., 3)."""
+    """The one of the equal rotations `(angle + 2 pi k) axis` that is nearest to `near`; both (..., 3)."""
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
     distance = np.linalg.norm(near, axis=-1, keepdims=True)
     # The identity has every axis: take the one that `near` points along.

@@ -1,8 +1,9 @@
-"""A funnel: from where about its plan a policy works, how often, and how sure that is. NumPy only."""
+"""A funnel: the states about a plan from which a policy succeeds, at which rate, with which confidence. NumPy only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -10,141 +11,115 @@ import numpy.typing as npt
 from lqrsim.errors import (
     Array,
     InputError,
-    check_array,
     check_count,
-    check_items,
     check_kind,
     check_name,
     check_number,
-    check_seed,
-    check_shape,
-    check_text,
     excerpt,
-    numbers_of,
     shaped,
     vectors_of,
 )
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.fields import Bounds, Line, check_fields
 from lqrsim.results.hashing import sha256
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution_parts import Trajectory
 
 FAMILIES = ("cost_to_go", "tube", "given")
-FLAT = 1e-13  # smallest eigenvalue of a shape whose diagonal is 1s, below which the ellipsoid is flat
+FLAT = 1e-13  # smallest eigenvalue of a shape scaled to a unit diagonal, below which the ellipsoid is flat
 
 
 @dataclass(frozen=True, kw_only=True)
 class Funnel:
-    """Ellipsoids about a plan, at some knots, from which runs succeed with a stated rate.
+    """Ellipsoids about a plan, at some knots, from which runs succeed at a stated rate.
 
-    At each of the knots, `{plan + e: e' shape^-1 e <= level^2}`. The share that succeeds is of states drawn uniformly
-    in the ellipsoid, by volume, and of the disturbances. With the stated confidence that share is at least `rate` at
-    all of the knots at once. It is not the share of each single state, and says nothing of other knots: there the level
-    is interpolated, see `level`.
+    The ellipsoid at a knot is `{plan + e: e' shape^-1 e <= level^2}`. The rate is the share of runs that succeed, over
+    states drawn uniformly from the volume of the ellipsoid and over the disturbances. With the stated confidence it is
+    at least `rate` at all knots at once. It says nothing of a single state, nor of other knots, where the level is
+    interpolated; see `level`.
 
-    T steps, n states, k knots; d of the states are off the plan, all others on it.
+    T steps, n states, k knots; d of the states may be off the plan, all others are on it.
 
     Attributes:
       plan: nominal states and controls.
       state_coordinates: what the states are.
       control_coordinates: what the controls are.
       states: names of the d states that may be off the plan.
-      shape: (T+1, d, d), of level 1, in these states' units.
-      family: where the shape is from: "cost_to_go", the inverse of its Hessian, so that level^2/2 is what being off the
-        plan costs; "tube", the predicted covariance, so that levels are standard deviations; or "given".
+      shape: (T+1, d, d), the ellipsoids of level 1, in the units of these states.
+      family: origin of the shape: "cost_to_go", the inverse of its Hessian, so that level^2/2 is the cost of the
+        deviation; "tube", the predicted covariance, so that levels are standard deviations; or "given".
       knots: (k,), in order.
       levels: (k,), 0 where there is none.
-      trials: (k,) of the fresh trials that certify the level; 0 where there is none.
-      successes: (k,), of these trials.
-      reasons: (k) why a level is 0, or what kept larger ones from being tried; else empty.
-      rate: as asked for.
-      confidence: as asked for.
+      trials: (k,) fresh trials that certify the level; 0 where there is none.
+      successes: (k,), of these trials. They must show the rate with the confidence.
+      reasons: (k) why a level is 0, or why no larger one was tried; otherwise empty.
+      rate: required share of runs that succeed.
+      confidence: required confidence that all levels are right.
       simulated: trials that were run in all.
-      policy_digest: of what decided on the controls.
-      goal_radius: within which the goal counts as reached, as in `Rollout`.
+      policy_digest: hash of the controller.
+      goal_radius: distance from the goal within which a run succeeds, as in `Rollout`.
       disturbances: a description of each.
-      seed: of all draws.
+      seed: of all random numbers.
       options: the settings of the search.
-      versions: of lqrsim and the libraries that the bits depend on, and the processor.
+      versions: of lqrsim and of the libraries that the bits depend on, and the processor.
 
     Raises:
-      InputError: parts that do not fit together.
+      InputError: the parts do not fit together, or the trials do not show the rate.
     """
 
     plan: Trajectory
-    state_coordinates: Coordinates
-    control_coordinates: Coordinates
-    states: tuple[str, ...]
-    shape: Array
-    family: str
-    knots: npt.NDArray[np.int64]
-    levels: Array
-    trials: npt.NDArray[np.int64]
-    successes: npt.NDArray[np.int64]
-    reasons: tuple[str, ...]
-    rate: float
-    confidence: float
+    state_coordinates: Annotated[Coordinates, "n"]
+    control_coordinates: Annotated[Coordinates, "m"]
+    states: Annotated[tuple[Line, ...], "d"]
+    shape: Annotated[Array, "T+1 d d", Bounds()]
+    family: Line
+    knots: Annotated[npt.NDArray[np.int64], "k"]
+    levels: Annotated[Array, "k", Bounds(at_least=0.0)]
+    trials: Annotated[npt.NDArray[np.int64], "k"]
+    successes: Annotated[npt.NDArray[np.int64], "k"]
+    reasons: Annotated[tuple[Line, ...], "k"]
+    rate: Annotated[float, Bounds(above=0.0, below=1.0)]
+    confidence: Annotated[float, Bounds(above=0.0, below=1.0)]
     simulated: int
-    policy_digest: str
-    goal_radius: float
-    disturbances: tuple[str, ...]
+    policy_digest: Line
+    goal_radius: Annotated[float, Bounds(above=0.0)]
+    disturbances: tuple[Line, ...]
     seed: int
     options: Mapping[str, object] = field(default_factory=dict)
-    versions: Mapping[str, str] = field(default_factory=dict)
+    versions: Mapping[str, Line] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        plan = check_kind("Funnel: plan", self.plan, Trajectory, "a Trajectory")
-        for name, size in (("state_coordinates", plan.states), ("control_coordinates", plan.controls)):
-            space = check_kind(f"Funnel: {name}", getattr(self, name), Coordinates, "Coordinates")
-            check_shape(f"Funnel: plan of {name}", size, (None, len(space)))
-        for name in ("states", "reasons", "disturbances"):
-            texts = check_items(f"Funnel: {name}", getattr(self, name), str, "a tuple of texts")
-            object.__setattr__(self, name, texts)
+        check_fields(self)
+        check_name("Funnel: family", self.family, FAMILIES)
+        if not self.plan.finite:
+            raise InputError("Funnel: plan: got NaN or infinity, want finite states and controls")
         if not self.states or len(set(self.states)) < len(self.states):
             raise InputError(f"Funnel: states: got {excerpt(self.states)}, want different names, at least one")
         for name in self.states:
             check_name("Funnel: states", name, self.state_coordinates.names)
-        d = len(self.states)
-        shape = check_array("Funnel: shape", self.shape, (plan.steps + 1, d, d))
-        scale = np.maximum(np.abs(shape).max(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
-        if np.abs(shape - shape.transpose(0, 2, 1)).max(initial=0.0) > 1e-9 * scale.max():
-            raise InputError("Funnel: shape: got a matrix that is not symmetric, want symmetric ones")
-        object.__setattr__(self, "shape", shape)
-        check_name("Funnel: family", self.family, FAMILIES)
-        self._check_levels()
-        for name in ("rate", "confidence"):
-            number = check_number(f"Funnel: {name}", getattr(self, name), above=0.0, below=1.0)
-            object.__setattr__(self, name, number)
-        check_count("Funnel: simulated", self.simulated, at_least=0)
-        check_text("Funnel: policy_digest", self.policy_digest, "a hash", empty=True)
-        radius = check_number("Funnel: goal_radius", self.goal_radius, above=0.0)
-        object.__setattr__(self, "goal_radius", radius)
-        object.__setattr__(self, "seed", check_seed("Funnel: seed", self.seed))
-        for name in ("options", "versions"):
-            given = check_kind(f"Funnel: {name}", getattr(self, name), Mapping, "a dictionary by name")
-            if not all(isinstance(key, str) for key in given):
-                raise InputError(f"Funnel: {name}: got {excerpt(given)}, want a dictionary by name")
-
-    def _check_levels(self) -> None:
-        """Raises InputError unless there is a level for each knot, with its trials."""
+        skew = np.abs(self.shape - self.shape.transpose(0, 2, 1)).max(initial=0.0)
+        if skew > 1e-9 * max(np.abs(self.shape).max(initial=0.0), np.finfo(float).tiny):
+            raise InputError("Funnel: shape: got a matrix that is not symmetric, want symmetric matrices")
         last = self.plan.steps - 1
-        knots = _counts("knots", self.knots, None)
-        count = len(knots)
-        if not count or (np.diff(knots) <= 0).any() or knots[-1] > last:
-            raise InputError(f"Funnel: knots: got {excerpt(knots.tolist())}, want some of 0 to {last}, in order")
-        levels = check_array("Funnel: levels", self.levels, (count,))
-        trials, successes = (_counts(name, getattr(self, name), count) for name in ("trials", "successes"))
+        if not len(self.knots) or (np.diff(self.knots) <= 0).any() or self.knots[-1] > last:
+            raise InputError(f"Funnel: knots: got {excerpt(self.knots.tolist())}, want some of 0 to {last}, in order")
         for name, wrong, want in (
-            ("levels", levels < 0, "numbers >= 0"),
-            ("successes", successes > trials, "no more than the trials"),
-            ("trials", (trials == 0) != (levels == 0), "some where there is a level, and none elsewhere"),
+            ("successes", self.successes > self.trials, "no more than the trials"),
+            ("trials", (self.trials == 0) != (self.levels == 0), "some where there is a level, and none elsewhere"),
         ):
             if wrong.any():
                 raise InputError(f"Funnel: {name}: got {excerpt(getattr(self, name))}, want {want}")
-        if len(self.reasons) != count:
-            raise InputError(f"Funnel: reasons: got {len(self.reasons)}, want one for each of the {count} knots")
-        for name, array in (("knots", knots), ("levels", levels), ("trials", trials), ("successes", successes)):
-            object.__setattr__(self, name, array)
+        self._check_certified()
+
+    def _check_certified(self) -> None:
+        """Raises InputError if the fresh trials do not certify their level."""
+        doubt = (1 - self.confidence) / len(self.knots)  # Bonferroni: at one knot, for all to hold at once
+        for trials, successes in zip(self.trials.tolist(), self.successes.tolist(), strict=True):
+            if trials and _chance_of_so_few(trials - successes, trials, self.rate) > doubt * (1 + 1e-6):
+                raise InputError(
+                    f"Funnel: successes: got {successes} of {trials} trials, which do not show a rate of {self.rate:g}"
+                    f" with confidence {self.confidence:g} at {len(self.knots)} knots, want more"
+                )
 
     @cached_property
     def chosen(self) -> list[int]:
@@ -157,9 +132,9 @@ class Funnel:
         return self.plan.dt * self.knots
 
     def level(self, t: float) -> float:
-        """The level in force `t` seconds after the start of the plan: that of the knot, or linear between two knots.
+        """The level `t` seconds after the start of the plan, linear between two knots.
 
-        Only at `knots` is it certified. Before the first and after the last of them, theirs is held.
+        It is certified at `knots` only. Before the first and after the last knot their levels hold.
 
         Args:
           t: seconds since the start of the plan.
@@ -173,15 +148,15 @@ class Funnel:
         return float(np.interp(self._knot(t), self.knots, self.levels))
 
     def deviation(self, x: npt.ArrayLike, t: float, *, about: npt.ArrayLike | None = None) -> Array:
-        """The levels (...) of the ellipsoids on which states (..., n) are, at the nearest knot of the plan.
+        """The levels (...) of the ellipsoids through states (..., n), at the nearest knot of the plan.
 
-        Angles may be in any representative. Only `states` count. Infinite where the ellipsoid is flat, or the state not
-        finite.
+        Angles may be in any representative. Only `states` count. The level is infinite where the ellipsoid is flat or
+        the state is not finite.
 
         Args:
           x: (..., n).
           t: seconds since the start of the plan.
-          about: (n,), the state to which they are compared, in place of the plan's.
+          about: (n,), the centre of the ellipsoid, in place of the plan's state.
 
         Returns:
           (...).
@@ -201,12 +176,12 @@ class Funnel:
     def contains(self, x: npt.ArrayLike, t: float, *, about: npt.ArrayLike | None = None) -> npt.NDArray[np.bool_]:
         """Whether states (..., n) are in the funnel `t` seconds after the start of the plan, (...).
 
-        None is where the level is 0.
+        Where the level is 0, no state is.
 
         Args:
           x: (..., n).
           t: seconds since the start of the plan.
-          about: (n,), the state to which they are compared, in place of the plan's.
+          about: (n,), the centre of the ellipsoid, in place of the plan's state.
 
         Returns:
           (...), True or False.
@@ -218,36 +193,36 @@ class Funnel:
         return (self.deviation(x, t, about=about) <= level) & (level > 0)
 
     def left_at(self, rollout: Rollout) -> Array:
-        """When each run first was outside, (K,), in seconds; infinite where it never was.
+        """The time at which each run first left the funnel, (K,), in seconds; infinite where it never did.
 
         Args:
-          rollout: a run of the funnel's plan, K trials.
+          rollout: K trials of the funnel's plan.
 
         Returns:
           (K,).
 
         Raises:
-          InputError: it is no run of the funnel's plan.
+          InputError: the rollout has another plan.
         """
         check_kind("rollout", rollout, Rollout, "a Rollout, such as simulate(...) returns")
         if not np.array_equal(rollout.plan.states, self.plan.states):
-            raise InputError("rollout: got one of another plan than the funnel's, want a run of that")
+            raise InputError("rollout: got one of another plan, want a run of the funnel's plan")
         inside = np.array([self.contains(rollout.states[:, i], t) for i, t in enumerate(self.plan.times)])
         return np.where(inside.all(axis=0), np.inf, self.plan.dt * np.argmin(inside, axis=0))
 
     def states_at(self, knot: int, points: npt.ArrayLike, level: float) -> Array:
-        """The states (..., n) that points (..., d) of the unit ball are in the ellipsoid of a level at a knot.
+        """Map points (..., d) of the unit ball to states (..., n) in the ellipsoid of a level at a knot.
 
         Args:
-          knot: number of it.
-          points: (..., d), of the unit ball for states in the ellipsoid.
+          knot: number of the knot.
+          points: (..., d).
           level: of the ellipsoid.
 
         Returns:
           (..., n).
 
         Raises:
-          InputError: no such knot, no such points, or the ellipsoid is flat there.
+          InputError: there is no such knot, the points have another shape, or the ellipsoid is flat.
         """
         knot = check_count("knot", knot, at_least=0, at_most=self.plan.steps)
         points = vectors_of("points", points, len(self.states))
@@ -257,7 +232,7 @@ class Funnel:
 
     @property
     def position_covariance(self) -> Array:
-        """(T+1, p, p): of the funnel's shadow on the position, whose outline is at 1 standard deviation, in m^2.
+        """(T+1, p, p) in m^2: its one-sigma ellipsoids are the funnel's projection onto the position.
 
         Raises:
           InputError: the robot has no position, or some of it is not among `states`.
@@ -277,12 +252,12 @@ class Funnel:
         return sha256(texts, self.plan.states, self.shape, self.knots, self.levels)[:16]
 
     def summary(self) -> str:
-        """A line for each knot: its level, how far that is along each state, and the trials that certify it."""
+        """A line for each knot: its level, its extent along the states, and the trials that certify it."""
         meant = {"cost_to_go": "level^2/2 is cost", "tube": "levels are standard deviations"}.get(self.family, "")
         of = "all states" if len(self.states) == len(self.state_coordinates) else ", ".join(self.states)
         lines = [
-            f"funnel of {of}, {self.family}{f' ({meant})' if meant else ''}: at least {self.rate:g} of the runs begun"
-            f" in it succeed, with confidence {self.confidence:g} at all knots at once; {self.simulated:,} trials"
+            f"funnel of {of}, {self.family}{f' ({meant})' if meant else ''}: at least {self.rate:g} of the runs that"
+            f" start in it succeed, with confidence {self.confidence:g} at all knots at once; {self.simulated:,} trials"
         ]
         for i, knot in enumerate(self.knots):
             line = f"  {self.times[i]:6.2f} s  level {self.levels[i]:.4g}"
@@ -295,7 +270,7 @@ class Funnel:
         return self.summary()
 
     def _extent(self, knot: int) -> str:
-        """The largest half axis along the states of each unit."""
+        """The largest half width among the states of each unit."""
         half = self.level(knot * self.plan.dt) * np.sqrt(np.diagonal(self.shape[knot]))
         units = [self.state_coordinates.units[i] for i in self.chosen]
         widest = {unit: max(h for h, u in zip(half, units, strict=True) if u == unit) for unit in units}
@@ -306,7 +281,7 @@ class Funnel:
 
     @cached_property
     def _inverse(self) -> Array:
-        """(T+1, d, d); NaN where the shape has none."""
+        """(T+1, d, d); NaN where the shape is flat."""
         inverse = np.full(self.shape.shape, np.nan)
         for knot in range(len(self.shape)):
             if not flat(self.shape[knot]):
@@ -315,25 +290,23 @@ class Funnel:
         return inverse
 
     def _root(self, knot: int) -> Array:
-        """Lower triangular L (d, d) with L L' = shape."""
+        """The lower triangular L (d, d) with L L' = shape."""
         if flat(self.shape[knot]):
-            raise InputError(f"shape: got an ellipsoid that is flat at knot {knot}, want one of all of its states")
+            raise InputError(f"shape: got a flat ellipsoid at knot {knot}, want one with a volume")
         size = np.sqrt(np.diagonal(self.shape[knot]))
         return size[:, None] * np.linalg.cholesky(self.shape[knot] / np.outer(size, size))
 
 
 def flat(shape: Array) -> bool:
-    """Whether an ellipsoid of this shape (d, d) has no volume, whatever its states' units are."""
+    """Whether an ellipsoid of this shape (d, d) has no volume, whatever the units of its states."""
     size = np.sqrt(np.maximum(np.diagonal(shape), 0.0))
     if not (np.isfinite(shape).all() and (size > 0).all()):
         return True
     return bool(np.linalg.eigvalsh(shape / np.outer(size, size))[0] < FLAT)
 
 
-def _counts(name: str, value: object, size: int | None) -> npt.NDArray[np.int64]:
-    """Whole numbers (size,) that are not negative. Raises InputError for others."""
-    numbers = numbers_of(f"Funnel: {name}", value)
-    check_shape(f"Funnel: {name}", numbers, (size,))
-    if not ((numbers >= 0) & (numbers == np.floor(numbers)) & (numbers < 2**53)).all():
-        raise InputError(f"Funnel: {name}: got {excerpt(numbers.tolist())}, want whole numbers >= 0")
-    return numbers.astype(np.int64)
+def _chance_of_so_few(failures: int, trials: int, rate: float) -> float:
+    """The chance of at most so many failures in independent trials that succeed at this rate."""
+    i = np.arange(failures)
+    ratios = np.log((trials - i) / (i + 1)) + np.log1p(-rate) - np.log(rate)  # of successive terms
+    return float(np.exp(trials * np.log(rate) + np.concatenate([[0.0], np.cumsum(ratios)])).sum())

@@ -1,27 +1,29 @@
-"""What a trial is to reach, how near counts, and how far from the plan it is, for every robot. NumPy only.
+"""The goal of a trial, its distance from goal and plan, and how it ended, for every robot. NumPy only.
 
-Robots with a position are measured in metres, all others by a scaled error: of the states that count, the largest
-difference, each relative to the state's range along the plan (at least 1 unit), with whole turns taken out.
+Distances are in metres for robots with a position. For all others they are a scaled error: the largest difference among
+the states that count, each relative to the state's range along the plan (at least 1 unit), whole turns left out.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_number, excerpt, shaped
 from lqrsim.results.coordinates import Coordinates
 
-TOLERANCE = 0.1  # of the scaled error, unless something else is asked for
+OUTCOMES = ("reached", "timed out", "collided", "diverged", "error")
+TOLERANCE = 0.1  # of the scaled error, by default
 OF_RANGE = "of the plan's range"
 
 
 def scale_of(plan: Array) -> Array:
-    """What each state's differences are relative to, (n,): its range along a plan (T+1, n), at least 1 unit."""
+    """The scale (n,) of each state's differences: its range along a plan (T+1, n), at least 1 unit."""
     return np.maximum(np.ptp(plan, axis=0), 1.0)
 
 
 def tracking_error(space: Coordinates, states: Array, plan: Array) -> Array:
-    """How far states (..., T+1, n) are from those of the plan (T+1, n), (..., T+1): see `tracking_unit`."""
+    """Distance (..., T+1) of states (..., T+1, n) from those of a plan (T+1, n), in `tracking_unit`."""
     if space.position:
         place = list(space.position)
         return np.linalg.norm(states[..., place] - plan[..., place], axis=-1)
@@ -35,19 +37,19 @@ def tracking_unit(space: Coordinates) -> str:
 
 @dataclass(frozen=True)
 class Target:
-    """What a run is to reach: the goal, or the plan's end where the final cost names no state.
+    """The goal of a run, or the end of its plan where the final cost names no goal.
 
     Args:
       space: of the states.
-      goal: (n,), NaN in the states that do not count; None where there is none.
-      plan: (T+1, n), states that are meant to lead there.
+      goal: (n,), NaN in the states that do not count; None if there is none.
+      plan: (T+1, n), the planned states.
 
     Attributes:
-      state: (n,), the goal, or the end of the plan; NaN in the states that do not count.
+      state: (n,), the goal or the end of the plan; NaN in the states that do not count.
       name: "goal" or "plan's end".
 
     Raises:
-      InputError: the goal has another shape, or names no state.
+      InputError: the goal has another shape, or is NaN in all states.
     """
 
     space: Coordinates
@@ -59,9 +61,9 @@ class Target:
             return
         goal = shaped("goal", self.goal, (len(self.space),))
         if np.isinf(goal).any():
-            raise InputError(f"goal: got {excerpt(goal.tolist())}, want finite numbers, NaN in what does not count")
+            raise InputError(f"goal: got {excerpt(goal.tolist())}, want finite numbers, or NaN for any state")
         if np.isnan(goal).all():
-            raise InputError("goal: got NaN for every state, want a number for one at least, or None without a goal")
+            raise InputError("goal: got NaN for every state, want a number for at least one, or None without a goal")
         object.__setattr__(self, "goal", goal)
 
     @property
@@ -74,33 +76,34 @@ class Target:
 
     @property
     def places(self) -> list[int]:
-        """The entries of the position that count; none where it is the scaled error that is measured."""
+        """Indices of the position that count; none where the distance is a scaled error."""
         return [i for i in self.space.position if np.isfinite(self.state[i])]
 
     @property
     def unit(self) -> str:
-        """Of `distance`: m, or OF_RANGE."""
+        """Unit of `distance`: m, or OF_RANGE."""
         return "m" if self.places else OF_RANGE
 
     def distance(self, states: Array) -> Array:
-        """How far states (..., n) are from it, (...); NaN for states that are not finite."""
+        """Distance (...) of states (..., n) from the target; NaN for states that are not finite."""
         state = self.state
         if self.places:
             return np.linalg.norm(states[..., self.places] - state[self.places], axis=-1)
         counts = np.isfinite(state)
-        # What does not count is left where it is: a rotation vector's turns are those of all three entries.
+        # States that do not count keep their value, for the turns of a rotation vector follow from all three entries.
         apart = self.space.difference(states, np.where(counts, state, states)) / scale_of(self.plan)
         return np.max(np.abs(apart[..., counts]), axis=-1)
 
     def radius(self, robot_radius: float | None, goal_radius: float | None, goal_tolerance: float | None) -> float:
-        """Within which distance it counts as reached.
+        """The distance within which the target counts as reached.
 
         Args:
           robot_radius: in metres, the default where distances are in metres.
-          goal_radius: in metres. goal_tolerance: of the scaled error, TOLERANCE by default.
+          goal_radius: in metres.
+          goal_tolerance: of the scaled error, TOLERANCE by default.
 
         Raises:
-          InputError: one of them is out of range, or it is the other one that this goal is judged by.
+          InputError: one of them is out of range, or is not in the unit of this target.
         """
         if self.places:
             if goal_tolerance is not None:
@@ -118,22 +121,43 @@ class Target:
         return check_number("goal_tolerance", TOLERANCE if goal_tolerance is None else goal_tolerance, above=0.0)
 
     def describe(self, distance: float) -> str:
-        """A distance with its unit and what it is from."""
+        """A distance as text: "0.1 m from the goal"."""
         return f"{distance:.3g} {self.unit} from the {self.name}"
 
     def misses(self, radius: float | None) -> bool:
-        """Whether the plan itself ends outside the radius; never where the radius is not known."""
+        """Whether the plan ends outside the radius; False if the radius is not known."""
         return radius is not None and not float(self.distance(self.plan[-1])) <= radius
 
     def of_plan(self, radius: float | None) -> list[str]:
-        """What there is to say of where the plan ends: how far from the goal, and in a line of its own if it misses."""
+        """Lines on the end of the plan: its distance from the goal, and another line if it misses."""
         if self.goal is None:
             return ["the final cost names no goal; the plan's end stands in for it"]
         away = float(self.distance(self.plan[-1]))
         lines = [f"the plan ends {self.describe(away)}"]
         if radius is not None and self.misses(radius):
             lines.append(
-                f"the plan MISSES the goal: it ends {away - radius:.3g} {self.unit} outside {radius:g}; where it should"
-                " not, raise the weights of the final cost, or give it more steps"
+                f"the plan MISSES the goal: it ends {away - radius:.3g} {self.unit} outside {radius:g}; to mend that,"
+                " raise the weights of the final cost or the number of steps"
             )
         return lines
+
+
+def endings(
+    *, collided_at: Array, diverged_at: Array, failed_at: Array, distance: Array, radius: float, horizon: float
+) -> tuple[npt.NDArray[np.str_], Array]:
+    """How trials ended, and when. The first event ends a trial; later ones do not count.
+
+    Args:
+      collided_at, diverged_at, failed_at: (K,) seconds, infinite where it did not happen. Of events at the same time
+        the one that is named first counts.
+      distance: (K,) from the target at the end. radius: within which it counts as reached. horizon: in seconds.
+
+    Returns:
+      one of OUTCOMES for each trial, (K,), and the time in seconds at which it ended, (K,).
+    """
+    events = np.stack([collided_at, diverged_at, failed_at])
+    first = np.argmin(events, axis=0)
+    happened = np.isfinite(events.min(axis=0))
+    arrived = np.where(np.asarray(distance) <= radius, "reached", "timed out")
+    outcome = np.where(happened, np.array(["collided", "diverged", "error"])[first], arrived)
+    return outcome, np.where(happened, events.min(axis=0), horizon)

@@ -1,4 +1,4 @@
-"""Hashes of what is kept or compared: one way for all of them."""
+"""The hash of arrays and text that all files, caches and digests use."""
 
 import hashlib
 
@@ -7,10 +7,10 @@ import numpy.typing as npt
 
 
 def sha256(*parts: str | bytes | npt.NDArray[np.generic] | np.generic) -> str:
-    """SHA-256 of the parts one after the other, in hexadecimal: text as UTF-8, arrays as their numbers in C order.
+    """SHA-256 of the concatenated parts, in hexadecimal: text as UTF-8, arrays as their numbers in C order.
 
-    Nothing is put between the parts, and an array's shape and type do not count: where they may differ, a text in front
-    of it says them.
+    There is no separator, and an array's shape and type do not count: where they may differ, put them before the array
+    as text.
     """
     hasher = hashlib.sha256()
     for part in parts:

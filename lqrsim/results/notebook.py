@@ -1,6 +1,6 @@
-"""How results show themselves in a notebook: a heading, a table and a drawing, as HTML. NumPy only.
+"""HTML of results for notebooks: a heading, a table and a drawing. NumPy only.
 
-All text is escaped: names come from files, which anyone may have written.
+All text is escaped, for names come from files that anyone may have written.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT, MARGIN = 360, 240, 12  # of a drawing, in pixels
 POINTS = 300  # of a line at most
-MOST = 10  # rows of trials that are shown; and lines
+MOST = 10  # trials in the table, and lines in the drawing
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#17becf", "#bcbd22", "#7f7f7f")
 
 
 def of_solution(solution: "Solution") -> str:
-    """Status, numbers, and the plan."""
+    """Status, numbers and plan of a solution."""
     plan = solution.trajectory
     rows = [("cost", _number(solution.cost)), ("iterations", str(len(solution.iterations)))]
     rows += [(name, _number(getattr(solution, name))) for name in ("gap", "optimality", "violation")]
@@ -40,7 +40,7 @@ def of_solution(solution: "Solution") -> str:
 
 
 def of_rollout(rollout: "Rollout") -> str:
-    """How the first trials ended, and their paths about the plan."""
+    """Outcomes of the first trials, and their paths about the plan."""
     target, least, away = rollout.target, rollout.least_clearance(), rollout.goal_distance
     rows = [
         ("trial", "outcome", "ended", f"largest error, {rollout.tracking_unit}", f"from the {target.name}", "clearance")
@@ -63,7 +63,7 @@ def of_table(heading: str, remarks: Iterable[str], rows: Sequence[Sequence[str]]
 
 
 def _number(value: float) -> str:
-    """Four digits of it; a dash where there is none."""
+    """A number with four digits; a dash if it is not finite."""
     return f"{value:.4g}" if np.isfinite(value) else "-"
 
 
@@ -71,7 +71,8 @@ def _page(heading: str, remarks: Iterable[str], rows: Sequence[Sequence[str]], p
     """A heading, remarks, a table and a picture side by side.
 
     Args:
-      rows: of the table; with `head` the first one names the columns, else the first column names the rows.
+      rows: of the table.
+      head: whether the first row names the columns; otherwise the first column names the rows.
     """
     lines = "".join(f"<div>{escape(remark)}</div>" for remark in remarks)
     table = "".join(
@@ -86,9 +87,9 @@ def _page(heading: str, remarks: Iterable[str], rows: Sequence[Sequence[str]], p
 
 
 def _drawing(space: Coordinates, times: Array, plan: Array, runs: Array) -> str:
-    """The plan (T+1, n) and runs (K, T+1, n) as SVG: the first two axes of a position, else each state over time.
+    """The plan (T+1, n) and runs (K, T+1, n) as SVG: paths along the first two axes of the position, of MOST runs.
 
-    The first MOST runs are drawn; of states over time, each to its own scale, the first.
+    Without a position, the states of the plan and of the first run over time, each to its own scale.
     """
     dashes = "4 3" if len(runs) else ""
     if space.position:
@@ -113,7 +114,7 @@ def _cell(text: str, *, named: bool) -> str:
 
 
 def _range(values: Array) -> tuple[Array, Array]:
-    """The least and the largest finite value of each column, apart at least by a little."""
+    """The smallest and the largest finite value of each column, kept apart by a little."""
     finite = np.where(np.isfinite(values), values, np.nan)
     known = np.isfinite(finite).any(axis=0)
     finite = np.where(known, finite, 0.0)
@@ -123,7 +124,7 @@ def _range(values: Array) -> tuple[Array, Array]:
 
 
 def _svg(lines: list[tuple[Array, str, str, str]], title: str, *, equal: bool) -> str:
-    """Lines (N, 2) with a colour, a title and dashes, to one scale if `equal`; what is not finite is left out."""
+    """Lines (N, 2) with colour, title and dashes, to one scale if `equal`; points that are not finite are left out."""
     low, high = _range(np.concatenate([line for line, *_ in lines]))
     room = np.array([WIDTH, HEIGHT]) - 2 * MARGIN
     scale = room / (high - low)

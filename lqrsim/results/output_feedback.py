@@ -1,36 +1,33 @@
-"""A filter and the law that follows its estimates, as recursions that run on a robot. NumPy only.
+"""A filter with its feedback law, as recursions that a robot can run. NumPy only.
 
-`OffsetFree` predicts with the dynamics themselves, compiled; here they are linear about the plan, so that nothing but
-products of small matrices is left. `tests/test_policy_files.py` holds one against the other.
+`OffsetFree` predicts with the compiled nonlinear dynamics. Here the dynamics are linear about the plan, so that
+products of small matrices suffice. `tests/test_policy_files.py` compares the two.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_kind, check_number, excerpt, shaped, vectors_of
+from lqrsim.errors import Array, InputError, check_number, excerpt, vectors_of
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.fields import Bounds, check_fields
 from lqrsim.results.hashing import sha256
-
-# Shapes in letters: T steps, n states, m controls, Y measured numbers, Z numbers in the state of the filter.
-SHAPES = {
-    "gain": "T m Z", "offset": "T m", "correction": "T Z Y", "sensor": "T Y n", "sensor_offset": "T Y",
-    "transition": "T Z Z", "input": "T Z m", "drift": "T Z", "nominal": "T Z",
-}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
 class OutputFeedbackPolicy:
-    """Output feedback about a plan: what is measured goes in, controls come out, and what it knows is one vector z.
+    """Output feedback about a plan, from measurements to controls; its whole state is one vector z.
 
-    In each control period t, with x the first n numbers of z and y what is measured,
+    In each control period t, with x the first n numbers of z and y the measurement,
 
         z = z + correction_t (y - sensor_t x - sensor_offset_t)
         u = clip(gain_t z + offset_t)
         z = transition_t z + input_t u + drift_t
 
-    Angles of x are taken nearest to the nominal before, those of y nearest to what is expected. z begins as nominal_0.
+    Before, angles of x are taken nearest to the nominal ones, and angles of y nearest to the expected ones. z begins as
+    nominal_0.
 
     Attributes:
       gain: (T, m, Z); u = clip(gain z + offset).
@@ -41,46 +38,38 @@ class OutputFeedbackPolicy:
       transition: (T, Z, Z), to the next control period: z = transition z + input u + drift.
       input: (T, Z, m).
       drift: (T, Z).
-      nominal: (T, Z), what z is in an undisturbed run: the state, what the actuators have reached if they lag, the
-        states of what disturbs the robot; and, where commands or measurements are late, the commands under way.
+      nominal: (T, Z), z in an undisturbed run: the state, the actuator outputs if they lag, the states of the
+        disturbances, and the pending commands if commands or measurements are late.
       dt: seconds of a control period.
       state_coordinates: names and units of the states, and which of them wrap.
-      control_coordinates: names and units of the controls, and the limits that the actuators keep.
+      control_coordinates: names, units and limits of the controls.
       measured_coordinates: names and units of the measured numbers, and which of them wrap.
 
     Raises:
-      InputError: arrays that do not fit together, or numbers that are not finite.
+      InputError: the arrays do not fit together, or a number is not finite.
     """
 
-    gain: Array
-    offset: Array
-    correction: Array
-    sensor: Array
-    sensor_offset: Array
-    transition: Array
-    input: Array
-    drift: Array
-    nominal: Array
-    dt: float
-    state_coordinates: Coordinates
-    control_coordinates: Coordinates
-    measured_coordinates: Coordinates
+    gain: Annotated[Array, "T m Z", Bounds()]
+    offset: Annotated[Array, "T m", Bounds()]
+    correction: Annotated[Array, "T Z Y", Bounds()]
+    sensor: Annotated[Array, "T Y n", Bounds()]
+    sensor_offset: Annotated[Array, "T Y", Bounds()]
+    transition: Annotated[Array, "T Z Z", Bounds()]
+    input: Annotated[Array, "T Z m", Bounds()]
+    drift: Annotated[Array, "T Z", Bounds()]
+    nominal: Annotated[Array, "T Z", Bounds()]
+    dt: Annotated[float, Bounds(above=0.0)]
+    state_coordinates: Annotated[Coordinates, "n"]
+    control_coordinates: Annotated[Coordinates, "m"]
+    measured_coordinates: Annotated[Coordinates, "Y"]
 
     def __post_init__(self) -> None:
-        who = "OutputFeedbackPolicy"
-        for name in ("state_coordinates", "control_coordinates", "measured_coordinates"):
-            check_kind(f"{who}: {name}", getattr(self, name), Coordinates, "Coordinates")
-        nominal = shaped(f"{who}: nominal", self.nominal, (None, None))
-        n, m = len(self.state_coordinates), len(self.control_coordinates)
-        sizes = {"T": len(nominal), "n": n, "m": m, "Y": len(self.measured_coordinates), "Z": nominal.shape[1]}
-        if sizes["T"] < 1 or sizes["Z"] < n:
-            raise InputError(f"{who}: nominal: got shape {nominal.shape}, want at least one row, of {n} states or more")
-        for name, letters in SHAPES.items():
-            array = shaped(f"{who}: {name}", getattr(self, name), tuple(sizes[letter] for letter in letters.split()))
-            if not np.isfinite(array).all():
-                raise InputError(f"{who}: {name}: got numbers that are not finite, want finite numbers")
-            object.__setattr__(self, name, array)
-        object.__setattr__(self, "dt", check_number(f"{who}: dt", self.dt, above=0.0))
+        sizes = check_fields(self)
+        if not sizes["T"] or sizes["Z"] < sizes["n"]:
+            raise InputError(
+                f"OutputFeedbackPolicy: nominal: got shape {self.nominal.shape}, want at least one row, of"
+                f" {sizes['n']} states or more"
+            )
 
     @property
     def steps(self) -> int:
@@ -90,27 +79,28 @@ class OutputFeedbackPolicy:
     @property
     def digest(self) -> str:
         """Hash of the recursions and their times, 16 hexadecimal digits."""
-        return sha256(*(getattr(self, name) for name in SHAPES), np.float64(self.dt))[:16]
+        recursions = (value for value in vars(self).values() if isinstance(value, np.ndarray))
+        return sha256(*recursions, np.float64(self.dt))[:16]
 
     def start(self) -> Array:
         """The state of the filter before the first measurement, (Z,)."""
         return self.nominal[0].copy()
 
     def step(self, z: npt.ArrayLike, measurement: npt.ArrayLike | None, t: float) -> tuple[Array, Array]:
-        """The control (..., m) of a control period, and z (..., Z) for the next; call it once in each.
+        """Controls (..., m) of this control period, and z (..., Z) for the next; to be called once in each period.
 
-        After the horizon the last recursions stay in force.
+        After the horizon the last recursion holds.
 
         Args:
-          z: (..., Z), from `start` or the call before; it is not changed.
-          measurement: (..., Y), angles in any representative; None where it got lost: then it is predicted.
+          z: (..., Z), from `start` or the previous call; it is not changed.
+          measurement: (..., Y), angles in any representative; None if it was lost, for a prediction alone.
           t: seconds since the start.
 
         Returns:
           Controls (..., m), and z (..., Z) for the next period.
 
         Raises:
-          InputError: `t` is negative or not finite, or the others are not finite or of another length.
+          InputError: `t` is negative or not finite, or an array is not finite or has another length.
         """
         z, t = vectors_of("z", z, self.nominal.shape[1]), check_number("t", t, at_least=0.0)
         k, n = int(min(t / self.dt + 1e-9, self.steps - 1)), len(self.state_coordinates)
@@ -120,7 +110,7 @@ class OutputFeedbackPolicy:
         if measurement is not None:
             y = vectors_of("measurement", measurement, len(self.measured_coordinates))
             if not np.isfinite(y).all():
-                raise InputError(f"measurement: got {excerpt(y)}, want finite numbers, or None where it got lost")
+                raise InputError(f"measurement: got {excerpt(y)}, want finite numbers, or None if it was lost")
             expected = z[..., :n] @ self.sensor[k].T + self.sensor_offset[k]
             z = z + self.measured_coordinates.difference(y, expected) @ self.correction[k].T
         control = self.control_coordinates.clip(z @ self.gain[k].T + self.offset[k])

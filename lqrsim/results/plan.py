@@ -1,22 +1,13 @@
-"""A plan with the feedback law along it: what every solve returns, and what every run can follow. NumPy only."""
+"""A plan with its feedback law: the result of every solve. NumPy only."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy.typing as npt
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_count,
-    check_items,
-    check_kind,
-    check_name,
-    check_number,
-    check_shape,
-    real,
-)
+from lqrsim.errors import Array, InputError, check_count, check_name, check_shape
+from lqrsim.results.fields import LINE, Bounds, check_fields
 from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution_parts import HORIZONS, Multipliers, Status, Trajectory, left_after
@@ -25,80 +16,61 @@ from lqrsim.results.value_functions import Quadratic
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """A plan with the feedback law along it, and what a next solve begins with.
+    """A plan with its feedback law, and all that a next solve can begin with.
 
-    A `Solution` and a `Replan` are plans; both have a `cost` and a `violation` too.
+    A `Solution` and a `Replan` are plans with a `cost` and a `violation`.
 
     Attributes:
       status: how the solve ended; see `Status`.
-      detail: where and why, if it is not a success.
+      detail: where and why it failed; for solutions also remarks.
       policy: the feedback law.
       trajectory: the plan: the rollout of the policy by the model from its first state.
-      cost_to_go: the value function of the law, a `Quadratic`; None where it is not known, and of re-plans with
+      cost_to_go: the value function of the law, a `Quadratic`; None where it is unknown, and for re-plans with
         constraints, which do not need it.
-      multipliers: of each of the problem's constraints; none where the plan keeps them all without being made to.
-      goal: (n,) the state that the problem asks for, NaN in states that do not matter; None where it names no state.
-      goal_radius: within which the plan's end counts as at the goal, in `target.unit`; None where that is not known.
+      multipliers: one for each constraint of the problem; none where no constraint is active.
+      goal: (n,) the goal state of the problem, NaN in states that do not matter; None where it has none.
+      goal_radius: distance from the goal, in `target.unit`, within which the plan reaches it; None where it is unknown.
     """
 
     status: Status
-    detail: str
+    detail: Annotated[str, 10 * LINE]
     policy: AffinePolicy
     trajectory: Trajectory
     cost_to_go: Quadratic | None
     multipliers: tuple[Multipliers, ...] = ()
-    goal: Array | None = None
-    goal_radius: float | None = None
+    goal: Annotated[Array, "n"] | None = None
+    goal_radius: Annotated[float, Bounds(above=0.0)] | None = None
 
     def __post_init__(self) -> None:
         who = type(self).__name__
-        check_kind(f"{who}: status", self.status, Status, f"a Status, one of {', '.join(Status.__members__)}")
-        check_kind(f"{who}: detail", self.detail, str, "text")
-        check_kind(f"{who}: policy", self.policy, AffinePolicy, "an AffinePolicy")
-        check_kind(f"{who}: trajectory", self.trajectory, Trajectory, "a Trajectory")
-        check_kind(f"{who}: cost_to_go", self.cost_to_go, (Quadratic, type(None)), "a Quadratic or None")
-        multipliers = check_items(f"{who}: multipliers", self.multipliers, Multipliers, "a tuple of Multipliers")
-        object.__setattr__(self, "multipliers", multipliers)
-        if self.goal is not None:
-            object.__setattr__(self, "goal", real(f"{who}: goal", self.goal))
-        for name, (array, shape) in self._shapes().items():  # which refuses parts of several problems
-            check_shape(f"{who}: {name}", array, shape)
-        _ = self.target  # which refuses what is no goal
-        if self.goal_radius is not None:
-            radius = check_number(f"{who}: goal_radius", self.goal_radius, above=0.0)
-            object.__setattr__(self, "goal_radius", radius)
-
-    def _shapes(self) -> dict[str, tuple[Array, tuple[int | None, ...]]]:
-        """Arrays by name, each with the shape that fits the trajectory."""
-        states, steps = self.trajectory.states.shape, self.trajectory.steps
-        gain = steps, self.trajectory.controls.shape[1], states[1]
-        arrays: dict[str, tuple[Array, tuple[int | None, ...]]] = {"policy.gain": (self.policy.gain, gain)}
+        check_fields(self)
         if self.cost_to_go is not None:
-            arrays["cost_to_go.gradient"] = self.cost_to_go.gradient, states
-        if self.goal is not None:
-            arrays["goal"] = self.goal, states[1:]
-        return arrays | {f"multipliers[{i}]": (one.values, (steps + 1, None)) for i, one in enumerate(self.multipliers)}
+            check_shape(f"{who}: cost_to_go.gradient", self.cost_to_go.gradient, self.trajectory.states.shape)
+        _ = self.target  # which refuses what is no goal
+        if self.status.success and not self.trajectory.finite:
+            raise InputError(
+                f"{who}: trajectory: got NaN or infinity in a plan that is {self.status.name}, want numbers"
+            )
 
     @property
     def success(self) -> bool:
-        """Whether the solve converged: CONVERGED, or COST_CONVERGED where only the cost was asked for."""
+        """Whether the solve converged: CONVERGED, or COST_CONVERGED where only the cost was tested."""
         return self.status.success
 
     @property
     def target(self) -> Target:
-        """What a run of the policy is to reach: the goal, or the plan's end where there is none."""
+        """The goal of a run, or the end of the plan where there is none."""
         return Target(self.policy.state_coordinates, self.goal, self.trajectory.states)
 
     def shifted(self, steps: int, *, horizon: str = "moving") -> Self:
-        """The rest of it after `steps` steps, to begin the next solve with: `start=solution.shifted(k)`.
+        """The rest of the plan after `steps` steps, to begin the next solve with: `start=solution.shifted(k)`.
 
-        Of a "moving" horizon the end is filled up: the last law, value function and multipliers stay in force, as a
-        policy's last law does after its horizon, and the last control is held. A "shrinking" one has so many steps
-        less. Status, log, cost and digest stay those of the whole.
+        A "moving" horizon keeps its length: the last law, value function, multipliers and control are repeated at the
+        end. A "shrinking" one has fewer steps. Status, log, cost and digest stay those of the whole plan.
 
         Args:
-          steps: how many steps are over, less than the plan has.
-          horizon: "moving" fills up the end, "shrinking" has fewer steps.
+          steps: steps that are over, fewer than the plan has.
+          horizon: "moving" or "shrinking".
 
         Returns:
           A plan of the same type.
@@ -125,5 +97,31 @@ class Plan:
         return replace(self, **parts, **self._shifted_parts(steps, moved))
 
     def _shifted_parts(self, steps: int, moved: Callable[[npt.ArrayLike], Array]) -> dict[str, Any]:
-        """What else `shifted` changes: field -> new value. `moved` takes an array to what is left of it."""
+        """Further fields that `shifted` changes, with their new values; `moved` shifts an array."""
         return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replan(Plan):
+    """The result of a prepared solver: a plan from a given state, no worse than the rollout of the law it began with.
+
+    No worse means: its violation is no larger, and if both keep the constraints, its cost is no higher. It can be used
+    whatever its status, unless `cost` is not finite.
+
+    Attributes:
+      improved: whether there is a new plan; otherwise this is the rollout of the law that the solve began with.
+      cost: of the plan, start and end included.
+      before: cost of the rollout of the law that the solve began with.
+      violation: of the worst constraint at the steps; 0 where all are kept.
+      iterations: number of iterations.
+      seconds: time that the solve took.
+      iterating: part of `seconds` in iterations and in the first rollout.
+    """
+
+    improved: bool
+    cost: float
+    before: float
+    violation: float
+    iterations: int
+    seconds: float
+    iterating: float

@@ -1,66 +1,47 @@
-"""The feedback law, and how it is run on a robot. NumPy only.
+"""The feedback law, as a robot runs it. NumPy only.
 
-The same law is written once more, in `kernels/policy_evaluation.py`, for simulations of many trials: compiled, it gives
-each trial the bits that it gets alone, which NumPy's products of matrices do not. Here it is for a robot, where there
-need be no compiler. `tests/test_policy.py` holds one against the other.
+`kernels/policy_evaluation.py` has the same law compiled, for simulations of many trials: there a trial gets the same
+bits whatever runs beside it, which NumPy's matrix products do not guarantee. `tests/test_policy.py` compares the two.
 """
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_count,
-    check_flag,
-    check_kind,
-    check_name,
-    check_number,
-    excerpt,
-    shaped,
-    vectors_of,
-)
+from lqrsim.errors import Array, InputError, check_count, check_flag, check_name, check_number, excerpt, vectors_of
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.fields import Bounds, check_fields
 from lqrsim.results.hashing import sha256
 from lqrsim.results.solution_parts import HORIZONS, left_after
 
 
 @dataclass(frozen=True, kw_only=True)
 class AffinePolicy:
-    """The feedback law `u_t = gain_t x + offset_t`, with what is needed to run it on a robot.
+    """The feedback law `u_t = gain_t x + offset_t`, with all that a robot needs to run it.
 
-    Calling it needs NumPy alone. Paper: Eq. (13); for the inverse policy, which takes the state of *arrival*, Eq. (19).
+    Calling it needs NumPy alone. Paper: Eq. (13); Eq. (19) for the inverse policy, which takes the state of *arrival*.
 
     Attributes:
       gain: (T, m, n); L.
       offset: (T, m); bold l.
-      nominal: (T, n), the state that each law was made about. Angles of a measured state are taken nearest to it.
+      nominal: (T, n), the state about which each law was computed. Angles of a measured state are taken nearest to it.
       dt: seconds between two laws.
       state_coordinates: names and units of the states, and which of them wrap.
-      control_coordinates: names and units of the controls, and the limits that the actuators keep.
+      control_coordinates: names, units and limits of the controls.
     """
 
-    gain: Array
-    offset: Array
-    nominal: Array
-    dt: float
-    state_coordinates: Coordinates
-    control_coordinates: Coordinates
+    gain: Annotated[Array, "T m n"]
+    offset: Annotated[Array, "T m"]
+    nominal: Annotated[Array, "T n"]
+    dt: Annotated[float, Bounds(above=0.0)]
+    state_coordinates: Annotated[Coordinates, "n"]
+    control_coordinates: Annotated[Coordinates, "m"]
 
     def __post_init__(self) -> None:
-        for name in ("state_coordinates", "control_coordinates"):
-            check_kind(f"AffinePolicy: {name}", getattr(self, name), Coordinates, "Coordinates")
-        n, m = len(self.state_coordinates), len(self.control_coordinates)
-        for name, shape in (("gain", (m, n)), ("offset", (m,)), ("nominal", (n,))):
-            array = shaped(
-                f"AffinePolicy: {name}", getattr(self, name), (self.steps if name != "gain" else None, *shape)
-            )
-            if not len(array):
-                raise InputError(f"AffinePolicy: {name}: got none, want one a step, at least one")
-            object.__setattr__(self, name, array)
-        object.__setattr__(self, "dt", check_number("AffinePolicy: dt", self.dt, above=0.0))
+        if not check_fields(self)["T"]:
+            raise InputError("AffinePolicy: got no law, want one for each step, at least one")
 
     @property
     def steps(self) -> int:
@@ -76,7 +57,7 @@ class AffinePolicy:
         """The rest of the policy after `steps` steps; see `Solution.shifted`.
 
         Args:
-          steps: how many steps are over.
+          steps: steps that are over.
           horizon: "moving" or "shrinking", as in `Solution.shifted`.
 
         Returns:
@@ -88,7 +69,7 @@ class AffinePolicy:
         return replace(self, **parts)
 
     def control(self, state: npt.ArrayLike, step: int) -> Array:
-        """The law of one step before saturation, (..., m), at states (..., n) given in the nominal's representative.
+        """Controls (..., m) of one step before saturation, at states (..., n) in the nominal's representative.
 
         Args:
           state: (..., n), in the nominal's representative.
@@ -98,7 +79,7 @@ class AffinePolicy:
           Controls (..., m), before saturation.
 
         Raises:
-          InputError: no such step, counted from 0, or no such states.
+          InputError: there is no such step, or the states have another shape.
         """
         step = check_count("step", step, at_least=0, at_most=self.steps - 1)
         return vectors_of("state", state, self.gain.shape[-1]) @ self.gain[step].T + self.offset[step]
@@ -106,14 +87,14 @@ class AffinePolicy:
     def __call__(self, state: npt.ArrayLike, t: float, *, interpolate: bool = False) -> Array:
         """The control (..., m) to apply in a measured state (..., n), `t` seconds after the start.
 
-        Angles and rotation vectors may be given in any representative. The result is held within the control
-        limits. Between two knots the earlier law is held, as it is in the plan; `interpolate=True` blends the two
-        instead, for controllers that run faster than the plan. After the horizon the last law stays in force.
+        Angles and rotation vectors may be in any representative. The result is clipped to the control limits. Between
+        two knots the earlier law holds, as in the plan; `interpolate=True` blends the two, for controllers that run
+        faster than the plan. After the horizon the last law holds.
 
         Args:
           state: (..., n), measured; angles and rotation vectors in any representative.
           t: seconds since the start, 0 or more.
-          interpolate: whether to blend the laws of two knots instead of holding the earlier one.
+          interpolate: whether to blend the laws of two knots.
 
         Returns:
           Controls (..., m), within the control limits.
@@ -124,7 +105,7 @@ class AffinePolicy:
         state, t = vectors_of("state", state, self.gain.shape[-1]), check_number("t", t, at_least=0.0)
         if not np.isfinite(state).all():
             raise InputError(f"state: got {excerpt(state)}, want finite numbers")
-        # A time that is a knot up to rounding belongs to the law that begins there.
+        # Rounding must not put a time at a knot before it.
         knot = t / self.dt + 1e-9
         step = int(min(knot, self.steps - 1))
         gain, offset, nominal = self.gain[step], self.offset[step], self.nominal[step]

@@ -1,225 +1,200 @@
-"""What comes out of running a policy: a `Rollout`. NumPy only; `save_load.py` writes it to disk and reads it back."""
+"""Runs of a controller: a `Rollout`. NumPy only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_array,
-    check_count,
-    check_items,
-    check_kind,
-    check_number,
-    check_seed,
-    check_shape,
-    check_text,
-    excerpt,
-    numbers_of,
-    shaped,
-    vectors_of,
-)
+from lqrsim.errors import Array, InputError, check_count, excerpt, vectors_of
 from lqrsim.results import notebook
-from lqrsim.results.ball_record import BallRecord
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.results.goal import Target, tracking_error, tracking_unit
+from lqrsim.results.fields import Bounds, Line, check_fields
+from lqrsim.results.goal import Target, endings, tracking_error, tracking_unit
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.results.trial_outcome import endings
+
+
+@dataclass(frozen=True, kw_only=True)
+class BallRecord:
+    """Where the balls of a robot were in its runs, and where they should have been: what pictures of it need.
+
+    K trials of T control periods, B balls; the last ball stands for a robot without a position.
+
+    Attributes:
+      driven: (K, T+1, B, 3) centres in the world, in metres; NaN where the states are.
+      planned: (T+1, B, 3) the same of the plan.
+      radii: (B,) in metres.
+      anchors: (B, 4) number of the MJCF's body that a ball is fixed to, and its place in the body's axes in metres; NaN
+        for a ball that names no site.
+    """
+
+    driven: Annotated[Array, "K T+1 B 3"]
+    planned: Annotated[Array, "T+1 B 3", Bounds()]
+    radii: Annotated[Array, "B", Bounds(at_least=0.0)]
+    anchors: Annotated[Array, "B 4"]
+
+    def __post_init__(self) -> None:
+        if not check_fields(self)["B"]:
+            raise InputError("BallRecord: radii: got none, want at least one ball")
+
+    @property
+    def tracked(self) -> tuple[int, Array]:
+        """The body that the last ball is fixed to, and its place on it, (3,).
+
+        Raises:
+          InputError: the last ball names no site.
+        """
+        body, *place = self.anchors[-1].tolist()
+        if not np.isfinite(body):
+            raise InputError("balls: got no site for the last of them, want one among the sites= of CollisionSpheres")
+        return int(body), np.array(place)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rollout:
-    """Closed-loop runs of one policy in MuJoCo, with everything that a picture of them needs.
+    """Closed-loop runs of one controller in MuJoCo, with everything that a picture of them needs.
 
-    K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, to the last bit
-    on equal processors.
+    K trials of T control periods; n states, m controls. Row k is trial `first_trial + k` of `seed`, bit for bit on
+    equal processors.
 
     Attributes:
-      robot: its name.
-      body: the robot's in the MJCF.
-      scene: its name.
+      robot: name of the robot.
+      body: name of the robot's body in the MJCF.
+      scene: name of the scene.
       model: the MJCF that was run, as text.
-      plan: what the policy meant to do.
-      policy_digest: hash of the policy.
+      plan: the nominal states and controls.
+      policy_digest: hash of the controller.
       state_coordinates: names and units of the states, and which of them wrap.
       control_coordinates: names and units of the controls, and their limits.
-      goal: (n,) the state that the plan was to reach, NaN in states that do not count; None where it is the plan's end.
+      goal: (n,) the goal state, NaN in states that do not count; None if the goal is the end of the plan.
       goal_radius: distance from the goal within which a trial has reached it, in `target.unit`: metres, or of the
         scaled error where the goal has no position.
       radius: of the robot's collision circle or sphere, in metres.
       states: (K, T+1, n) true states; angles in the representative nearest the plan.
-      measured: (K, T+1, n) the states that the policy was shown.
-      commanded: (K, T, m) what the policy asked for.
-      applied: (K, T, m) what the actuators got, within the robot's limits.
+      measured: (K, T+1, n) states as measured, which the controller gets.
+      commanded: (K, T, m) the controller's commands.
+      applied: (K, T, m) what the actuators applied, within the robot's limits.
       forces: (K, T, 3) disturbing force at the robot's centre of mass in N, world axes.
-      torques: the same in N m.
-      displaced: (K, obstacles, 3) by how much each obstacle is away from where the plan believes it, in metres.
-      clearance: (K, T+1) signed distance to the nearest obstacle minus the radius in metres; infinite without any.
-      contacts: (K,) control periods from the collision on in which MuJoCo reported a contact of the robot with an
-        obstacle; 0 where the robot goes through them.
+      torques: (K, T, 3) disturbing torque in N m, world axes.
+      displaced: (K, obstacles, 3) displacement of each obstacle from its place in the plan, in metres.
+      clearance: (K, T+1) signed distance to the nearest obstacle minus the radius, in metres; infinite without
+        obstacles.
+      contacts: (K,) control periods, from the collision on, in which MuJoCo reported a contact of the robot with an
+        obstacle; 0 where the robot passes through obstacles.
       collided_at: (K,) seconds to the first collision, at a knot or between two; infinite where there was none.
-      obstacles: (K) names of what they collided with; empty where there was none.
-      diverged_at: (K,) seconds to the knot from which on the simulation was unstable, or what the policy was shown was
-        not finite, or its filter had diverged; infinite where nothing was. The states are NaN from there on.
-      failed_at: (K,) seconds to the knot at which the controller failed; infinite where it did not. From there on, too.
-      reasons: (K) why it failed, or what of its filter diverged; empty where neither was so.
+      obstacles: (K) name of the obstacle of that collision; empty where there was none.
+      diverged_at: (K,) seconds to the knot at which the simulation became unstable, a measurement was not finite, or
+        the controller's filter had diverged; infinite where nothing did. The states are NaN from that knot on.
+      failed_at: (K,) seconds to the knot at which the controller failed; infinite where it did not. The states are NaN
+        from that knot on.
+      reasons: (K) why the controller failed or its filter diverged; empty otherwise.
       frame_times: (F,) seconds.
-      frames: (K, F, nq) MuJoCo's qpos then, for drawing.
-      disturbances: one description each.
-      seed: from which the random numbers were drawn.
-      first_trial: number of the first trial, from which its random numbers were drawn.
-      versions: of lqrsim and the libraries that the bits depend on, and the processor.
-      tube: (T+1, p, p) covariance of the position about the plan that was predicted for the controller and the
-        disturbances, in m^2; p is 2 or 3, as the position has it. None where nobody predicted it; see `predict_tube`.
-      collision_chance: (T+1,) the predicted chance of being in collision at each knot, or None.
-      balls: where the robot's balls were, if it has any and was recorded for drawing; or None.
-      controller_run: the run of the controller (`ControllerRun`), with what it recorded: the estimates of an
-        `OffsetFree`, the log of a `Replanner`. In memory only: None in a rollout that was loaded, pickled or copied.
+      frames: (K, F, nq) MuJoCo's qpos at these times, for drawing.
+      disturbances: a description of each.
+      seed: of the random numbers.
+      first_trial: number of the first trial; a trial's random numbers depend on the seed and its number.
+      versions: of lqrsim and of the libraries that the bits depend on, and the processor.
+      tube: (T+1, p, p) predicted covariance of the position about the plan, for this controller and these disturbances,
+        in m^2; p is 2 or 3, the size of the position. None if it was not predicted; see `predict_tube`.
+      collision_chance: (T+1,) predicted chance of being in collision at each knot, or None.
+      balls: places of the robot's balls, if it has any and frames were recorded; or None.
+      controller_run: the controller's run (`ControllerRun`), with what it recorded: the estimates of an `OffsetFree`,
+        the log of a `Replanner`. In memory only: None in a rollout that was loaded, pickled or copied.
     """
 
-    robot: str
-    body: str
-    scene: str
+    robot: Line
+    body: Line
+    scene: Line
     model: str
     plan: Trajectory
-    policy_digest: str
-    state_coordinates: Coordinates
-    control_coordinates: Coordinates
-    goal: Array | None
-    goal_radius: float
-    radius: float
-    states: Array
-    measured: Array
-    commanded: Array
-    applied: Array
-    forces: Array
-    torques: Array
-    displaced: Array
-    clearance: Array
-    contacts: npt.NDArray[np.int64]
-    collided_at: Array
-    obstacles: tuple[str, ...]
-    diverged_at: Array
-    failed_at: Array
-    reasons: tuple[str, ...]
-    frame_times: Array
-    frames: Array
-    disturbances: tuple[str, ...]
+    policy_digest: Line
+    state_coordinates: Annotated[Coordinates, "n"]
+    control_coordinates: Annotated[Coordinates, "m"]
+    goal: Annotated[Array, "n"] | None
+    goal_radius: Annotated[float, Bounds(above=0.0)]
+    radius: Annotated[float, Bounds(at_least=0.0)]
+    states: Annotated[Array, "K T+1 n"]
+    measured: Annotated[Array, "K T+1 n"]
+    commanded: Annotated[Array, "K T m"]
+    applied: Annotated[Array, "K T m"]
+    forces: Annotated[Array, "K T 3"]
+    torques: Annotated[Array, "K T 3"]
+    displaced: Annotated[Array, "K obstacles 3"]
+    clearance: Annotated[Array, "K T+1"]
+    contacts: Annotated[npt.NDArray[np.int64], "K"]
+    collided_at: Annotated[Array, "K"]
+    obstacles: Annotated[tuple[Line, ...], "K"]
+    diverged_at: Annotated[Array, "K"]
+    failed_at: Annotated[Array, "K"]
+    reasons: Annotated[tuple[Line, ...], "K"]
+    frame_times: Annotated[Array, "F", Bounds()]
+    frames: Annotated[Array, "K F nq"]
+    disturbances: tuple[Line, ...]
     seed: int
     first_trial: int = 0
-    versions: Mapping[str, str] = field(default_factory=dict)
-    tube: Array | None = None
-    collision_chance: Array | None = None
+    versions: Mapping[str, Line] = field(default_factory=dict)
+    tube: Annotated[Array, "T+1 p p", Bounds()] | None = None
+    collision_chance: Annotated[Array, "T+1", Bounds(at_least=0.0, at_most=1.0)] | None = None
     balls: BallRecord | None = None
     controller_run: Any = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the controller's run, which may hold what cannot be copied."""
+        """Without the controller's run, which may not be copyable."""
         return vars(self) | {"controller_run": None}
 
     def __post_init__(self) -> None:
-        check_kind("Rollout: plan", self.plan, Trajectory, "a Trajectory")
-        for name in ("state_coordinates", "control_coordinates"):
-            check_kind(f"Rollout: {name}", getattr(self, name), Coordinates, "Coordinates")
-        for name in ("robot", "body", "scene", "policy_digest"):
-            check_text(f"Rollout: {name}", getattr(self, name), "a name", empty=True)
-        check_kind("Rollout: model", self.model, str, "the MJCF as text")
-        said = check_items("Rollout: disturbances", self.disturbances, str, "a description of each, as text")
-        object.__setattr__(self, "disturbances", said)
-        for name, above in (("radius", None), ("goal_radius", 0.0)):
-            least = 0.0 if above is None else None
-            number = check_number(f"Rollout: {name}", getattr(self, name), above=above, at_least=least)
-            object.__setattr__(self, name, number)
-        for name in ("seed", "first_trial"):
-            object.__setattr__(self, name, check_seed(f"Rollout: {name}", getattr(self, name)))
-        given = check_kind("Rollout: versions", self.versions, Mapping, "a dictionary of name: version")
-        if not all(isinstance(one, str) for item in given.items() for one in item):
-            raise InputError(f"Rollout: versions: got {excerpt(given)}, want a dictionary of name: version")
-        self._check_shapes()
-        self._check_prediction()
-        if self.balls is not None:
-            check_kind("Rollout: balls", self.balls, BallRecord, "a BallRecord, or None")
-            check_shape("Rollout: balls.driven", self.balls.driven, (self.trials, self.plan.steps + 1, None, 3))
-
-    def _check_shapes(self) -> None:
-        """Raises InputError for arrays that do not fit together."""
-        n, m, steps = len(self.state_coordinates), len(self.control_coordinates), self.plan.steps
-        check_shape("Rollout: plan.states", self.plan.states, (steps + 1, n))
-        check_shape("Rollout: plan.controls", self.plan.controls, (steps, m))
-        states = shaped("Rollout: states", self.states, (None, steps + 1, n))
-        trials, times = len(states), shaped("Rollout: frame_times", self.frame_times, (None,))
-        if not trials:
+        sizes = check_fields(self)
+        if not sizes["K"]:
             raise InputError("Rollout: states: got no trial, want at least one")
-        shapes: dict[str, tuple[int | None, ...]] = {
-            "states": states.shape, "measured": states.shape, "commanded": (trials, steps, m),
-            "applied": (trials, steps, m), "forces": (trials, steps, 3), "torques": (trials, steps, 3),
-            "displaced": (trials, None, 3), "clearance": (trials, steps + 1), "frame_times": (None,),
-            "frames": (trials, len(times), None),
-        }  # fmt: skip
-        for name, shape in shapes.items():
-            object.__setattr__(self, name, shaped(f"Rollout: {name}", getattr(self, name), shape))
-        numbers = numbers_of("Rollout: contacts", self.contacts)
-        check_shape("Rollout: contacts", numbers, (trials,))
-        if not ((numbers >= 0) & (numbers <= steps) & (numbers == np.floor(numbers))).all():
-            raise InputError(
-                f"Rollout: contacts: got {excerpt(numbers.tolist())}, want whole numbers from 0 to {steps}"
-            )
-        object.__setattr__(self, "contacts", numbers.astype(np.int64))
-        self._check_endings(trials)
-        if self.goal is not None:
-            object.__setattr__(self, "goal", shaped("Rollout: goal", self.goal, (n,)))
-        _ = self.target  # which refuses what is no goal
+        if not self.plan.finite:
+            raise InputError("Rollout: plan: got NaN or infinity, want finite states and controls")
+        if (self.contacts > self.plan.steps).any():
+            raise InputError(f"Rollout: contacts: got {self.contacts.max()}, want at most {self.plan.steps}, the steps")
+        if not (np.diff(self.frame_times) > 0).all():
+            raise InputError("Rollout: frame_times: got times that are not in order, want increasing times")
+        _ = self.target  # which checks the goal
+        self._check_tube()
+        self._check_endings()
 
-    def _check_prediction(self) -> None:
-        """Raises InputError unless what was predicted is covariances of the position, and chances."""
-        steps, size = self.plan.steps, len(self.state_coordinates.position)
+    def _check_tube(self) -> None:
+        """Raises InputError unless a predicted tube is covariances of the position."""
         if self.tube is not None:
-            if not size:
-                raise InputError("Rollout: tube: got one of a robot without a position, want None")
-            tube = check_array("Rollout: tube", self.tube, (steps + 1, size, size))
-            scale = np.abs(tube).max(axis=(1, 2), keepdims=True)
-            relative = tube / np.where(scale > 0, scale, 1.0)
-            # What is summed up in another order differs in the last digits.
+            size = len(self.state_coordinates.position)
+            if self.tube.shape[1] != size or not size:
+                wanted = (
+                    f"{size} by {size} matrices, as the position has entries" if size else "None without a position"
+                )
+                raise InputError(f"Rollout: tube: got shape {self.tube.shape}, want {wanted}")
+            scale = np.abs(self.tube).max(axis=(1, 2), keepdims=True)
+            relative = self.tube / np.where(scale > 0, scale, 1.0)
+            # Rounding may leave the last digits asymmetric.
             skewed = np.abs(relative - relative.transpose(0, 2, 1)).max(axis=(1, 2)) > 1e-9
             negative = np.linalg.eigvalsh(relative)[:, 0] < -1e-9
             for wrong, want in ((skewed, "a symmetric matrix"), (negative, "no negative variance")):
                 if wrong.any():
                     at = int(np.argmax(wrong))
-                    raise InputError(f"Rollout: tube: got {excerpt(tube[at].tolist())} at knot {at}, want {want}")
-            object.__setattr__(self, "tube", tube)
-        if self.collision_chance is not None:
-            chance = check_array("Rollout: collision_chance", self.collision_chance, (steps + 1,))
-            if not ((chance >= 0) & (chance <= 1)).all():
-                raise InputError(f"Rollout: collision_chance: got {excerpt(chance.tolist())}, want chances from 0 to 1")
-            object.__setattr__(self, "collision_chance", chance)
+                    raise InputError(f"Rollout: tube: got {excerpt(self.tube[at].tolist())} at knot {at}, want {want}")
 
-    def _check_endings(self, trials: int) -> None:
-        """Raises InputError unless what ended trials has its time within the run, and its words."""
+    def _check_endings(self) -> None:
+        """Raises InputError unless trials ended within the run, and what ended them is named."""
         horizon = self.plan.horizon
-        for name, words in (("collided_at", "obstacles"), ("diverged_at", ""), ("failed_at", "reasons")):
-            times = shaped(f"Rollout: {name}", getattr(self, name), (trials,))
+        for name in ("collided_at", "diverged_at", "failed_at"):
+            times = getattr(self, name)
             if not (((times >= 0) & (times <= horizon)) | (times == np.inf)).all():
                 wanted = f"seconds from 0 to {horizon:g}, infinite where it did not happen"
                 raise InputError(f"Rollout: {name}: got {excerpt(times.tolist())}, want {wanted}")
-            object.__setattr__(self, name, times)
-            if not words:
-                continue
-            said = check_items(f"Rollout: {words}", getattr(self, words), str, "a text for each trial")
-            if len(said) != trials:
-                raise InputError(f"Rollout: {words}: got {len(said)}, want one for each of the {trials} trials")
-            may_say = np.isfinite(times)
-            if words == "reasons":  # of a filter, too
-                may_say |= np.isfinite(self.diverged_at)
-            for text, time, may in zip(said, times.tolist(), may_say, strict=True):
-                if bool(text) != np.isfinite(time) and not (text and may):
-                    wanted = "a text where it is finite, and none elsewhere"
-                    raise InputError(f"Rollout: {words}: got {excerpt(text)} at {name} {time:g}, want {wanted}")
-            object.__setattr__(self, words, said)
+        collided, failed = np.isfinite(self.collided_at), np.isfinite(self.failed_at)
+        for name, must, may in (
+            ("obstacles", collided, collided),
+            ("reasons", failed, failed | np.isfinite(self.diverged_at)),  # of a filter that diverged, too
+        ):
+            texts = np.array([bool(text) for text in getattr(self, name)])
+            if (wrong := (must & ~texts) | (texts & ~may)).any():
+                k = int(np.argmax(wrong))
+                ended = "ended that way" if must[k] else "did not end that way"
+                raise InputError(f"Rollout: {name}: got {excerpt(getattr(self, name)[k])} for trial {k}, which {ended}")
 
     @property
     def trials(self) -> int:
@@ -233,16 +208,16 @@ class Rollout:
 
     @property
     def target(self) -> Target:
-        """What the trials were to reach."""
+        """The goal of the trials."""
         return Target(self.state_coordinates, self.goal, self.plan.states)
 
     @property
     def plane(self) -> str:
-        """The axes of the world that `places` are along; of a robot without a position, of its last ball."""
+        """The axes of the world that `places` are along; for a robot without a position, those of its last ball."""
         return self.state_coordinates.plane or ("xyz" if self.balls is not None else "")
 
     def places(self, trial: int) -> Array:
-        """Places of the robot in a trial: its position, or its last ball.
+        """Places of the robot in a trial: its position, or that of its last ball.
 
         Args:
           trial: row of the rollout.
@@ -261,17 +236,17 @@ class Rollout:
 
     @property
     def planned_places(self) -> Array:
-        """Where it should have been, (T+1, 2 or 3)."""
+        """The planned places, (T+1, 2 or 3)."""
         if self.state_coordinates.position or self.balls is None:
             return self.plan.states[:, list(self.state_coordinates.position)]
         return self.balls.planned[:, -1]
 
     def in_world(self, places: npt.ArrayLike, *, height: float = 0.0) -> Array:
-        """Points (..., 3) in the world of places (..., 2 or 3); height in metres is that of those seen from above.
+        """Points (..., 3) in the world of places (..., 2 or 3).
 
         Args:
           places: (..., 2 or 3), in metres.
-          height: in metres, of places that are seen from above.
+          height: in metres, of places in a horizontal plane that has no height of its own.
 
         Returns:
           Points (..., 3).
@@ -295,22 +270,22 @@ class Rollout:
 
     @property
     def goal_distance(self) -> Array:
-        """Distance from the target at the end, (K,), in `target.unit`."""
+        """Distance from the goal at the end, (K,), in `target.unit`."""
         return self.target.distance(self.states[:, -1])
 
     @cached_property
     def tracking_error(self) -> Array:
-        """Distance from the plan's position in metres, (K, T+1); for robots without one see `tracking_unit`."""
+        """Distance from the plan, (K, T+1), in `tracking_unit`."""
         return tracking_error(self.state_coordinates, self.states, self.plan.states)
 
     @property
     def tracking_unit(self) -> str:
-        """Of `tracking_error`: m; or of the scaled error that `goal.py` describes, for robots without a position."""
+        """Unit of `tracking_error`: m, or that of the scaled error (`goal.py`) for robots without a position."""
         return tracking_unit(self.state_coordinates)
 
     @property
     def saturated(self) -> npt.NDArray[np.bool_]:
-        """Whether a command stood at a limit, (K, T)."""
+        """Whether a command was at a limit, (K, T)."""
         low, high = np.array(self.control_coordinates.low), np.array(self.control_coordinates.high)
         return np.any((self.commanded <= low) | (self.commanded >= high), axis=-1)
 
@@ -327,19 +302,20 @@ class Rollout:
 
     @property
     def outcome(self) -> tuple[str, ...]:
-        """`reached`, `timed out`, `collided`, `diverged` or `error` for each trial: the first event ends it."""
+        """`reached`, `timed out`, `collided`, `diverged` or `error` for each trial, by its first event."""
         return tuple(self._endings[0].tolist())
 
     @property
     def ended(self) -> Array:
-        """When each trial ended, (K,), in seconds; the horizon where nothing ended it before."""
+        """When each trial ended, (K,), in seconds; the horizon if no event ended it."""
         return self._endings[1]
 
     @property
     def counts(self) -> npt.NDArray[np.bool_]:
-        """Which knots count, (K, T+1): those before a trial ended, the last one if nothing ended it, the first always.
+        """Which knots count, (K, T+1): those before the trial ended, the last if no event ended it, and always the
+        first.
 
-        They are the same whether obstacles stop the robot or not.
+        They do not depend on whether obstacles stop the robot.
         """
         ran = ~np.isin(self._endings[0], ("collided", "diverged", "error"))
         counted = (self.times < self.ended[:, None]) | ran[:, None]
@@ -353,25 +329,25 @@ class Rollout:
 
     @property
     def diverged(self) -> npt.NDArray[np.bool_]:
-        """Whether a trial ended as its simulation became unstable, or its filter diverged, (K,)."""
+        """Whether an unstable simulation or filter ended a trial, (K,)."""
         return self._endings[0] == "diverged"
 
     @property
     def reached(self) -> npt.NDArray[np.bool_]:
-        """Whether a trial ran to its end, and that is within `goal_radius` of the goal, (K,)."""
+        """Whether a trial ran to the end of its plan and ended within `goal_radius` of the goal, (K,)."""
         return self._endings[0] == "reached"
 
     def least_clearance(self) -> Array:
-        """The least clearance of each trial until it ended, (K,), in metres: not above 0 where it collided."""
+        """The least clearance of each trial until it ended, (K,), in metres; at most 0 where it collided."""
         least = np.where(self.counts, self.clearance, np.inf).min(axis=1)
         return np.where(self.collided, np.minimum(least, 0.0), least)
 
     def tally(self) -> str:
-        """How many of the trials reached the target, in a line."""
+        """How many trials reached the goal, as a line."""
         return f"{self.reached.sum()} of {self.trials} trials reached the {self.target.name}"
 
     def summary(self) -> str:
-        """One line a trial: outcome, tracking error, clearance, saturation; before that, where the plan ends."""
+        """Disturbances, the end of the plan, and for each trial outcome, tracking error, clearance and saturation."""
         what = "; ".join(self.disturbances) or "undisturbed"
         lines = [f"{self.robot} in {self.scene}, {what}, seed {self.seed}"]
         lines += [f"  {line}" for line in self.target.of_plan(self.goal_radius)]

@@ -1,4 +1,4 @@
-"""Checks of what a JSON text holds, which is what anyone may have written: each says in one line what is wrong.
+"""Checks of JSON that anyone may have written; each reports in one line what is wrong.
 
 A check takes the name of a field and its value, and returns the value. `parse` reads the text, `canonical` writes it.
 """
@@ -11,16 +11,19 @@ from lqrsim.errors import InputError, check_name, check_number, excerpt
 
 Check = Callable[[str, Any], Any]
 LINE = 1000  # characters of a name or another line; more is no name
-_DEPTH = 6  # of lists and objects in each other, where they may be anything
+_DEPTH = 6  # nested lists and objects in `anything`
 
 
 def parse(text: str | bytes) -> Any:
-    """What a JSON text says. Raises ValueError or RecursionError for what is none, or has a name twice."""
-    return json.loads(text, object_pairs_hook=_unique)
+    """Parse a JSON text. Raises ValueError if it is none, is nested too deeply, or has a name twice in an object."""
+    try:
+        return json.loads(text, object_pairs_hook=_unique)
+    except RecursionError:
+        raise ValueError("lists or objects too deep within each other") from None
 
 
 def canonical(value: Any) -> str:
-    """The one JSON text of what is equal: names in order, no spaces. Raises TypeError or ValueError."""
+    """The canonical JSON text of a value: sorted names, no spaces. Raises TypeError or ValueError."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
@@ -32,16 +35,16 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def text(field: str, value: Any) -> str:
-    """Any text that can be written."""
+    """Any text that can be encoded."""
     if not isinstance(value, str):
         raise InputError(f"{field}: got {excerpt(value)}, want text")
     if not value.isascii() and any("\ud800" <= letter <= "\udfff" for letter in value):
-        raise InputError(f"{field}: got {excerpt(value)}, want text without halves of letters")
+        raise InputError(f"{field}: got {excerpt(value)}, want text without halves of surrogate pairs")
     return value
 
 
 def line(field: str, value: Any) -> str:
-    """A text of one line that is not too long for a name."""
+    """One line of text, not too long for a name."""
     text(field, value)
     if len(value) > LINE or any(
         letter < " " or "\x7f" <= letter <= "\x9f" or letter in "\u2028\u2029" for letter in value
@@ -51,7 +54,7 @@ def line(field: str, value: Any) -> str:
 
 
 def number(*, at_least: float | None = None, above: float | None = None, at_most: float | None = None) -> Check:
-    """A finite number within these bounds."""
+    """The check for a finite number within bounds."""
 
     def check(field: str, value: Any) -> float:
         check_number(field, _real(field, value), at_least=at_least, above=above, at_most=at_most)
@@ -76,25 +79,25 @@ def _real(field: str, value: Any) -> float:
 
 
 def count(field: str, value: Any) -> int:
-    """A whole number, not negative."""
+    """A whole number >= 0."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise InputError(f"{field}: got {excerpt(value)}, want a whole number >= 0")
     return value
 
 
 def one_of(names: Iterable[str]) -> Check:
-    """One of these texts."""
+    """The check for one of these texts."""
     valid = list(names)
     return lambda field, value: check_name(field, value[:100] if isinstance(value, str) else value, valid)
 
 
 def optional(check: Check) -> Check:
-    """The same, or null."""
+    """The check for null, or what another check allows."""
     return lambda field, value: None if value is None else check(field, value)
 
 
 def listed(check: Check) -> Check:
-    """A list of such."""
+    """The check for a list, all of whose entries pass a check."""
 
     def each(field: str, value: Any) -> list[Any]:
         if not isinstance(value, list):
@@ -105,7 +108,7 @@ def listed(check: Check) -> Check:
 
 
 def row(*checks: Check) -> Check:
-    """A list with one entry for each check."""
+    """The check for a list with one entry for each check."""
 
     def each(field: str, value: Any) -> list[Any]:
         if not isinstance(value, list) or len(value) != len(checks):
@@ -116,7 +119,7 @@ def row(*checks: Check) -> Check:
 
 
 def mapped(check: Check) -> Check:
-    """An object with any names, and such values."""
+    """The check for an object with any names, all of whose values pass a check."""
 
     def each(field: str, value: Any) -> dict[str, Any]:
         _object(field, value)
@@ -126,7 +129,7 @@ def mapped(check: Check) -> Check:
 
 
 def record(checks: Mapping[str, Check]) -> Check:
-    """An object with exactly these names; each has its check."""
+    """The check for an object with exactly these names, each with its own check."""
 
     def each(field: str, value: Any) -> dict[str, Any]:
         _object(field, value)
@@ -140,12 +143,12 @@ def record(checks: Mapping[str, Check]) -> Check:
 
 
 def anything(field: str, value: Any, depth: int = _DEPTH) -> Any:
-    """Whatever JSON can say, if not in too many lists and objects in each other."""
+    """Any JSON value, with a limit to nested lists and objects."""
     if isinstance(value, str):
         return text(field, value)
     if isinstance(value, list | dict):
         if depth == 0:
-            raise InputError(f"{field}: got lists or objects in each other, want at most {_DEPTH}")
+            raise InputError(f"{field}: got more nested lists or objects, want at most {_DEPTH}")
         if isinstance(value, list):
             return [anything(f"{field}[{i}]", one, depth - 1) for i, one in enumerate(value)]
         return {

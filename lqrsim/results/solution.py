@@ -1,80 +1,66 @@
-"""What comes out of a solve. NumPy only.
-
-`solution_parts.py` has the plan, the log and how it ended, `policy.py` the feedback law, `value_functions.py` the value
-functions. `save_load.py` writes a `Solution` to disk and reads it back; `rollout.py` has what comes out of running it.
-"""
+"""The result of a solve. NumPy only."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import (
-    Array,
-    InputError,
-    check_items,
-    check_kind,
-    excerpt,
-    real,
-)
+from lqrsim.errors import Array, InputError, check_shape
 from lqrsim.results import notebook
+from lqrsim.results.fields import Line
 from lqrsim.results.plan import Plan
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.solution_parts import (
-    Candidate,
-    Certificate,
-    Iteration,
-)
+from lqrsim.results.solution_parts import Candidate, Certificate, Iteration
 from lqrsim.results.value_functions import Moments, Quadratic, TotalCost
 
 
 @dataclass(frozen=True, kw_only=True)
 class Solution(Plan):
-    """A locally optimal feedback policy and how it was found.
+    """A locally optimal feedback policy, and how it was found.
 
-    A `Plan`, with the log of the solve and what else it found. The detail also says where the safeguard had to step in,
-    and the policy and the cost-to-go are those of the last backward pass that was completed.
+    A `Plan` with the log of the solve. `detail` also says where the safeguard stepped in. The policy and the cost-to-go
+    are those of the last backward pass that was completed.
 
     Attributes:
-      inverse_policy: the law that traces the optimum backwards from a state of arrival; None from `ilqr`, and where
-        states of arrival cannot be chosen freely, as after a fixed start.
+      inverse_policy: the law that follows the optimum backwards from a state of arrival; None from `ilqr`, and after a
+        fixed start, from which not every state can be reached.
       cost_to_come: the value function of the last forward pass, a `Quadratic` in the primal form and `Moments` in the
         dual; None where a pass failed, and from `ilqr`.
       iterations: the log.
       clearance: signed distance to the nearest obstacle minus the robot's radius along the plan in metres, (T+1,); None
         where the problem has no obstacles.
-      certificate: what the plan is, recomputed from the problem; cost, violation and optimality are read from it.
+      certificate: measures of the plan, recomputed from the problem; the source of cost, violation and optimality.
       gap: of the plan; see `Iteration.gap`. NaN if there is none.
       solver: name of the function that was called.
-      options: its settings; with noise, that in words, and the risk.
-      problem_digest: hash of everything that defined the problem.
-      versions: of lqrsim and the libraries that the bits depend on, and the processor.
-      scenario: what the command line was asked for; empty where a program called the solver.
-      candidates: the starts that were tried, where there were several.
+      options: its settings; with noise, a description of the noise, and the risk.
+      problem_digest: hash of everything that defines the problem.
+      versions: of lqrsim and of the libraries that the bits depend on, and the processor.
+      scenario: the scenario that the command line solved; empty where a program called the solver.
+      candidates: the starts that were tried, if there were several.
     """
 
     inverse_policy: AffinePolicy | None
     cost_to_come: Quadratic | Moments | None
     iterations: tuple[Iteration, ...]
-    clearance: Array | None
+    clearance: Annotated[Array, "T+1"] | None
     certificate: Certificate
     gap: float
-    solver: str
+    solver: Line
     options: Mapping[str, object]
-    problem_digest: str
-    versions: Mapping[str, str]
-    scenario: str = ""
+    problem_digest: Line
+    versions: Mapping[str, Line]
+    scenario: Line = ""
     candidates: tuple[Candidate, ...] = ()
 
     @classmethod
     def _assembled(cls, later: Mapping[str, Callable[[], Any]], **parts: Any) -> "Solution":
-        """A solver's own, whose parts fit each other: without a check, and with parts that are made when they are read.
+        """A solution without checks, for a solver, whose parts fit; some of them are made when they are first read.
 
         Args:
-          later: name -> what makes it, for parts that have no default.
-          **parts: all others.
+          later: name -> function that makes it, for parts without a default.
+          **parts: all other parts.
 
         Returns:
           A Solution.
@@ -94,39 +80,18 @@ class Solution(Plan):
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def __post_init__(self) -> None:
-        check_kind("Solution: inverse_policy", self.inverse_policy, (AffinePolicy, type(None)), "an AffinePolicy, None")
-        kinds = (Quadratic, Moments, type(None))
-        check_kind("Solution: cost_to_come", self.cost_to_come, kinds, "a Quadratic, Moments or None")
-        for name, kind in (("iterations", Iteration), ("candidates", Candidate)):
-            items = check_items(f"Solution: {name}", getattr(self, name), kind, f"a tuple of {kind.__name__}")
-            object.__setattr__(self, name, items)
-        for name in ("solver", "problem_digest", "scenario"):
-            check_kind(f"Solution: {name}", getattr(self, name), str, "text")
-        for name in ("options", "versions"):
-            given = check_kind(f"Solution: {name}", getattr(self, name), Mapping, "a dictionary by name")
-            if not all(isinstance(key, str) for key in given):
-                raise InputError(f"Solution: {name}: got {excerpt(given)}, want a dictionary by name")
-        if self.clearance is not None:
-            object.__setattr__(self, "clearance", real("Solution: clearance", self.clearance))
         super().__post_init__()
-
-    def _shapes(self) -> dict[str, tuple[Array, tuple[int | None, ...]]]:
-        arrays, states = super()._shapes(), self.trajectory.states.shape
-        if self.inverse_policy is not None:
-            arrays["inverse_policy.gain"] = self.inverse_policy.gain, arrays["policy.gain"][1]
-        if isinstance(self.cost_to_come, Quadratic):
-            arrays["cost_to_come.gradient"] = self.cost_to_come.gradient, states
-        elif self.cost_to_come is not None:
-            arrays["cost_to_come.mean"] = self.cost_to_come.mean, states
-        if self.clearance is not None:
-            arrays["clearance"] = self.clearance, states[:1]
-        return arrays
+        come = self.cost_to_come
+        if come is not None:
+            mean = come.gradient if isinstance(come, Quadratic) else come.mean
+            check_shape("Solution: cost_to_come", mean, self.trajectory.states.shape)
+        if self.candidates and all(one.status is None for one in self.candidates):
+            raise InputError("Solution: candidates: got none that ended, want at least one, or no candidates")
 
     @property
     def cost(self) -> float:
-        """True cost of the plan, start and end included; with noise what runs of the policy are expected to cost.
-
-        With a risk it is (1/risk) log E exp(risk cost) of them. Either is worked out to second order about the plan.
+        """Cost of the plan, start and end included; with noise the expected cost of a run, with a risk
+        (1/risk) log E exp(risk cost), both to second order about the plan.
         """
         return self.certificate.cost
 
@@ -137,7 +102,7 @@ class Solution(Plan):
 
     @property
     def violation(self) -> float:
-        """By how much the worst constraint is missed at the steps; see `Certificate`."""
+        """Violation of the worst constraint at the steps; see `Certificate`."""
         return self.certificate.violation
 
     @property
@@ -147,11 +112,11 @@ class Solution(Plan):
 
     @property
     def total_cost(self) -> TotalCost:
-        """Cost-to-go plus cost-to-come, Eq. (20). Raises InputError where there is no cost-to-come, as from `ilqr`."""
+        """Cost-to-go plus cost-to-come, Eq. (20). Raises InputError without a cost-to-come, as from `ilqr`."""
         if self.cost_to_go is None or self.cost_to_come is None:
             raise InputError(
-                f"total_cost: got a solution of {self.solver} without both value functions, want one of smooth, not"
-                " shifted, whose passes were completed"
+                f"total_cost: got a solution of {self.solver} without both value functions, want one of smooth that"
+                " completed its passes and was not shifted"
             )
         return TotalCost(self.cost_to_go, self.cost_to_come)
 
@@ -163,17 +128,17 @@ class Solution(Plan):
         }  # fmt: skip
 
     def open_loop(self) -> "Solution":
-        """The same plan without feedback: its controls, whatever the state. Shows what the feedback is worth."""
+        """The same plan with zero gains, to compare with: the planned controls, whatever the state."""
         policy = replace(self.policy, gain=np.zeros_like(self.policy.gain), offset=self.trajectory.controls)
         return replace(self, policy=policy, inverse_policy=None)
 
     def iteration_table(self) -> str:
-        """The log as text, a line an iteration."""
+        """The log as a table, one line for each iteration."""
         rows = [iteration.row(number) for number, iteration in enumerate(self.iterations, start=1)]
         return "\n".join([Iteration.HEADER, *rows])
 
     def summary(self) -> str:
-        """The status with its remedy, and what came out, in a few lines."""
+        """The status with its remedy, cost, clearance, goal, limits and starts, in at most 15 lines."""
         lines = [f"{self.status.name} after {len(self.iterations)} iterations of {self.solver}: {self.status.meaning}"]
         if self.detail:
             lines.append(f"  detail:    {self.detail}")
@@ -184,7 +149,7 @@ class Solution(Plan):
         if "noise" in self.options:
             meant = f"log E exp(risk cost) / risk, risk {self.options.get('risk')}"
             if self.cost_to_go is None:
-                meant = "that without noise: there is no cost-to-go to weigh it with"
+                meant = "without noise: there is no cost-to-go"
             elif not self.options.get("risk"):
                 meant = "an expectation"
             lines.append(f"  noise:     {self.options['noise']}; the cost is {meant}")
@@ -193,12 +158,12 @@ class Solution(Plan):
             verdict = "collides" if self.clearance[knot] < 0 else "clear"
             lines.append(f"  clearance: {self.clearance[knot]:.3f} m at {knot * self.trajectory.dt:.2f} s ({verdict})")
         lines += [f"  goal:      {line}" for line in self._at_goal()]
-        lines += [f"  limits:    {line}" for line in self._beyond_limits()]
-        lines += [f"  starts:    {line}" for line in self._search()]
+        lines += [f"  limits:    {line}" for line in _first(self._beyond_limits(), 2)]
+        lines += [f"  starts:    {line}" for line in _first(self._search(), 3)]
         return "\n".join(lines)
 
     def _at_goal(self) -> list[str]:
-        """How far from the goal the plan ends, and whether it misses it."""
+        """Distance from the goal to the end of the plan, and whether the plan misses the goal."""
         if not np.isfinite(self.trajectory.states).all():
             return []
         target, radius = self.target, self.goal_radius
@@ -207,7 +172,7 @@ class Solution(Plan):
         return target.of_plan(radius)
 
     def _beyond_limits(self) -> list[str]:
-        """One line for each control that the plan takes beyond its limits."""
+        """A line for each control that is planned beyond its limits."""
         space, controls = self.policy.control_coordinates, self.trajectory.controls
         return [
             f"{label} is planned from {used.min():.3g} to {used.max():.3g}, beyond {low:.3g} to {high:.3g}"
@@ -216,7 +181,7 @@ class Solution(Plan):
         ]
 
     def _search(self) -> list[str]:
-        """Which of several starts was the best, if there were several."""
+        """The start of the plan, and how the others ended, if there were several."""
         if not self.candidates:
             return []
         ended = [candidate for candidate in self.candidates if candidate.status is not None]
@@ -231,7 +196,12 @@ class Solution(Plan):
         return lines + [f"{one.start} ended {one.status and one.status.name} at {one.cost:.6g}" for one in others]
 
     def __str__(self) -> str:
-        return f"{self.iteration_table()}\n{self.summary()}"
+        return self.summary()
 
     def _repr_html_(self) -> str:
         return notebook.of_solution(self)
+
+
+def _first(lines: list[str], most: int) -> list[str]:
+    """The first lines, and how many more there are."""
+    return lines if len(lines) <= most + 1 else [*lines[:most], f"and {len(lines) - most} more"]

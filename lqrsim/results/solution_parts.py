@@ -1,19 +1,21 @@
-"""What a `Solution` is made of: trajectory, status, log, certificate, multipliers, candidates. NumPy only."""
+"""Parts of a `Solution`: trajectory, status, log, certificate, multipliers, candidates. NumPy only."""
 
 import enum
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_count, check_kind, check_number, check_text, shaped
+from lqrsim.errors import Array, InputError, check_count
+from lqrsim.results.fields import Bounds, Line, check_fields
 
-# How a horizon goes on: it moves along with the robot, or its end stays where it is.
+# The end of a horizon moves along with the robot, or stays where it is.
 HORIZONS = ("moving", "shrinking")
 
 
 def left_after(steps: int, array: npt.ArrayLike, *, filled: bool) -> Array:
-    """What is left of an array (T, ...) after so many steps; `filled` up with the last to the same length."""
+    """An array (T, ...) without its first steps; with `filled` the last entry is repeated to keep the length."""
     array = np.asarray(array)
     rest = array[steps:]
     return np.concatenate([rest, np.repeat(array[-1:], steps, axis=0)]) if filled and steps else rest
@@ -29,23 +31,17 @@ class Trajectory:
       dt: seconds between two states.
 
     Raises:
-      InputError: they do not fit together, there is no step, or dt is not above 0. NaN is what a failed solve has.
+      InputError: the shapes do not fit, there is no step, or dt is not above 0. NaN is allowed: a failed solve has it.
     """
 
-    states: Array
-    controls: Array
-    dt: float
+    states: Annotated[Array, "T+1 n"]
+    controls: Annotated[Array, "T m"]
+    dt: Annotated[float, Bounds(above=0.0)]
 
     def __post_init__(self) -> None:
-        controls = shaped("Trajectory: controls", self.controls, (None, None))
-        if not controls.size:
-            raise InputError(f"Trajectory: controls: got shape {controls.shape}, want (T, m), at least one of each")
-        states = shaped("Trajectory: states", self.states, (len(controls) + 1, None))
-        if not states.size:
-            raise InputError(f"Trajectory: states: got shape {states.shape}, want ({len(states)}, n), at least one n")
-        object.__setattr__(self, "states", states)
-        object.__setattr__(self, "controls", controls)
-        object.__setattr__(self, "dt", check_number("Trajectory: dt", self.dt, above=0.0))
+        sizes = check_fields(self)
+        if not min(sizes.values()):
+            raise InputError(f"Trajectory: got {sizes}, want at least one step, state and control")
 
     @property
     def steps(self) -> int:
@@ -53,8 +49,13 @@ class Trajectory:
         return len(self.controls)
 
     @property
+    def finite(self) -> bool:
+        """Whether all states and controls are finite."""
+        return bool(np.isfinite(self.states).all() and np.isfinite(self.controls).all())
+
+    @property
     def horizon(self) -> float:
-        """Duration in seconds; the paper's l."""
+        """Duration in seconds; l in the paper."""
         return self.steps * self.dt
 
     @property
@@ -64,7 +65,7 @@ class Trajectory:
 
 
 class Status(enum.StrEnum):
-    """How a solve ended. `meaning` says it in words, `remedy` what to try."""
+    """How a solve ended; `meaning` explains it, `remedy` says what to try."""
 
     CONVERGED = "converged"
     COST_CONVERGED = "cost converged"
@@ -81,7 +82,7 @@ class Status(enum.StrEnum):
 
     @property
     def success(self) -> bool:
-        """True for CONVERGED, and for COST_CONVERGED, where only the cost was asked for."""
+        """True for CONVERGED, and for COST_CONVERGED, where only the cost was tested."""
         return self in (Status.CONVERGED, Status.COST_CONVERGED)
 
     @property
@@ -90,35 +91,35 @@ class Status(enum.StrEnum):
 
     @property
     def remedy(self) -> str:
-        """What to try; empty where nothing needs to be."""
+        """What to try; empty for a success."""
         return _STATUS_TEXT[self][1]
 
 
 _STATUS_TEXT = {
     Status.CONVERGED: ("optimality and, with a cost-to-come, the gap are within tolerance", ""),
     Status.COST_CONVERGED: (
-        "the change of cost is within tolerance; gap and optimality were not asked for",
-        'look at the gap, or solve with stop="optimal"',
+        "the change of cost is within tolerance; gap and optimality were not tested",
+        'check the gap, or solve with stop="optimal"',
     ),
     Status.MAX_ITERATIONS: (
-        "the iteration limit came first",
-        "raise max_iterations if the improvements still shrink; if they do not, try another start",
+        "the iteration limit was reached",
+        "raise max_iterations while the improvements shrink; otherwise try another start",
     ),
     Status.STALLED: (
         "no step makes the plan better, though it is not within tolerance",
         "try another start; scale states, controls and costs to similar sizes; or accept a larger tolerance",
     ),
     Status.TIME_LIMIT: (
-        "the time limit came first; the plan is the best so far",
-        "raise time_limit, or begin nearer: start=solution of a similar problem",
+        "the time limit was reached; the plan is the best so far",
+        "raise time_limit, or start nearer: start=solution of a similar problem",
     ),
     Status.INTERRUPTED: (
-        "the callback raised, or Ctrl-C; the plan is the best so far",
+        "the callback raised an exception, or Ctrl-C was pressed; the plan is the best so far",
         "solve again, from start=solution",
     ),
     Status.INFEASIBLE: (
-        "the constraints cannot be met, at least not near the plan that misses them least",
-        "relax the constraint that is named, give more time, or try another start",
+        "the constraints cannot be met, at least near the plan with the least violation",
+        "relax the constraint that is named, allow more time, or try another start",
     ),
     Status.DIVERGED: (
         "the cost of the policy grew beyond all bounds",
@@ -133,17 +134,14 @@ _STATUS_TEXT = {
         "raise the control weight, start with an InitialPrior, shorten dt, or try the other solver",
     ),
     Status.RISK_TOO_HIGH: (
-        "the expectation of exp(risk * cost) does not exist: the noise is too strong for so much risk aversion",
-        "lower the risk, below the largest that is named, or the noise; or begin with start=solution of a lower risk",
+        "the expectation of exp(risk * cost) is infinite: the noise is too strong for this risk",
+        "lower the risk below the largest that is named, or lower the noise; or start from a solution of a lower risk",
     ),
     Status.NOT_CERTIFIED: (
-        "the method converged, but its plan, checked against the problem, is not what it claims",
-        "try another start or form; and please report it, for it is a fault of lqrsim",
+        "the method converged, but a check of its plan against the problem failed",
+        "try another start or form, and please report it: this is a bug in lqrsim",
     ),
 }
-
-
-ITERATION_NUMBERS = ("cost", "improvement", "gap", "optimality", "dynamics_residual", "violation", "seconds")
 
 
 @dataclass(frozen=True)
@@ -151,28 +149,28 @@ class Iteration:
     """One line of the log.
 
     Attributes:
-      cost: true cost of rolling the policy out under the true dynamics, with noise that which is expected; NaN where it
-        was only to keep the constraints.
-      improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration. Of damped iterations with
-        constraints it is of the cost with the augmented Lagrangian, and so is the optimality.
-      gap: largest difference between the minimal-total-cost states and that rollout, each state relative to its
-        range along the rollout (at least 1 unit). Where the safeguard went part of the way, they are taken there; 0 for
-        steps of iLQR, Newton's method and restoration, which have none. Of the interior point it is the largest between
-        two steps of its plan, which need not obey the dynamics until the end.
+      cost: of the policy's rollout under the true dynamics, with noise its expectation; NaN while only the constraints
+        are to be met.
+      improvement: `(previous cost - cost) / |cost|`; infinite in the first iteration. In damped iterations with
+        constraints this and the optimality refer to the augmented Lagrangian.
+      gap: largest difference between the states of minimal total cost and the rollout, each state relative to its
+        range along the rollout (at least 1 unit); after a partial step of the safeguard, the states of that step. 0
+        for steps of iLQR, Newton's method and restoration. In the interior point method it is the largest defect of
+        the dynamics between two steps of its plan, which is zero only at the end.
       optimality: the decrease that a linear-quadratic model about the rollout still predicts, relative to the cost; NaN
-        where it was not evaluated (it is once the other tests pass, and after the last iteration). Of the interior
-        point it is what is left of the optimality conditions: the slope of the Lagrangian in a control, times the
-        control's range, or the product of a multiplier and its slack, the larger one, relative to the cost.
-      dynamics_residual: how far one step of the true dynamics takes a minimal-total-cost state from the next one, at
-        most; relative as the gap is, and evaluated where the optimality is. The plan itself is a rollout, and has none.
-        Of the interior point it is the gap.
-      violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all inequalities are
-        kept and there are no equalities, which are off by rounding at least; NaN where it was not evaluated.
-      seconds: time this iteration took.
+        where it was not evaluated (it is once the other tests pass, and after the last iteration). In the interior
+        point method it is the residual of the optimality conditions, relative to the cost: the larger of the gradient
+        of the Lagrangian in a control times the control's range, and the product of a multiplier and its slack.
+      dynamics_residual: largest defect of the dynamics between two states of minimal total cost, relative as the gap
+        is, and evaluated where the optimality is. The plan itself is a rollout and has no defect. In the interior point
+        method it equals the gap.
+      violation: of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there are no
+        equalities, which have rounding errors at least; NaN where it was not evaluated.
+      seconds: time that this iteration took.
       method: "smooth", the paper's; "newton", at the end; with constraints or limits "interior point", and
-        "restoration", a descent in which constraints may be missed at a price; of the safeguard's "damped", or "ilqr"
-        where its step is that of iLQR; of Newton's method and the safeguard "rejected" (it would have cost more, or a
-        pass failed; cost is that of the plan that was kept).
+        "restoration", a descent on cost and penalised violation; in the safeguard "damped", or "ilqr" where its step is
+        that of iLQR; in Newton's method and the safeguard "rejected" (the cost would have risen, or a pass failed; the
+        cost is that of the plan that was kept).
     """
 
     cost: float
@@ -182,13 +180,10 @@ class Iteration:
     dynamics_residual: float
     violation: float
     seconds: float
-    method: str
+    method: Line
 
     def __post_init__(self) -> None:
-        for name in ITERATION_NUMBERS:
-            if type(value := getattr(self, name)) is not float:
-                object.__setattr__(self, name, float(shaped(f"Iteration: {name}", value, ())))
-        check_kind("Iteration: method", self.method, str, "text")
+        check_fields(self)
 
     HEADER = (
         f"{'iteration':>9} {'cost':>14} {'improvement':>12} {'gap':>10} {'optimality':>11} {'violation':>10} {'ms':>8}"
@@ -196,7 +191,7 @@ class Iteration:
     )
 
     def row(self, number: int) -> str:
-        """This iteration as a line under `HEADER`.
+        """This iteration as a line of the table under `HEADER`.
 
         Args:
           number: of the iteration, from 1.
@@ -217,9 +212,9 @@ class Iteration:
 
 @dataclass(frozen=True, kw_only=True)
 class Certificate:
-    """What the plan is, recomputed from the problem after the solve, on a path that the solvers do not use.
+    """Measures of a plan, recomputed from the problem after the solve by code that the solvers do not use.
 
-    A solution that says CONVERGED has passed: optimality and violation are within tolerance, the rest within rounding.
+    For a CONVERGED solution optimality and violation are within tolerance, the other residuals within rounding.
 
     Attributes:
       cost: of the plan; see `Solution.cost`.
@@ -229,11 +224,11 @@ class Certificate:
       policy_residual: largest difference between a control and the policy's at that state, relative to the terms of
         `L x + l`.
       limits: how far a control is beyond its limits, in its unit.
-      violation: by how much the worst constraint is missed at the steps, in its unit; 0 where all inequalities are
-        kept and there are no equalities. Of a converged plan it is at most `constraint_tolerance`, of equalities at
-        most 1e-6, unless constraints are elastic.
-      optimality: the decrease of cost that the slopes of the cost in the policy's offsets (and in a start that is not
-        fixed) still promise, relative to the cost; infinite where there is no cost-to-go to weigh them with.
+      violation: of the worst constraint at the steps, in its unit; 0 where all inequalities hold and there are no
+        equalities. For a converged plan it is at most `constraint_tolerance`, for equalities at most 1e-6, unless
+        constraints are elastic.
+      optimality: the decrease of cost that the gradient in the policy's offsets (and in a free start) still predicts,
+        relative to the cost; infinite without a cost-to-go, which is needed to weigh the gradient.
     """
 
     cost: float
@@ -245,29 +240,23 @@ class Certificate:
     optimality: float
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = float(shaped(f"Certificate: {field.name}", getattr(self, field.name), ()))
-            object.__setattr__(self, field.name, value)
+        check_fields(self)
 
 
 @dataclass(frozen=True)
 class Multipliers:
-    """What a constraint presses with, at each step: zero where an inequality is kept with room to spare.
+    """The multipliers of a constraint, one for each row at each step; zero where an inequality is inactive.
 
     Attributes:
-      values: (T+1, rows): what a unit more of the constraint would cost; of an inequality not negative.
-      penalty: mu of the augmented Lagrangian, which holds the policy to the constraint.
+      values: (T+1, rows): the change of cost with a unit of the constraint; not negative for an inequality.
+      penalty: weight mu of the augmented Lagrangian.
     """
 
-    values: Array
-    penalty: float
+    values: Annotated[Array, "T+1 _"]
+    penalty: Annotated[float, Bounds(at_least=0.0)]
 
     def __post_init__(self) -> None:
-        values = shaped("Multipliers: values", self.values, (None, None))
-        if not len(values):
-            raise InputError(f"Multipliers: values: got shape {values.shape}, want (T+1, rows)")
-        object.__setattr__(self, "values", values)
-        object.__setattr__(self, "penalty", check_number("Multipliers: penalty", self.penalty, at_least=0.0))
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -275,25 +264,20 @@ class Candidate:
     """One of several starts that a search tried.
 
     Attributes:
-      start: what it was.
-      cost: true cost of the last plan that it led to; infinite if a pass failed, or the plan is only to keep the
-        constraints.
-      iterations: how many it took until then.
+      start: its name.
+      cost: of its last plan; infinite if a pass failed, or if the plan was only to meet the constraints.
+      iterations: number of iterations.
       status: how it ended; None where it was dropped after a few iterations.
-      trajectory: that plan.
+      trajectory: its last plan.
     """
 
-    start: str
+    start: Line
     cost: float
     iterations: int
     status: Status | None
     trajectory: Trajectory
 
     def __post_init__(self) -> None:
-        check_text("Candidate: start", self.start, "what it was", at_most=1000, empty=True)
-        if np.isnan(cost := float(shaped("Candidate: cost", self.cost, ()))):
+        check_fields(self)
+        if np.isnan(self.cost):
             raise InputError("Candidate: cost: got nan, want a number, infinite where there is none")
-        object.__setattr__(self, "cost", cost)
-        check_count("Candidate: iterations", self.iterations, at_least=0)
-        check_kind("Candidate: status", self.status, (Status, type(None)), "a Status or None")
-        check_kind("Candidate: trajectory", self.trajectory, Trajectory, "a Trajectory")

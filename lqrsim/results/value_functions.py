@@ -1,28 +1,26 @@
-"""Value functions: quadratics of the state, by their coefficients or by their moments. NumPy only."""
+"""Value functions: quadratics of the state, in coefficients or in moments. NumPy only."""
 
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_kind, check_shape, real, shaped, vectors_of
+from lqrsim.errors import Array, InputError, check_kind, check_shape, vectors_of
+from lqrsim.results.fields import check_fields
 
 
-def _fit(value: object, names: tuple[str, str, str]) -> None:
-    """Keep a matrix, a vector and a number, or all of them along the same axes, as arrays. Raises InputError."""
-    kind = type(value).__name__
-    vector = real(f"{kind}: {names[1]}", getattr(value, names[1]))
-    if not vector.ndim or not vector.shape[-1]:
-        raise InputError(f"{kind}: {names[1]}: got shape {vector.shape}, want (..., n), of at least one state")
-    for name, shape in zip(names, ((*vector.shape, vector.shape[-1]), vector.shape, vector.shape[:-1]), strict=True):
-        object.__setattr__(value, name, shaped(f"{kind}: {name}", getattr(value, name), shape))
+def _check(value: object) -> None:
+    """Check the fields of a quadratic function. Raises InputError, also where it is of no state."""
+    if not check_fields(value)["n"]:
+        raise InputError(f"{type(value).__name__}: got no state, want at least one")
 
 
 @contextlib.contextmanager
 def _invertible(what: str) -> Iterator[None]:
-    """Raises InputError for what is singular."""
+    """A block in which a singular matrix raises InputError."""
     try:
         yield
     except np.linalg.LinAlgError as error:
@@ -31,22 +29,22 @@ def _invertible(what: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Quadratic:
-    """A quadratic function of the state, or one a knot: `1/2 x'Hx + x'g + const`.
+    """A quadratic function of the state, or one for each knot: `1/2 x'Hx + x'g + const`.
 
     Paper: Eqs. (8), (14), (20).
 
     Attributes:
       hessian: (T+1, n, n), symmetric; S, Sbar. A single function has no leading axis, here and below.
-      gradient: (T+1, n), the slope at the origin; bold s, bold sbar.
+      gradient: (T+1, n), at the origin; bold s, bold sbar.
       constant: (T+1,), or a number; s, sbar.
     """
 
-    hessian: Array
-    gradient: Array
-    constant: Array | float
+    hessian: Annotated[Array, "... n n"]
+    gradient: Annotated[Array, "... n"]
+    constant: Annotated[Array, "..."]
 
     def __post_init__(self) -> None:
-        _fit(self, ("hessian", "gradient", "constant"))
+        _check(self)
 
     def __add__(self, other: "Quadratic") -> "Quadratic":
         check_kind("other", other, Quadratic, "a Quadratic")
@@ -55,7 +53,7 @@ class Quadratic:
         return Quadratic(self.hessian + other.hessian, self.gradient + other.gradient, self.constant + other.constant)
 
     def __call__(self, states: npt.ArrayLike) -> Array:
-        """The values at given states, one per knot.
+        """The values at these states, one for each knot.
 
         Args:
           states: (T+1, n).
@@ -75,37 +73,38 @@ class Quadratic:
         return curved + np.einsum("...i,...i->...", x, self.gradient) + self.constant
 
     def minimizer(self) -> Array:
-        """The states (T+1, n) of least value. Paper: Eq. (21). Raises InputError where a Hessian is singular."""
+        """The states (T+1, n) that minimise it. Paper: Eq. (21). Raises InputError for a singular Hessian."""
         with _invertible("hessian"):
             return -np.linalg.solve(self.hessian, self.gradient[..., None])[..., 0]
 
     def minimum(self) -> Array:
-        """The least value at each knot, (T+1,)."""
+        """The minimum at each knot, (T+1,)."""
         return self(self.minimizer())
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Quadratic functions of the state by moments, one a knot: `1/2 (x - mean)' covariance^-1 (x - mean) + const`.
+    """Quadratic functions of the state by moments, one for each knot: `1/2 (x - mean)' covariance^-1 (x - mean) +
+    const`.
 
-    What the dual form has for the cost-to-come: a state that cannot be reached at all has no covariance in that
-    direction, and costs infinitely much. For the terms see Kalman smoothing, to which LQR smoothing is dual.
+    The dual form's cost-to-come. In a direction in which no state can be reached the covariance is zero and the cost
+    infinite. The terms are those of Kalman smoothing, to which LQR smoothing is dual.
 
     Attributes:
       covariance: (T+1, n, n), symmetric, positive semidefinite; zero at 0 after a fixed start. Sbar^-1.
-      mean: (T+1, n), where the least cost is; -Sbar^-1 sbar.
+      mean: (T+1, n), the states of least cost; -Sbar^-1 sbar.
       constant: (T+1,), the least cost.
     """
 
-    covariance: Array
-    mean: Array
-    constant: Array
+    covariance: Annotated[Array, "... n n"]
+    mean: Annotated[Array, "... n"]
+    constant: Annotated[Array, "..."]
 
     def __post_init__(self) -> None:
-        _fit(self, ("covariance", "mean", "constant"))
+        _check(self)
 
     def quadratic(self) -> Quadratic:
-        """The same functions by their coefficients. Raises InputError where a covariance is singular."""
+        """The same functions in coefficients. Raises InputError for a singular covariance."""
         with _invertible("covariance"):
             hessian = np.linalg.inv(self.covariance)
         hessian = 0.5 * (hessian + np.swapaxes(hessian, -1, -2))
@@ -113,17 +112,17 @@ class Moments:
         return Quadratic(hessian, gradient, self.constant - 0.5 * np.einsum("...i,...i->...", gradient, self.mean))
 
     def minimizer(self) -> Array:
-        """The states (T+1, n) of least value: the means."""
+        """The states (T+1, n) that minimise it: the means."""
         return self.mean
 
     def minimum(self) -> Array:
-        """The least value at each knot, (T+1,)."""
+        """The minimum at each knot, (T+1,)."""
         return self.constant
 
 
 @dataclass(frozen=True)
 class TotalCost:
-    """Cost-to-go plus cost-to-come: the least cost of a trajectory through a state, at each knot. Paper: Eq. (20).
+    """Cost-to-go plus cost-to-come: the least cost of a trajectory through a state, for each knot. Paper: Eq. (20).
 
     Attributes:
       cost_to_go: the least cost from a state to the end.
@@ -134,20 +133,19 @@ class TotalCost:
     cost_to_come: Quadratic | Moments
 
     def __post_init__(self) -> None:
-        check_kind("TotalCost: cost_to_go", self.cost_to_go, Quadratic, "a Quadratic")
-        check_kind("TotalCost: cost_to_come", self.cost_to_come, (Quadratic, Moments), "a Quadratic or Moments")
+        check_fields(self)
         come = self.cost_to_come.gradient if isinstance(self.cost_to_come, Quadratic) else self.cost_to_come.mean
         check_shape("TotalCost: cost_to_come", come, self.cost_to_go.gradient.shape)
 
     def minimizer(self) -> Array:
-        """The states (T+1, n) of least total cost; x_hat. Paper: Eq. (21). Raises InputError where there is none."""
+        """The states (T+1, n) of least total cost; x_hat. Paper: Eq. (21). Raises InputError if there are none."""
         if isinstance(self.cost_to_come, Quadratic):
             return (self.cost_to_go + self.cost_to_come).minimizer()
         moved = np.einsum("...ij,...j->...i", self.cost_to_come.covariance, self.costate())
         return self.cost_to_come.mean - moved
 
     def costate(self) -> Array:
-        """The slopes (T+1, n) of the cost-to-go at the minimisers: what a unit more of each state would cost."""
+        """The gradients (T+1, n) of the cost-to-go at the minimisers."""
         go = self.cost_to_go
         if isinstance(self.cost_to_come, Quadratic):
             return np.einsum("...ij,...j->...i", go.hessian, self.minimizer()) + go.gradient
@@ -157,9 +155,10 @@ class TotalCost:
             return np.linalg.solve(np.eye(mean.shape[-1]) + go.hessian @ covariance, slope[..., None])[..., 0]
 
     def covariance(self) -> Array:
-        """The inverses (T+1, n, n) of the Hessians: zero in a direction in which no state can be reached.
+        """The inverses (T+1, n, n) of the Hessians, zero in a direction in which no state can be reached.
 
-        As of a normal distribution, at k standard deviations the total cost is `k^2/2` above its least.
+        Read as the covariance of a normal distribution: at k standard deviations the total cost is `k^2/2` above its
+        least.
         """
         come, curvature = self.cost_to_come, self.cost_to_go.hessian
         with _invertible("hessian"):
@@ -167,7 +166,7 @@ class TotalCost:
             return covariance @ np.linalg.inv(np.eye(covariance.shape[-1]) + curvature @ covariance)
 
     def minimum(self) -> Array:
-        """The least total cost at each knot, (T+1,): for a linear-quadratic problem the same number at all."""
+        """The least total cost at each knot, (T+1,); the same at all knots for a linear-quadratic problem."""
         if isinstance(self.cost_to_come, Quadratic):
             return (self.cost_to_go + self.cost_to_come).minimum()
         costate, covariance = self.costate(), self.cost_to_come.covariance

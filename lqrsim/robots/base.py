@@ -2,13 +2,14 @@
 
 import abc
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
 from lqrsim.errors import Array, check_number
 
 if TYPE_CHECKING:
+    from lqrsim.problem.collision_geoms import CollisionGeoms
     from lqrsim.problem.collision_spheres import CollisionSpheres
     from lqrsim.problem.dynamics import Dynamics
 
@@ -28,6 +29,7 @@ class Robot(abc.ABC):
       radius: of its collision circle (seen from above) or ball (the rest), in metres.
       balls: what collides, in place of that: of a robot that is more than one ball, or that has no position. None by
         default. The radius is then how large pictures take the robot to be, and near what goal it has arrived.
+      geoms: what collides, in place of both, where a simulator has distances: of a robot from an MJCF. None by default.
     """
 
     name: str
@@ -39,6 +41,14 @@ class Robot(abc.ABC):
     activations: int = 0
     radius: float
     balls: "CollisionSpheres | None" = None
+    geoms: "CollisionGeoms | None" = None
+
+    @property
+    def shape(self) -> "dict[str, Any]":
+        """What collides, as a keyword for ObstacleCost and Clearance: geoms, else balls, else radius."""
+        if self.geoms is not None:
+            return {"geoms": self.geoms}
+        return {"balls": self.balls} if self.balls is not None else {"radius": self.radius}
 
     @property
     @abc.abstractmethod

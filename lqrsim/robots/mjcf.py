@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,9 +14,12 @@ from lqrsim.results.coordinates import Coordinates
 from lqrsim.robots.base import Robot
 from lqrsim.robots.mjcf_balls import MjcfBalls
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
+from lqrsim.robots.mjcf_geoms import MjcfGeoms
 from lqrsim.scenes import mjcf_joints
+from lqrsim.scenes.mjcf_obstacles import in_the_way
 from lqrsim.scenes.mjcf_outline import outline_of
-from lqrsim.scenes.scene import Scene, load_scene, scene_from_xml
+from lqrsim.scenes.scene import Choice, Scene, checked_model, chosen_geoms, obstacle_geoms, read_mjcf, scene_of
+from lqrsim.scenes.world import KINDS, OTHER_KINDS
 
 _AXES = "xyz"
 _WIDTH = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # in qpos and in qvel
@@ -40,8 +44,9 @@ class MjcfRobot(Robot):
     `<name>_` where the joint has no name. A hinge without limits is an angle. The controls are MuJoCo's `ctrl`, by the
     actuators' names, limited by their ctrlrange. What has no name in the MJCF gets one, as `unnamed_joint_0`.
 
-    Obstacles, geoms that are fixed to the world, do not collide in the plan's physics: costs and constraints keep clear
-    of them. Level planes do collide, if `floors`. All other contacts are MuJoCo's.
+    Obstacles are the geoms that are fixed to the world and can touch the robot, but its own base, which carries it, and
+    the floor that it stands on. They do not collide in the plan's physics: costs and constraints keep clear of them, at
+    MuJoCo's distances, as `ls.Clearance(robot.scene.world, geoms=robot.geoms)`. All other contacts are MuJoCo's.
 
     Args:
       file: the name of a packaged scene, the path of an MJCF, or a Scene.
@@ -50,14 +55,17 @@ class MjcfRobot(Robot):
       position: the 2 or 3 states that are the body's place in the world, in metres; by default those of which MuJoCo's
         kinematics says so. () for none.
       radius: of a ball about the body's origin that has in it all that may collide; by default the least that is sure.
-      outline: whether what collides is many `balls`, fixed to the bodies, and not that one; by default where there is
-        no position. Spheres are balls, capsules chains of them, and the rest the ball that it is in.
-      floors: whether level planes are for standing on.
+      outline: whether there are `balls`, fixed to the bodies, about all that collides; by default where there is no
+        position. Spheres are balls, capsules chains of them, and the rest the ball that it is in. They are what
+        pictures follow, and cheap bounds of what collides.
+      floors: whether level planes and height fields are for standing on, if a joint lets the robot sink to them.
+      obstacles: others, as for `load_scene`: names of geoms or bodies, a function of a geom, or False for none. What is
+        none collides as MuJoCo has it, in the plan, too.
 
     Attributes:
       scene: what it moves in.
       dynamics: MuJoCo's steps.
-      balls: its outline, or None for one ball of `radius`.
+      geoms: what collides of it. balls: an outline of it, or None.
 
     Raises:
       InputError: no such file, body or state; nothing moves, or has an actuator; or the MJCF has what states do not
@@ -73,14 +81,19 @@ class MjcfRobot(Robot):
         radius: float | None = None,
         outline: bool | None = None,
         floors: bool = True,
+        obstacles: Choice = True,
     ) -> None:
-        scene = file if isinstance(file, Scene) else load_scene(file)
-        self.scene = scene_from_xml(mjcf_joints.named(scene.xml), scene.name)
-        self.name = self.scene.name
-        model, who = self.scene.model, f"MjcfRobot {self.name}"
+        self.name, xml = (file.name, file.xml) if isinstance(file, Scene) else read_mjcf(file)
+        xml, who = mjcf_joints.named(xml), f"MjcfRobot {self.name}"
+        model = checked_model(xml, self.name)
         number = mjcf_joints.body_of(model, body, who)
-        self._stated = {
+        candidates = list(file.geoms) if isinstance(file, Scene) else obstacle_geoms(model)
+        default = in_the_way(model, candidates, number, floors=check_flag(f"{who}: floors", floors))
+        geoms = chosen_geoms(model, obstacles, default, who)
+        self.scene = scene_of(xml, self.name, model, geoms, (*KINDS, *OTHER_KINDS))
+        self._stated: dict[str, Any] = {
             "body": body, "position": position, "radius": radius, "outline": outline, "floors": floors,
+            "obstacles": obstacles if isinstance(obstacles, bool) else self.scene.world.names,
         }  # fmt: skip
         self._joints, actuators = mjcf_joints.joints_of(model), mjcf_joints.actuators_of(model)
         self.body = model.body(number).name
@@ -96,7 +109,7 @@ class MjcfRobot(Robot):
             angles=tuple(one.dof for one in self._joints if one.kind == "hinge" and one.limits is None),
         )  # fmt: skip
         self._dynamics = MjcfDynamics(
-            self.scene.xml, who, body=number, floors=check_flag(f"{who}: floors", floors), states=states,
+            xml, who, body=number, obstacles=tuple(geoms), states=states,
             controls=Coordinates(
                 names=self.actuators or ("none",), units=tuple(one.unit for one in actuators) or ("",),
                 low=tuple(one.low for one in actuators), high=tuple(one.high for one in actuators),
@@ -107,6 +120,7 @@ class MjcfRobot(Robot):
         self.radius = check_number(f"{who}: radius", reach, at_least=0.0)
         many = not place if outline is None else check_flag(f"{who}: outline", outline)
         self.balls = MjcfBalls(outline_of(model), self._balls_at) if many else None
+        self.geoms: MjcfGeoms = MjcfGeoms(self.scene)  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def _states(self) -> Iterator[tuple[str, str]]:
         """Names and units: positions, velocities, states of actuators."""
@@ -165,7 +179,9 @@ class MjcfRobot(Robot):
           InputError: as there.
         """
         changed = self.dynamics.with_parameters(**values)
-        return MjcfRobot(scene_from_xml(changed.xml, self.name), **self._stated)
+        model = checked_model(changed.xml, self.name)
+        scene = scene_of(changed.xml, self.name, model, self.scene.geoms, (*KINDS, *OTHER_KINDS))
+        return MjcfRobot(scene, **self._stated)
 
     @property
     def joint_limits(self) -> StateBounds:

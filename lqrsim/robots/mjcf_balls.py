@@ -1,18 +1,16 @@
 """The outline of a robot of an MJCF: balls along what collides, where MuJoCo's kinematics has them."""
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any
 
 import numpy as np
 
 from lqrsim.codegen.sources import source_of
-from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_places
 from lqrsim.problem.collision_spheres import CollisionSpheres, SphereCenters
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.robots.mjcf_dynamics import MjcfDynamics
+from lqrsim.robots.mjcf_memory import MjcfMemory
 from lqrsim.scenes.mjcf_outline import Outline
 
 
@@ -35,32 +33,7 @@ class MjcfBalls(CollisionSpheres):
     def bind(self, dynamics: Dynamics) -> SphereCenters:
         if not isinstance(dynamics, MjcfDynamics):
             raise InputError(f"balls: got those of an MJCF for {dynamics.name}, want its own dynamics, robot.dynamics")
-        memory = _Memory.of(dynamics, self)
+        memory = MjcfMemory.of(dynamics)
         positions = dynamics.physics.model.nv
         data = np.concatenate([[len(self), positions], np.c_[self.outline.bodies, self.outline.offsets].ravel()])
         return SphereCenters(source_of(mjcf_places), data, tuple(range(positions)), functions=(memory,))
-
-
-class _Memory(UserFunction):
-    """MuJoCo's memory in the place of a function's address: compiled code finds its numbers there."""
-
-    @classmethod
-    def of(cls, dynamics: MjcfDynamics, balls: MjcfBalls) -> "_Memory":
-        """That of these dynamics."""
-        numbers = dynamics.physics.numbers
-        memory = cls(
-            function=partial(_plainly, balls.place), level="compiled", states=len(dynamics.state_coordinates),
-            controls=0, parameters=(), offset=1, values=3 * len(balls), entries=balls.names, columns=3,
-            with_control=False,
-        )  # fmt: skip
-        memory.held.append((numbers, numbers.ctypes.data))
-        vars(memory).update(identity=dynamics.fixed, of_what=(dynamics, balls))
-        return memory
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """That of the dynamics in the other process."""
-        return _Memory.of, vars(self)["of_what"]
-
-
-def _plainly(place: Callable[[Array], Array], x: Array, p: Any) -> Array:
-    return place(x)

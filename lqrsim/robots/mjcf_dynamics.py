@@ -43,11 +43,11 @@ class MjcfDynamics(Dynamics):
     discrete: ClassVar[bool] = True
 
     def __init__(
-        self, xml: str, name: str, *, body: int, floors: bool, states: Coordinates, controls: Coordinates,
-        actuators: tuple[int, ...],
+        self, xml: str, name: str, *, body: int, obstacles: tuple[int, ...], states: Coordinates,
+        controls: Coordinates, actuators: tuple[int, ...],
     ) -> None:  # fmt: skip
         self._name = name
-        self._stated: dict[str, Any] = {"body": body, "floors": floors, "actuators": actuators}
+        self._stated: dict[str, Any] = {"body": body, "obstacles": obstacles, "actuators": actuators}
         self.functions, self.level = (), "compiled"
         self.parameters: dict[str, float] = {}
         self.disturbances = dict.fromkeys(WRENCH, 0.0)

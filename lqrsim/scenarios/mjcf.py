@@ -1,6 +1,6 @@
 """A scenario from any MJCF: `lqrsim solve "cartpole.xml,start={'pole': 3.14}"`."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ def mjcf(
     steps: int = 150,
     body: str | None = None,
     floors: bool = True,
-    obstacles: bool = True,
+    obstacles: bool | Sequence[str] = True,
     parameters: Mapping[str, float] | None = None,
 ) -> Scenario:
     """Make a scenario that moves the robot of an MJCF from a start to a goal, within the limits of its actuators.
@@ -47,7 +47,7 @@ def mjcf(
       steps: number of control periods.
       body: as in `MjcfRobot`.
       floors: as in `MjcfRobot`.
-      obstacles: whether the cost includes an ObstacleCost.
+      obstacles: names of geoms or bodies to keep clear of, or False for none; by default as in `MjcfRobot`.
       parameters: other parameters of the MJCF, as in `MjcfRobot.with_parameters`: {"pole_mass": 0.3}.
 
     Returns:
@@ -56,7 +56,7 @@ def mjcf(
     Raises:
       InputError: there is no such file, keyframe, state, unit or parameter; or as `MjcfRobot` and `Problem` do.
     """
-    robot = MjcfRobot(path, body=body, floors=floors)
+    robot = MjcfRobot(path, body=body, floors=floors, obstacles=obstacles)
     given = check_kind("parameters", parameters, (Mapping, type(None)), "numbers by name: {'mass': 0.6}")
     if given:
         names = check_items("parameters", list(given), str, "names and numbers: {'mass': 0.6}")
@@ -71,11 +71,8 @@ def mjcf(
     else:
         efforts = per_entry("effort", effort, controls, above=0.0)
     cost: Cost = ControlCost(efforts)
-    if obstacles and len(plant.world):
-        if robot.balls is None:
-            cost = cost + ObstacleCost(robot.scene.world, radius=robot.radius)
-        else:
-            cost = cost + ObstacleCost(plant.world, balls=robot.balls)
+    if len(plant.world):
+        cost = cost + ObstacleCost(plant.world, geoms=robot.geoms)
     problem = Problem(
         dynamics=dynamics, dt=max(1, round(PERIOD / timestep)) * timestep if dt is None else dt, steps=steps,
         initial=FixedState(_state(robot, "start", start)), stage_cost=cost,

@@ -1,5 +1,6 @@
 """MuJoCo's own steps as numbers that compiled code can work with: addresses, sizes, and memory for several threads."""
 
+import copy
 import ctypes
 import platform
 from functools import cache
@@ -11,9 +12,10 @@ import numpy as np
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
-from lqrsim.scenes.scene import model_from_xml, obstacle_geoms
+from lqrsim.scenes.scene import model_from_xml
 
 _CONVERGED = 1e-14  # the constraint solver's tolerance: what it leaves is divided by the difference of a derivative
+_CLOSE, _LOOKS = 1e-10, 100  # m, and iterations at most, of distances
 _PARTS = {
     mujoco.mjtIntegrator.mjINT_EULER: "mj_Euler",
     mujoco.mjtIntegrator.mjINT_IMPLICIT: "mj_implicit",
@@ -26,14 +28,14 @@ class MjcfPhysics:
 
     The model is the MJCF's own, but that
 
-    - obstacles do not collide: they are for costs and constraints to keep clear of. Level planes do, if `floors`;
+    - obstacles do not collide: they are for costs and constraints to keep clear of;
     - controls are not cut off at their range, which would hide from a solver which way to go from there;
     - the constraint solver ends nearer to its solution;
     - what blows up is not reset.
 
     Args:
       xml: the MJCF as text. name: of it, for messages. body: id of the one that is pushed.
-      actuators: ids of those that the controls are for, in order.
+      actuators: ids of those that the controls are for, in order. obstacles: ids of the geoms that are obstacles.
 
     Attributes:
       model: MuJoCo's. numbers: what the kernel takes, with no wrench. team: the words that its threads share.
@@ -42,10 +44,13 @@ class MjcfPhysics:
       InputError: it has what a state of joints and actuators does not describe.
     """
 
-    def __init__(self, xml: str, name: str, *, body: int, actuators: tuple[int, ...], floors: bool) -> None:
+    def __init__(
+        self, xml: str, name: str, *, body: int, actuators: tuple[int, ...], obstacles: tuple[int, ...]
+    ) -> None:
         self.model = model_from_xml(xml, name)
         _check(self.model, name)
-        _prepare(self.model, floors)
+        _prepare(self.model, obstacles)
+        self._exact = _for_distances(self.model)
         slots = 2 * processors()
         self._data = [mujoco.MjData(self.model) for _ in range(2 * slots)]
         for data in self._data:
@@ -65,7 +70,8 @@ class MjcfPhysics:
         fields = {
             kernel.QPOS: data.qpos, kernel.QVEL: data.qvel, kernel.ACT: data.act, kernel.CTRL: data.ctrl,
             kernel.WARM: data.qacc_warmstart, kernel.QACC: data.qacc, kernel.PUSH: data.xfrc_applied[body],
-            kernel.XPOS: data.xpos, kernel.XMAT: data.xmat,
+            kernel.XPOS: data.xpos, kernel.XMAT: data.xmat, kernel.GEOM_XPOS: data.geom_xpos,
+            kernel.GEOM_XMAT: data.geom_xmat,
         }  # fmt: skip
         for place, array in fields.items():
             row[place] = array.ctypes.data
@@ -85,7 +91,9 @@ class MjcfPhysics:
         numbers[kernel.JOINTS], numbers[kernel.ACTUATORS] = model.njnt, kernel.TABLE + joints.size
         numbers[kernel.TEAM], numbers[kernel.JOB] = self.team.ctypes.data, self._job.ctypes.data
         numbers[kernel.YIELD], numbers[kernel.KINEMATICS] = _yield(), functions["mj_kinematics"]
-        numbers[kernel.RESET] = functions["mj_resetData"]
+        numbers[kernel.RESET], numbers[kernel.COMPOS] = functions["mj_resetData"], functions["mj_comPos"]
+        numbers[kernel.JAC], numbers[kernel.DISTANCE] = functions["mj_jac"], functions["mj_geomDistance"]
+        numbers[kernel.DISTANCE_MODEL] = self._exact._address
         return np.concatenate([numbers, joints.ravel(), actuators])
 
 
@@ -106,13 +114,8 @@ def _check(model: mujoco.MjModel, name: str) -> None:
             raise InputError(f"{name}: {what}: {got}, want {wanted}")
 
 
-def _prepare(model: mujoco.MjModel, floors: bool) -> None:
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    for geom in obstacle_geoms(model):
-        plane = model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_PLANE)
-        if floors and plane and abs(data.geom_xmat[geom][8]) > 1 - 1e-9:
-            continue  # level: to stand on
+def _prepare(model: mujoco.MjModel, obstacles: tuple[int, ...]) -> None:
+    for geom in obstacles:
         model.geom_contype[geom] = model.geom_conaffinity[geom] = 0
         if ((model.pair_geom1 == geom) | (model.pair_geom2 == geom)).any():
             who = model.geom(geom).name
@@ -123,6 +126,17 @@ def _prepare(model: mujoco.MjModel, floors: bool) -> None:
     option.tolerance = min(option.tolerance, _CONVERGED)
     if mujoco.__version__ == "4.0.0":
         option.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # on sparse ones its Newton solver is wrong
+
+
+def _for_distances(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The same model with more exact distances, whose directions are gradients.
+
+    With MuJoCo's own tolerance of 1e-6 m, the direction between two geoms that nearly touch can be a few degrees off.
+    """
+    exact = copy.copy(model)
+    exact.opt.ccd_tolerance, exact.opt.ccd_iterations = _CLOSE, max(_LOOKS, exact.opt.ccd_iterations)
+    exact.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)  # the other way is wrong at a distance
+    return exact
 
 
 @cache
@@ -141,7 +155,11 @@ def _functions() -> dict[str, int]:
     (library, *_) = sorted(folder.glob(patterns.get(platform.system(), "libmujoco.so*")))
     loaded = ctypes.CDLL(str(library))
     found = {}
-    for name in ("mj_step", "mj_forwardSkip", "mj_Euler", "mj_implicit", "mj_kinematics", "mj_resetData"):
+    names = (
+        "mj_step", "mj_forwardSkip", "mj_Euler", "mj_implicit", "mj_kinematics", "mj_resetData", "mj_comPos", "mj_jac",
+        "mj_geomDistance",
+    )  # fmt: skip
+    for name in names:
         address = ctypes.cast(getattr(loaded, name), ctypes.c_void_p).value
         assert address is not None
         found[name] = address

@@ -7,8 +7,12 @@ contype or conaffinity is not zero, and contacts are not switched off by a flag.
 - geoms that are only drawn (both zero) are no obstacles, nor is anything that can move, the robot included;
 - planes are walls, floors and ceilings, infinite whatever size they are drawn with, solid behind. One that is parallel
   to the plane in which a robot moves does not bound it: the floor that it drives on, for one (`World.seen_by`);
-- plane, sphere, capsule, cylinder and box have a distance. Any other type is refused by name, not left out;
+- plane, sphere, capsule, cylinder and box have a distance. Any other type is refused by name, not left out. A robot
+  from an MJCF has MuJoCo's distances, to all types;
 - a cylinder or capsule whose ends both lie on or behind planes has no ends that anything can reach, and is infinite.
+
+`obstacles=` of `load_scene` is another choice, by names or by a function. `MjcfRobot` leaves out what is not in the way
+of that robot.
 """
 
 import contextlib
@@ -16,15 +20,15 @@ import os
 import re
 import threading
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_kind, check_name, check_path, check_text
-from lqrsim.scenes.world import KINDS, Obstacle, World
+from lqrsim.errors import InputError, check_items, check_kind, check_name, check_path, check_text, excerpt
+from lqrsim.scenes.world import KINDS, OTHER_KINDS, Obstacle, World
 
 try:
     import mujoco
@@ -41,9 +45,13 @@ except Exception as error:
 _PACKAGED = [Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models"]
 _FLAGS = mujoco.mjtDisableBit
 DEEPEST = 490  # MuJoCo's reader refuses a little more
+_FLAT = 1e-9  # m, for what has no thickness
 MOST_CELLS = 4096**2  # of a height field; MuJoCo crashes with far more
 
 MODELS = next((folder for folder in _PACKAGED if folder.is_dir()), _PACKAGED[0])
+
+
+Choice = bool | Sequence[str] | Callable[[Any], bool]  # of obstacles; see `load_scene`
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,20 +63,22 @@ class Scene:
       xml: the whole MJCF as text, includes resolved. It alone makes the model again.
       model: compiled from `xml`.
       world: the obstacles, as the module's docstring defines them.
+      geoms: ids of their geoms in the model, in the same order.
     """
 
     name: str
     xml: str
     model: mujoco.MjModel
     world: World
+    geoms: tuple[int, ...]
 
     def __post_init__(self) -> None:
         check_text("Scene: name", self.name, "a name", at_most=1000)
         check_kind("Scene: xml", self.xml, str, "the MJCF as text")
         check_kind("Scene: model", self.model, mujoco.MjModel, "a mujoco.MjModel")
         check_kind("Scene: world", self.world, World, "a World")
-        if len(self.world) != (count := len(obstacle_geoms(self.model))):
-            raise InputError(f"Scene: world: got {len(self.world)} obstacles, want {count}, those of the model")
+        if len(self.world) != len(self.geoms):
+            raise InputError(f"Scene: world: got {len(self.world)} obstacles, want {len(self.geoms)}, one a geom")
 
 
 def names() -> list[str]:
@@ -76,18 +86,28 @@ def names() -> list[str]:
     return sorted(path.stem for path in MODELS.glob("*.xml") if "<include" in path.read_text(encoding="utf-8"))
 
 
-def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
+def load_scene(name_or_path: str | os.PathLike[str], *, obstacles: Choice = True) -> Scene:
     """A packaged scene by name, or any MJCF by path. It may include the packaged robots, e.g. `create.xml`, by name.
 
     Args:
       name_or_path: a name in models/, or the path of an MJCF file.
+      obstacles: what is an obstacle of all that is fixed to the world: all that can collide; none, with False; names of
+        geoms, or of bodies for all of theirs; or a function of a geom, as `model.geom(number)` has it, which says
+        whether it is one.
 
     Returns:
       The Scene.
 
     Raises:
-      InputError: no such scene or file; it does not parse or compile; an obstacle is of a type without a distance.
+      InputError: no such scene or file; it does not parse or compile; there is no geom of such a name; or an obstacle
+        is of a type without a distance.
     """
+    name, xml = read_mjcf(name_or_path)
+    return scene_from_xml(xml, name, obstacles=obstacles)
+
+
+def read_mjcf(name_or_path: str | os.PathLike[str]) -> tuple[str, str]:
+    """The name and the whole text of an MJCF, includes resolved; as `load_scene`."""
     path = check_path("scene", name_or_path, "the name of a packaged scene, or the path of an .xml file")
     if path.suffix.lower() != ".xml":
         packaged = names()
@@ -99,10 +119,9 @@ def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
         packaged = ", ".join(names())
         raise InputError(f"scene: got {os.fspath(name_or_path)!r}, want a file that exists, or one of: {packaged}")
     try:
-        xml = _flatten(path)
+        return path.stem, _flatten(path)
     except RecursionError:
         raise InputError(f"scene: got {path.name} with elements nested deeper than {DEEPEST}, want fewer") from None
-    return scene_from_xml(xml, path.stem)
 
 
 def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
@@ -124,8 +143,14 @@ def model_from_xml(xml: str, what: str) -> mujoco.MjModel:
     return model
 
 
-def scene_from_xml(xml: str, name: str) -> Scene:
+def scene_from_xml(xml: str, name: str, *, obstacles: Choice = True) -> Scene:
     """The scene of an MJCF given as text, without includes. Raises InputError as `load_scene` does."""
+    model = checked_model(xml, name)
+    return scene_of(xml, name, model, chosen_geoms(model, obstacles, obstacle_geoms(model), f"scene {name}"))
+
+
+def checked_model(xml: str, name: str) -> mujoco.MjModel:
+    """The model of a scene's MJCF. Raises InputError as `model_from_xml`, and where MuJoCo solves it wrongly."""
     model = model_from_xml(xml, f"scene {name}")
     if mujoco.mj_isSparse(model) and mujoco.__version__ == "4.0.0":
         # Newton on a sparse Jacobian gives wrong forces in 4.0.0 (fixed in 4.0.1).
@@ -133,7 +158,45 @@ def scene_from_xml(xml: str, name: str) -> Scene:
             f"scene {name}: got a sparse constraint Jacobian, which MuJoCo 4.0.0 solves wrongly;"
             ' want <option jacobian="dense"/> or a newer MuJoCo'
         )
-    return Scene(name, xml, model, World(_obstacles(model, name)))
+    return model
+
+
+def scene_of(xml: str, name: str, model: mujoco.MjModel, geoms: Sequence[int], kinds: Collection[str] = KINDS) -> Scene:
+    """The scene in which these geoms are the obstacles. Raises InputError if one is not of these kinds."""
+    return Scene(name, xml, model, World(_obstacles(model, name, geoms, kinds)), tuple(geoms))
+
+
+def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int], what: str) -> list[int]:
+    """Ids of the geoms that are obstacles by a choice, as `load_scene` has it.
+
+    Args:
+      default: those with True. what: it is, for messages.
+
+    Raises:
+      InputError: no geom or body that is fixed to the world has such a name, or it is no choice.
+    """
+    if isinstance(obstacles, bool):
+        return list(default) if obstacles else []
+    fixed = np.flatnonzero(model.body_weldid[model.geom_bodyid] == 0).tolist()
+    if callable(obstacles):
+        try:
+            return [geom for geom in fixed if obstacles(model.geom(geom))]
+        except Exception as error:  # whatever a user's function may raise becomes one line
+            raise InputError(
+                f"{what}: obstacles: got {type(error).__name__} ({error}), want a rule for geoms"
+            ) from error
+    wanted = "True, False, names of geoms or bodies, or a function of a geom"
+    if isinstance(obstacles, str):
+        raise InputError(f"{what}: obstacles: got {excerpt(obstacles)}, want a tuple of names: ({excerpt(obstacles)},)")
+    listed = check_items(f"{what}: obstacles", obstacles, str, wanted)
+    geoms_of: dict[str, list[int]] = {}
+    for geom in fixed:
+        geoms_of.setdefault(model.geom(geom).name, []).append(geom)
+        if model.geom_bodyid[geom]:
+            geoms_of.setdefault(model.body(model.geom_bodyid[geom]).name, []).append(geom)
+    geoms_of.pop("", None)
+    found = {geom for name in listed for geom in geoms_of[check_name(f"{what}: obstacles", name, tuple(geoms_of))]}
+    return sorted(found)
 
 
 _quiet, _count, _before = threading.Lock(), 0, None
@@ -207,21 +270,26 @@ def _check_numbers(model: mujoco.MjModel, what: str) -> None:
             raise InputError(f"{what}: got NaN in the MJCF (MuJoCo's {field}[{element}]), want numbers")
 
 
-def _obstacles(model: mujoco.MjModel, scene: str) -> list[Obstacle]:
+def _obstacles(model: mujoco.MjModel, scene: str, geoms: Sequence[int], kinds: Collection[str]) -> list[Obstacle]:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     taken = {model.geom(geom).name for geom in range(model.ngeom)}
     found: list[Obstacle] = []
-    for geom in obstacle_geoms(model):
+    for geom in geoms:
         kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
         name = model.geom(geom).name or free_name(f"{kind} {geom}", taken)
-        if kind not in KINDS:
+        if kind not in kinds:
             raise InputError(
                 f"scene {scene}: got the obstacle {name!r} of type {kind}, want one of: {', '.join(KINDS)};"
-                ' or contype="0" conaffinity="0" if it is only to be drawn'
+                ' or contype="0" conaffinity="0" if it is only to be drawn; or obstacles= to choose others; or an'
+                " MjcfRobot, which has MuJoCo's distances"
             )
+        position, rotation = data.geom_xpos[geom].copy(), data.geom_xmat[geom].reshape(3, 3).copy()
         size = np.zeros(3) if kind == "plane" else model.geom_size[geom].copy()
-        found.append(Obstacle(name, kind, data.geom_xpos[geom].copy(), data.geom_xmat[geom].reshape(3, 3).copy(), size))
+        if kind in OTHER_KINDS:
+            middle, size = model.geom_aabb[geom, :3], np.maximum(model.geom_aabb[geom, 3:], _FLAT)
+            position += rotation @ middle
+        found.append(Obstacle(name, kind, position, rotation, size))
     planes = [obstacle for obstacle in found if obstacle.kind == "plane"]
     return [_endless(obstacle, planes) if obstacle.kind in ("capsule", "cylinder") else obstacle for obstacle in found]
 

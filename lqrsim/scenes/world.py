@@ -16,6 +16,8 @@ SPACE = "xyz"
 PLANES = tuple(a + b for a in SPACE for b in SPACE if a != b)
 
 KINDS = ("plane", "sphere", "capsule", "cylinder", "box")
+# Of MuJoCo's, without a distance here: those of a robot from an MJCF are MuJoCo's own.
+OTHER_KINDS = ("ellipsoid", "mesh", "hfield", "sdf")
 
 
 @dataclass(frozen=True)
@@ -24,12 +26,12 @@ class Obstacle:
 
     Attributes:
       name: of the geom in the MJCF.
-      kind: one of `KINDS`.
+      kind: one of `KINDS`, which have a distance here, or of `OTHER_KINDS`, to which only `MjcfRobot.geoms` has one.
       position: (3,) in metres.
       rotation: (3, 3), whose columns are the local axes; a plane's free side is its local +z, capsules and cylinders
         lie along their local z.
       size: (3,) in metres: sphere (radius, 0, 0); capsule and cylinder (radius, half length, 0), the latter infinite if
-        the half length is; box half lengths; plane (0, 0, 0).
+        the half length is; box half lengths, and of other kinds those of the box that they are in; plane (0, 0, 0).
       velocity: (3,) in m/s, of an obstacle that moves straight on: `position` is where it is at the time 0. Plans take
         it into account; the scene that MuJoCo simulates is another matter, and stands still.
     """
@@ -43,14 +45,14 @@ class Obstacle:
 
     def __post_init__(self) -> None:
         check_text("obstacle: name", self.name, "a name", at_most=1000)
-        check_name(f"obstacle {self.name!r}: kind", self.kind, KINDS)
+        check_name(f"obstacle {self.name!r}: kind", self.kind, (*KINDS, *OTHER_KINDS))
         object.__setattr__(self, "position", check_array(f"obstacle {self.name!r}: position", self.position, (3,)))
         rotation = check_array(f"obstacle {self.name!r}: rotation", self.rotation, (3, 3))
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
             raise InputError(f"obstacle {self.name!r}: rotation: got {rotation.tolist()}, want orthonormal axes")
         object.__setattr__(self, "rotation", rotation)
         size = check_array(f"obstacle {self.name!r}: size", self.size, (3,), infinite=True)
-        used = {"plane": 0, "sphere": 1, "capsule": 2, "cylinder": 2, "box": 3}[self.kind]
+        used = {"plane": 0, "sphere": 1, "capsule": 2, "cylinder": 2}.get(self.kind, 3)
         if (size[:used] <= 0).any():
             raise InputError(f"obstacle {self.name!r}: size: got {size[:used].tolist()}, want lengths above 0")
         object.__setattr__(self, "size", size)
@@ -58,7 +60,16 @@ class Obstacle:
 
     @property
     def row(self) -> Array:
-        """This obstacle as `ROW` numbers."""
+        """This obstacle as `ROW` numbers.
+
+        Raises:
+          InputError: it has no distance.
+        """
+        if self.kind not in KINDS:
+            raise InputError(
+                f"obstacle {self.name!r}: got a {self.kind}, want one of: {', '.join(KINDS)}; or an MjcfRobot, with"
+                " geoms=robot.geoms, whose distances are MuJoCo's"
+            )
         return np.concatenate([[KINDS.index(self.kind)], self.position, self.rotation.ravel(), self.size])
 
 

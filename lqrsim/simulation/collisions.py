@@ -1,16 +1,15 @@
 """The definition of a collision: the first moment at which the robot of a trial touches an obstacle.
 
-It touches one if the signed distance of its position, minus its radius, is negative, or that of one of its balls; or if
-MuJoCo detects a contact of one of its geoms with it. Detection uses states without obstacle contacts, so that it is
-bit-identical whether an obstacle then stops the robot or not. It checks the knots, the parts of a control period that
-`Physics` has, and straight lines between them.
+It touches one if the signed distance of its position, minus its radius, is negative, or that of one of its balls or
+geoms; or if MuJoCo detects a contact of one of its geoms with it. Detection uses states without obstacle contacts, so
+that it is bit-identical whether an obstacle then stops the robot or not. It checks the knots, the parts of a control
+period that `Physics` has, and straight lines between them.
 """
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
-from lqrsim.scenes.world import ROW, signed_distance
 from lqrsim.simulation.physics import Period
 from lqrsim.simulation.plant import Plant
 
@@ -69,10 +68,10 @@ class Collisions:
         self.clearance = self._clear(self._last)
 
     def _search_line(self, step: int, part: int, parts: int, there: Array, open_: npt.NDArray[np.bool_]) -> None:
-        """Check the lines from the balls' last places to these places (K, B, 2 or 3)."""
+        """Check the lines from the robot's last places to these, (K, B, 2 or 3) or (K, 1, n)."""
         last, before = self._last, self.clearance
         self._last, self.clearance = there, self._clear(there)
-        length = np.linalg.norm(there - last, axis=2).max(axis=1)  # of the ball that moved furthest
+        length = self.plant.travel(last, there)
         # If the clearances at both ends add up to more than the length, no point of the line touches an obstacle.
         rows = np.flatnonzero(open_ & np.isinf(self.at) & ~(before + self.clearance > length))
         rows = rows[np.isfinite(length[rows])]
@@ -100,13 +99,4 @@ class Collisions:
     def _hit(self, row: int, time: float, places: Array) -> None:
         """Record a collision with the obstacle that is nearest to the balls at these places (B, 2 or 3)."""
         self.at[row] = time
-        world, points = self.plant.world, np.zeros((len(places), 3))
-        points[:, : places.shape[1]] = places
-        table, away = world.table.ravel(), self.plant.across(self.displaced[row])
-        nearest = np.full(len(world), np.inf)
-        larger = self.plant.radii - self.plant.radii.min()  # without the part that all have, which adds only rounding
-        for point, radius in zip(points, larger, strict=True):
-            there = (point - away).tolist()  # relative to each displaced obstacle
-            found = [signed_distance(table, ROW * number, *seen) - radius for number, seen in enumerate(there)]
-            nearest = np.minimum(nearest, found)
-        self.obstacles[row] = world.names[int(np.argmin(nearest))]
+        self.obstacles[row] = self.plant.nearest(places, self.displaced[row])

@@ -12,11 +12,12 @@ from mujoco import batch
 
 from lqrsim.codegen import distances
 from lqrsim.errors import Array, InputError, check_kind, check_number, shaped, vectors_of
+from lqrsim.problem.collision_geoms import CollisionGeoms
 from lqrsim.problem.collision_spheres import evaluate
-from lqrsim.results.ball_record import BallRecord
+from lqrsim.results.rollout import BallRecord
 from lqrsim.robots.base import Robot
-from lqrsim.scenes.scene import Scene, free_name, obstacle_geoms
-from lqrsim.scenes.world import World
+from lqrsim.scenes.scene import Scene, free_name
+from lqrsim.scenes.world import ROW, World, signed_distance
 from lqrsim.simulation import plant_validation
 
 MOST_STEPS = 100_000_000  # physics steps in a run; they take minutes to hours
@@ -31,8 +32,9 @@ class Plant:
     Attributes:
       robot: with the dynamics and the limits.
       scene: with the MJCF and the obstacles.
+      geoms: the robot's geoms that collide, if MuJoCo's distances count; else None.
       balls, places: the robot's balls and their centres; None if it is one ball at its position.
-      world: the obstacles for the robot's position or its balls; none without either.
+      world: the obstacles for the robot's geoms, its balls or its position; none without any.
       obstacles: names of the obstacles that the robot can collide with: those of `world`. Without a position, and for
         balls in space, all that the MJCF lets it touch, except level planes on which a free joint, or a slide that is
         not level, lets it stand.
@@ -55,13 +57,17 @@ class Plant:
         self.robot, self.scene = robot, scene
         self._step: float | None = None  # s, instead of the MJCF's
         self.balls, self.places = robot.balls, None if robot.balls is None else robot.balls.bind(robot.dynamics)
+        self.geoms = geoms_in(robot, scene)
         self.world = World()
-        if self.places is not None and not self.places.in_plane:
+        if self.geoms is not None:
+            self.world = scene.world
+        elif self.places is not None and not self.places.in_plane:
             near = _in_the_way(robot, scene)
             self.world = World([one for one in scene.world.obstacles if one.name in near])
         elif space.position:
             self.world = scene.world.seen_by(space.plane, space.offset)
-        self.obstacles = self.world.names if space.position or self.places else _in_the_way(robot, scene)
+        bounded = space.position or self.places is not None or self.geoms is not None
+        self.obstacles = self.world.names if bounded else _in_the_way(robot, scene)
         self.model = self._compile()
         joints = [self.model.joint(name) for name in robot.joints]
         self.body = int(self.model.body(robot.body).id)
@@ -137,9 +143,9 @@ class Plant:
     def enclosed(self) -> bool:
         """Whether all parts of the robot that collide are within its radius, so that it touches nothing before.
 
-        For balls this is not known.
+        For balls and geoms this is not known.
         """
-        if self.balls is not None:
+        if self.balls is not None or self.geoms is not None:
             return not self.obstacles
         return not self.obstacles or (len(self.world) > 0 and extent(self) <= self.robot.radius * (1 + 1e-9))
 
@@ -163,6 +169,8 @@ class Plant:
     def clearance(self, states: npt.ArrayLike, displaced: Array | None = None) -> Array:
         """Signed distance to the nearest obstacle minus the robot's radius, in metres; for balls the least of all.
 
+        For geoms it is that of the nearest one, by MuJoCo.
+
         Args:
           states: (..., n).
           displaced: (K, obstacles, 3), displacements of the obstacles in each trial, along the world's axes; states are
@@ -184,18 +192,22 @@ class Plant:
 
     @property
     def radii(self) -> Array:
-        """Radii of the robot's balls in metres, (B,); the robot's radius without any."""
+        """Radii of the robot's balls in metres, (B,); the robot's radius without any; that of the largest geom."""
+        if self.geoms is not None:
+            return np.array([self.geoms.size])
         return np.array([self.robot.radius]) if self.balls is None else self.balls.radii
 
     def middles(self, states: Array) -> Array:
-        """The centres of the robot's balls, in the coordinates of `world`.
+        """The centres of the robot's balls, in the coordinates of `world`; for geoms the states.
 
         Args:
           states: (..., n).
 
         Returns:
-          (..., B, 2 or 3), in metres.
+          (..., B, 2 or 3), in metres; or (..., 1, n).
         """
+        if self.geoms is not None:
+            return states[..., None, :]
         if self.balls is None or self.places is None:
             return states[..., None, list(self.robot.dynamics.state_coordinates.position)]
         return evaluate(self.places, len(self.balls), states)
@@ -212,6 +224,8 @@ class Plant:
         """
         if not len(self.world):
             return np.full(middles.shape[:-2], np.inf)
+        if self.geoms is not None:
+            return self._distances(middles[..., 0, :], displaced).min(axis=-1)
         if displaced is None or not displaced.any():
             return (distances.signed_distance(self.world, middles) - self.radii).min(axis=-1)
         trials, size = len(middles), middles.shape[-1]
@@ -219,6 +233,53 @@ class Plant:
             self.world, middles.reshape(trials, -1, size), self.across(displaced)
         )
         return (found.reshape(middles.shape[:-1]) - self.radii).min(axis=-1)
+
+    def travel(self, before: Array, after: Array) -> Array:
+        """How far any point of the robot goes at most between places, (...), in metres.
+
+        Args:
+          before: (..., B, 2 or 3), as of `middles`.
+          after: likewise.
+
+        Returns:
+          (...).
+        """
+        if self.geoms is not None:
+            return self.geoms.travel(before[..., 0, :], after[..., 0, :])
+        return np.linalg.norm(after - before, axis=-1).max(axis=-1)
+
+    def nearest(self, middles: Array, displaced: Array) -> str:
+        """The name of the obstacle that is nearest at a place.
+
+        Args:
+          middles: (B, 2 or 3), as of `middles`.
+          displaced: (obstacles, 3), by how much they are elsewhere.
+
+        Returns:
+          A name.
+        """
+        if self.geoms is not None:
+            return self.world.names[int(self._distances(middles[None], displaced[None])[0, 0].argmin())]
+        points = np.zeros((len(middles), 3))
+        points[:, : middles.shape[1]] = middles
+        table, away = self.world.table.ravel(), self.across(displaced)
+        found = np.full(len(self.world), np.inf)
+        larger = self.radii - self.radii.min()  # what all have changes no order, except by rounding
+        for point, radius in zip(points, larger, strict=True):
+            there = (point - away).tolist()  # seen from where each obstacle is
+            own = [signed_distance(table, ROW * number, *seen) - radius for number, seen in enumerate(there)]
+            found = np.minimum(found, own)
+        return self.world.names[int(np.argmin(found))]
+
+    def _distances(self, states: Array, displaced: Array | None) -> Array:
+        """MuJoCo's distances of the geoms to each obstacle, (..., O); NaN where the states are."""
+        assert self.geoms is not None
+        if np.isfinite(states).all():
+            return self.geoms.clearances(self.robot.dynamics, self.world, states, displaced)
+        known = np.asarray(np.isfinite(states).all(axis=-1))
+        found = self._distances(np.where(known[..., None], states, 0.0), displaced)
+        found[~known] = np.nan
+        return found
 
     def record_of_balls(self, planned: Array, driven: Array) -> BallRecord | None:
         """The centres of the robot's balls along a plan and in runs, for pictures.
@@ -285,7 +346,7 @@ class Plant:
         if self._step is not None:
             spec.option.timestep = self._step
         geoms = {geom.id: geom for geom in spec.geoms}
-        for geom, obstacle in zip(obstacle_geoms(self.scene.model), self.scene.world.obstacles, strict=True):
+        for geom, obstacle in zip(self.scene.geoms, self.scene.world.obstacles, strict=True):
             geoms[geom].name = obstacle.name
         taken = {sensor.name for sensor in spec.sensors}
         for name in self.obstacles:
@@ -353,6 +414,14 @@ def extent(plant: Plant) -> float:
     return off + reach + float(thickest)
 
 
+def geoms_in(robot: Robot, scene: Scene) -> CollisionGeoms | None:
+    """The geoms of a robot in a scene, with the obstacles of that; None if it has none. Raises InputError."""
+    geoms = robot.geoms
+    if geoms is None or geoms.of_scene(scene):
+        return geoms
+    raise InputError(f"scene {scene.name}: got another than the robot's own, want robot.scene, with its obstacles")
+
+
 def _in_the_way(robot: Robot, scene: Scene) -> tuple[str, ...]:
     """Names of the obstacles of a robot without a position: all that it can touch, except its floor.
 
@@ -368,7 +437,7 @@ def _in_the_way(robot: Robot, scene: Scene) -> tuple[str, ...]:
             sinks |= bool(slides or model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE)
         body = int(model.body_parentid[body])
     level = [one.kind == "plane" and abs(one.rotation[2, 2]) > 1 - 1e-9 for one in scene.world.obstacles]
-    touched = [_can_be_touched(model, geom) for geom in obstacle_geoms(model)]
+    touched = [_can_be_touched(model, geom) for geom in scene.geoms]
     found = zip(scene.world.names, level, touched, strict=True)
     return tuple(name for name, lies, near in found if near and not (sinks and lies))
 

@@ -82,20 +82,26 @@ def goal_radius_of(problem: Problem) -> float | None:
     goal, position = problem.weighed_goal, list(problem.dynamics.state_coordinates.position)
     if not position or (goal is not None and np.isnan(goal[position]).all()):
         return None
-    return max((one.radius for one in _kept_clear(problem) if one.balls is None), default=0.0) or None
+    return (
+        max((one.radius for one in _kept_clear(problem) if one.balls is None and one.geoms is None), default=0.0)
+        or None
+    )
 
 
 def clearance_of(problem: Problem, states: Array) -> Array | None:
     """Signed distance to the nearest obstacle minus the robot's radius, (T+1,); None without obstacles.
 
-    For a robot of several collision spheres it is the smallest of theirs.
+    For a robot of several collision spheres or geoms it is the smallest of theirs.
     """
     space = problem.dynamics.state_coordinates
     place = states[:, list(space.position)]
-    worlds = {(id(one.world), one.radius, id(one.balls)): one for one in _kept_clear(problem) if len(one.world)}
+    kept = [one for one in _kept_clear(problem) if len(one.world)]
+    worlds = {(id(one.world), one.radius, id(one.balls), id(one.geoms)): one for one in kept}
     found = []
     for one in worlds.values():
-        if one.balls is not None:
+        if one.geoms is not None:
+            found.append(one.geoms.clearances(problem.dynamics, one.world, states).min(axis=1))
+        elif one.balls is not None:
             found.append(clearances(one.balls, problem.dynamics, one.world, states, problem.times).min(axis=1))
         else:
             seen = one.world.seen_by(space.plane, space.offset)

@@ -78,7 +78,7 @@ def _sizes(dynamics: Dynamics) -> dict[str, int]:
 def structure(problem: Problem) -> tuple[Any, ...]:
     """A key that is equal for problems that share all their compiled code."""
     costs = tuple(tuple((term.code, term.nonconvex_in) for term in problem.terms(field)) for field in _FIELDS)
-    constraints = tuple((one.code, one.uses_control, one.equality, one.balls) for one in problem.constraint_terms)
+    constraints = tuple((one.code, one.uses_control, one.equality, one.shared) for one in problem.constraint_terms)
     term = problem.noise_term
     noise = None if term is None else (term.source, tuple(term.filled.items()))
     return problem.dynamics.step_source, tuple(_sizes(problem.dynamics).items()), costs, constraints, noise
@@ -128,7 +128,7 @@ def cost_terms(problem: Problem, field: str) -> list[CostTerm]:
 def _cost(problem: Problem, field: str, constraints: list[tuple[ConstraintTerm, Array]]) -> CostModel:
     terms, sizes = cost_terms(problem, field), tuple(_sizes(problem.dynamics).items())
     functions, project = _term_functions(tuple((term.code, term.nonconvex_in) for term in terms), sizes)
-    stated = tuple((one.code, one.balls, one.equality, one.uses_control) for one, _ in constraints)
+    stated = tuple((one.code, one.shared, one.equality, one.uses_control) for one, _ in constraints)
     acting = Constraints(
         _constraint_functions(stated, sizes), tuple(numbers(one) for one, _ in constraints),
         tuple(own for _, own in constraints), len(constraints),
@@ -158,11 +158,11 @@ def _term_functions(terms: tuple[tuple[Source, tuple[int, ...] | None], ...], si
 def _constraint_functions(constraints: tuple[tuple[Source, int, bool, bool], ...], sizes: _Sizes) -> Array:
     """`Constraints.functions`."""
     rows = []
-    for code, balls, equality, uses_control in constraints:
+    for code, shared, equality, uses_control in constraints:
         pairs = {"constraint_value": (code, "value"), "constraint_slope": (code, "slope")}
         source = source_of(augmented_lagrangian)
-        if balls:
-            source = source_of(ball_constraint, PLACES=3 * balls)
+        if shared:
+            source = source_of(ball_constraint, PLACES=shared)
             pairs |= {name: (code, name) for name in ("places", "places_jacobian")}
         module = module_of(source.filled(**pairs), f"a constraint: {code.what}", **dict(sizes), EQUALITY=int(equality))
         found = module.addresses("augment", "augmentation", "constraint_values", "add_slope")

@@ -16,7 +16,7 @@ from lqrsim.solvers.engine import Workspace
 
 STATIONARY = 5e-3  # slope that may be left, relative to what cancels
 AT_LIMIT = 1e-4  # of a control's range, which a barrier may have left, and which could lessen nothing that matters
-NAMED = 3  # constraints at most that a message names
+NAMED = 3  # constraints at most that a message names beside the one that is missed most
 
 
 @dataclass(frozen=True)
@@ -25,14 +25,18 @@ class Evidence:
 
     Attributes:
       states: (T+1, n). controls: (T, m). left: the slope that is left, relative to what cancels. missed: in all.
-      against: what stands against what is missed, in words.
+      against: what stands against what is missed, and what else is missed, in words, the strongest first.
     """
 
     states: Array
     controls: Array
     left: float
     missed: float
-    against: str
+    against: tuple[str, ...]
+
+    def beside(self, worst: str) -> str:
+        """What a message names beside the constraint that it begins with."""
+        return ", ".join([name for name in self.against if not worst.startswith(name.split(" at ")[0])][:NAMED])
 
 
 def evidence(
@@ -61,10 +65,13 @@ def evidence(
             if short[t, row] > allowed:
                 alone[t] -= slope
                 missed += float(short[t, row] / sizes[k][row])
-        shown = np.where(short > allowed, 0.0, np.abs(weights))
-        if shown.size and shown.max() > 1e-2:
-            t, row = np.unravel_index(shown.argmax(), shown.shape)
-            holding.append((float(shown.max()), f"{term.describe(int(row))} at {t * problem.dt:.2f} s"))
+        for row in range(term.rows):
+            beyond = float(short[:, row].max())
+            share = 1 + beyond / sizes[k][row] if beyond > allowed else float(np.abs(weights[:, row]).sum())
+            if share > 1e-2:
+                t = int((short if beyond > allowed else np.abs(weights))[:, row].argmax())
+                told = f", missed by {beyond:.2g}" if beyond > allowed else ""
+                holding.append((share, f"{term.describe(row)} at {t * problem.dt:.2f} s{told}"))
     if not missed > 0:
         return None
     space = problem.control_coordinates
@@ -94,5 +101,4 @@ def evidence(
         holding += [
             (float(pressed[i]) / size, f"the limits of {names[i]}") for i in range(m) if pressed[i] > 1e-2 * size
         ]
-    against = [name for _, name in sorted(holding, reverse=True)[:NAMED]]
-    return Evidence(states, controls, left, missed, ", ".join(against))
+    return Evidence(states, controls, left, missed, tuple(name for _, name in sorted(holding, reverse=True)))

@@ -16,11 +16,11 @@ from lqrsim.problem.costs import Cost, CostSum, ObstacleCost, QuadraticCost, ter
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import TOLERANCE, Target
-from lqrsim.results.solution_parts import Candidate, Status
+from lqrsim.results.solution_parts import Candidate, Status, Trajectory
 from lqrsim.solvers.assembly import clearance_of
 from lqrsim.solvers.budget import Callback
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, resolve
+from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, StartLike, resolve
 from lqrsim.solvers.parallel import workers
 from lqrsim.solvers.strategy import Known, finish, refine
 
@@ -203,8 +203,7 @@ class Search:
             best = self.best[1]
             if self._budget.stop.due or best.final or (best.success and not run.cost < best.cost):
                 break
-            if self._finish(run).final and best.status is Status.INFEASIBLE:
-                break
+            self._finish(run)
 
     @property
     def is_unacceptable(self) -> bool:
@@ -216,10 +215,10 @@ class Search:
         problem = self._problem
         space = problem.dynamics.state_coordinates
         if _pull(problem) == 0 or problem.goal is None:
-            return self._idle()
+            return self._idle() or self._stuck
         (run, found), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
         if not found.success:
-            return run.budget.left > 0 and found.status is not Status.INFEASIBLE
+            return run.budget.left > 0
         if space.position:
             place = list(space.position)
             arrived = np.linalg.norm(found.states[-1, place] - problem.goal[place]) <= max(radius, 1e-3)
@@ -237,9 +236,21 @@ class Search:
         off = np.abs(found.controls - nominal).max()
         return found.success and found.cost > 0 and off <= IDLE * max(1.0, np.abs(nominal).max())
 
+    @property
+    def says_infeasible(self) -> bool:
+        """Whether the best is that constraints contradict each other, by evidence that other starts may disprove."""
+        return self._stuck and self.best[1].status is Status.INFEASIBLE
+
+    @property
+    def _stuck(self) -> bool:
+        """Whether a violation is stationary somewhere, and no plan was found."""
+        return bool(self._known.evidence) and not self.best[1].success
+
     def widen(self) -> None:
         """Look for another way round, or, where there is nothing to go round, for controls that lead anywhere."""
-        if _pull(self._problem) == 0:
+        if self._stuck and _pull(self._problem) == 0:
+            self._try_elsewhere()
+        elif _pull(self._problem) == 0:
             self._try_sinusoidal_controls()
         else:
             for times in HEAVIER:
@@ -255,6 +266,27 @@ class Search:
         # Even one that is not at its end is better than to do nothing.
         better = found.violation <= best.violation and found.cost < best.cost
         self._finished.insert(0 if better else len(self._finished), (chosen, found))
+
+    def _try_elsewhere(self) -> None:
+        """From other starts, until one leads to a plan: before constraints are said to contradict each other."""
+        problem = self._problem
+        starts: dict[str, StartLike] = {
+            f"controls that sway {cycles} times": sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]
+        }
+        place, begin, goal = list(problem.dynamics.state_coordinates.position), problem.start, problem.goal
+        if place and begin is not None and goal is not None and (goal != begin)[place].any():
+            for name, bend in bends((goal - begin)[place], 3)[1:]:
+                states = path(begin, goal, np.zeros(len(begin)), problem.steps)
+                states[:, place] = path(begin[place], goal[place], bend, problem.steps)
+                controls = np.tile(problem.nominal_control, (problem.steps, 1))
+                starts[f"a path {name}"] = Trajectory(states, controls, problem.dt)
+        for name, one in starts.items():
+            if self._budget.stop.due or self.best[1].success:
+                return
+            run = self._another(resolve(one, problem))
+            self._named.append((name, run))
+            self._known.from_start = False
+            self._finish(run)
 
     def _try_reweighted(self, times: float) -> None:
         """Of plans for heavier obstacles, go on from the best by steps that lower the true cost alone."""
@@ -304,11 +336,9 @@ class Search:
         problem = self._problem if problem is None else problem
         return SolveRun(problem, self._settings, initial_guess, self._start, self._budget.another())
 
-    def _finish(self, run: SolveRun) -> RunResult:
-        found = self._to_its_end(run, finish, self._known)
-        self._finished.append((run, found))
+    def _finish(self, run: SolveRun) -> None:
+        self._finished.append((run, self._to_its_end(run, finish, self._known)))
         self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equals, the first
-        return found
 
     def _to_its_end(self, run: SolveRun, how: Callable[[SolveRun, Known], RunResult], known: Known) -> RunResult:
         """Run to the end; report all its iterations to the callback, also those before."""

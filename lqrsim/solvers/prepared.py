@@ -12,9 +12,8 @@ from lqrsim.kernels.records import Motion
 from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import Problem
-from lqrsim.results.plan import Plan
+from lqrsim.results.plan import Plan, Replan
 from lqrsim.results.policy import AffinePolicy
-from lqrsim.results.replan import Replan
 from lqrsim.results.solution_parts import Iteration, Multipliers, Status, Trajectory
 from lqrsim.results.value_functions import Quadratic
 from lqrsim.solvers import compiled

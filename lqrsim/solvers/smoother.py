@@ -177,8 +177,10 @@ def _solve(
     search = Search([name for name, _ in given], runs, callback, threads)
     with problem.dynamics.solving(threads if len(runs) == 1 else 1):
         search.run()
-        default = settings.start is None and settings.starts is None and settings.safeguard
-        if default and not stop.due and search.is_unacceptable:
+        default = settings.start is None and settings.starts is None
+        # That constraints contradict each other is said of the problem, wherever the caller begins.
+        poor = search.says_infeasible or (default and search.is_unacceptable)
+        if settings.safeguard and not stop.due and poor:
             search.widen()
         if problem.risk > 0 and settings.safeguard and not stop.due:
             search.retry_without_risk()

@@ -12,7 +12,8 @@ With constraints, whatever comes first is followed by the interior point, which 
     the same, after such a descent.
 
 Where none of these converges, the plan that misses the constraints least is the answer. It is INFEASIBLE if two starts
-came to plans about which no change lessens what is missed.
+came to plans whose violation is stationary, and of the same size. A search tells its runs what the others found, and
+tries further starts before it says so.
 
 Problems with noise and constraints, those of an MJCF, and `finish=None` have the augmented Lagrangian alone.
 """
@@ -36,7 +37,7 @@ from lqrsim.solvers.interior_point import INTERIOR, Found, InteriorPoint, Measur
 from lqrsim.solvers.restoration import Restored, restore
 
 FAR = 100.0  # times what may be missed: then the price is too low, or there is no way to keep all
-STARTS, SURE = 2, 4  # from which what is missed has to be stationary, to be called infeasible; and not to try others
+STARTS, ALIKE = 2, 0.05  # that have to come to the least stationary violation, to within this share, for INFEASIBLE
 AUGMENTED = 100  # iterations of the augmented Lagrangian
 OPENING, GUIDED = 10, 60  # iterations of smoothing at most before constraints come in; and with an ObstacleCost
 MOST, RESTORED = 300, 150  # of the interior point from one plan; and of a descent at one price
@@ -56,10 +57,12 @@ class Known:
 
     Attributes:
       evidence: plans whose violation is stationary. from_start: whether the start itself was tried.
+      rows: (R,) the sizes of rows by which violations are measured.
     """
 
     evidence: list[tuple[Evidence, RunResult]] = field(default_factory=list)
     from_start: bool = False
+    rows: Array | None = None
 
 
 def finish(run: SolveRun, known: Known) -> RunResult:
@@ -247,6 +250,9 @@ class Ladder:
             return budget.stop.due or slow == PATIENCE
 
         sizes = self._stages.sizes(plan)
+        if self._known.rows is None:
+            self._known.rows = sizes.rows
+        sizes = sizes._replace(rows=self._known.rows)
         if left < 1 or budget.stop.due:
             return None
         try:
@@ -432,15 +438,16 @@ class Ladder:
             lagrangian.evaluate(best.states, best.controls)
             status = Status.STALLED if self._budget.left > 1 else Status.MAX_ITERATIONS
             detail = lagrangian.worst()
-            if len(self._known.evidence) >= STARTS and best.violation > self._allowed:
-                least, best = min(self._known.evidence, key=lambda pair: pair[0].missed)
+            evidence = sorted(self._known.evidence, key=lambda pair: pair[0].missed)
+            alike = [one for one in evidence if one[0].missed <= (1 + ALIKE) * evidence[0][0].missed]
+            if len(alike) >= STARTS and best.violation > self._allowed:
+                least, best = alike[0]
                 lagrangian.evaluate(best.states, best.controls)
                 detail = lagrangian.worst()
                 status = Status.INFEASIBLE
-                detail += f"; against it stand {least.against}" if least.against else ""
-            status = Status.TIME_LIMIT if stop.due else status
-            sure = status is Status.INFEASIBLE and len(self._known.evidence) >= SURE
-            best = replace(best, status=status, detail=detail, final=sure)
+                beside = least.beside(detail)
+                detail += f"; against it stand {beside}" if beside else ""
+            best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
         return run.certified(best)
 
 

@@ -25,9 +25,8 @@ from lqrsim.errors import (
 )
 from lqrsim.problem.noise import Noise
 from lqrsim.results.funnel import Funnel, flat
-from lqrsim.results.goal import Target
+from lqrsim.results.goal import Target, endings
 from lqrsim.results.solution import Solution
-from lqrsim.results.trial_outcome import endings
 from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import seeded
 from lqrsim.simulation.plant import Plant

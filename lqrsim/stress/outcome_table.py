@@ -7,8 +7,8 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError, check_kind, check_shape, excerpt, numbers_of, shaped
 from lqrsim.problem.problem import Problem
+from lqrsim.results.goal import OUTCOMES as OUTCOMES
 from lqrsim.results.rollout import Rollout
-from lqrsim.results.trial_outcome import OUTCOMES as OUTCOMES
 from lqrsim.solvers import compiled
 
 

@@ -10,7 +10,7 @@ from lqrsim.errors import Array, InputError, check_function, check_kind
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.verify.verdict import Criterion
-from lqrsim.view.recorded_model import model_of, place_in, robot_body
+from lqrsim.view.recorded_trial import model_of, place_in, robot_body
 
 Progress = Callable[[int, int], object]
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from lqrsim.errors import Array, InputError
 from lqrsim.view.cameras import Camera, measuring_of
-from lqrsim.view.marker import RIM
+from lqrsim.view.decorative_geoms import RIM
 
 FEWEST_PIXELS = 20  # pixels of what is tracked; the middle of fewer is not known well enough
 LEAST_SHARE = 0.5  # of the mark that must be seen; the rest may be outside of the picture

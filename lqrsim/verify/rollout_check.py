@@ -15,7 +15,7 @@ from lqrsim.verify.ground_truth import Progress
 from lqrsim.verify.verdict import Positions, Verification, compare
 from lqrsim.view import cameras, gl
 from lqrsim.view.cameras import Camera
-from lqrsim.view.recorded_model import place_in, robot_body
+from lqrsim.view.recorded_trial import place_in, robot_body
 
 SIZE = (640, 480)
 POSITION_BOUND = 1 / 60  # the worst error that is allowed, in radii of the robot: 5 and 2.8 mm for the packaged ones

@@ -10,9 +10,9 @@ from matplotlib.collections import PolyCollection
 from lqrsim.errors import check_kind, check_number
 from lqrsim.results.funnel import Funnel
 from lqrsim.scenes.world import World
-from lqrsim.view import obstacle_plots, prediction_plots, style
+from lqrsim.view import figure_parts, style
 from lqrsim.view.ellipsoids import SIGMAS, Ellipsoids
-from lqrsim.view.style import PLAN, RUNS
+from lqrsim.view.style import RUNS
 
 FACE, EDGE, CERTIFIED = "#cfe3f5", "#5f97c9", RUNS[0]
 
@@ -60,20 +60,16 @@ def _shadow(
     """The shadow, the plan and the obstacles, as seen along the axis that is not of the plane."""
     space = funnel.state_coordinates
     plan = funnel.plan.states[:, list(space.position)]
+    figure_parts.draw_obstacles(axes, space, world, plan, radius, plane)
     if len(space.position) == 2:
-        flat = world.seen_by(space.plane, space.offset)
-        corners = obstacle_plots.bounds(plan, flat, 1.5 * radius)
-        obstacle_plots.draw_in_plane(axes, flat, *corners, radius, plane=space.plane)
         axes.set_title("funnel (pale grey: within a radius)")
     else:
-        corners = obstacle_plots.bounds(plan, world, 1.5 * radius)
-        obstacle_plots.draw_projected(axes, world, *corners, *plane)
         axes.set_title(f"funnel, from {'above' if plane == (0, 1) else 'the side'}")
     onto = np.eye(len(space.position))[list(plane)]
     every = Ellipsoids(plan, covariances / SIGMAS**2).seen_in(onto)  # whose outlines are then of the level
     last = int(funnel.knots[-1]) + 1
     whole = Ellipsoids(every.centres[:last], every.covariances[:last])
-    prediction_plots.draw_tube(axes, whole, "funnel, interpolated", face=FACE, edge=EDGE)
+    figure_parts.draw_tube(axes, whole, "funnel, interpolated", face=FACE, edge=EDGE)
     held = funnel.knots[funnel.levels > 0]
     outlines = every.outlines()[held]
     axes.add_collection(
@@ -81,10 +77,7 @@ def _shadow(
             list(outlines), facecolors="none", edgecolors=CERTIFIED, linewidths=1.6, zorder=2.8, label="certified"
         )
     )
-    path = plan[:, list(plane)]
-    axes.plot(*path.T, "--", color=PLAN, linewidth=0.9, zorder=3, label="planned")
-    axes.plot(*path[0], "o", color=PLAN, markersize=6, zorder=3, label="start")
-    axes.plot(*path[-1], "*", color=PLAN, markersize=10, zorder=3, label="end of the plan")
+    figure_parts.draw_plan(axes, plan[:, list(plane)])
 
 
 def _levels(axes: Axes, funnel: Funnel) -> None:

@@ -1,19 +1,20 @@
 """The whole picture: a renderer for each run, side by side, with captions; and how well it is drawn."""
 
 import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from lqrsim.errors import InputError, check_count, check_items, check_kind, check_name, check_text, excerpt
+from lqrsim.errors import Array, InputError, check_count, check_items, check_kind, check_name, check_text, excerpt
 from lqrsim.results.funnel import Funnel
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.view import gl, marker
+from lqrsim.view import gl
 from lqrsim.view.camera_views import CameraView, camera_view, leaves_room_for_captions
 from lqrsim.view.captions import Caption, Legend
+from lqrsim.view.decorative_geoms import mark_radius
 from lqrsim.view.layout import Box, side_by_side, split_into_panes
 from lqrsim.view.options import ALL_OVERLAYS, OVERLAYS, Overlay, Quality
 from lqrsim.view.overlays import Overlays, common_scale
@@ -179,7 +180,7 @@ class Picture:
     @property
     def markers(self) -> tuple[float, ...]:
         """Radii in metres of the marks that the runs' robots wear in calibrated panes."""
-        return tuple(marker.radius(run) for run in self.runs)
+        return tuple(mark_radius(run) for run in self.runs)
 
     def draw(self, time: float, *, fade: float = 1.0, earlier: Iterable[float] = ()) -> Pixels:
         """The picture (height, width, 3) at `time`, with the robot also where it was earlier.
@@ -202,6 +203,44 @@ class Picture:
         if self.legend is not None:
             self.legend.draw(image)
         return image
+
+
+class LivePicture:
+    """Draws one trial, with its plan.
+
+    Args:
+      camera, size: as in `render`, but "chase", which needs to know where the robot will go.
+
+    Raises:
+      InputError: a size or a text is wrong, or that camera.
+    """
+
+    def __init__(self, camera: str, size: tuple[int, int]) -> None:
+        if camera == "chase":
+            raise InputError("camera: got 'chase', want one that does not look ahead, such as 'overview' or 'top'")
+        self._options = PictureOptions(camera=camera, overlays=("plan",), quality="draft", size=size)
+        self._stack = contextlib.ExitStack()
+        self._picture: Picture | None = None
+
+    def draw(self, so_far: Callable[[], Rollout], frame: Array, time: float) -> Pixels:
+        """The picture (height, width, 3) with MuJoCo's qpos at `frame` (nq,).
+
+        Args:
+          so_far: the run that it is of, asked for when the picture is opened.
+
+        Raises:
+          InputError: there is no such camera, or no OpenGL.
+        """
+        if self._picture is None:
+            self._picture = self._stack.enter_context(open_picture(so_far(), self._options))
+        for part in self._picture.parts:
+            part.recorded.frame_times, part.recorded.frames = np.array([time]), frame[None]
+        return self._picture.draw(time)
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        self._picture = None
+        self._stack.close()
 
 
 def _checked_size(size: Any) -> tuple[int, int]:

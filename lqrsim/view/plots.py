@@ -16,7 +16,7 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenes.world import World
-from lqrsim.view import obstacle_plots, prediction_plots, style
+from lqrsim.view import figure_parts, style
 from lqrsim.view.ellipsoids import Ellipsoids
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 
@@ -72,7 +72,7 @@ def plot_run(
             (_path_of_balls if of_balls else _path_in_plane)(path_axes, solution, rollouts, world, trial)
         if chances:
             below = figure.add_gridspec(1, 1, left=0.085, right=0.455, bottom=low, top=low + 0.1)[0]
-            prediction_plots.draw_chances(figure.add_subplot(below), chances)
+            figure_parts.draw_chances(figure.add_subplot(below), chances)
         _tracking_error(figure.add_subplot(right[0]), rollouts, trial)
         rows = right[1].subgridspec(strips, 1, hspace=0.18)
         _controls([figure.add_subplot(row) for row in rows], solution.trajectory, rollouts, trial)
@@ -128,18 +128,12 @@ def _tubes(rollouts: Mapping[str, Rollout]) -> Iterator[tuple[Ellipsoids, dict[s
 def _path_in_plane(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
     paths, radius = _paths(solution, rollouts, trial), next(iter(rollouts.values())).radius
     places = np.vstack([points for *_, points in paths])
-    space = solution.policy.state_coordinates
-    flat = world.seen_by(space.plane, space.offset)
-    obstacle_plots.draw_in_plane(
-        axes, flat, *obstacle_plots.bounds(places, flat, 1.5 * radius), radius, plane=space.plane
-    )
+    figure_parts.draw_obstacles(axes, solution.policy.state_coordinates, world, places, radius, (0, 1))
     for ellipsoids, looks in _tubes(rollouts):
-        prediction_plots.draw_tube(axes, ellipsoids, **looks)
+        figure_parts.draw_tube(axes, ellipsoids, **looks)
     for name, color, line, points in paths:
         axes.plot(*points.T, line, color=color, label=name)
-    plan = paths[-1][-1]
-    axes.plot(*plan[0], "o", color=PLAN, markersize=6, label="start")
-    axes.plot(*plan[-1], "*", color=PLAN, markersize=10, label="end of the plan")
+    figure_parts.mark_ends(axes, paths[-1][-1])
     axes.set_title("path (pale: closer than the robot's radius)")
 
 
@@ -151,8 +145,8 @@ def _path_of_balls(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
     low, high = np.nanmin(driven, axis=(0, 1)), np.nanmax(driven, axis=(0, 1))
     across, up = sorted(np.argsort(high - low, kind="stable")[1:].tolist())
     margin = float(radii.max()) + 0.1 * float((high - low).max())
-    corners = obstacle_plots.bounds(driven[np.isfinite(driven).all(axis=(1, 2))].reshape(-1, 3), world, margin)
-    obstacle_plots.draw_projected(axes, world, *corners, across, up)
+    corners = figure_parts.bounds(driven[np.isfinite(driven).all(axis=(1, 2))].reshape(-1, 3), world, margin)
+    figure_parts.draw_projected(axes, world, *corners, across, up)
     alive = np.flatnonzero(np.isfinite(driven).all(axis=(1, 2)))
     for number, knot in enumerate(np.unique(np.linspace(0, len(alive) - 1, MOMENTS).astype(int))):
         paler, (red, green, blue) = 0.75 * (1 - number / (MOMENTS - 1)), to_rgb(RUNS[0])
@@ -162,24 +156,18 @@ def _path_of_balls(axes: Axes, solution: Solution, rollouts: Mapping[str, Rollou
     paths = _paths(solution, rollouts, trial)
     for name, color, line, points in paths:
         axes.plot(*points[:, [across, up]].T, line, color=color, label=name, zorder=3)
-    plan = paths[-1][-1][:, [across, up]]
-    axes.plot(*plan[0], "o", color=PLAN, markersize=6, label="start", zorder=3)
-    axes.plot(*plan[-1], "*", color=PLAN, markersize=10, label="end of the plan", zorder=3)
+    figure_parts.mark_ends(axes, paths[-1][-1][:, [across, up]])
     axes.set_title("balls, paler the earlier, and the path of the last")
 
 
 def _path_in_space(axes: Axes3D, solution: Solution, rollouts: Mapping[str, Rollout], world: World, trial: int) -> None:
     paths = _paths(solution, rollouts, trial)
-    obstacle_plots.draw_in_space(
-        axes, world, *obstacle_plots.bounds(np.vstack([points for *_, points in paths]), world)
-    )
+    figure_parts.draw_in_space(axes, world, *figure_parts.bounds(np.vstack([points for *_, points in paths]), world))
     for ellipsoids, looks in _tubes(rollouts):
-        prediction_plots.draw_tube_in_space(axes, ellipsoids, **looks)
+        figure_parts.draw_tube_in_space(axes, ellipsoids, **looks)
     for name, color, line, points in paths:
         axes.plot(*points.T, line, color=color, label=name)
-    plan = paths[-1][-1]
-    axes.plot(*plan[:1].T, "o", color=PLAN, markersize=6, label="start")
-    axes.plot(*plan[-1:].T, "*", color=PLAN, markersize=10, label="end of the plan")
+    figure_parts.mark_ends(axes, paths[-1][-1])
     axes.set_title("path")
 
 

@@ -13,7 +13,7 @@ from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.scenes.world import World
-from lqrsim.view import obstacle_plots, prediction_plots, style
+from lqrsim.view import figure_parts, style
 from lqrsim.view.ellipsoids import OF_COST, Ellipsoids
 from lqrsim.view.style import PLAN, RUNS
 
@@ -88,7 +88,7 @@ def draw(figure: Figure, solution: Solution, world: World, radius: float, tube: 
     _cost(figure.add_subplot(rows[0]), solution)
     if tube is not None and chances:
         axes = figure.add_subplot(rows[1])
-        prediction_plots.draw_chances(axes, [(tube.plan.times, tube.step_chance, TUBE["edge"])])
+        figure_parts.draw_chances(axes, [(tube.plan.times, tube.step_chance, TUBE["edge"])])
         axes.set_title(f"predicted chance of collision ({tube.collision_chance:.2g} in all)")
     of_gains = rows[len(ratios) - 1].subgridspec(len(strips), 1, hspace=0.18)
     _gains([figure.add_subplot(row) for row in of_gains], strips, policy, solution.trajectory.times)
@@ -100,27 +100,19 @@ def _tube(
     """The tube, the plan and the obstacles, as seen along the axis that is not of the plane."""
     position = solution.policy.state_coordinates.position
     plan = solution.trajectory.states[:, list(position)]
+    figure_parts.draw_obstacles(axes, solution.policy.state_coordinates, world, plan, radius, plane)
     if len(position) == 2:
-        space = solution.policy.state_coordinates
-        flat = world.seen_by(space.plane, space.offset)
-        obstacle_plots.draw_in_plane(
-            axes, flat, *obstacle_plots.bounds(plan, flat, 1.5 * radius), radius, plane=space.plane
-        )
         axes.set_title("tube (grey: closer than the robot's radius)")
     else:
-        obstacle_plots.draw_projected(axes, world, *obstacle_plots.bounds(plan, world, 1.5 * radius), *plane)
         axes.set_title(f"tube, from {'above' if plane == (0, 1) else 'the side'}")
     onto = np.eye(len(position))[list(plane)]
     if tube is not None:
         ellipsoids = Ellipsoids.predicted(plan, tube.position_covariance)
-        prediction_plots.draw_tube(axes, ellipsoids.seen_in(onto), ellipsoids.label, **TUBE)
+        figure_parts.draw_tube(axes, ellipsoids.seen_in(onto), ellipsoids.label, **TUBE)
     elif solution.cost_to_come is not None:
         ellipses = Ellipsoids.of_cost(solution, position).seen_in(onto)
-        prediction_plots.draw_tube(axes, ellipses, OF_COST, **COST_TUBE)
-    path = plan[:, list(plane)]
-    axes.plot(*path.T, "--", color=PLAN, linewidth=1.4 if tube is None else 0.9, zorder=3, label="planned")
-    axes.plot(*path[0], "o", color=PLAN, markersize=6, zorder=3, label="start")
-    axes.plot(*path[-1], "*", color=PLAN, markersize=10, zorder=3, label="end of the plan")
+        figure_parts.draw_tube(axes, ellipses, OF_COST, **COST_TUBE)
+    figure_parts.draw_plan(axes, plan[:, list(plane)], linewidth=1.4 if tube is None else 0.9)
 
 
 def _states(strips: list[Axes], units: list[str], solution: Solution) -> None:
@@ -160,15 +152,8 @@ def _gains(strips: list[Axes], units: list[tuple[str, str]], policy: AffinePolic
             if unit == answer:
                 norm = strength(policy, number, deviation)
                 line, colour = LINES[number % len(LINES)], RUNS[number % len(RUNS)]
-                axes.stairs(
-                    norm,
-                    times,
-                    baseline=None,
-                    color=colour,
-                    linestyle=line,
-                    linewidth=1.2,
-                    label=name.replace("_", " "),
-                )
+                looks = {"baseline": None, "color": colour, "linestyle": line, "linewidth": 1.2}
+                axes.stairs(norm, times, label=name.replace("_", " "), **looks)
         axes.set_ylabel(f"{answer or '1'}\nper {deviation or '1'}")
         axes.set_ylim(bottom=0)
         axes.margins(x=0.01)

@@ -1,8 +1,10 @@
 """Videos and stills of executed runs, drawn offscreen by MuJoCo from a `Rollout` alone."""
 
 import os
+from base64 import b64encode
 from collections.abc import Callable, Sequence
 from fractions import Fraction
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,6 @@ from lqrsim.results.solution import Solution
 from lqrsim.view import video_metadata
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 from lqrsim.view.picture import QUALITIES, Picture, PictureOptions, open_picture
-from lqrsim.view.picture_file import PictureFile
 from lqrsim.view.scene_renderer import MOST_ROBOTS
 from lqrsim.view.video import encoder, gif
 
@@ -24,6 +25,23 @@ FADE_SECONDS = 0.25
 MOST_FRAMES = 1_000_000  # frames of a video
 SMALLEST_GIF = 480, 270  # pixels of a GIF that nobody gave a size: what is written on it can be read
 PALETTE_SAMPLES = 12  # moments that the palette of a GIF is made of
+LARGEST_SHOWN = 30_000_000  # bytes of a file that is put into a notebook; larger ones make it slow
+MEDIA_TYPES = {".mp4": "video/mp4", ".gif": "image/gif", ".png": "image/png"}
+
+
+class PictureFile(type(Path())):  # a Path of this system: before Python 3.12 a subclass of Path itself does not work
+    """A Path that shows the file's content in a notebook."""
+
+    def _repr_html_(self) -> str | None:
+        kind = MEDIA_TYPES.get(self.suffix.lower())
+        if kind is None or not self.is_file():
+            return None
+        if (size := self.stat().st_size) > LARGEST_SHOWN:
+            return f"<div>{escape(str(self))}: {size / 1e6:.0f} MB, too large to show here</div>"
+        data = f"data:{kind};base64,{b64encode(self.read_bytes()).decode()}"
+        if kind.startswith("video"):
+            return f'<video controls="" loop="" style="max-width:100%" src="{data}"></video>'
+        return f'<img alt="{escape(self.name)}" style="max-width:100%" src="{data}"/>'
 
 
 def render(

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from mujoco.rendering.classic import gl_context
 
 from lqrsim.errors import Array
-from lqrsim.view import marker
 from lqrsim.view.camera_views import CameraView
+from lqrsim.view.decorative_geoms import draw_mark, mark_radius
 from lqrsim.view.layout import Box
 from lqrsim.view.overlays import Overlays
 from lqrsim.view.recorded_trial import RecordedTrial
@@ -96,8 +96,8 @@ class SceneRenderer:
                 common = scene.ngeom
                 self.overlays.draw_force(scene, data, time)
                 if view.camera is not None:
-                    radius = marker.radius(self.recorded.rollout)
-                    marker.draw(scene, view.camera, self.recorded.place_in(data), radius)
+                    radius = mark_radius(self.recorded.rollout)
+                    draw_mark(scene, view.camera, self.recorded.place_in(data), radius)
                 mujoco.mjr_render(where, scene, self.context)
                 scene.ngeom = common
         whole = mujoco.MjrRect(0, 0, self.pixels.shape[1], self.pixels.shape[0])

@@ -46,7 +46,7 @@ class VideoMetadata:
 
     Attributes:
       runs: digests of the rollouts. markers: radius in metres of the ball that each one's robot wears in panes with a
-        camera; see marker.py.
+        camera; see `decorative_geoms.py`.
       rate: frames a second. speed: seconds of the run in a second of the video. frames: how many there are.
     """
 

@@ -20,9 +20,8 @@ from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
 from lqrsim.view.browser import Browser
-from lqrsim.view.movable_goal import MovableGoal, model_with_goal
-from lqrsim.view.recorded_model import model_of
-from lqrsim.view.viewed_replanner import LONGEST_RUN, ViewedReplanner, lengthened
+from lqrsim.view.recorded_trial import model_of
+from lqrsim.view.viewed_replanner import LONGEST_RUN, MovableGoal, ViewedReplanner, lengthened, model_with_goal
 from lqrsim.view.viewer_base import PUSHES, RestartRequested, Viewer, ViewerClosed
 
 KEYS = """Arrow keys and Page Up/Down push the robot, seen from the camera. Ctrl and the right mouse button drag it.

@@ -11,11 +11,11 @@ import numpy as np
 from mujoco import mjtGeom as Geom
 
 from lqrsim.errors import Array, InputError
-from lqrsim.results.ball_record import BallRecord
 from lqrsim.results.coordinates import Coordinates
+from lqrsim.results.rollout import BallRecord
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.view.decorative_geoms import PLAN_RGB, decorate
-from lqrsim.view.recorded_model import floor_below, place_of, robot_body
+from lqrsim.view.recorded_trial import floor_below, place_of, robot_body
 
 PLANNED_RGBA = (*PLAN_RGB, 0.25)
 TRACE_RGBA = (0.05, 0.35, 0.62, 1.0)
@@ -49,7 +49,7 @@ class Viewer(abc.ABC):
     Args:
       model: what moves. plan: what it should do. space: of the plan's states. body: the robot's in the model.
       radius: of the robot, in metres. balls: of one without a position, where they should be.
-      goal: name of the body that is the goal, a mocap body, if it can be moved; see `movable_goal.py`.
+      goal: name of the body that is the goal, a mocap body, if it can be moved; see `MovableGoal`.
       push: what a key adds to its velocity, in m/s.
       speed: of the time shown, 1 is real. seconds: after which the viewer closes; never by default.
 

@@ -1,4 +1,4 @@
-"""Short functions: what the kernels' language has, and what is not of it."""
+"""Short functions: what the kernels' language contains, and what it refuses."""
 
 import re
 
@@ -681,7 +681,7 @@ def f(a:
 
 
 def _blocks(text: str) -> dict[str, tuple[str, str]]:
-    """By their names what is said of each, and its lines."""
+    """Each block's message and lines, by its name."""
     parted = (one.partition("\n") for one in re.split("(?m)^## ", text)[1:])
     named = ((*head.split(": ", 1), body.rstrip()) for head, _, body in parted)
     return {name: (said, body) for name, said, body in named}

@@ -1,16 +1,52 @@
-"""Obstacles in figures: in the plane as the planner sees them, in space as surfaces."""
+"""What figures have in common: obstacles, a plan, predicted tubes, and chances of collision."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgba
 from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.spatial import ConvexHull
 
 from lqrsim.codegen import distances
 from lqrsim.errors import Array
+from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.world import Obstacle, World
-from lqrsim.view.style import MARGIN, SOLID
+from lqrsim.view.ellipsoids import Ellipsoids
+from lqrsim.view.style import MARGIN, PLAN, SOLID
 
 EDGE = "#5b6470"
+OUTLINES = 24  # ellipses whose outlines are drawn
+BEADS = 0.2  # mean half axis, relative to the distance between neighbours, below which outlines look like beads
+LEAST = 1e-6  # smallest chance that is drawn
+
+
+def draw_obstacles(
+    axes: Axes, space: Coordinates, world: World, places: Array, radius: float, plane: tuple[int, int]
+) -> None:
+    """Draw the obstacles around places (k, 2 or 3) of a robot of that radius.
+
+    A planar robot has its own plane. One in space is seen along the axis that is not in `plane`, two of its axes.
+    """
+    if len(space.position) == 2:
+        flat = world.seen_by(space.plane, space.offset)
+        draw_in_plane(axes, flat, *bounds(places, flat, 1.5 * radius), radius, plane=space.plane)
+    else:
+        draw_projected(axes, world, *bounds(places, world, 1.5 * radius), *plane)
+
+
+def draw_plan(axes: Axes, path: Array, *, linewidth: float = 0.9) -> None:
+    """Draw a planned path (T+1, 2) with its start and its end."""
+    axes.plot(*path.T, "--", color=PLAN, linewidth=linewidth, zorder=3, label="planned")
+    mark_ends(axes, path)
+
+
+def mark_ends(axes: Axes, path: Array) -> None:
+    """Mark the start and the end of a planned path (T+1, 2 or 3)."""
+    axes.plot(*path[:1].T, "o", color=PLAN, markersize=6, zorder=3, label="start")
+    axes.plot(*path[-1:].T, "*", color=PLAN, markersize=10, zorder=3, label="end of the plan")
 
 
 def bounds(places: Array, world: World, margin: float = 0.0) -> tuple[Array, Array]:
@@ -76,7 +112,7 @@ def surface(obstacle: Obstacle, low: Array, high: Array) -> Array:
         up = np.linspace(0, np.pi, 13)
         local = np.broadcast_arrays(np.cos(around) * np.sin(up), np.sin(around) * np.sin(up), np.cos(up))
         local = radius * np.stack(local)
-    elif obstacle.kind == "box":
+    elif obstacle.kind not in ("capsule", "cylinder"):  # a box, or the one that it is in
         ring = obstacle.size[:2, None] * np.array([[-1, -1, 1, 1, -1], [-1, 1, 1, -1, -1]])
         ends = obstacle.size[2] * np.array([-1, 1])
         local = np.stack(np.broadcast_arrays(ring[0][:, None], ring[1][:, None], ends))
@@ -87,3 +123,43 @@ def surface(obstacle: Obstacle, low: Array, high: Array) -> Array:
         ends = np.clip([spans[0].max(), spans[1].min()], -half, half)
         local = np.stack(np.broadcast_arrays(radius * np.cos(around), radius * np.sin(around), ends))
     return np.tensordot(obstacle.rotation, local, axes=1) + obstacle.position[:, None, None]
+
+
+def draw_tube(axes: Axes, ellipses: Ellipsoids, label: str, *, face: str, edge: str) -> None:
+    """Ellipses as one area, and the outlines of some of them, unless these would be beads on a string."""
+    every = ellipses.outlines()
+    axes.add_collection(PolyCollection(list(every), facecolors=face, edgecolors="none", zorder=1.5, label=label))
+    chosen = np.unique(np.linspace(0, len(every) - 1, OUTLINES).astype(int)) if len(every) else np.arange(0)
+    apart = np.linalg.norm(np.diff(ellipses.centres[chosen], axis=0), axis=1)
+    if len(chosen) < 2 or ellipses.axes()[0][chosen].mean() > BEADS * apart.mean():
+        some = PolyCollection(list(every[chosen]), facecolors="none", edgecolors=edge, linewidths=0.6, zorder=2.5)
+        axes.add_collection(some)
+
+
+def draw_tube_in_space(axes: Axes3D, ellipsoids: Ellipsoids, label: str, *, face: str, edge: str) -> None:
+    """The shadows that ellipsoids cast along the line of sight, each at its own place, of some that overlap."""
+    up, around = np.radians(axes.elev), np.radians(axes.azim)
+    right = np.array([-np.sin(around), np.cos(around), 0.0])
+    forward = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+    onto = np.stack([right, np.cross(forward, right)])
+    chosen = ellipsoids.spread(len(ellipsoids.centres))
+    flat = ellipsoids.seen_in(onto)
+    around_centres = flat.outlines()[chosen] - flat.centres[chosen, None, :]
+    discs = ellipsoids.centres[chosen, None, :] + around_centres @ onto
+    axes.add_collection3d(Poly3DCollection(list(discs), facecolors=to_rgba(edge, 0.15), edgecolors="none"))
+    axes.plot([], [], [], color=face, linewidth=7, label=label)  # as the legend shows it
+
+
+def draw_chances(axes: Axes, curves: Sequence[tuple[Array, Array, str]]) -> None:
+    """The chance of being in collision at each knot, of several: times (T+1,), chances (T+1,) and a colour each."""
+    most = LEAST
+    for times, chances, colour in curves:
+        axes.plot(times, np.where(chances > 0, chances, np.nan), color=colour)
+        most = max(most, float(chances.max()))
+    axes.set_yscale("log")
+    axes.set_ylim(LEAST, 1.0 if most > 0.1 else 10 * most)
+    axes.set(xlabel="time (s)", ylabel="chance", title="predicted chance of being in collision")
+    axes.margins(x=0.01)
+    axes.set_xlim(min(times[0] for times, *_ in curves), max(times[-1] for times, *_ in curves))
+    if most <= LEAST:
+        axes.text(0.5, 0.5, f"below {LEAST:g} throughout", transform=axes.transAxes, ha="center", va="center")

@@ -1,0 +1,22 @@
+"""What distances that a model brings leave to spare beyond margins. The kernels' subset.
+
+`data` has what the distances read, and from AT on for how many steps there are margins, of which the last hold from
+there on, how many at a step, of each row the number of its obstacle, and the margins, a step after the other.
+"""
+
+from lqrsim.kernels.declarations import N
+
+AT = 0
+ROWS = 1  # how many there are
+
+
+def value(at, u, t, row, data):
+    """What the row's distance leaves to spare, of all distances."""
+    steps, each = int(data[AT]), int(data[AT + 1])
+    return at[row] - data[AT + 2 + ROWS + min(t, steps - 1) * each + int(data[AT + 2 + row]) % each]
+
+
+def slope(at, moves, t, row, data, gradient):
+    """Add its gradient, of all distances and their derivatives in the states."""
+    for i in range(N):
+        gradient[i] += moves[row, i]

@@ -1,0 +1,47 @@
+"""The cost of obstacles at distances that a model brings. The kernels' subset.
+
+It is `weight * sum of exp(-sharpness * distance)` where the distances are less than the largest of interest, D, and 0
+from there on; so that neither the cost nor its slope jumps, the tangent at D is taken off. `data` has what the
+distances read, and from AT on the sharpness, the weight and D. `places` and `places_jacobian` are the distances here.
+"""
+
+from lqrsim.kernels.declarations import N, places, places_jacobian, stack
+from lqrsim.kernels.exponential import exponential
+from lqrsim.kernels.linear_algebra import clear
+
+AT = 0
+ROWS = 1  # how many there are
+MOVED = 1  # states that the distances depend on: the first ones
+
+
+def value(x, u, t, data):
+    """The cost; none at the first step, whose state is given."""
+    total = 0.0
+    if t > 0:
+        distances = stack(ROWS)
+        sharpness, least = data[AT], exponential(-data[AT] * data[AT + 2])
+        places(x, data, distances)
+        for row in range(ROWS):
+            beyond = data[AT + 2] - distances[row]
+            total += exponential(-sharpness * distances[row]) - least * (1 + sharpness * beyond)
+    return data[AT + 1] * total
+
+
+def derivatives(x, u, t, data, hessian, gradient):
+    """Add the Hessian and the gradient, and return the cost. The distances' own curvature is left out."""
+    total = 0.0
+    if t > 0:
+        distances, moves = stack(ROWS), stack(ROWS, N)
+        sharpness, weight, least = data[AT], data[AT + 1], exponential(-data[AT] * data[AT + 2])
+        clear(moves, ROWS, N)
+        places_jacobian(x, data, distances, moves)
+        for row in range(ROWS):
+            beyond, cost = data[AT + 2] - distances[row], exponential(-sharpness * distances[row])
+            total += cost - least * (1 + sharpness * beyond)
+            if beyond > 0:
+                force, stiffness = weight * sharpness * (cost - least), weight * sharpness * sharpness * cost
+                for i in range(MOVED):
+                    gradient[i] -= force * moves[row, i]
+                    for j in range(MOVED):
+                        hessian[i, j] += stiffness * moves[row, i] * moves[row, j]
+    return data[AT + 1] * total

@@ -1,0 +1,183 @@
+"""Distances between the geoms of a robot and those of obstacles, by MuJoCo's `mj_geomDistance`. The kernels' subset.
+
+`data` has the address of what `mjcf_dynamics.py` calls p, how many rows and how many pairs of geoms there are, the
+largest distance of interest, and of each pair: the row that it is for, the robot's geom and its body, the obstacle's
+geom, how far both reach from their middles together, and whether the obstacle is a plane. A row is the least distance
+of its pairs. Pairs whose bounding spheres are farther apart than that are not looked at.
+"""
+
+from math import sqrt
+
+from lqrsim.kernels.declarations import N, at, call, call_for_value, int32, outline, stack, store
+from lqrsim.kernels.mjcf_dynamics import (
+    BALL,
+    COMPOS,
+    DATA,
+    DISTANCE,
+    DISTANCE_MODEL,
+    FLAGS,
+    FREE,
+    GEOM_XMAT,
+    GEOM_XPOS,
+    JAC,
+    JOINTS,
+    KINEMATICS,
+    MODEL,
+    NV,
+    QPOS,
+    SLOT,
+    SLOTS,
+    TABLE,
+    take_slot,
+    write_positions,
+)
+from lqrsim.kernels.rotation_ratios import cosine_ratio, cubic_ratio
+
+ROWS = 1  # how many there are
+LARGEST, PAIRS, PAIR = 3, 4, 6  # where they begin in data, and how many numbers each pair takes
+TOUCHING = 1e-12  # m; the segment between two geoms that touch has no direction
+
+
+def distances(x, data, out):
+    """Write the least distance of each row, in metres; at most the largest of interest."""
+    which, segments, nowhere = stack(ROWS), stack(ROWS, 6), stack(1)
+    find(x, nowhere, -1, data, 0, out, which, segments)
+
+
+def distances_jacobian(x, data, out, slopes):
+    """Write these and their derivatives in the states (any, N), which are zeros when they come."""
+    which, segments = stack(ROWS), stack(ROWS, 6)
+    find_with_slopes(x, data, 0, out, slopes, which, segments)
+
+
+def distances_of(count, states, each, displaced, moved, data, out, which, segments):
+    """Write the distances, row by row, at states (count, N).
+
+    If obstacles have moved, each of so many states has the same displaced, three numbers a row.
+    """
+    rows = int(data[1])
+    for i in range(count):
+        find_one(
+            states[i], displaced, 3 * rows * (i // each) if moved == 1 else -1, data, rows * i, out, which, segments
+        )
+
+
+def slopes_of(count, states, data, out, slopes, which, segments):
+    """Write the distances and their derivatives (any, N), which are zeros when they come, at states (count, N)."""
+    rows = int(data[1])
+    for i in range(count):
+        find_with_slopes(states[i], data, rows * i, out, slopes, which, segments)
+
+
+@outline
+def find_one(x, displaced, moved, data, first, out, which, segments):
+    """As `find`."""
+    find(x, displaced, moved, data, first, out, which, segments)
+
+
+def find(x, displaced, moved, data, first, out, which, segments):
+    """Write the least distance of each row to out from `first` on, its pair, or -1, and the segment between the two."""
+    p = at(data[0])
+    slot = take_slot(p)
+    one = at(p[SLOTS] + 8 * SLOT * slot)
+    write_positions(x, p, at(one[QPOS]))
+    call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
+    look(p, one, data, displaced, moved, first, out, which, segments)
+    store(p[FLAGS], slot, 0)
+
+
+def find_with_slopes(x, data, first, out, slopes, which, segments):
+    """The same, and the derivatives: the speed of the nearest point, against the direction to the obstacle's."""
+    p = at(data[0])
+    slot, nv = take_slot(p), int(p[NV])
+    one = at(p[SLOTS] + 8 * SLOT * slot)
+    moves, normal, nowhere = stack(3 * N), stack(3), stack(1)
+    write_positions(x, p, at(one[QPOS]))
+    call(p[KINEMATICS], at(p[MODEL]), at(one[DATA]))
+    call(p[COMPOS], at(p[MODEL]), at(one[DATA]))
+    look(p, one, data, nowhere, -1, first, out, which, segments)
+    for row in range(int(data[1])):
+        if which[row] >= 0:
+            pair = PAIRS + PAIR * int(which[row])
+            write_normal(one, int(data[pair + 1]), int(data[pair + 3]), out[first + row], segments[row], normal)
+            call(p[JAC], at(p[MODEL]), at(one[DATA]), moves, 0, segments[row], int32(int(data[pair + 2])))
+            for j in range(nv):
+                for i in range(3):
+                    slopes[first + row, j] -= normal[i] * moves[nv * i + j]
+            turn_to_states(x, p, slopes[first + row])
+    store(p[FLAGS], slot, 0)
+
+
+def look(p, one, data, displaced, moved, first, out, which, segments):
+    """As `find`, of an MjData that has its positions.
+
+    Where obstacles have moved, which is told by moved from 0 on, it is by displaced[moved + 3 row] and what follows.
+    """
+    middles, axes, segment = at(one[GEOM_XPOS]), at(one[GEOM_XMAT]), stack(6)
+    for row in range(int(data[1])):
+        out[first + row], which[row] = data[LARGEST], -1.0
+    for k in range(int(data[2])):
+        pair = PAIRS + PAIR * k
+        row, own, other = int(data[pair]), 3 * int(data[pair + 1]), 3 * int(data[pair + 3])
+        before_x, before_y, before_z = middles[other], middles[other + 1], middles[other + 2]
+        if moved >= 0:
+            for i in range(3):
+                middles[other + i] += displaced[moved + 3 * row + i]
+        x, y, z = middles[own] - middles[other], middles[own + 1] - middles[other + 1], middles[own + 2]
+        z -= middles[other + 2]
+        if data[pair + 5] == 1:
+            apart = axes[3 * other + 2] * x + axes[3 * other + 5] * y + axes[3 * other + 8] * z
+        else:
+            apart = sqrt(x * x + y * y + z * z)
+        least = out[first + row]
+        if not apart - data[pair + 4] >= least:
+            distance = call_for_value(
+                p[DISTANCE], at(p[DISTANCE_MODEL]), at(one[DATA]), int32(own // 3), int32(other // 3), least, segment
+            )
+            if not distance >= least:
+                out[first + row], which[row] = distance, float(k)
+                for i in range(6):
+                    segments[row, i] = segment[i]
+        middles[other], middles[other + 1], middles[other + 2] = before_x, before_y, before_z
+
+
+def write_normal(one, own, other, distance, segment, normal):
+    """Write the direction from the robot's nearest point to the obstacle's; if they are one, from middle to middle."""
+    length = 0.0
+    for i in range(3):
+        normal[i] = segment[3 + i] - segment[i]
+        length += normal[i] * normal[i]
+    sign = 1.0 if distance >= 0 else -1.0
+    if length < TOUCHING * TOUCHING:
+        middles = at(one[GEOM_XPOS])
+        sign, length = 1.0, 0.0
+        for i in range(3):
+            normal[i] = middles[3 * other + i] - middles[3 * own + i]
+            length += normal[i] * normal[i]
+    scale = sign / sqrt(length) if length > 0 else 0.0
+    for i in range(3):
+        normal[i] *= scale
+
+
+def turn_to_states(x, p, slope):
+    """Turn a derivative in angular velocities, in place, to one in the states' rotation vectors.
+
+    A rotation vector r that changes by dr turns the body by dr - cosine r x dr + cubic r x (r x dr), in its own axes.
+    """
+    once, twice = stack(3), stack(3)
+    for k in range(int(p[JOINTS])):
+        kind, d = int(p[TABLE + 3 * k]), int(p[TABLE + 3 * k + 2])
+        if kind <= BALL:
+            d = d + 3 if kind == FREE else d
+            square = x[d] * x[d] + x[d + 1] * x[d + 1] + x[d + 2] * x[d + 2]
+            cross(x, d, slope[d], slope[d + 1], slope[d + 2], once)
+            cross(x, d, once[0], once[1], once[2], twice)
+            for i in range(3):
+                slope[d + i] += cosine_ratio(square) * once[i] + cubic_ratio(square) * twice[i]
+
+
+def cross(x, d, a, b, c, out):
+    """Write x[d:d+3] x (a, b, c)."""
+    out[0] = x[d + 1] * c - x[d + 2] * b
+    out[1] = x[d + 2] * a - x[d] * c
+    out[2] = x[d] * b - x[d + 1] * a

@@ -1,0 +1,123 @@
+"""Robots whose distances to obstacles a simulator knows: what costs and constraints need of them."""
+
+import abc
+from dataclasses import dataclass
+
+import numpy.typing as npt
+
+from lqrsim.codegen.sources import Source
+from lqrsim.codegen.user_functions import UserFunction
+from lqrsim.errors import Array
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.scenes.scene import Scene
+from lqrsim.scenes.world import World
+
+
+@dataclass(frozen=True)
+class GeomDistances:
+    """Distances between parts of a robot and obstacles, made for one system: what gets compiled, and what it reads.
+
+    Attributes:
+      source: defines `distances(x, data, out)`, which writes one number a row, and `distances_jacobian(x, data, out,
+        slopes)`, which writes them and the derivatives in the states (rows, N) that are not zero, to zeros.
+      data: (any,) float64, which the source reads from the first on, after the addresses of its functions.
+      parts: what messages call the part of the robot that each row is of. obstacles: the number of the obstacle that
+        each row is to; -1 for the nearest of all.
+      moved: how many of the states the distances depend on, from the first on.
+      functions: what the source calls with `call`; their addresses come first in what it is given.
+    """
+
+    source: Source
+    data: Array
+    parts: tuple[str, ...]
+    obstacles: tuple[int, ...]
+    moved: int
+    functions: tuple[UserFunction, ...]
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers of the data that compiled code is given are the distances'."""
+        return len(self.functions) + len(self.data)
+
+    def filling(self, kernel: Source) -> Source:
+        """A kernel of costs or constraints, with the distances as what it calls places."""
+        return kernel.filled(places=(self.source, "distances"), places_jacobian=(self.source, "distances_jacobian"))
+
+
+class CollisionGeoms(abc.ABC):
+    """What collides of a robot, whose distances its simulator knows; `MjcfRobot.geoms` is it.
+
+    `ObstacleCost(world, geoms=...)` and `Clearance(world, geoms=...)` keep all of it clear.
+    """
+
+    @property
+    @abc.abstractmethod
+    def size(self) -> float:
+        """The radius of the largest geom's bounding sphere, in metres."""
+
+    @abc.abstractmethod
+    def bind(self, dynamics: Dynamics, world: World, reach: float) -> GeomDistances:
+        """Bind the distances to a system.
+
+        Args:
+          dynamics: of the robot. world: the obstacles. reach: in metres, the largest distance of interest.
+
+        Returns:
+          The GeomDistances.
+
+        Raises:
+          InputError: the dynamics are not the robot's, or an obstacle is not in its MJCF, or moves.
+        """
+
+    @abc.abstractmethod
+    def clearances(
+        self, dynamics: Dynamics, world: World, states: npt.ArrayLike, displaced: Array | None = None
+    ) -> Array:
+        """Signed distances to the obstacles.
+
+        Args:
+          dynamics: of the robot. world: the obstacles. states: (..., n). displaced: (K, O, 3), by how much obstacles
+            are elsewhere in each trial, in metres; states are then (K, ..., n).
+
+        Returns:
+          (..., O) in metres.
+
+        Raises:
+          InputError: as `bind`.
+        """
+
+    @abc.abstractmethod
+    def slopes(self, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> tuple[Array, Array]:
+        """Signed distances to the obstacles, and their derivatives in the states.
+
+        Args:
+          dynamics: of the robot. world: the obstacles. states: (K, n).
+
+        Returns:
+          (K, O) in metres and (K, O, n).
+
+        Raises:
+          InputError: as `bind`.
+        """
+
+    @abc.abstractmethod
+    def of_scene(self, scene: Scene) -> bool:
+        """Whether these are the geoms of that scene, with its obstacles.
+
+        Args:
+          scene: of a plant.
+
+        Returns:
+          Whether they are.
+        """
+
+    @abc.abstractmethod
+    def travel(self, before: Array, after: Array) -> Array:
+        """How far any point moves at most on a straight line between states.
+
+        Args:
+          before: (..., n). after: (..., n).
+
+        Returns:
+          (...), in metres.
+        """

@@ -1,0 +1,249 @@
+"""Checks of a record's fields by their annotations: said once, held when a record is made and when a file is read.
+
+    @dataclass(frozen=True)
+    class Trajectory:
+        states: Annotated[Array, "T+1 n"]
+        controls: Annotated[Array, "T m"]
+        dt: Annotated[float, Bounds(above=0.0)]
+
+        def __post_init__(self) -> None:
+            check_fields(self)
+
+A letter is a size, the same in all of a record and in the records within it; `...` is any number of dimensions, `_` any
+size. The letter of a tuple, or of `Coordinates`, is its length.
+"""
+
+import enum
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from types import NoneType, UnionType
+from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from lqrsim.errors import InputError, check_count, check_items, check_kind, check_number, excerpt, numbers_of, real
+
+Sizes = dict[str, int]
+
+LINE = 1000  # characters of a name or another line
+Line = Annotated[str, LINE]  # one printable line
+LARGEST_COUNT = 2**128 - 1  # of a seed
+
+
+class Bounds(NamedTuple):
+    """The numbers that a field may hold, all finite. A field without bounds may also hold infinity and NaN."""
+
+    above: float | None = None
+    at_least: float | None = None
+    at_most: float | None = None
+    below: float | None = None
+
+
+class Declared(NamedTuple):
+    """What an annotation says of a field.
+
+    Attributes:
+      kinds: of which one is meant; what `typing` names them by.
+      dtype: of an array, float64 or int64; None for anything else.
+      letters: the shape of an array, or the length of something else; empty where none is said.
+      longest: characters of a text that is one printable line; None for any text.
+      optional: whether it may be None.
+    """
+
+    kinds: tuple[Any, ...]
+    dtype: type[np.generic] | None
+    letters: str
+    bounds: Bounds | None
+    longest: int | None
+    optional: bool
+
+
+def check_fields(record: Any) -> Sizes:
+    """Check the fields of a record and keep them as their annotations say: arrays as float64, tuples as tuples.
+
+    Returns:
+      The sizes, by letter.
+
+    Raises:
+      InputError: a field is of another kind, range or size.
+    """
+    sizes: Sizes = {}
+    who = type(record).__name__
+    for name, said in _in_order(type(record)):
+        value = getattr(record, name)
+        kept = _checked(f"{who}: {name}", value, said, sizes)
+        if kept is not value:
+            object.__setattr__(record, name, kept)
+    return sizes
+
+
+@cache
+def declarations(kind: type) -> dict[str, Declared]:
+    """What is declared of each field of a record, but for those that are no part of its value (`compare=False`)."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {field.name: declared(hints[field.name]) for field in fields(kind) if field.compare}
+
+
+@cache
+def declared(annotation: Any) -> Declared:
+    """What an annotation says."""
+    said: list[Any] = []
+    optional = False
+    kinds: tuple[Any, ...] = (annotation,)
+    while len(kinds) == 1 and get_origin(kinds[0]) in (Annotated, Union, UnionType):
+        inside = get_args(kinds[0])
+        if get_origin(kinds[0]) is Annotated:
+            said += inside[1:]
+            kinds = inside[:1]
+        else:
+            kinds = tuple(one for one in inside if one is not NoneType)
+            optional = optional or len(kinds) < len(inside)
+
+    def first(kind: type) -> Any:
+        return next((one for one in said if isinstance(one, kind)), None)
+
+    dtype = None
+    if get_origin(kinds[0]) is np.ndarray:
+        dtype = np.int64 if "int64" in str(kinds[0]) else np.float64
+    return Declared(kinds, dtype, first(str) or "", first(Bounds), first(int), optional)
+
+
+@cache
+def _in_order(kind: type) -> list[tuple[str, Declared]]:
+    """Records first, which say what sizes are, then arrays, then tuples of a length."""
+
+    def order(item: tuple[str, Declared]) -> int:
+        said = item[1]
+        return 2 if get_origin(said.kinds[0]) is tuple and said.letters else int(said.dtype is not None)
+
+    return sorted(declarations(kind).items(), key=order)
+
+
+def _checked(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
+    """The value as it is declared. Raises InputError for another."""
+    kind, bounds = said.kinds[0], said.bounds
+    if value is None and said.optional:
+        return None
+    if said.dtype is not None:
+        return _array(field, value, said, sizes)
+    if kind is float:
+        return _number(field, value) if bounds is None else check_number(field, value, **bounds._asdict())
+    if kind is int:
+        return check_count(field, value, at_least=0, at_most=LARGEST_COUNT)
+    if kind is str:
+        return check_string(field, value, said.longest)
+    if kind is object:
+        return value
+    origin = get_origin(kind)
+    if origin is tuple:
+        items = check_items(field, value, object, "a tuple")
+        if said.letters:
+            _check_length(field, len(items), said.letters, sizes)
+        inner = declared(get_args(kind)[0])
+        return tuple(_checked(f"{field}[{i}]", item, inner, sizes) for i, item in enumerate(items))
+    if origin is not None:  # a Mapping
+        value = check_kind(field, value, Mapping, "a dictionary by name")
+        inner = declared(get_args(kind)[1])
+        names = {name: check_string(f"{field}: a name", name, LINE) for name in value}
+        return {name: _checked(f"{field}.{name}", value[name], inner, sizes) for name in names}
+    names = [one.__name__ for one in said.kinds]
+    want = " or ".join(f"{'an' if name[0] in 'AEIOU' else 'a'} {name}" for name in names)
+    if issubclass(kind, enum.Enum):
+        want += f", one of {', '.join(kind.__members__)}"
+    value = check_kind(field, value, said.kinds, want)
+    if said.letters:
+        _check_length(field, len(value), said.letters, sizes)
+    elif is_dataclass(value):
+        _share_sizes(field, value, sizes)
+    return value
+
+
+def _share_sizes(field: str, record: Any, sizes: Sizes) -> None:
+    """Raises InputError unless a record's sizes are those that are known; others become known by it."""
+    for name, said in declarations(type(record)).items():
+        value, inner = getattr(record, name), f"{field}.{name}"
+        if value is None or said.letters.startswith("..."):
+            continue
+        if isinstance(value, np.ndarray):
+            check_sizes(inner, value.shape, said.letters, sizes)
+        elif said.letters:
+            _check_length(inner, len(value), said.letters, sizes)
+        elif is_dataclass(value):
+            _share_sizes(inner, value, sizes)
+
+
+def check_sizes(field: str, shape: tuple[int, ...], letters: str, sizes: Sizes) -> None:
+    """Raises InputError unless a shape fits these letters and the sizes so far; new letters get theirs."""
+    wanted = letters.split()
+    if wanted[0] == "...":
+        leading = len(shape) - len(wanted) + 1
+        wanted = [f"...{i}" for i in range(leading)] + wanted[1:]
+    before = dict(sizes)
+    fits = len(wanted) == len(shape)
+    for letter, length in zip(wanted, shape, strict=False):
+        name, _, more = letter.partition("+")
+        size = length - int(more or 0)
+        expected = int(name) if name.isdecimal() else size if name == "_" else sizes.setdefault(name, size)
+        fits = fits and size == expected and size >= 0
+    if not fits:
+        known = [_length_of(letter, before) for letter in letters.split()]
+        meaning = "" if known == letters.split() else f" = ({', '.join(known)})"
+        raise InputError(f"{field}: got shape {shape}, want ({', '.join(letters.split())}){meaning}")
+
+
+def _length_of(letter: str, sizes: Sizes) -> str:
+    """The length that a letter stands for, such as 151 for T+1; the letter itself where it is not known."""
+    name, _, more = letter.partition("+")
+    return str(sizes[name] + int(more or 0)) if name in sizes else letter
+
+
+def _check_length(field: str, length: int, letter: str, sizes: Sizes) -> None:
+    """Raises InputError unless something has as many entries as the letter says."""
+    if length != (want := sizes.setdefault(letter, length)):
+        raise InputError(f"{field}: got {length} entries, want {want}")
+
+
+def _array(field: str, value: Any, said: Declared, sizes: Sizes) -> Any:
+    """An array of the declared numbers, shape and bounds."""
+    array = real(field, value, f"numbers of shape ({', '.join(said.letters.split())})")
+    check_sizes(field, array.shape, said.letters, sizes)
+    if said.dtype is np.int64:
+        numbers = numbers_of(field, array)
+        if not ((numbers >= 0) & (numbers == np.floor(numbers)) & (numbers < 2**53)).all():
+            raise InputError(f"{field}: got {excerpt(numbers.tolist())}, want whole numbers >= 0")
+        return numbers.astype(np.int64)
+    if said.bounds is not None:
+        above, least, most, below = (np.nan if bound is None else bound for bound in said.bounds)
+        bad = ~np.isfinite(array) | (array <= above) | (array < least) | (array > most) | (array >= below)
+        if bad.any():
+            place = tuple(np.argwhere(bad)[0].tolist())
+            check_number(f"{field}{list(place)}", array[place].item(), **said.bounds._asdict())
+    return array
+
+
+def _number(field: str, value: Any) -> float:
+    """A number, infinite ones and NaN too."""
+    if type(value) is float:
+        return value
+    array = real(field, value, "a number")
+    if array.shape or isinstance(value, (bool, np.bool_)):
+        raise InputError(f"{field}: got {excerpt(value)}, want a number")
+    return float(array)
+
+
+def check_string(field: str, value: Any, longest: int | None = None) -> str:
+    """`value` if it is text that a file can hold; with `longest`, one printable line of so many characters.
+
+    Lines are printed as they are, and a terminal obeys control characters.
+
+    Raises:
+      InputError: it is not.
+    """
+    if not isinstance(value, str):
+        raise InputError(f"{field}: got {excerpt(value)}, want text")
+    if longest is not None and not (len(value) <= longest and value.isprintable()):
+        raise InputError(f"{field}: got {excerpt(value)}, want one printable line of at most {longest} characters")
+    if not value.isascii() and any("\ud800" <= letter <= "\udfff" for letter in value):
+        raise InputError(f"{field}: got {excerpt(value)}, want text without halves of surrogate pairs")
+    return value

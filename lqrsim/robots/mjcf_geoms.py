@@ -1,0 +1,146 @@
+"""What collides of a robot from an MJCF, at MuJoCo's own distances."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.codegen.compiled_module import in_c_order, module_of
+from lqrsim.codegen.sources import source_of
+from lqrsim.errors import Array, InputError, check_number, vectors_of
+from lqrsim.kernels import mjcf_distances
+from lqrsim.problem.collision_geoms import CollisionGeoms, GeomDistances
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.robots.mjcf_dynamics import MjcfDynamics
+from lqrsim.robots.mjcf_memory import MjcfMemory
+from lqrsim.scenes import mjcf_obstacles
+from lqrsim.scenes.scene import Scene
+from lqrsim.scenes.world import Obstacle, World
+
+MOST_ROWS = 128  # distances that costs and constraints have at a step; with more, one a body: to the nearest obstacle
+_FAR = 1e6  # m; beyond all obstacles
+
+
+class MjcfGeoms(CollisionGeoms):
+    """All that moves and collides in an MJCF; `MjcfRobot` makes it. Meshes collide by their convex hulls.
+
+    Args:
+      scene: of the robot, in which all geoms have names.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        model, pairs = scene.model, mjcf_obstacles.pairs_of(scene.model, list(scene.geoms))
+        self._pairs, self._levers = pairs, mjcf_obstacles.levers(model)
+        plane = np.array([one.kind == "plane" for one in scene.world.obstacles], dtype=bool)
+        number = {geom: i for i, geom in enumerate(scene.geoms)}
+        self._number = np.array([number[geom] for geom in pairs[:, 1].tolist()], dtype=np.int64)
+        self._plane = plane[self._number] if len(pairs) else np.zeros(0, dtype=bool)
+        self._bodies = model.geom_bodyid[pairs[:, 0]].astype(np.int64)
+        own = model.geom_rbound[pairs[:, 0]]
+        self._bounds = own + np.where(self._plane, 0.0, model.geom_rbound[pairs[:, 1]])
+
+    @property
+    def size(self) -> float:
+        """The radius of the largest geom's bounding sphere, in metres."""
+        geoms = mjcf_obstacles.solid_geoms(self.scene.model)
+        return float(self.scene.model.geom_rbound[geoms].max(initial=0.0))
+
+    def bind(self, dynamics: Dynamics, world: World, reach: float) -> GeomDistances:
+        own, numbers = self._bound(dynamics, world)
+        if world.moving:
+            raise InputError("geoms: got obstacles that move, want balls=robot.balls for them")
+        chosen = np.flatnonzero(np.isin(self._number, numbers))
+        place = {int(one): i for i, one in enumerate(numbers)}
+        keys = [(int(self._bodies[k]), place[int(self._number[k])]) for k in chosen]
+        if len(set(keys)) > MOST_ROWS:
+            keys = [(body, -1) for body, _ in keys]
+        rows = sorted(set(keys))
+        index = {key: row for row, key in enumerate(rows)}
+        data = self._data(chosen, np.array([index[key] for key in keys], dtype=np.int64), max(1, len(rows)), reach)
+        return GeomDistances(
+            source=source_of(mjcf_distances, ROWS=max(1, len(rows))), data=data,
+            parts=tuple(self.scene.model.body(body).name for body, _ in rows),
+            obstacles=tuple(number for _, number in rows), moved=self.scene.model.nv,
+            functions=(MjcfMemory.of(own),),
+        )  # fmt: skip
+
+    def clearances(
+        self, dynamics: Dynamics, world: World, states: npt.ArrayLike, displaced: Array | None = None
+    ) -> Array:
+        own, numbers = self._bound(dynamics, world)
+        states = vectors_of("states", states, len(own.state_coordinates))
+        flat, count = in_c_order(states.reshape(-1, states.shape[-1])), len(numbers)
+        moved = displaced is not None and bool(displaced.any())
+        away = in_c_order(displaced.reshape(-1)) if moved and displaced is not None else np.zeros(1)
+        each = len(flat) // len(displaced) if moved and displaced is not None else max(1, len(flat))
+        out, which, segments = np.empty(max(1, len(flat) * count)), np.empty(count + 1), np.empty((count + 1, 6))
+        if count:
+            data = self._to_each(own, numbers)
+            self._module(own).distances_of(len(flat), flat, each, away, int(moved), data, out, which, segments)
+        return out[: len(flat) * count].reshape(*states.shape[:-1], count)
+
+    def slopes(self, dynamics: Dynamics, world: World, states: npt.ArrayLike) -> tuple[Array, Array]:
+        own, numbers = self._bound(dynamics, world)
+        flat, count = in_c_order(vectors_of("states", states, len(own.state_coordinates))), len(numbers)
+        out, slopes = np.empty(max(1, len(flat) * count)), np.zeros((max(1, len(flat) * count), flat.shape[1]))
+        which, segments = np.empty(count + 1), np.empty((count + 1, 6))
+        if count:
+            self._module(own).slopes_of(len(flat), flat, self._to_each(own, numbers), out, slopes, which, segments)
+        shape = len(flat), count
+        return out[: len(flat) * count].reshape(shape), slopes[: len(flat) * count].reshape(*shape, -1)
+
+    def of_scene(self, scene: Scene) -> bool:
+        return scene is self.scene or (scene.xml == self.scene.xml and scene.geoms == self.scene.geoms)
+
+    def travel(self, before: Array, after: Array) -> Array:
+        nv = len(self._levers)
+        return np.abs(after[..., :nv] - before[..., :nv]) @ self._levers
+
+    def _bound(self, dynamics: Dynamics, world: World) -> tuple[MjcfDynamics, npt.NDArray[np.int64]]:
+        """The dynamics, and which obstacles of the scene's those of the world are. Raises InputError."""
+        if not isinstance(dynamics, MjcfDynamics):
+            raise InputError(f"geoms: got those of an MJCF for {dynamics.name}, want its own dynamics, robot.dynamics")
+        if world is self.scene.world:
+            return dynamics, np.arange(len(world))
+        known = {one.name: (number, one) for number, one in enumerate(self.scene.world.obstacles)}
+        found = []
+        for one in world.obstacles:
+            number, own = known.get(one.name, (-1, None))
+            if not _same(one, own):
+                raise InputError(
+                    f"geoms: got the obstacle {one.name!r}, which is not one of the robot's MJCF, want those of"
+                    f" robot.scene.world: {', '.join(known) or 'there are none'}; or balls=robot.balls"
+                )
+            found.append(number)
+        return dynamics, np.array(found, dtype=np.int64)
+
+    def _data(self, chosen: npt.NDArray[np.intp], rows: npt.NDArray[np.int64], count: int, reach: float) -> Array:
+        """What the kernel reads, but the address of p."""
+        columns = [
+            rows, self._pairs[chosen, 0], self._bodies[chosen], self._pairs[chosen, 1], self._bounds[chosen],
+            self._plane[chosen],
+        ]  # fmt: skip
+        table = np.stack([np.asarray(column, dtype=np.float64) for column in columns], axis=1)
+        return np.concatenate([[count, len(chosen), check_number("reach", reach)], table.ravel()])
+
+    def _to_each(self, dynamics: MjcfDynamics, numbers: npt.NDArray[np.int64]) -> Array:
+        """The same with its address, of all distances to each obstacle."""
+        place = np.full(len(self.scene.world), -1, dtype=np.int64)
+        place[numbers] = np.arange(len(numbers))
+        rows = np.asarray(place[self._number], dtype=np.int64)
+        chosen = np.flatnonzero(rows >= 0)
+        data = self._data(chosen, rows[chosen], len(numbers), _FAR)
+        return np.concatenate([[float(dynamics.physics.numbers.ctypes.data)], data])
+
+    def _module(self, dynamics: MjcfDynamics) -> Any:
+        n = len(dynamics.state_coordinates)
+        return module_of(source_of(mjcf_distances), f"MuJoCo's distances ({n} states)", N=n)
+
+
+def _same(one: Obstacle, other: Obstacle | None) -> bool:
+    """Whether two obstacles have one shape and place."""
+    if other is None or one.kind != other.kind:
+        return False
+    pairs = ((one.position, other.position), (one.rotation, other.rotation), (one.size, other.size))
+    return all(np.array_equal(mine, its) for mine, its in pairs)

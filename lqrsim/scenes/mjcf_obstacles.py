@@ -1,0 +1,142 @@
+"""What is in the way of a robot that is all that moves in an MJCF, and which of its geoms can touch it."""
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.errors import Array
+
+Pairs = npt.NDArray[np.int64]  # (K, 2), the robot's geom and the obstacle's
+
+_LEVEL = 1 - 1e-9  # the least vertical part of the normal of a plane that is level
+
+
+def in_the_way(model: mujoco.MjModel, candidates: list[int], body: int, *, floors: bool) -> list[int]:
+    """Those of the candidates, ids of geoms that are fixed to the world, that are obstacles of the robot.
+
+    They can touch it, are not its own base, and not the floor that it stands on.
+
+    Args:
+      body: the robot's first that moves. floors: whether level planes and height fields are for standing on, if a free
+        joint, or a slide that is not level, lets the robot sink to them.
+    """
+    base, touched = _base(model), set(touching_pairs(model, candidates)[:, 1].tolist())
+    ground = _ground(model) if floors and _sinks(model, body) else set[int]()
+    return [
+        geom
+        for geom in candidates
+        if geom in touched and geom not in ground and int(model.geom_bodyid[geom]) not in base
+    ]
+
+
+def touching_pairs(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
+    """The pairs of a geom that moves and an obstacle that MuJoCo lets collide.
+
+    By contype and conaffinity, unless their bodies are excluded; or as a pair of the MJCF.
+    """
+    moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0)
+    fixed = np.array(obstacles, dtype=np.int64)
+    kinds, others = model.geom_contype, model.geom_conaffinity
+    touch = (kinds[moving][:, None] & others[fixed]) | (others[moving][:, None] & kinds[fixed]) != 0
+    if model.nexclude:
+        own, far = model.geom_bodyid[moving].astype(np.int64)[:, None], model.geom_bodyid[fixed].astype(np.int64)
+        signs = np.minimum(own, far) << 16 | np.maximum(own, far)
+        touch &= ~np.isin(signs, model.exclude_signature)
+    rows, columns = (dict(zip(ids.tolist(), range(len(ids)), strict=True)) for ids in (moving, fixed))
+    for one, other in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True):
+        for mover, obstacle in ((one, other), (other, one)):
+            if mover in rows and obstacle in columns:
+                touch[rows[mover], columns[obstacle]] = True
+    first, second = np.nonzero(touch)
+    return np.stack([moving[first], fixed[second]], axis=1)
+
+
+def pairs_of(model: mujoco.MjModel, obstacles: list[int]) -> Pairs:
+    """The pairs whose distances matter: those that can touch, and of an obstacle that nothing can touch, all.
+
+    Such an obstacle was asked for by name, or by a rule.
+    """
+    pairs = touching_pairs(model, obstacles)
+    untouched = sorted(set(obstacles) - set(pairs[:, 1].tolist()))
+    if untouched:
+        moving = solid_geoms(model)
+        extra = np.stack(np.meshgrid(moving, untouched, indexing="ij"), axis=-1).reshape(-1, 2)
+        pairs = np.concatenate([pairs, extra])
+    return pairs
+
+
+def solid_geoms(model: mujoco.MjModel) -> npt.NDArray[np.intp]:
+    """Ids of the geoms that move and can collide; of all that move where none can."""
+    moves = model.body_weldid[model.geom_bodyid] != 0
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    return np.flatnonzero(moves & collides) if (moves & collides).any() else np.flatnonzero(moves)
+
+
+def levers(model: mujoco.MjModel) -> Array:
+    """How far any point of the robot moves at most for each degree of freedom, (nv,): in m/rad, or 1 for slides.
+
+    Wherever the joints are; slides between a joint and what it turns count with their range, or 1 m without one.
+    """
+    reach, spans = np.zeros(model.nbody), np.zeros(model.nbody)
+    found = np.ones(model.nv)
+    for joint in range(model.njnt):
+        spans[model.jnt_bodyid[joint]] += 2 * np.linalg.norm(model.jnt_pos[joint])
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+            spans[model.jnt_bodyid[joint]] += np.abs(model.jnt_range[joint]).max() if model.jnt_limited[joint] else 1.0
+    for geom in solid_geoms(model).tolist():
+        body = int(model.geom_bodyid[geom])
+        reach[body] = max(reach[body], float(np.linalg.norm(model.geom_pos[geom]) + model.geom_rbound[geom]))
+    for body in range(model.nbody - 1, 0, -1):  # children come after their parents
+        parent = int(model.body_parentid[body])
+        reach[parent] = max(reach[parent], reach[body] + spans[body] + float(np.linalg.norm(model.body_pos[body])))
+    for joint in range(model.njnt):
+        kind, body, first = model.jnt_type[joint], int(model.jnt_bodyid[joint]), int(model.jnt_dofadr[joint])
+        far = reach[body] + spans[body] + float(np.linalg.norm(model.jnt_pos[joint]))
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            found[first + 3 : first + 6] = far
+        elif kind == mujoco.mjtJoint.mjJNT_BALL:
+            found[first : first + 3] = far
+        elif kind == mujoco.mjtJoint.mjJNT_HINGE:
+            found[first] = far
+    return found
+
+
+def _base(model: mujoco.MjModel) -> set[int]:
+    """The bodies that carry what moves, up to the world, and all that is fixed to the last of them."""
+    fixed, base, carriers = model.body_weldid == 0, set[int](), set[int]()
+    for body in np.flatnonzero(~fixed).tolist():
+        above = int(model.body_parentid[body])
+        if fixed[above] and above:
+            carriers.add(above)
+    for body in carriers:
+        above = body
+        while above:
+            base.add(above)
+            above = int(model.body_parentid[above])
+    for body in range(1, model.nbody):  # children come after their parents
+        if fixed[body] and int(model.body_parentid[body]) in carriers:
+            carriers.add(body)
+    return base | carriers
+
+
+def _ground(model: mujoco.MjModel) -> set[int]:
+    """Level planes that face up, and height fields."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    planes = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (data.geom_xmat[:, 8] > _LEVEL)
+    return set(np.flatnonzero(planes | (model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD))).tolist())
+
+
+def _sinks(model: mujoco.MjModel, body: int) -> bool:
+    """Whether a joint lets a body sink: a free one, or a slide that is not level, of it or of what carries it."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    while body:
+        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        for joint in range(first, first + count):
+            kind = model.jnt_type[joint]
+            slides = kind == mujoco.mjtJoint.mjJNT_SLIDE and abs(data.xaxis[joint, 2]) > 1e-9
+            if slides or kind == mujoco.mjtJoint.mjJNT_FREE:
+                return True
+        body = int(model.body_parentid[body])
+    return False

@@ -1,0 +1,255 @@
+"""Distances of robots from MJCFs: those of MuJoCo's bindings, with their derivatives; and what is an obstacle."""
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lqrsim as ls
+from lqrsim.errors import Array, InputError
+from lqrsim.problem.derivative_check import evaluate
+from lqrsim.scenes.scene import scene_from_xml
+
+SHAPES = {
+    "sphere": 'size="0.08"', "capsule": 'size="0.04 0.1"', "cylinder": 'size="0.06 0.08"',
+    "box": 'size="0.1 0.06 0.05"', "ellipsoid": 'size="0.1 0.06 0.05"', "mesh": 'mesh="rock"',
+}  # fmt: skip
+OBSTACLES = (*SHAPES, "plane")
+
+
+def rock(rng: np.random.Generator) -> str:
+    """The vertices of a mesh without flat sides."""
+    return " ".join(f"{number:.6g}" for number in 0.08 * rng.normal(size=(12, 3)).ravel())
+
+
+def arm(own: str, other: str, seed: int) -> ls.MjcfRobot:
+    """Something with a free, a ball, a hinge and a slide joint, and two obstacles."""
+    rng = np.random.default_rng(seed)
+    place, turn = rng.uniform(-0.3, 0.3, 3) + np.array([0.9, 0, 0]), rng.uniform(-180, 180, 3)
+    far = f'pos="{place[0]} {place[1]} {place[2]}" euler="{turn[0]} {turn[1]} {turn[2]}"'
+    obstacle = '<geom name="other" type="plane" size="1 1 1" pos="0 0 -0.6" euler="20 30 0"/>'
+    if other != "plane":
+        obstacle = f'<geom name="other" type="{other}" {SHAPES[other]} {far}/>'
+    xml = f"""<mujoco><asset><mesh name="rock" vertex="{rock(rng)}"/></asset><worldbody>
+      {obstacle}<geom name="ball" size="0.1" pos="-0.2 0.7 0.1"/>
+      <body name="hull"><freejoint/><geom name="hull" size="0.1"/>
+        <body name="upper" pos="0.2 0 0"><joint name="shoulder" type="ball"/>
+          <geom type="capsule" size="0.03" fromto="0.05 0 0 0.25 0 0"/>
+          <body name="fore" pos="0.3 0 0"><joint name="elbow" axis="0 1 0.3"/><joint name="reach" type="slide"/>
+            <geom name="tip" type="{own}" {SHAPES[own]} pos="0.1 0 0" euler="10 20 30"/></body></body></body>
+      </worldbody>
+      <actuator><motor joint="elbow"/></actuator></mujoco>"""
+    return ls.MjcfRobot(scene_from_xml(xml, "arm", obstacles=False), obstacles=("other", "ball"))
+
+
+def by_bindings(robot: ls.MjcfRobot, state: Array, displaced: Array | None = None) -> Array:
+    """The least distance of all moving geoms to each obstacle, by `mujoco.mj_geomDistance`."""
+    model, data = robot.scene.model, mujoco.MjData(robot.scene.model)
+    data.qpos[:] = robot.configuration(state)[0]
+    mujoco.mj_kinematics(model, data)
+    moving = [geom for geom in range(model.ngeom) if model.body_weldid[model.geom_bodyid[geom]]]
+    found = []
+    for number, name in enumerate(robot.scene.world.names):
+        obstacle = model.geom(name).id
+        if displaced is not None:
+            data.geom_xpos[obstacle] += displaced[number]
+        found.append(min(mujoco.mj_geomDistance(model, data, geom, obstacle, 100.0, None) for geom in moving))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("other", OBSTACLES)
+@pytest.mark.parametrize("own", SHAPES)
+@settings(max_examples=3, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_distances_are_mujocos_and_so_are_their_derivatives(own: str, other: str, seed: int) -> None:
+    robot, rng = arm(own, other, seed), np.random.default_rng(seed)
+    n = len(robot.dynamics.state_coordinates)
+    states = robot.at() + np.concatenate([rng.normal(0, 0.3, (4, n // 2)), np.zeros((4, n // 2))], axis=1)
+    found, slopes = robot.geoms.slopes(robot.dynamics, robot.scene.world, states)
+    expected = np.array([by_bindings(robot, state) for state in states])
+    # MuJoCo's own tolerance of distances is 1e-6 m; ours is less.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
+    h = 1e-5
+    for state, slope in zip(states, slopes, strict=True):
+        ends = np.stack([state + side * h * e for e in np.eye(n) for side in (1, -1)]).reshape(n, 2, n)
+        sides = robot.geoms.clearances(robot.dynamics, robot.scene.world, ends)
+        one = (sides[:, 0] - sides[:, 1]) / (2 * h)
+        middle = robot.geoms.clearances(robot.dynamics, robot.scene.world, state)
+        kink = np.abs(sides[:, 0] - 2 * middle + sides[:, 1]) > 1e-8  # an edge, or another geom, is nearest there
+        np.testing.assert_allclose(np.where(kink, slope.T, one), slope.T, rtol=0, atol=2e-4)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_obstacles_that_are_elsewhere(seed: int) -> None:
+    robot, rng = arm("mesh", "box", seed), np.random.default_rng(seed)
+    n = len(robot.dynamics.state_coordinates)
+    states, displaced = robot.at() + rng.normal(0, 0.2, (2, 3, n)), rng.normal(0, 0.2, (2, 2, 3))
+    found = robot.geoms.clearances(robot.dynamics, robot.scene.world, states, displaced)
+    expected = [
+        [by_bindings(robot, state, away) for state in some] for some, away in zip(states, displaced, strict=True)
+    ]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
+    plant = ls.Plant(robot, robot.scene)
+    np.testing.assert_allclose(plant.clearance(states, displaced), found.min(axis=-1), rtol=0, atol=1e-12)
+    # No point goes farther than is said: the distances of two states differ by no more.
+    travel = robot.geoms.travel(states[:, :-1], states[:, 1:])
+    still = robot.geoms.clearances(robot.dynamics, robot.scene.world, states)
+    assert (np.abs(np.diff(still, axis=1)) <= travel[..., None] + 1e-6).all()
+
+
+@pytest.mark.parametrize("own", ["capsule", "mesh"])
+def test_costs_and_constraints_have_the_derivatives_of_what_they_say(own: str) -> None:
+    robot = arm(own, "cylinder", 3)
+    world, n = robot.scene.world, len(robot.dynamics.state_coordinates)
+    problem = ls.Problem(
+        dynamics=robot.dynamics, dt=0.02, steps=5, initial=ls.FixedState(robot.at()),
+        stage_cost=ls.ControlCost([1.0]) + ls.ObstacleCost(world, geoms=robot.geoms, sharpness=5.0, weight=2.0),
+        final_cost=ls.QuadraticCost(np.ones(n), about=robot.at()),
+        constraints=[ls.Clearance(world, geoms=robot.geoms, margin=[[0.01, 0.02]])],
+    )  # fmt: skip
+    checks = ls.check_derivatives(problem, samples=2, tolerance=1e-4)
+    assert all(check.good for check in checks), checks
+    (_, term) = problem.terms("stage_cost")
+    state = robot.at(elbow=0.3, x=0.1)
+    value = evaluate(term, robot.dynamics, state, np.zeros(1))[0]
+    bodies = {"hull", "upper", "fore"}
+    rows = [one for one in term.functions if one.is_memory]
+    assert len(rows) == 1
+    assert {name for name in bodies if any(name in check.what for check in checks)} == bodies
+    apart = bodywise(robot, state)
+    np.testing.assert_allclose(value, 2.0 * np.exp(-5.0 * apart).sum(), rtol=1e-5)
+
+
+def bodywise(robot: ls.MjcfRobot, state: Array) -> Array:
+    """The least distance of each body to each obstacle, by the bindings."""
+    model, data = robot.scene.model, mujoco.MjData(robot.scene.model)
+    data.qpos[:] = robot.configuration(state)[0]
+    mujoco.mj_kinematics(model, data)
+    return np.array([
+        min(mujoco.mj_geomDistance(model, data, geom, model.geom(name).id, 100.0, None)
+            for geom in range(model.ngeom) if model.geom_bodyid[geom] == body)
+        for body in range(1, model.nbody) for name in robot.scene.world.names
+    ])  # fmt: skip
+
+
+ARM = """<mujoco><option timestep="0.01" integrator="implicitfast" gravity="0 0 {gravity}"/>
+  <asset><mesh name="rock" vertex="{rock}"/></asset><default><joint damping="0.2" armature="0.05"/></default><worldbody>
+  <geom name="floor" type="plane" size="2 2 1" pos="0 0 -0.5"/>
+  <geom name="post" type="{kind}" {size} pos="0.4 0.35 0"/>
+  <body name="pedestal" pos="0 0 0"><geom name="pedestal" type="mesh" mesh="rock"/>
+    <body name="cover"><geom name="cover" size="0.06"/></body>
+    <body name="upper"><joint name="a" axis="0 0 1"/><joint name="b" axis="0 1 0"/>
+      <geom type="capsule" fromto="0.15 0 0 0.3 0 0" size="0.03"/>
+      <body name="fore" pos="0.4 0 0"><joint name="c" axis="0 1 0"/>
+        <geom type="box" pos="0.12 0 0" size="0.1 0.03 0.03"/></body></body></body></worldbody>
+  <actuator><motor joint="a"/><motor joint="b"/><motor joint="c"/></actuator>{more}</mujoco>"""
+
+
+def arm_file(folder: Path, kind: str = "mesh", more: str = "", gravity: float = 0.0) -> Path:
+    """An arm on a base of its own, a post in its way that its straight path goes through."""
+    size = {"mesh": 'mesh="rock"', "cylinder": 'size="0.06 0.3"', "ellipsoid": 'size="0.06 0.06 0.3"'}[kind]
+    file, stone = folder / "arm.xml", rock(np.random.default_rng(4))
+    file.write_text(ARM.format(kind=kind, size=size, rock=stone, more=more, gravity=gravity), encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize("kind", ["mesh", "ellipsoid"])
+def test_an_arm_goes_round_a_post_without_a_ball(tmp_path: Path, kind: str) -> None:
+    """The plan keeps its margin, and the run has the clearance of the bindings; a plan through the post collides."""
+    robot = ls.MjcfRobot(arm_file(tmp_path, kind), obstacles=("post",))
+
+    def solved(**kept: Any) -> ls.Solution:
+        problem = ls.Problem(
+            dynamics=robot.dynamics, dt=0.02, steps=60, initial=ls.FixedState(robot.at()),
+            stage_cost=ls.ControlCost(np.full(3, 0.01)), control_limits=(-20, 20),
+            final_cost=ls.QuadraticCost([1000.0] * 3 + [100.0] * 3, about=robot.at(a=1.4)), **kept,
+        )  # fmt: skip
+        return ls.smooth(problem)
+
+    plant, apart = ls.Plant(robot, robot.scene), ls.Clearance(robot.scene.world, geoms=robot.geoms, margin=0.02)
+    through, round_ = solved(), solved(constraints=[apart])
+    assert round_.status.name == "CONVERGED", round_
+    assert round_.clearance is not None
+    expected = [by_bindings(robot, state)[0] for state in round_.trajectory.states]
+    np.testing.assert_allclose(round_.clearance, expected, rtol=0, atol=2e-6)
+    assert round_.clearance[1:].min() > 0.02 - 1e-4
+    run, hit = ls.simulate(plant, round_), ls.simulate(plant, through)
+    assert run.outcome[0] == "reached"
+    table = ls.stress.outcomes(hit)
+    assert (table.outcome[0], table.obstacle[0]) == ("collided", "post")
+    # It collided when the distance by the bindings had just become negative.
+    first = [by_bindings(robot, state)[0] < 0 for state in through.trajectory.states].index(True)
+    assert 0.02 * (first - 1) - 1e-9 <= table.ended[0] <= 0.02 * first + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("chosen", "found"),
+    [
+        (True, ("floor", "post")), (False, ()), (("post",), ("post",)), (["pedestal"], ("pedestal",)),
+        (lambda geom: geom.name != "cover", ("floor", "post", "pedestal")),
+    ],
+)  # fmt: skip
+def test_what_is_an_obstacle(tmp_path: Path, chosen: Any, found: tuple[str, ...]) -> None:
+    robot = ls.MjcfRobot(arm_file(tmp_path), obstacles=chosen)
+    assert robot.scene.world.names == found
+    assert ls.Plant(robot, robot.scene).obstacles == found
+    assert robot.with_parameters(a_damping=0.5).scene.world.names == found
+    # What is none collides as MuJoCo has it, in the plan, too.
+    solid = robot.dynamics.physics.model.geom("post").contype[0] != 0
+    assert solid == ("post" not in found)
+
+
+def test_excluded_bodies_and_other_bits_are_no_obstacles(tmp_path: Path) -> None:
+    exclude = '<contact><exclude body1="world" body2="fore"/><exclude body1="upper" body2="world"/></contact>'
+    assert ls.MjcfRobot(arm_file(tmp_path, more=exclude)).scene.world.names == ()
+    file = arm_file(tmp_path, "cylinder")
+    file.write_text(file.read_text().replace('name="post"', 'name="post" contype="2" conaffinity="4"'))
+    assert ls.MjcfRobot(file).scene.world.names == ("floor",)
+
+
+def test_a_floor_is_for_who_can_sink_to_it(tmp_path: Path) -> None:
+    legged = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/><geom name="wall" type="box"
+      size="0.1 1 1" pos="2 0 0"/><body pos="0 0 0.2">{}<geom type="box" size="0.2 0.1 0.05"/><body pos="0.2 0 0">
+      <joint name="hip" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.15" size="0.03"/></body></body>
+      </worldbody>
+      <actuator><motor joint="hip"/></actuator></mujoco>"""
+    for joints, found in (
+        ("<freejoint/>", ("wall",)), ('<joint type="slide" axis="0 0 1"/>', ("wall",)),
+        ('<joint type="slide" axis="1 0 0"/>', ("floor", "wall")),
+    ):  # fmt: skip
+        file = tmp_path / "legged.xml"
+        file.write_text(legged.format(joints))
+        assert ls.MjcfRobot(file).scene.world.names == found
+        assert ls.MjcfRobot(file, floors=False).scene.world.names == ("floor", "wall")
+        scenario = ls.scenarios.mjcf(str(file), steps=5)  # on the floor
+        assert scenario.plant().obstacles == found
+
+
+def test_what_cannot_be_an_obstacle_is_refused_in_one_line(tmp_path: Path) -> None:
+    file = arm_file(tmp_path)
+    with pytest.raises(InputError, match=r"obstacles: got 'poost', want one of: .*post"):
+        ls.MjcfRobot(file, obstacles=("poost",))
+    with pytest.raises(InputError, match=r"obstacles: got 'post', want a tuple of names: \('post',\)"):
+        ls.MjcfRobot(file, obstacles="post")
+    with pytest.raises(InputError, match=r"obstacles: got AttributeError"):
+        ls.MjcfRobot(file, obstacles=lambda geom: geom.colour)
+    with pytest.raises(InputError, match=r"got the obstacle 'post' of type mesh, .*MjcfRobot"):
+        ls.load_scene(file)
+    assert ls.load_scene(file, obstacles=("floor",)).world.names == ("floor",)
+    robot, other = ls.MjcfRobot(file), ls.World([ls.Obstacle("egg", "sphere", np.zeros(3), np.eye(3), np.full(3, 0.1))])
+    with pytest.raises(InputError, match=r"geoms: got the obstacle 'egg', which is not one of the robot's MJCF, want"):
+        ls.Clearance(other, geoms=robot.geoms).bind(robot.dynamics)
+    with pytest.raises(InputError, match=r"obstacle 'post': got a mesh, want one of: plane"):
+        ls.Clearance(robot.scene.world, balls=robot.balls).bind(robot.dynamics)
+    cost = ls.ControlCost(np.ones(3)) + ls.ObstacleCost(robot.scene.world, geoms=robot.geoms)
+    bad: dict[str, Any] = {
+        "dynamics": robot.dynamics, "dt": 0.02, "steps": 5, "initial": ls.FixedState(robot.at(a=0.72)),
+        "stage_cost": cost, "final_cost": ls.QuadraticCost(np.ones(6), about=robot.at()),
+    }  # fmt: skip
+    with pytest.raises(InputError, match=r"initial: got a start .* inside obstacle 'post', want it clear"):
+        ls.Problem(**bad)
