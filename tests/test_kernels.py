@@ -28,7 +28,7 @@ from lqrsim.codegen.llvm import Loaded, object_code
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.printer import Program
 from lqrsim.codegen.sources import Function, Scope, Source, source_of, text_source
-from lqrsim.control.law import turning_of
+from lqrsim.control.controllers import turning_of
 from lqrsim.errors import Array
 from lqrsim.kernels import (
     active_set,

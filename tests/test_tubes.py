@@ -15,7 +15,7 @@ from scipy.stats import multivariate_normal, norm
 import lqrsim as ls
 from lqrsim.control.collision_chance import Surroundings, both_below, collision_chance
 from lqrsim.control.controllers import Feedback
-from lqrsim.control.loop_moments import limited
+from lqrsim.control.linear_loop import limited
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.errors import Array
 

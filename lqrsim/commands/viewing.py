@@ -12,7 +12,7 @@ from lqrsim.commands.options import ControllerName, DesignSet, SolutionFile, opt
 from lqrsim.view.options import OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
-    from lqrsim.control.live_replanner import LiveReplanner
+    from lqrsim.control.replanner import LiveReplanner
     from lqrsim.problem.problem import Problem
     from lqrsim.results.solution import Solution
     from lqrsim.scenarios.packaged import Scenario

@@ -10,16 +10,13 @@ import numpy as np
 
 from lqrsim.control.collision_chance import Surroundings
 from lqrsim.control.controllers import Controller
-from lqrsim.control.filter_law import FilterLaw
-from lqrsim.control.filter_run import FilterRun, empty_records
+from lqrsim.control.filter_law import FilterLaw, FilterRun, empty_records, policy_of
 from lqrsim.control.kalman import check_observable, kalman_filter
-from lqrsim.control.loop_moments import Loop
-from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.policy_of_filter import policy_of
+from lqrsim.control.linear_loop import LinearLoop
+from lqrsim.control.plan_model import PlanModel, Sensors, sensor_of
 from lqrsim.control.replan_rule import ReplanRule
 from lqrsim.control.replanned import ReplannedRun
-from lqrsim.control.sensors import Sensors, sensor_of
-from lqrsim.control.tolerances import Prediction, choose_tolerances, reach_of, unit_means, with_filter
+from lqrsim.control.tracking import Prediction, choose_tolerances, reach_of, unit_means, with_filter
 from lqrsim.control.tracking_laws import AT_END, Weights, check_plan, effort_of
 from lqrsim.control.uncertainty import PerEntry, Uncertainty, per_entry
 from lqrsim.errors import Array, InputError, check_flag, check_kind, check_number
@@ -158,7 +155,7 @@ class OffsetFree(Controller):
         if self._rule is not None:
             raise InputError(f"OffsetFree: {what}: got a law with replan_every={self._rule.every:g}, want one without")
 
-    def loop(self) -> Loop:
+    def loop(self) -> LinearLoop:
         """The closed loop about the plan, as matrices, with the uncertainty as it was stated.
 
         Raises:
@@ -168,7 +165,7 @@ class OffsetFree(Controller):
         truth = replace(self.model, uncertainty=self.uncertainty.as_steady)
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self._law.nominal[:-1])
-        return Loop(truth, self.gain, offset, self.filter.gain, *self._law.limits)
+        return LinearLoop(truth, self.gain, offset, self.filter.gain, *self._law.limits)
 
     @property
     def policy(self) -> OutputFeedbackPolicy:

@@ -16,8 +16,7 @@ import numpy as np
 
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.controllers import ControllerRun
-from lqrsim.control.filter_law import FilterLaw
-from lqrsim.control.filter_run import FilterRun
+from lqrsim.control.filter_law import FilterLaw, FilterRun
 from lqrsim.control.kalman import kalman_filter
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.replan_rule import ReplanLog, ReplanRule, SolveRequest

@@ -11,7 +11,7 @@ import numpy as np
 
 from lqrsim.control.collision_chance import Surroundings, collision_chance
 from lqrsim.control.controllers import ControllerLike
-from lqrsim.control.loop_moments import Loop
+from lqrsim.control.linear_loop import LinearLoop
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.tracking_laws import check_plan
@@ -126,11 +126,11 @@ def predict_tube(
         at_plan = policy.state_coordinates.nearest(plan.states[:-1], policy.nominal)
         offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls
         space = policy.control_coordinates
-        loop = Loop(model, policy.gain, offset, None, np.array(space.low), np.array(space.high))
+        loop = LinearLoop(model, policy.gain, offset, None, np.array(space.low), np.array(space.high))
     return tube_of(loop, Surroundings.of(problem, uncertainty.obstacles))
 
 
-def tube_of(loop: Loop, surroundings: Surroundings) -> Tube:
+def tube_of(loop: LinearLoop, surroundings: Surroundings) -> Tube:
     """The tube of a closed loop among obstacles. Raises InputError for what the linear model does not have."""
     model = loop.model
     for field in ("latency", "delay"):

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lqrsim.control import law
-from lqrsim.control.controllers import Controller, ControllerRun
+from lqrsim.control.controllers import Controller, ControllerRun, turn_to_nearest
 from lqrsim.errors import Array, InputError
 from lqrsim.gym.task import EpisodeTrials, Flags, Task
 from lqrsim.results.coordinates import Coordinates
@@ -186,5 +185,5 @@ class Episode:
 
     def _near_plan(self, states: Array) -> Array:
         near = np.array(states, order="C")[None]
-        law.turn_to_nearest(self._loop.settings.states, near, self._plan.states[self._loop.step][None])
+        turn_to_nearest(self._loop.settings.states, near, self._plan.states[self._loop.step][None])
         return near[0]

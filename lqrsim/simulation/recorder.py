@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.control import law
+from lqrsim.control.controllers import turn_to_nearest
 from lqrsim.errors import Array
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
@@ -73,7 +73,7 @@ class Recorder:
     def turn_to_plan(self, space: Coordinates) -> None:
         """Replace the angles of all states by their representatives nearest the plan."""
         for array in (self.states, self.measured):
-            law.turn_to_nearest(space, array.transpose(1, 0, 2), self.plan.states)
+            turn_to_nearest(space, array.transpose(1, 0, 2), self.plan.states)
 
     def stacked_frames(self, each: int, *, all_of_them: bool) -> Array:
         """The frames (K, F, nq); NaN for those that were not reached.

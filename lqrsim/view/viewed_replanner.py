@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from lqrsim.control.controllers import Controller, ControllerRun
-from lqrsim.control.live_replanner import LiveReplanner
 from lqrsim.control.replan_rule import ActivePlan
+from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.constraints import goals_of
 from lqrsim.problem.costs import Cost, CostSum, QuadraticCost, terms_of

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from lqrsim.control.controllers import ControllerLike
-from lqrsim.control.live_replanner import LiveReplanner
+from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import Array, InputError
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution

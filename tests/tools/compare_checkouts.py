@@ -1,8 +1,8 @@
 """Compare the results of two checkouts of this project, for a change that should not change them.
 
-    python experiments/compare_checkouts.py ../before .        # some minutes
-    python experiments/compare_checkouts.py ../before . --quick
-    python experiments/compare_checkouts.py ../before . --tolerance 1e-10    # where rounding may differ
+    python tests/tools/compare_checkouts.py ../before .        # some minutes
+    python tests/tools/compare_checkouts.py ../before . --quick
+    python tests/tools/compare_checkouts.py ../before . --tolerance 1e-10    # where rounding may differ
 
 Each checkout computes in a process of its own, with the packages of this one and a cache of its own. Compared are the
 solutions of the paper's 100 queries of the quadrotor and of the drive, in both forms, with and without the paper's

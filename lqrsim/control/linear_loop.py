@@ -35,7 +35,7 @@ class LoopMoments(NamedTuple):
 
 
 @dataclass
-class Loop:
+class LinearLoop:
     """A closed loop about a plan, as matrices.
 
     Attributes:
