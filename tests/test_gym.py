@@ -107,7 +107,7 @@ def test_many_at_once_are_the_same_trials(quadrotor: ls.Scenario, quadrotor_solu
         alone = run(single, lqrsim.gym.Expert(single), seed=1, options={"trial": first + 2})
         assert rewards[2] == pytest.approx(alone[1].sum(), rel=1e-12)
     assert {"collided"} <= set(rollout.outcome)
-    with pytest.raises(InputError, match=r"^step: got episodes that have all ended"):
+    with pytest.raises(InputError, match=r"^step: all episodes have ended"):
         env.step(env.action_space.sample())
 
 
