@@ -1,4 +1,4 @@
-"""The command line. Each command reads what the one before wrote; `lqrsim COMMAND --help` documents each."""
+"""The command line; `lqrsim COMMAND --help` documents each command."""
 
 import contextlib
 import io
@@ -33,12 +33,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Args:
-      arguments: what follows `lqrsim` on the command line. By default those of this process, which then is the
-        command's own: signals stop it, and let it remove what it has not finished.
+      arguments: the words after `lqrsim` on the command line. By default those of this process, which then handles
+        signals as a command does: it removes unfinished files and ends.
 
     Returns:
-      The exit code: 0 done; 1 not converged or out of bounds; 2 bad input, or what is printed cannot be written;
-      130 stopped with Ctrl-C, 143 with SIGTERM; 141 nobody reads what it prints.
+      The exit code: 0 done; 1 not converged or out of bounds; 2 bad input, or standard output cannot be written;
+      130 stopped by Ctrl-C, 143 by SIGTERM; 141 standard output was closed.
     """
     own = arguments is None
     if own:
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (BrokenPipeError, process.Unprintable) as error:
         process.discard_output()
         cause = error.__cause__ if isinstance(error, process.Unprintable) else error
-        if isinstance(cause, BrokenPipeError):  # whoever reads what is printed, such as `head`, has had enough
+        if isinstance(cause, BrokenPipeError):  # the reader, such as `head`, has closed the pipe
             return 141
         why = cause.strerror if isinstance(cause, OSError) else cause
         process.print_error(f"lqrsim: error: standard output: got {why}, want one that can be written")

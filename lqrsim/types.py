@@ -1,4 +1,4 @@
-"""Records that other functions return or take, for annotations and for extensions."""
+"""Records that functions return or take, for annotations and extensions."""
 
 from lqrsim.control.chance_constrained import SafePlan
 from lqrsim.control.replan_rule import ReplanRecord

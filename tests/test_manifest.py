@@ -149,7 +149,7 @@ def test_what_was_edited_with_all_its_hashes_has_no_shards(folder: Path, name: s
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m: m["campaign"].update(strengths=[True]), r"campaign.strengths\[0\]: got True, want a number"),
+        (lambda m: m["campaign"].update(strengths=[True]), r"campaign.strengths\[0\]: got True, want a finite number"),
         (lambda m: m["campaign"].update(trials=10**9), "trials: got 1000000000 in shards of 2"),
         (lambda m: m["campaign"].update(trials="4"), "campaign.trials: got '4', want a whole number"),
         (lambda m: m["campaign"].update(scenario=None), "campaign.scenario: got None, want text"),

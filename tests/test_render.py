@@ -398,7 +398,7 @@ def test_diverged_trial_stands_still(flight: ls.Rollout, tmp_path: Path) -> None
     # The captions, upper left, tell the time; the marks of the plan move on.
     assert (np.abs(images[0] - images[1])[70:].max(axis=2) > 20).mean() < 0.02
     states[:], frames[:] = np.nan, np.nan
-    with pytest.raises(ls.InputError, match="without one finite state"):
+    with pytest.raises(ls.InputError, match="without a finite state"):
         render_still(broken, tmp_path / "still.png", size=SMALL)
 
 

@@ -342,7 +342,7 @@ class TestFunctions:
         value = f"def value(x, u, t, row, data):\n    return {said}\n\n\n"
         slope = "def slope(x, u, t, row, data, gradient):\n    gradient[0] += 1.0\n"
         line = refusal(lambda: ls.types.ConstraintTerm(value + slope, np.zeros(0), 1, str))
-        assert line == f"ConstraintTerm: source: got {said[:-6]} in line 2, want cos: modules are not at hand"
+        assert line == f"ConstraintTerm: source: got {said[:-6]} in line 2, want cos, without a module"
         term = value.replace("row, ", "") + slope.replace(
             "def slope(x, u, t, row, data, gradient)", "def derivatives(x, u, t, data, hessian, gradient)"
         )
@@ -352,7 +352,8 @@ class TestFunctions:
     @pytest.mark.parametrize(
         ("source", "wanted"),
         [
-            ("x = 1", "want it to define value"), ("def value(", "which is no Python"), (3, "got 3, want text"),
+            ("x = 1", "which does not define value(...), want it to"), ("def value(", "which is not valid Python"),
+            (3, "got 3, want text"),
             ("def value(x):\n    pass\n", "got value of 1 arguments, want 5"), ("import os\n" * 2, "value"),
         ],
     )  # fmt: skip

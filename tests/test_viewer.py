@@ -151,9 +151,9 @@ web_server.serve = lambda handler, **options: serve(handler, **{{**options, {}}}
 @pytest.mark.parametrize(
     ("before", "reason"),
     [
-        (BIND.format("'0.0.0.0'"), r"others can reach at \S+, port \d+"),
-        (BIND.format("'::'"), r"others can reach at \S+, port \d+"),
-        (SERVE.format("'process_request': None"), r"lets http://127\.0\.0\.1:\d+ in to /drop, port \d+"),
+        (BIND.format("'0.0.0.0'"), r"others can reach the server at \S+, port \d+"),
+        (BIND.format("'::'"), r"others can reach the server at \S+, port \d+"),
+        (SERVE.format("'process_request': None"), r"admits http://127\.0\.0\.1:\d+ to /drop, port \d+"),
         (SERVE.format("'process_response': shared(options['process_response'])"), r"lets any page read /, port \d+"),
     ],
 )

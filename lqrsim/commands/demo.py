@@ -124,7 +124,7 @@ def _render_video(rollout: Rollout, path: Path, *, quick: bool) -> None:
     from lqrsim.view import cameras
     from lqrsim.view.render import render
 
-    insets = cameras.measuring(rollout)
+    insets = cameras.measuring(rollout.plane)
     quality, fps = ("draft", 5) if quick else ("standard", 30)
     with console.progress("rendering", "frame") as progress:
         render(rollout, path, insets=insets, quality=quality, fps=fps, progress=progress)

@@ -2,8 +2,10 @@
 
 Each iteration takes a step to the minimum of a quadratic model of the Lagrangian with a logarithmic barrier, subject to
 the linearised dynamics, by a Riccati recursion; gaps between the steps of the plan are closed on the way. The barrier
-falls by Mehrotra's rule where the last step was long. A filter decides how much of a step is taken (Waechter and
-Biegler, 2006). Where a model has no minimum, the Hessian is mixed with that of the projected cost until it has.
+falls by Mehrotra's rule where the last step was long and the measures come down, and otherwise when its own problem is
+nearly solved. A filter decides how much of a step is taken (Waechter and Biegler, 2006); what a long step leaves open
+is then closed by corrections with the same models. Where a model has no minimum, the Hessian is mixed with that of the
+projected cost until it has.
 
 A row d of an inequality is d >= 0, of an equality d = 0; limits of controls are rows, too. With a multiplier y, held
 between a lowest and a highest one, `d = s - p` has two slacks: s, whose product with y - lowest is the barrier's
@@ -36,6 +38,8 @@ REGULARISATION = 1e-8  # of equalities, relative
 # rounding beside its weight, of which the kernel takes a share of 1e-9 for nothing.
 CROSSING = 1e-6
 LONG = 0.3  # the part of a step from which the next one takes Mehrotra's rule
+LATELY = 4  # iterations with that rule, than the worst of which the measures must be better for it to go on
+CLOSINGS, CLOSER = 3, 0.3  # corrections after a long step at most, and what each must leave of what was missed
 BOUNDARY = 0.99  # of the way to where a slack is zero, how much is taken at least
 NOTHING = 1e-4  # of what it typically costs to change all, a cost that is as good as none
 SHORTEST = 1e-7  # part of a step
@@ -413,6 +417,7 @@ class InteriorPoint:
         self._rows_of(plan, barrier, room, price, multipliers)
         self.iterations = 0
         self._filter: list[tuple[float, float]] = []
+        self._errors: list[float] = []
         self._mixed, self._part, self._forced = False, 1.0, 0
         self._soft = 1.0
         stages.linearize(plan, self._costates, self.stages.spread(self._force), np.inf)
@@ -647,7 +652,8 @@ class InteriorPoint:
         """One iteration; whether there was a step."""
         stages, point, scale = self.stages, self.point, self._scale
         least = 0.1 * tolerance * scale
-        if self._mixed or self._part < LONG:
+        free = self._falls()
+        if self._mixed or self._part < LONG or not free:
             self._lower_barrier(least)
         duals = self._duals(self._force)
         ratio = point.slack / duals
@@ -662,7 +668,7 @@ class InteriorPoint:
             corrections = np.zeros(len(point.slack))
             self._mixed = mix > 0
             hessian = self._hessian(mix, barrier)
-            if not self._mixed and self._part >= LONG and len(self._row):
+            if free and not self._mixed and self._part >= LONG and len(self._row):
                 corrections = self._predict(hessian, sigma, duals, least)
                 self._solve(hessian, sigma, duals, corrections, self._missed(point) * 0)
             step = self._step(sigma, duals, corrections)
@@ -704,6 +710,18 @@ class InteriorPoint:
         stages.linearize(new.plan, self._costates, self.stages.spread(self._force), 1e-10 * scale)
         self._measure()
         return True
+
+    def _falls(self) -> bool:
+        """Whether the measures have come down lately, so that Mehrotra's rule may choose the barrier's parameter.
+
+        That rule empties the filter each time: without this, iterations may go round in a circle.
+        """
+        found, missed = self.measures, float((np.abs(self._missed(self.point)) / self._size).max(initial=0.0))
+        error = max(found.stationarity, found.gap, missed, float(self._products.max(initial=0.0)) / self._scale)
+        good = error < max(self._errors[-LATELY:], default=np.inf)
+        if good:
+            self._errors.append(error)
+        return good
 
     def _lower_barrier(self, least: float) -> None:
         """Lower its parameter while the measures are within reach of it."""
@@ -798,17 +816,18 @@ class InteriorPoint:
         slacks = -self._sign * self._bound - self.parameter / self.point.slack
         return float((self.stages.models.gradient * joined).sum() + slacks @ step.slack)
 
-    def _at(self, step: Step, part: float) -> Point | None:
-        """The point a part of a step further; None where it is not finite."""
+    def _at(self, step: Step, part: float, *, about: Point | None = None) -> Point | None:
+        """The point a part of a step further than this one, or another; None where it is not finite."""
+        about = self.point if about is None else about
         plan = Motion(
-            in_c_order(self.point.plan.states + part * step.plan.states),
-            in_c_order(self.point.plan.controls + part * step.plan.controls),
+            in_c_order(about.plan.states + part * step.plan.states),
+            in_c_order(about.plan.controls + part * step.plan.controls),
         )
         cost, arrived = self.stages.trial(plan)
         numbers = self.stages.values(plan)[self.stages.live]
         if not np.isfinite(cost) or not np.isfinite(numbers).all() or not np.isfinite(arrived).all():
             return None
-        slack = self.point.slack + part * step.slack
+        slack = about.slack + part * step.slack
         slack = np.where(self._hard, np.maximum(slack, numbers[self._row]), slack)
         return Point(plan, cost, arrived, numbers, slack)
 
@@ -838,6 +857,8 @@ class InteriorPoint:
         while part > SHORTEST:
             tried = self._at(step, part)
             if tried is not None and self._acceptable(tried, part, slope):
+                if hessian is not None and part >= LONG:
+                    tried = self._closed(tried, hessian, sigma, duals, part, slope)
                 return tried, part, step
             if first and tried is not None and hessian is not None and self._off(tried) >= self._off(self.point):
                 beyond = part * self._missed(self.point) + self._missed(tried) - self._missed(self.point)
@@ -853,6 +874,28 @@ class InteriorPoint:
             first = False
             part /= 2
         return None
+
+    def _closed(self, tried: Point, hessian: Array, sigma: Array, duals: Array, part: float, slope: float) -> Point:
+        """The point nearer to a motion that keeps its rows, by the least changes, as far as the filter takes them.
+
+        With the models of the step, so that each change costs a Riccati pass and a look at where the steps lead. So a
+        plan that is good enough keeps everything long before it is the best.
+        """
+        stages = self.stages
+        for _ in range(CLOSINGS):
+            off, missed = self._off(tried), self._missed(tried)
+            gaps = tried.arrived - tried.plan.states[1:]
+            if not stages.direction(hessian, stages.pull(sigma * missed), gaps):
+                break
+            moved = np.matmul(stages.slopes, stages.joined()[:, :, None])[:, :, 0][stages.live]
+            multipliers = -sigma * (moved + missed)
+            slack = -self._sign * (self.point.slack / duals) * multipliers[self._row]
+            change = Step(stages.changes, slack, multipliers, self._costates)
+            closer = self._at(change, self._longest(tried.slack, slack), about=tried)
+            if closer is None or self._off(closer) > CLOSER * off or not self._acceptable(closer, part, slope):
+                break
+            tried = closer
+        return tried
 
     def _tidy(self, slack: Array) -> None:
         """Keep the products of slacks and multipliers within reach of the barrier's parameter, where rows are hard."""

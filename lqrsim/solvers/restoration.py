@@ -30,7 +30,8 @@ WEIGHTS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)  # on changes of controls, relative to co
 DAMPING, LIGHT, HEAVY = 0.1, 1e-3, 1e6  # the same where the damping is 1; how small it may grow from, and how large be
 LONG, SHORT, TIMES = 0.4, 0.2, 4.0  # parts of a step with which the damping falls or grows, and by what
 WIDE = 1e3  # times what the barrier's parameter says of a multiplier, what it may be
-CLOSE, PATIENCE = 1e-4, 2  # what may be missed, relative to the rows' sizes, so often in a row that this is its end
+# What may be missed, relative to the rows' sizes, and a change of cost, so often in a row that this is the end.
+CLOSE, SLOW, PATIENCE = 1e-4, 1e-2, 2
 LEVEL, FINER = 1e-4, 0.1  # of the merit, a promised decrease that is next to nothing; and by what that falls
 
 
@@ -78,7 +79,7 @@ def restore(
 
     diagonal = np.arange(stages.n, stages.n + stages.m)
     lowest = np.where(equality, -highest, 0.0)
-    settled, damping, close, level, dual = False, 1.0, 0, LEVEL, None
+    settled, near, damping, close, level, dual, before = False, False, 1.0, 0, LEVEL, None, np.inf
     count = len(stages.problem.constraint_terms)
     force = np.zeros(len(size))
     costates = np.zeros((stages.steps + 1, stages.n))
@@ -130,7 +131,8 @@ def restore(
             damping = min(max(TIMES * damping, LIGHT), HEAVY)
         short = np.where(limit, 0.0, np.where(equality, np.abs(numbers), -numbers))
         missed, near = float(short.max(initial=0.0)), float((short / size).max(initial=0.0)) < CLOSE
-        close = close + 1 if near else 0
+        close = close + 1 if near and abs(before - cost) < SLOW * abs(cost) else 0
+        before = cost
         promised = -0.5 * slope / max(abs(now), 1e-300)
         if watch(cost, missed, promised) or close == PATIENCE:
             break
@@ -143,7 +145,7 @@ def restore(
         if taken is None or (parameter <= least and -slope < LAST * parameter):
             break
         plan = taken
-    return Restored(plan, settled, close > 0)
+    return Restored(plan, settled, near)
 
 
 def _slacks(numbers: Array, highest: Array, equality: Array, parameter: float) -> tuple[Array, Array]:

@@ -6,13 +6,13 @@ from lqrsim.codegen.compiled_module import Call, Entry
 from lqrsim.codegen.language import type_of
 from lqrsim.codegen.llvm import Loaded, object_code
 from lqrsim.codegen.printer import Program
-from lqrsim.codegen.sources import Function, Scope, text_source
+from lqrsim.codegen.sources import Scope, ScopedFunction, text_source
 
 
 class Compiled:
     """A function compiled for arguments of these types."""
 
-    def __init__(self, function: Function, *arguments: Any) -> None:
+    def __init__(self, function: ScopedFunction, *arguments: Any) -> None:
         program = Program()
         types = tuple(map(type_of, arguments))
         self.returns = program.entry(function, types, "entry")
