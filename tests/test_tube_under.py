@@ -7,7 +7,7 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.disturbances import ControlDelay, ControlNoise, MeasurementLatency, MeasurementNoise, Push
-from lqrsim.simulation.tube_under import tube_under
+from lqrsim.simulation.uncertainty_of import tube_under
 
 NOISE = ControlNoise(0.05)
 
@@ -23,7 +23,7 @@ def test_what_the_linear_model_does_not_have_is_said_in_one_line(
             [NOISE],
             ls.Replanner(problem, drive_solution, every=1.0),
         ),
-        "told of other disturbances": (
+        "designed for other disturbances": (
             [NOISE],
             ls.OffsetFree(problem, drive_solution, ls.uncertainty_of(plant, [ControlNoise(0.06)])),
         ),
