@@ -1,9 +1,9 @@
-"""Evidence that constraints cannot be kept, at least not near a plan: no change lessens what is missed.
+"""Evidence that constraints are infeasible near a plan: the violation is stationary.
 
-What is missed in all, each row relative to its size, has a slope in the controls. It is worked out here from the
-problem's own functions, on a path that the solvers do not use. Rows that are just kept hold against it with a share of
-their own, from 0 to 1, which the interior point comes to where constraints may be missed at a price; controls at their
-limits hold by themselves. Where all of it cancels, the plan is the best near it that can be had.
+The total violation, each row relative to its size, has a gradient in the controls. It is recomputed here from the
+problem's own functions, on a code path that the solvers do not use. Rows that are just kept balance it with multipliers
+from 0 to 1, which the restoration finds; controls at their limits balance it by themselves. Where everything cancels,
+no plan nearby violates the constraints less.
 """
 
 from dataclasses import dataclass
@@ -14,18 +14,19 @@ from lqrsim.errors import Array
 from lqrsim.problem.problem import Problem
 from lqrsim.solvers.engine import Workspace
 
-STATIONARY = 5e-3  # slope that may be left, relative to what cancels
-AT_LIMIT = 1e-4  # of a control's range, which a barrier may have left, and which could lessen nothing that matters
-NAMED = 3  # constraints at most that a message names beside the one that is missed most
+STATIONARY = 5e-3  # largest remaining gradient, relative to what cancels
+AT_LIMIT = 1e-4  # distance from a limit, relative to the range, that a barrier may leave
+NAMED = 3  # most constraints that a message names beside the one that is violated most
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Of a plan about which what is missed is stationary.
+    """A plan whose violation is stationary.
 
     Attributes:
-      states: (T+1, n). controls: (T, m). left: the slope that is left, relative to what cancels. missed: in all.
-      against: what stands against what is missed, and what else is missed, in words, the strongest first.
+      states: (T+1, n). controls: (T, m). left: the remaining gradient, relative to what
+        cancels. missed: the total violation.
+      against: the other constraints that conflict, in words, the strongest first.
     """
 
     states: Array
@@ -35,7 +36,7 @@ class Evidence:
     against: tuple[str, ...]
 
     def beside(self, worst: str) -> str:
-        """What a message names beside the constraint that it begins with."""
+        """The conflicting constraints other than the one that a message begins with, in words."""
         return ", ".join([name for name in self.against if not worst.startswith(name.split(" at ")[0])][:NAMED])
 
 
@@ -43,11 +44,12 @@ def evidence(
     problem: Problem, work: Workspace, states: Array, controls: Array, *, shares: list[Array], sizes: list[Array],
     allowed: float, control_size: Array, state_size: Array,
 ) -> Evidence | None:  # fmt: skip
-    """The evidence that a plan is, or None.
+    """Return the evidence that a plan provides, or None.
 
     Args:
-      shares: of each constraint (T+1, rows), from -1 to 1. sizes: of each (rows,) by how much its rows change.
-      allowed: how much may be missed. control_size, state_size: by how much these change.
+      shares: multipliers of each constraint relative to the price, (T+1, rows), from -1 to 1.
+      sizes: typical sizes of each constraint's rows, (rows,). allowed: the tolerance.
+      control_size, state_size: typical sizes of controls and states.
     """
     steps, (n, m) = len(controls), (states.shape[1], controls.shape[1])
     slopes, alone, missed = np.zeros((steps + 1, n + m)), np.zeros((steps + 1, n + m)), 0.0
