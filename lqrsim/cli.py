@@ -1,8 +1,12 @@
 """The command line; `lqrsim COMMAND --help` documents each command."""
 
+import contextlib
+import io
+import itertools
 import logging
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from lqrsim import process
 
@@ -70,9 +74,7 @@ def _run(arguments: list[str]) -> int:
             print(f"lqrsim {version('lqrsim')}")
         return 0
 
-    import tyro
-
-    from lqrsim.commands import COMMANDS, Command
+    from lqrsim.commands import COMMANDS
 
     if arguments in (["--help"], ["-h"]):
         lines = "\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items())
@@ -80,23 +82,47 @@ def _run(arguments: list[str]) -> int:
             print(f"usage: lqrsim COMMAND ...\n\n{DESCRIPTION.format(commands=lines)}")
         raise SystemExit(0)
     with process.printing():
-        command = tyro.cli(Command, prog="lqrsim", args=arguments)
+        command = _parse(arguments)
 
-    from lqrsim.commands import console
+    from lqrsim.commands import NAMES, console
     from lqrsim.errors import InputError
 
-    notices = logging.StreamHandler()  # on stderr, such as that code is being compiled
+    notices = logging.StreamHandler()  # on stderr: what takes long, such as compiling for a new kind of problem
     logger = logging.getLogger("lqrsim")
     logger.addHandler(notices)
     logger.setLevel(logging.INFO)
     try:
+        if isinstance(command, str):
+            raise InputError(command)
         with process.interruptible():
-            return console.run(command)
+            return console.run(command, NAMES[type(command)])
     except InputError as error:
+        if "--json" in arguments:
+            name = f"lqrsim {arguments[0]}" if arguments[0] in COMMANDS else "lqrsim"
+            console.print_json({"format": name, "version": 1, "exit_code": 2, "error": str(error)})
         process.print_error(f"lqrsim: error: {error}")
         return 2
     finally:
         logger.removeHandler(notices)
+
+
+def _parse(arguments: list[str]) -> Any:
+    """Parse the arguments into a command. With `--json` a usage error is returned as a line, not printed in a box."""
+    import tyro
+
+    from lqrsim.commands import Command
+
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(printed) if "--json" in arguments else contextlib.nullcontext():
+            return tyro.cli(Command, prog="lqrsim", args=arguments)
+    except SystemExit as end:
+        if "--json" not in arguments or end.code != 2:
+            raise
+    # The first line is the box's title; a rule separates the hints below.
+    lines = [line.strip("│╭╮╰╯ ") for line in printed.getvalue().splitlines()]
+    text = " ".join(itertools.takewhile(lambda line: not line.startswith("──"), filter(None, lines[1:])))
+    return text or "got arguments that cannot be parsed"
 
 
 if __name__ == "__main__":

@@ -322,7 +322,7 @@ def excerpt(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def told(error: BaseException) -> str:
+def format_error(error: BaseException) -> str:
     """What an exception says, for a message: its kind, and its text as one printable line, whatever that is."""
     try:
         text = " ".join(str(error).split())

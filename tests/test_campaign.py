@@ -206,7 +206,7 @@ def test_finished_is_finished(reference: Results, monkeypatch: pytest.MonkeyPatc
         raise AssertionError
 
     before = {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
-    monkeypatch.setattr(trials, "work", never)
+    monkeypatch.setattr(trials.Job, "work", never)
     run_campaign(CAMPAIGN, reference.folder)
     run_campaign(replace(CAMPAIGN, time_limit=1.0), reference.folder)  # not a part of what is asked
     assert before == {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
@@ -532,7 +532,7 @@ def test_what_is_no_campaign_is_not_opened(tmp_path: Path, make: Callable[[Path]
     [
         ("stress quadrotr", ["scenario: got 'quadrotr'"]),
         ("stress quadrotor --sweep hurricane", ["hurricane"]),
-        ("stress quadrotor --sweep scenario:Gust", ["kind of sweep scenario: got 'Gust'", "ControlNoise"]),
+        ("stress quadrotor --sweep scenario:Gust", ["kind of disturbance in scenario: got 'Gust'", "ControlNoise"]),
         ("stress quadrotor --trials 0", ["trials: got 0"]),
         ("stress quadrotor --strengths -1", ["strengths: got -1"]),
         ("stress quadrotor --strengths 1 1", ["strengths: got (1.0, 1.0)", "each once"]),

@@ -253,16 +253,21 @@ def test_a_bad_number_is_refused_in_one_line_that_names_class_and_field(name, fi
             lambda: Dryden(altitude=400.0),
             "^Dryden: altitude: got 400.0, want a finite number >= 0 <= 304.8$",
         ),
-        (lambda: Saturation(), "^Saturation: share: got neither it and limits, want"),
+        (lambda: Saturation(), "^Saturation: share: got neither share and limits, want"),
         (lambda: Saturation(share=1.1), "^Saturation: share: got 1.1, want"),
         (lambda: ActuatorLoss(remaining=1.1), "^ActuatorLoss: remaining: got 1.1, want"),
-        (lambda: MassMismatch(), "^MassMismatch: got neither of std and factor, want one of them$"),
-        (lambda: AxleMismatch(0.1, 1.1), "^AxleMismatch: got both std and factor, want one of them$"),
+        (lambda: MassMismatch(), "^MassMismatch: got neither of std and factor, want one of the two$"),
+        (lambda: AxleMismatch(0.1, 1.1), "^AxleMismatch: got both std and factor, want one of the two$"),
         (
             lambda: ThrustMismatch(0.34),
             "^ThrustMismatch: std: got 0.34, want a finite number >= 0 < 0.333333$",
         ),
         (lambda: MassMismatch(factor=0.0), "^MassMismatch: factor: got 0, want numbers > 0$"),
+        *[
+            (lambda kind=kind: KINDS[kind](factor=()), f"^{kind}: factor: got no numbers, want at least one$")
+            for kind in KINDS
+            if kind.endswith("Mismatch")
+        ],
     ],
 )
 def test_numbers_beyond_their_bounds_are_refused(make, message):

@@ -32,7 +32,7 @@ from lqrsim.results.goal import OF_RANGE, Target, endings
 from lqrsim.robots.base import Robot
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.simulation.plant import Plant
-from lqrsim.simulation.tube_under import tube_under
+from lqrsim.simulation.uncertainty_of import tube_under
 from lqrsim.stress import trials
 from lqrsim.stress.campaign import Campaign, run_campaign
 from lqrsim.stress.outcome_table import OUTCOMES, Outcomes, outcomes

@@ -13,15 +13,15 @@ import pytest
 import lqrsim as ls
 import lqrsim.gym
 from lqrsim.cli import main
-from lqrsim.commands.failures import Break, Rare
-from lqrsim.stress.trials import solve
+from lqrsim.commands.reliability import Break, Rare
+from lqrsim.stress.policies import solve
 from lqrsim.view import viewer
 
 DRIVE, LIGHT = "differential_drive", (ls.disturbances.ControlNoise(0.02), ls.disturbances.MeasurementNoise(0.01))
 CAMPAIGN = ls.stress.Campaign(
     scenario=DRIVE, sweeps={"light": LIGHT}, strengths=(1.0,),
     policies=("smooth", "ilqr", "open_loop", "replan", "track", "offset_free"), replan_every=12.0, trials=4, shard=2,
-    stated=LIGHT,
+    design_disturbances=LIGHT,
 )  # fmt: skip
 FEW = ["--sweep", "scenario", "--strengths", "1", "--trials", "2", "--workers", "0"]
 
@@ -159,7 +159,7 @@ def test_the_folder_has_all_that_it_takes_to_replay_and_to_go_on(
 
 
 def test_a_campaign_that_solves_does_not_go_on_with_a_solution(left: ls.Solution, tmp_path: Path) -> None:
-    campaign = dataclasses.replace(CAMPAIGN, policies=("smooth",), stated=None, trials=1)
+    campaign = dataclasses.replace(CAMPAIGN, policies=("smooth",), design_disturbances=None, trials=1)
     solved = ls.stress.run_campaign(campaign, tmp_path / "solved", workers=0)
     assert solved.given is None
     with pytest.raises(ls.InputError, match=r"^solution: got another, want none, as .*solved was begun with"):
@@ -174,7 +174,7 @@ def test_a_campaign_that_solves_does_not_go_on_with_a_solution(left: ls.Solution
 
 def test_the_hash_is_of_all_that_solving_again_begins_with(left: ls.Solution, tmp_path: Path) -> None:
     """Plans and policies of the same numbers are planned again in another way with another cost-to-go."""
-    campaign = dataclasses.replace(CAMPAIGN, policies=("replan",), stated=None, trials=1)
+    campaign = dataclasses.replace(CAMPAIGN, policies=("replan",), design_disturbances=None, trials=1)
     assert left.cost_to_go is not None
     steeper = dataclasses.replace(left.cost_to_go, hessian=2 * left.cost_to_go.hessian)
     digests = {
@@ -261,7 +261,7 @@ def test_what_does_not_fit_is_refused_by_name(
         "3, want a Solution": 3,
         "nothing.npz, want a file that exists": tmp_path / "nothing.npz",
     }
-    campaign = dataclasses.replace(CAMPAIGN, policies=("smooth",), stated=None)
+    campaign = dataclasses.replace(CAMPAIGN, policies=("smooth",), design_disturbances=None)
     for says, solution in unfit.items():
         with pytest.raises(ls.InputError, match=f"^solution: .*({says})"):
             ls.stress.run_campaign(campaign, tmp_path / "out", workers=0, solution=solution)

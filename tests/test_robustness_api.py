@@ -191,7 +191,8 @@ class TestCounts:
     @pytest.mark.parametrize("name", ["size", "particles", "moves", "repetitions", "most_levels"])
     def test_of_splitting(self, name: str, count: int) -> None:
         options = {"size": 2, name: count}
-        assert refusal(lambda: lq.stress.split(lambda z: z[:, 0], **options)).startswith(f"{name}: got {count}, ")
+        said = refusal(lambda: lq.stress.failure_probability(lambda z: z[:, 0], **options))
+        assert said.startswith(f"{name}: got {count}, ")
 
     def test_of_campaigns(self, tmp_path: Path) -> None:
         campaign = ls.stress.Campaign(
@@ -223,7 +224,7 @@ class TestCounts:
             clearance=None, candidates=(), multipliers=(),
         )  # fmt: skip
         line = refusal(lambda: ls.simulate(differential_drive.plant(), endless))
-        assert "10000 control periods of 100 s, which are 120000000 physics steps, want at most 100000000" in line
+        assert "10000 control periods of 100 s, which takes 120000000 physics steps, want at most 100000000" in line
 
 
 class TestDataThatUsersBuild:

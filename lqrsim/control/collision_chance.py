@@ -1,4 +1,4 @@
-"""How likely a robot is to collide, of the mean and the covariance of its states along a plan.
+"""Chance of collision, from mean and covariance of the states along a plan.
 
 Of each obstacle, the clearance is taken to be linear about the mean, so that it is normal. A collision is counted when
 it begins: the expected number of steps in which the clearance falls below zero. Clearances of two neighbouring steps
@@ -26,7 +26,7 @@ FAR = 12.0  # standard deviations of clearance, with which the chance of a colli
 
 
 class Spread(NamedTuple):
-    """How the clearances to O obstacles are distributed at T+1 knots.
+    """Distribution of the clearances to O obstacles at T+1 knots.
 
     Attributes:
       mean: in m, (T+1, O). std: in m, (T+1, O). correlation: of each with that of the knot before, (T, O).
@@ -39,7 +39,7 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a robot must not touch.
+    """Obstacles of a problem, as its robot sees them.
 
     Attributes:
       dynamics: of the problem.
@@ -138,7 +138,7 @@ class Surroundings:
         return clearance[knots, nearest, obstacle], np.einsum("kod,kodi->koi", normals, moves)
 
     def spread(self, states: Array, covariance: Array, across: Array) -> Spread:
-        """At mean states (T+1, n), of covariances (T+1, n, n), and (T, n, n) with the states of the knot before."""
+        """Clearances at mean states (T+1, n); `across` (T, n, n) is the covariance with the knot before."""
         place = list(self.position)
         clearance, normal, displaced = self.clearances(states)
         variance = np.einsum("toi,tij,toj->to", normal, covariance[:, place][:, :, place], normal) + displaced
@@ -162,7 +162,7 @@ def collision_chance(
 
 
 def chance_of_clearances(margin: Array, correlation: Array) -> tuple[Array, float]:
-    """The same of clearances in standard deviations (T+1, O), and the correlation of each with that before (T, O)."""
+    """`collision_chance` of clearances in standard deviations (T+1, O) and their correlations with the knot before."""
     each = ndtr(-margin)
     begins, near = np.zeros_like(correlation), margin[1:] < FAR
     # In collision at a knot and not at the one before.

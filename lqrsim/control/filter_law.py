@@ -26,12 +26,12 @@ class FilterLaw:
     """A filter and the law `u = gain z + offset` of its estimates z, about one plan.
 
     Attributes:
-      plan: what it is about, as it was solved for.
-      model: the linear model about it, which the filter believes.
+      plan: that it follows, as solved.
+      model: the linear model about it, which the filter assumes.
       filter: its gains and covariances.
-      weights: what deviations from the plan cost the law.
+      weights: of deviations from the plan.
       gain: (T, m, Z). offset: (T, m).
-      nominal: (T+1, Z), what z is in an undisturbed run.
+      nominal: z in an undisturbed run, (T+1, Z).
     """
 
     plan: Plan
@@ -46,11 +46,11 @@ class FilterLaw:
     def of(
         cls, plan: Plan, model: PlanModel, kalman: KalmanFilter, weights: Weights, granted: Array | None = None
     ) -> "FilterLaw":
-        """The law about the model's plan, which takes states (D,) of the unknowns for granted, by default zeros."""
+        """The law about the model's plan. `granted` are the unknowns' states (D,) that it assumes, by default 0."""
         trajectory = model.plan
         granted = np.zeros(len(model.transition)) if granted is None else granted
         gain, offset = tracking_laws(model, weights)
-        # In what the filter estimates, and not in deviations from the plan.
+        # From deviations to the filter's own numbers.
         unknowns = np.tile(granted, (trajectory.steps + 1, 1))
         nominal = np.concatenate([trajectory.states, model.reached, unknowns], axis=1)
         offset = trajectory.controls + offset - np.einsum("tij,tj->ti", gain, nominal[:-1])
@@ -58,7 +58,7 @@ class FilterLaw:
 
     @property
     def coordinates(self) -> tuple[Coordinates, Coordinates]:
-        """Of the states and of the controls."""
+        """Coordinates of the states and of the controls."""
         return self.plan.policy.state_coordinates, self.plan.policy.control_coordinates
 
     @property
@@ -71,8 +71,8 @@ class FilterLaw:
 class FilterRun(ControllerRun):
     """K trials of a run, with their estimates.
 
-    With measurements that are late by k periods the filter lives k periods ago, and what it estimates is predicted on,
-    by the commands since, to when the next command acts.
+    If measurements are late by k periods, the filter runs k periods behind. Its estimate is predicted forward with the
+    commands since, to the time at which the next command acts.
 
     Args:
       law: to begin with.
@@ -89,17 +89,17 @@ class FilterRun(ControllerRun):
 
     def __init__(self, law: FilterLaw, trials: int, records: tuple[Array, Array] | None) -> None:
         self.law, self.first = law, 0
-        self.model = law.model  # which predicts, whatever the law's plan takes for granted
+        self.model = law.model  # for predictions, whatever a later plan assumes of the unknowns
         self._trials = trials
         self.z = np.tile(law.nominal[0], (trials, 1))
-        # What is shown until the first measurement comes, if that gets lost, is where the plan begins.
+        # If the first measurement is lost, the plan's first state is shown.
         self._last = np.tile(law.model.plan.states[0], (trials, 1))
         self._diverged: dict[int, str] = {}
         self._differences = np.empty((trials, law.model.sensor.size))
         self.estimates, self.innovations = records or (None, None)
         self._limits = Limits(*law.limits)
         self._latency, self._delay = law.model.uncertainty.latency, law.model.uncertainty.delay
-        # Commands since the knot that z is of, the oldest first. Until the first commands come, the plan's are applied.
+        # Commands since the knot of z, the oldest first. Until the first ones arrive, the plan's are applied.
         controls = law.model.plan.controls
         self._commands = [np.tile(controls[min(i, len(controls) - 1)], (trials, 1)) for i in range(self._delay)]
 
@@ -111,8 +111,8 @@ class FilterRun(ControllerRun):
         return self._diverged
 
     def take_in(self, step: int, measured: Array) -> None:
-        """What is measured at a step, after the period before."""
-        if step < self._latency:  # there is nothing new
+        """Predict the estimate to the knot of a step's measurement, and correct it."""
+        if step < self._latency:  # no measurement has arrived
             return
         law, model = self.law, self.model
         if step > self._latency:
@@ -130,7 +130,7 @@ class FilterRun(ControllerRun):
             self.estimates[at], self.innovations[at] = self.z, self._differences
 
     def command(self, step: int) -> Array:
-        """The law of the estimates, at a step whose measurement was taken in."""
+        """The controls of a step, whose measurement was taken in."""
         law, model = self.law, self.model
         ahead = self.z
         if self._commands:
@@ -147,7 +147,7 @@ class FilterRun(ControllerRun):
         return out
 
     def _look_for_diverged(self, estimates: Array) -> None:
-        """Note whose estimates are not finite, or beyond all that a robot can be."""
+        """Note the trials whose estimate is not finite or larger than any plausible value."""
         places = np.empty(self._trials)
         self.model.compiled.diverged(self._trials, estimates, places)
         for k in np.flatnonzero(places < self.model.size):
@@ -156,18 +156,22 @@ class FilterRun(ControllerRun):
             self._diverged.setdefault(int(k), f"the estimate of {self.model.names[i]} {what}")
 
     def _predict(self, estimates: Array, commands: Array) -> None:
-        """A control period on."""
+        """Predict estimates by one control period."""
         self.model.compiled.predict(self._trials, in_c_order(commands), self.model.predictor, estimates)
 
 
 def empty_records(law: FilterLaw, trials: int) -> tuple[Array, Array]:
-    """Where `FilterRun` records estimates and innovations of K trials: NaN where nothing is taken in."""
+    """Arrays of NaN for the estimates and innovations of K trials."""
     knots, model = law.model.plan.steps + 1, law.model
     return np.full((knots, trials, model.size), np.nan), np.full((knots, trials, model.sensor.size), np.nan)
 
 
 def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
-    """The recursions of a law."""
+    """The law as an `OutputFeedbackPolicy`, linear about the plan.
+
+    Commands under way are part of its state and move up by one place in each period. If measurements are late by k
+    periods, z is k periods behind, and the law acts on the prediction of z with the commands since, which is linear.
+    """
     model, plan = law.model, law.model.plan
     late, steps, m = model.uncertainty, plan.steps, model.m
     latency, delay = late.latency, late.delay
@@ -183,13 +187,13 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
     }  # fmt: skip
     measured = _expected(law)
     for t in range(steps):
-        knot = max(t - latency, 0)  # that z is of
+        knot = max(t - latency, 0)  # of z
         under_way = min(t, latency) + delay  # commands, of which the newest are last
         first = width - under_way * m
         arrays["sensor"][t], arrays["sensor_offset"][t] = model.H[knot], measured[knot]
         if t >= latency:
             arrays["correction"][t, :size] = law.filter.gain[knot]
-        # Where the commands under way lead: z ahead = onto (z, commands) + constant.
+        # The prediction with the commands under way: z ahead = onto (z, commands) + constant.
         onto, constant = np.eye(size, width), np.zeros(size)
         for i in range(under_way):
             j = min(knot + i, steps - 1)
@@ -208,7 +212,7 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
 
 
 def _advance(now: dict[str, Array], step: tuple[Array, Array, Array], size: int, moves: bool) -> None:
-    """Write one period's transition, input and drift; `moves` where z goes on by a period, else it waits."""
+    """Write one period's transition, input and drift. Without `moves`, z waits for the first measurement."""
     (F, G, f), m, late = step, now["input"].shape[1], len(now["drift"]) > size
     now["transition"][:size, :size] = np.eye(size)
     if moves:
@@ -232,7 +236,7 @@ def _expected(law: FilterLaw) -> Array:
 
 
 def _measured_coordinates(law: FilterLaw) -> Coordinates:
-    """What the measured numbers are: where they are states, these."""
+    """Coordinates of the measured numbers: those of the states, if they are states."""
     space, names = law.coordinates[0], law.model.sensor.names
     if not set(names) <= set(space.names):
         return Coordinates(names=names, units=("",) * len(names))

@@ -1,4 +1,4 @@
-"""Mean and covariance of a closed loop about its plan, by its linear model: LQG-MP's recursion.
+"""Mean and covariance of a closed loop about its plan, by the recursion of LQG-MP.
 
 The true state and the estimate are jointly Gaussian: X = (z, zhat), zhat before the measurement of the same knot; for a
 law that estimates nothing X = z. The limits of the controls are in it by statistical linearisation: of u normal with
@@ -17,7 +17,7 @@ from lqrsim.errors import Array
 
 
 class LoopMoments(NamedTuple):
-    """Of a closed loop about its plan, X as above.
+    """Moments of X about its plan.
 
     Attributes:
       mean: of X, (T+1, X).
@@ -36,10 +36,10 @@ class LoopMoments(NamedTuple):
 
 @dataclass
 class LinearLoop:
-    """A closed loop about a plan, as matrices.
+    """A closed loop about a plan as matrices.
 
     Attributes:
-      model: what really happens. gain, offset: of the law, (T, m, Z or n) and (T, m), in deviations from the plan.
+      model: of the true system. gain, offset: of the law, (T, m, Z or n) and (T, m), in deviations from the plan.
       filter_gain: K, (T+1, Z, Y); None for a law of the states that are shown.
       low, high: limits of the controls, (m,).
     """
@@ -86,14 +86,14 @@ class LinearLoop:
         return LoopMoments(mean, covariance, across, std, saturation)
 
     def _without_control(self, t: int, seen: Array) -> tuple[Array, Array]:
-        """How X goes on without a deviation of the control, and what that adds, (X, X) and (X, m)."""
+        """Transition of X without control deviations, and their input matrix, (X, X) and (X, m)."""
         F, G = self.model.F[t], self.model.G[t]
         if self.filter_gain is None:
             return F, G
         return np.vstack([F @ np.eye(len(F), 2 * len(F)), F @ seen]), np.vstack([G, G])
 
     def _seen(self, t: int) -> tuple[Array, Array]:
-        """What the law is told, as a matrix times X, and the covariance of the noise on that."""
+        """Input of the law as a matrix times X, and the covariance of its noise."""
         model, n, size = self.model, self.model.n, self.model.size
         if self.filter_gain is None:
             return np.eye(n, size), np.diag(model.shown_std**2)
@@ -108,7 +108,7 @@ class LinearLoop:
 
 
 def limited(centre: Array, std: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:
-    """Of a normal number that is cut off: mean slope, mean, and variance beyond that of the slope; all (m,)."""
+    """Mean slope, mean and remaining variance of a clipped normal number, elementwise (..., m)."""
     sigma = np.maximum(std, 1e-12)
     a, b = (low - centre) / sigma, (high - centre) / sigma
     inside = ndtr(b) - ndtr(a)

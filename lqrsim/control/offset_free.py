@@ -1,7 +1,6 @@
-"""Output feedback that, by the linear model, leaves no steady error.
+"""Output feedback without steady errors, by the linear model.
 
-A Kalman filter estimates the state, what the actuators have reached, and what disturbs the robot; a tracking law
-follows all of it.
+A Kalman filter estimates the state, the actuators' outputs and the unknowns; a tracking law acts on all of it.
 """
 
 from dataclasses import replace
@@ -36,30 +35,31 @@ INEXACT = 0.02
 
 
 class OffsetFree(Controller):
-    """Estimates the state, the actuators and what disturbs the robot, and keeps to the plan by all of it.
+    """Keeps to a plan with estimates of the state, the actuators and the unknowns.
 
-    The filter's gains are made ahead of time, about the plan; it predicts with the model itself, with the unknowns as
-    they are estimated. A measurement that is the last one to the last bit got lost, and is predicted. One that is late
-    by `uncertainty.latency` is taken in where it belongs. Commands count as they are after saturation, so that nothing
-    winds up.
+    Gains are computed in advance, about the plan. Predictions use the nonlinear dynamics with the estimated
+    unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted. One that is late by
+    `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation, so nothing
+    winds up. It never assumes an exact model: controls are off by at least 2 % of the tolerated effort, and predicted
+    states by at least 2 % of what that effort moves them in two periods. `model.uncertainty` has what it assumes.
 
     Args:
       problem: that was solved.
       solution: its solution, or any with a plan of the same system.
-      uncertainty: what the run meets, as `uncertainty_of` makes it. What varies may have a mean, too, and what is
-        constant may change, in `memory` seconds by about its standard deviation: see `Uncertainty.steady`.
+      uncertainty: of the run, as from `uncertainty_of`. For the filter, unknowns that vary may have a mean, and
+        constants may change by about their standard deviation in `memory` seconds: see `Uncertainty.steady`.
       tolerate: as in `track`.
       effort: as in `track`.
       at_end: as in `track`.
       sensors: names of the states that are measured, by default all; or a matrix (Y, n); or a function h(x, u, p) of
         SymPy symbols, as in `Dynamics`, that does not depend on u.
       memory: in s, by default 5 s, or the plan's horizon where that is shorter.
-      record: whether runs keep what the filter makes of them, for holding it against `filter`; see below.
-      replan_every: seconds, rounded to control periods, after which it is looked at, again and again, whether the law
-        still leads to the goal and clear of obstacles: by the model, from the estimated state and with the estimated
-        constants. Where it does not, what is left of the horizon is solved from there; by default never. Where a solve
-        does not succeed, the law before goes on. Costs that depend on the step's number are not supported then.
-      replan_always: whether to solve at each of these times, wherever the law leads.
+      record: whether runs keep estimates and innovations, to compare them with `filter`; see below.
+      replan_every: seconds, rounded to control periods, between two checks whether the law still leads to the goal
+        without a collision, by the model from the estimated state with the estimated constants. If not, the rest of
+        the horizon is solved from there. If the solve fails, the law stays in force. By default, no checks. Costs that
+        depend on the step's number are then not supported.
+      replan_always: whether to solve at each of these times without a check.
 
     A run of it, which is a rollout's `controller_run`, has these attributes:
 
@@ -127,7 +127,7 @@ class OffsetFree(Controller):
         return ReplanRule("OffsetFree", problem, self.solution, every, name="replan_every", deadline=0.0)
 
     def _weights(self, tolerate: PerEntry | None, effort: Array, at_end: float) -> Weights:
-        """Of the tolerances, or of those that are chosen."""
+        """The weights of the given tolerances, or of chosen ones."""
         if tolerate is not None:
             return Weights.of(tolerate, effort, self.problem.dynamics, at_end=at_end)
         controls = self.solution.policy.control_coordinates
@@ -151,15 +151,15 @@ class OffsetFree(Controller):
         return self.solution
 
     def _check_one_plan(self, what: str) -> None:
-        """Raise InputError if there will be others: no matrices are known of these ahead of time."""
+        """Raise InputError if the law re-plans: matrices about later plans are not known in advance."""
         if self._rule is not None:
             raise InputError(f"OffsetFree: {what}: got a law with replan_every={self._rule.every:g}, want one without")
 
     def loop(self) -> LinearLoop:
-        """The closed loop about the plan, as matrices, with the uncertainty as it was stated.
+        """Return the closed loop about the plan as matrices, under the uncertainty as stated.
 
         Raises:
-          InputError: with `replan_every`, for then there are other plans.
+          InputError: with `replan_every`, which makes other plans.
         """
         self._check_one_plan("loop")
         truth = replace(self.model, uncertainty=self.uncertainty.as_steady)
@@ -169,10 +169,10 @@ class OffsetFree(Controller):
 
     @property
     def policy(self) -> OutputFeedbackPolicy:
-        """The same for a robot, with NumPy alone: predictions are linear about the plan. `save` writes it to a file.
+        """Filter and law for a robot, in NumPy alone, with predictions that are linear about the plan; `save` takes it.
 
         Raises:
-          InputError: with `replan_every`: NumPy alone solves nothing.
+          InputError: with `replan_every`, which needs a solver.
         """
         self._check_one_plan("policy")
         return policy_of(self._law)

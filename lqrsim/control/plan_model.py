@@ -46,7 +46,7 @@ Sensors = None | Sequence[str] | npt.ArrayLike | Callable[[Any, Any, Any], Any]
 
 
 class Sensor(NamedTuple):
-    """What is measured of a state.
+    """A function of the state that is measured.
 
     Attributes:
       source: `measure(x, data, out)` and `measure_slope(x, data, out)`; see `kernels/declarations.py`.
@@ -60,7 +60,7 @@ class Sensor(NamedTuple):
 
 
 def sensor_of(sensors: Sensors, space: Coordinates) -> Sensor:
-    """The sensor that is meant.
+    """Return the sensor for a user's `sensors`.
 
     Raises:
       InputError: there is no such state, a matrix of another shape, or a function that depends on what is no state.
@@ -160,7 +160,7 @@ class PlanModel:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """What messages call the entries of z, (Z,)."""
+        """Names of the entries of z for messages, (Z,)."""
         controls = self.dynamics.control_coordinates.names[: self.lagging]
         unknowns = (one.name for one, own in zip(self.remembered, self.own_states, strict=True) for _ in own)
         return (*self.dynamics.state_coordinates.names, *(f"what {one} has reached" for one in controls), *unknowns)
@@ -226,7 +226,7 @@ class PlanModel:
         return np.concatenate([np.zeros((len(self.parameters) + 2 * self.m, 0)), *columns], axis=1)
 
     def _column(self, unknown: Unknown) -> Array:
-        """Its shares of these values."""
+        """Its shares of these values, (P + 2 m,)."""
         controls, own = self.dynamics.control_coordinates.names, len(self.parameters)
         column = np.zeros(own + 2 * self.m)
         for name, share in unknown.shares.items():
@@ -240,7 +240,7 @@ class PlanModel:
 
     @cached_property
     def predictor(self) -> Predictor:
-        """What takes estimates on."""
+        """Record for the compiled predictions."""
         lag = np.array([self.lag.left, self.lag.mean])
         return Predictor(self.compiled_dynamics, self.plan.dt, self.places, lag, self.transition, self.output)
 

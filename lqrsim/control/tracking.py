@@ -1,4 +1,13 @@
-"""`track`: a policy that keeps a robot on a plan; and the choice of tolerances, for `track` and `OffsetFree`."""
+"""`track`, a policy that keeps a robot on a plan; and the choice of tolerances for `track` and `OffsetFree`.
+
+The chosen tolerances have the smallest predicted chance of failure: of a collision, or of an end farther from the
+plan's end than the goal's radius. All of them follow from one number, the time in which a deviation should vanish: each
+state may deviate by as much as random controls of the tolerated effort move it in that time. So units do not matter,
+and no state is held much more tightly than the controls can hold it. Weights that are tuned one by one can have better
+predictions, but only of the linear model that they are tuned for.
+
+The linear model is wrong where controls are often at their limits, so saturation counts against a law, too.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,7 +37,7 @@ FRAGILE = 3.0
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is predicted of a law: the chance of failing, the tube's mean width, the share of commands beyond limits."""
+    """Prediction for a law: chance of failure, mean width of the tube, share of commands beyond the limits."""
 
     chance: float
     width: float
@@ -37,7 +46,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Choice:
-    """Tolerances, with what is predicted under them.
+    """Tolerances, with the prediction for their law.
 
     Attributes:
       tolerate: of each state, (n,). settle: the time in s that they are of. weights: for the law. predicted: of it.
@@ -52,7 +61,7 @@ class Choice:
 def choose_tolerances(
     model: PlanModel, predicted: Callable[[Weights], list[Prediction]], effort: Array, at_end: float
 ) -> Choice:
-    """The tolerances for a law about a plan.
+    """Return the tolerances for a law about a plan.
 
     Args:
       predicted: predicts for each of C weights what their law leads to.
@@ -80,7 +89,7 @@ def choose_tolerances(
 
 
 def reach_of(model: PlanModel, effort: Array, periods: int) -> dict[int, Array]:
-    """How far random controls of that effort move each state in so many periods -> (n,), rms over the plan."""
+    """How far random controls of an effort move each state, (n,), in each number of periods: rms over the plan."""
     n, steps = model.n, model.plan.steps
     A, B = model.jacobian[:, :, :n], model.jacobian[:, :, n:]
     moved, total, reach = B * effort, np.zeros(n), dict[int, Array]()
@@ -93,7 +102,7 @@ def reach_of(model: PlanModel, effort: Array, periods: int) -> dict[int, Array]:
 
 
 def unit_means(units: tuple[str, ...], numbers: Array) -> Array:
-    """The same for all states of a unit: the rms of theirs."""
+    """Replace numbers (n,) by the rms over all states of the same unit."""
     squares = {unit: [number**2 for number, own in zip(numbers, units, strict=True) if own == unit] for unit in units}
     return np.array([np.sqrt(np.mean(squares[unit])) for unit in units])
 
@@ -102,7 +111,7 @@ def prediction_of(
     model: PlanModel, mean: Array, covariance: Array, across: Array, saturation: float, surroundings: Surroundings,
     radius: float | None,
 ) -> Prediction:  # fmt: skip
-    """Of the moments of the deviation of the states, as `collision_chance` takes them.
+    """The prediction for moments of the states' deviations, as in `collision_chance`.
 
     Args:
       radius: of the goal, in metres; None without one.
@@ -127,7 +136,7 @@ def with_filter(
     """Predictions for the laws of C weights that follow a filter's estimates.
 
     The filter is taken to be right about the noise: then its error is independent of what it estimates, and there is
-    less to compute than in `loop_moments.py`.
+    less to compute than in `linear_loop.py`.
     """
     n, own, steps, count = model.n, model.n + model.lagging, model.plan.steps, len(weights.state)
     gain, offset = tracking_laws(model, weights)
@@ -176,18 +185,18 @@ def track(
     uncertainty: Uncertainty | None = None,
     risk: float = 0.0,
 ) -> AffinePolicy:
-    """The policy that keeps to a plan: least squares of the deviations from it.
+    """Return the policy that minimises squared deviations from a plan.
 
-    The policy of `smooth` is optimal for the problem's cost, which mostly does not mind being off the plan. This one is
-    optimal for staying on it. `dataclasses.replace(solution, policy=track(...))` is a solution that is saved, run and
-    drawn as any other.
+    The policy of `smooth` is optimal for the problem's cost, which often does not penalise deviations from the plan.
+    This one is optimal for staying on it. It runs as `simulate(plant, solution, controller=track(...))`, and is saved
+    and drawn as any other policy.
 
     Args:
       problem: that was solved.
       solution: its solution, or any with a plan of the same system.
       tolerate: how far each state may be off, by unit or name: {"m": 0.05, "m/s": 0.2, "rad": 0.2, "rad/s": 0.2}. Only
         the ratios to one another and to `effort` matter. By default those under which the robot is least likely to fail
-        under the uncertainty; see `tolerances.py`.
+        under the uncertainty.
       effort: what may be added to each control to get back; by default a quarter of its range.
       at_end: the tolerances of the position at the plan's end, relative to before; of all states where there is none.
       uncertainty: what runs will meet, as `uncertainty_of` makes it; only for choosing tolerances.
@@ -246,7 +255,7 @@ def track(
 
 
 def _laws(problem: Problem, solution: Solution, model: PlanModel, weights: Weights, risk: float) -> tuple[Array, Array]:
-    """The laws with a risk, if there is one. Raises InputError where it is too high, and says what is not."""
+    """The laws, with the risk if it is not 0. Raises InputError if it is too high, with the largest that is not."""
     if not risk or problem.noise is None:
         return tracking_laws(model, weights)
     plan = solution.trajectory
@@ -265,5 +274,5 @@ def _laws(problem: Problem, solution: Solution, model: PlanModel, weights: Weigh
         middle = 0.5 * (low + high)
         low, high = (low, middle) if laws(middle) is None else (middle, high)
     raise InputError(
-        f"track: risk: got {risk:g}, want at most {low * (1 - 1e-5):.5g}: with more there is no expectation"
+        f"track: risk: got {risk:g}, want at most {low * (1 - 1e-5):.5g}: with more the expected cost is infinite"
     )

@@ -1,7 +1,7 @@
-"""Where a closed loop will be: the covariance of its deviation from the plan, and how likely it is to collide.
+"""Tubes: the covariance of a closed loop's deviation from its plan, and its chance of collision.
 
 LQG-MP (van den Berg, Abbeel and Goldberg 2011): with the linear model about the plan, the true state and the estimate
-are jointly Gaussian, and known before any run; `loop_moments.py` has the recursion.
+are jointly Gaussian, and known before any run; `linear_loop.py` has the recursion.
 """
 
 from dataclasses import dataclass, replace

@@ -22,9 +22,9 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.uncertainty_of import uncertainty_of
 from lqrsim.stress import analysis
+from lqrsim.stress.policies import DESIGNED, design_disturbances
 from lqrsim.stress.results import Results
-from lqrsim.stress.specification import TOLD, Campaign, Cell
-from lqrsim.stress.trials import stated_disturbances
+from lqrsim.stress.specification import Campaign, Cell
 
 MOST_VIDEOS = 100  # a page with more is too large for a browser
 
@@ -158,12 +158,12 @@ def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[
             f" numbers in each combination, of seed {campaign.seed}."
         ],
     }
-    if told := [policy for policy in tables.policies(table) if policy in TOLD]:
-        stated = stated_disturbances(scenario, campaign.stated)
-        unknown = uncertainty_of(scenario.plant(), stated).left_out
-        facts["Stated"] = [
-            f"{' and '.join(told)}: made for {_describe(stated, scenario)}.",
-            *([f"Not part of it: {'; '.join(unknown)}."] if unknown else []),
+    if designed := [policy for policy in tables.policies(table) if policy in DESIGNED]:
+        disturbances = design_disturbances(scenario, campaign.design_disturbances)
+        unknown = uncertainty_of(scenario.plant(), disturbances).left_out
+        facts["Design disturbances"] = [
+            f"{' and '.join(designed)}: designed for {_describe(disturbances, scenario)}.",
+            *([f"Left out of the design: {'; '.join(unknown)}."] if unknown else []),
         ]
     if manifest.get("versions"):
         facts["Versions"] = [", ".join(f"{name} {version}" for name, version in manifest["versions"].items())]
