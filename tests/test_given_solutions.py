@@ -103,7 +103,7 @@ def test_the_other_commands_run_it_too(
         raise ls.InputError("viewer: none here")
 
     for kind in (Rare, Break):
-        problem = kind(scenario=DRIVE, solution=stored, policy="track")._problem()
+        problem, _ = kind(scenario=DRIVE, solution=stored, policy="track", out=tmp_path)._begin("either")
         shown.append(problem.score.solution.trajectory)
     monkeypatch.setattr(viewer, "open_viewer", opened)
     assert main(["view", DRIVE, "--solution", str(stored)]) == 2
@@ -216,7 +216,7 @@ def test_a_plan_of_another_problem_is_run_but_not_planned_again(
     assert main(["stress", DRIVE, *FEW, "--solution", path, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     says = f"is of another problem than that of {DRIVE} (solved as {DRIVE}); its plan is run as it is"
-    why = "replan, which solves the scenario's problem again, of which the solution is not"
+    why = "replan, which re-plans the scenario's problem, while the solution is of another problem"
     assert f"\nsmooth {says}\n" in printed
     assert f"\nleft out: {why}\n" in printed
     assert ls.stress.Results(out).campaign.policies == ("smooth", "ilqr", "open_loop")
@@ -255,8 +255,8 @@ def test_what_does_not_fit_is_refused_by_name(
             dataclasses.replace(problem, dt=0.2), max_iterations=1
         ),
         r"with the goal y = 2.4, want 2.5 \(nan: none\)": ls.smooth(goal, max_iterations=1),
-        r"whose plan is not finite \(CONVERGED\)": dataclasses.replace(
-            left, trajectory=dataclasses.replace(left.trajectory, states=broken)
+        r"whose plan is not finite \(DIVERGED\)": dataclasses.replace(
+            left, status=ls.Status.DIVERGED, trajectory=dataclasses.replace(left.trajectory, states=broken)
         ),
         "3, want a Solution": 3,
         "nothing.npz, want a file that exists": tmp_path / "nothing.npz",

@@ -140,7 +140,7 @@ def test_a_worker_starts_no_other_process(tmp_path: Path) -> None:
         "    print('glfw.library' in sys.modules)\n"
         "if __name__ == '__main__':\n"
         "    process = executors._context.Process(target=work)\n"
-        "    with executors._surroundings():\n"
+        "    with executors._worker_environment():\n"
         "        process.start()\n"
         "    process.join()\n"
     )
